@@ -1,0 +1,7 @@
+"""``python -m dvo`` is the command ``dvo``."""
+
+import sys
+
+from dvo.cli import main
+
+sys.exit(main())

@@ -1,0 +1,180 @@
+"""From edges to normal equations: residuals, analytic Jacobians, and their sums by frame and by patch.
+
+Everything is in normalised camera coordinates of the target frame; the focal lengths enter with the weights. The Jacobian by
+the source pose is ``J_i = -J_j Ad(G_ij)``, and the adjoint depends on the frame pair only, so that the blocks of the source
+frame are made from the sums over a pair rather than from a second Jacobian of each edge.
+
+Shapes: ``B`` batch, ``G`` groups of ``M`` places (see :mod:`dvo.ba.edges`), ``P`` pairs, ``K`` patches, ``n`` free frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dvo.ba.edges import EdgePlan
+from dvo.geometry import so3
+from dvo.geometry.projection import MIN_Z_VALID
+
+MARGIN = 64.0
+"""A projection counts while it lies within the feature map grown by this many pixels."""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Which edges count.
+
+    Attributes:
+        max_residual: pixels; a longer residual is an outlier.
+        bounds: ``(width, height)`` of the feature map, or None.
+        focal, centre: ``(B, G, 2, 1)`` of the target frames, to go from normalised coordinates to pixels.
+    """
+
+    max_residual: float
+    bounds: tuple[float, float] | None
+    focal: Tensor
+    centre: Tensor
+
+
+@dataclass(frozen=True)
+class View:
+    """Points of a slice of groups as seen from the target frame: all ``(B, G, 1, M)`` but ``xy (B, G, 2, M)``."""
+
+    xy: Tensor
+    h: Tensor
+    inv_z: Tensor
+    seen: Tensor
+
+
+@dataclass
+class NormalEquations:
+    """``h_pp (B, 6n, 6n)``, ``h_pl (B, 6n, K, 1)``, ``h_ll (B, K, 1, 1)``, ``g_p (B, 6n)``, ``g_l (B, K, 1)``."""
+
+    h_pp: Tensor
+    h_pl: Tensor
+    h_ll: Tensor
+    g_p: Tensor
+    g_l: Tensor
+
+
+def relative_motion(poses_cw: Tensor, plan: EdgePlan) -> tuple[Tensor, Tensor]:
+    """Rotation ``(B, P, 3, 3)`` and translation ``(B, P, 3, 1)`` of ``T_j T_i^-1`` for each pair."""
+    r, t = so3.matrix(poses_cw[..., 3:]), poses_cw[..., :3, None]
+    rotation = r.index_select(1, plan.pair_j) @ r.index_select(1, plan.pair_i).mT
+    return rotation, t.index_select(1, plan.pair_j) - rotation @ t.index_select(1, plan.pair_i)
+
+
+def view(rotation: Tensor, t: Tensor, rays: Tensor, inverse_depth: Tensor) -> View:
+    """Move ``rays (B, G, 3, M)`` = (x, y, 1) with ``inverse_depth (B, G, 1, M)`` by the motion of each group, and project."""
+    moved = rotation @ rays + t * inverse_depth
+    z = moved[..., 2:, :]
+    seen = z > MIN_Z_VALID
+    inv_z = torch.where(seen, 1 / torch.where(seen, z, 1.0), 0.0)
+    return View(moved[..., :2, :] * inv_z, inverse_depth * inv_z, inv_z, seen)
+
+
+def counts(v: View, target: Tensor, weight: Tensor, gate: Gate, part: slice) -> Tensor:
+    """Which places count: ``(B, G, 1, M)`` bool."""
+    focal, centre = gate.focal[:, part], gate.centre[:, part]
+    pixels = (target - v.xy) * focal
+    use = v.seen & ((pixels * pixels).sum(-2, keepdim=True) < gate.max_residual**2)
+    if gate.bounds is not None:
+        place = v.xy * focal + centre
+        limit = place.new_tensor(gate.bounds)[:, None] + MARGIN
+        use = use & ((place > -MARGIN) & (place < limit)).all(-2, keepdim=True)
+    return use & torch.isfinite(weight).all(-2, keepdim=True)
+
+
+def accumulate(
+    poses_cw: Tensor,
+    inverse_depth: Tensor,
+    rays: Tensor,
+    target: Tensor,
+    weight: Tensor,
+    plan: EdgePlan,
+    gate: Gate,
+    slot: Tensor,
+    free: int,
+    pose_part: bool,
+    depth_part: bool,
+) -> tuple[NormalEquations, list[Tensor]]:
+    """Linearise at the present poses ``(B, N, 7)`` and inverse depths ``(B, K)``, and sum over the edges.
+
+    Args:
+        rays: ``(B, G, 3, M)``. target, weight: ``(B, G, 2, M)``, normalised.
+        slot, free: see :func:`dvo.ba.edges.free_slots`.
+        pose_part, depth_part: whether poses, depths are to move. What is not needed stays zero or empty.
+
+    Returns:
+        The equations, and for each chunk of the plan which places counted.
+    """
+    b, k, n, pairs = len(poses_cw), plan.patches, free, len(plan.pair_i)
+    zeros = poses_cw.new_zeros
+    rotation, t = relative_motion(poses_cw, plan)
+    tr = so3.hat(t[..., 0]) @ rotation
+    # [I | -Ad] padded to 8 rows and columns: from (e_j, u, C) of an edge to those, and (e_i, 0, 0)
+    both_ends = zeros(b, pairs, 8, 2, 8)
+    both_ends[..., 0, :].diagonal(dim1=-2, dim2=-1).fill_(1)
+    both_ends[..., :3, 1, :3] = both_ends[..., 3:6, 1, 3:6] = -rotation
+    both_ends[..., :3, 1, 3:6] = -tr
+    minus_adjoint = both_ends[..., :6, 1, :6]
+    both_ends = both_ends.view(b, pairs, 8, 16)
+
+    by_pair, by_both = zeros(b * pairs, 6, 7), zeros(b * (n + 1) * k, 8)
+    batch = torch.arange(b, device=slot.device)[:, None]
+    used = []
+    for part in plan.chunks():
+        group = plan.group_pair[part]
+        places = slice(part.start * plan.size, part.stop * plan.size)
+        kk = plan.kk[places]
+        depth = inverse_depth.index_select(1, kk).view(b, -1, 1, plan.size)
+        motion = t.index_select(1, group)
+        v = view(rotation.index_select(1, group), motion, rays[:, part], depth)
+        goal, w = target[:, part], weight[:, part]
+        use = counts(v, goal, w, gate, part)
+        used.append(use)
+        w = torch.where(use, w, 0.0)
+        residual = torch.where(use, goal - v.xy, 0.0)
+        j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
+        x, y = v.xy.unbind(-2)
+        h, (rx, ry), (dx, dy) = v.h[..., 0, :], residual.unbind(-2), j_d.unbind(-2)
+        xy, o = x * y, torch.zeros_like(x)
+        # Rows: the six columns of J_j, then the residual, then J_d; each for the x and the y axis.
+        rows = (h, o, o, h, -h * x, -h * y, -xy, -1 - y * y, 1 + x * x, xy, -y, x, rx, ry, dx, dy)
+        f = torch.stack(rows, -2)
+        if pose_part:
+            flat = f.view(*f.shape[:2], 8, 2 * plan.size)
+            products = (flat[..., :6, :] * w.flatten(-2)[..., None, :]) @ flat[..., :7, :].mT
+            index = (batch * pairs + group).flatten()
+            by_pair.index_add_(0, index, products.flatten(0, 1))
+        if depth_part:
+            wd = w * j_d
+            f = f.unflatten(-2, (8, 2))
+            products = f[..., 0, :] * wd[..., :1, :] + f[..., 1, :] * wd[..., 1:, :]
+            products = products.mT @ both_ends.index_select(1, group)
+            ends = torch.stack((slot[plan.pair_j[group]], slot[plan.pair_i[group]]), -1)[:, None] * k
+            index = (batch * (n + 1) * k + (ends + kk.view(-1, plan.size, 1)).flatten()).flatten()
+            by_both.index_add_(0, index, products.reshape(-1, 8))
+
+    by_both = by_both.view(b, n + 1, k, 8)
+    landmark = by_both[..., 6:].sum(1)
+    g_l, h_ll = landmark[..., :1], landmark[..., 1:, None]
+    if not pose_part:
+        return NormalEquations(zeros(b, 0, 0), zeros(b, 0, k, 1), h_ll, zeros(b, 0), g_l), used
+    h_pl = by_both[:, :n, :, :6].transpose(2, 3).reshape(b, 6 * n, k, 1)
+
+    by_pair = by_pair.view(b, pairs, 6, 7)
+    hessian, gradient = by_pair[..., :6], by_pair[..., 6:]
+    ji = hessian @ minus_adjoint
+    ii_gradient = minus_adjoint.mT @ torch.cat((ji, gradient), -1)
+    blocks = torch.cat((hessian, ji, ji.mT, ii_gradient[..., :6]), 1)
+    slot_i, slot_j = slot[plan.pair_i], slot[plan.pair_j]
+    row, column = torch.cat((slot_j, slot_j, slot_i, slot_i)), torch.cat((slot_j, slot_i, slot_j, slot_i))
+    index = (batch * (n + 1) ** 2 + row * (n + 1) + column).flatten()
+    grid = zeros(b * (n + 1) ** 2, 6, 6).index_add_(0, index, blocks.flatten(0, 1)).view(b, n + 1, n + 1, 6, 6)
+    h_pp = grid[:, :n, :n].transpose(2, 3).reshape(b, 6 * n, 6 * n)
+    gradients = torch.cat((gradient, ii_gradient[..., 6:]), 1)[..., 0]
+    g_p = zeros(b, n + 1, 6).index_add_(1, torch.cat((slot_j, slot_i)), gradients)[:, :n].reshape(b, 6 * n)
+    return NormalEquations(h_pp, h_pl, h_ll, g_p, g_l), used

@@ -1,0 +1,97 @@
+"""Normal equations with a block-diagonal landmark part, solved by Schur complement and damped Cholesky.
+
+    [ H_pp   H_pl ] [ dp ]   [ g_p ]
+    [ H_pl^T H_ll ] [ dl ] = [ g_l ]
+
+``P`` pose unknowns are few, ``K`` landmarks are many and do not couple among themselves: ``H_ll`` has one ``m x m`` block per
+landmark (``m = 1`` for an inverse depth, 3 for a point). See Triggs et al., "Bundle adjustment - a modern synthesis", 6.1.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+RETRIES = 6
+"""How often a failed factorisation is tried again, each time with ten times the damping."""
+
+
+def factorise(s: Tensor) -> tuple[Tensor, Tensor]:
+    """Cholesky factors of symmetric ``s (B, P, P)``, and which of them are good ``(B,)``.
+
+    Where the factorisation fails, damping of 1e-6 to 0.1 of the largest diagonal entry is tried; where that fails too, or
+    ``s`` is not finite, the factor is the identity.
+    """
+    factor, info = torch.linalg.cholesky_ex(s)
+    ok = (info == 0) & torch.isfinite(factor).all(-1).all(-1)
+    if bool(ok.all()):  # the only place of a step where an accelerator is waited for
+        return factor, ok
+    eye = torch.eye(s.shape[-1], dtype=s.dtype, device=s.device)
+    finite = torch.isfinite(s).all(-1).all(-1)
+    s = torch.where(finite[:, None, None], s, eye)
+    boost = s.diagonal(dim1=-2, dim2=-1).abs().amax(-1).clamp(min=torch.finfo(s.dtype).tiny) * 1e-6
+    for _ in range(RETRIES):
+        again, info = torch.linalg.cholesky_ex(s + boost[:, None, None] * eye)
+        mended = finite & ~ok & (info == 0)
+        factor = torch.where(mended[:, None, None], again, factor)
+        ok = ok | mended
+        boost = boost * 10
+    return torch.where(ok[:, None, None], factor, eye), ok
+
+
+def solve_with(factor: Tensor, ok: Tensor, y: Tensor) -> Tensor:
+    """``x (B, P)`` with ``L L^T x = y``; zero where the factor is not ``ok (B,)`` or the result is not finite."""
+    x = torch.cholesky_solve(y[..., None], factor)[..., 0]
+    return torch.where((ok & torch.isfinite(x).all(-1))[:, None], x, 0.0)
+
+
+def damped(s: Tensor, absolute: float | Tensor, relative: float | Tensor) -> Tensor:
+    """``s + absolute I + relative diag(s)`` for ``(B, P, P)``."""
+    return s + torch.diag_embed(s.diagonal(dim1=-2, dim2=-1) * relative + absolute)
+
+
+def invert_blocks(h_ll: Tensor) -> Tensor:
+    """Inverse of landmark blocks ``(B, K, m, m)``; zero for a landmark that nothing observes."""
+    if h_ll.shape[-1] == 1:
+        seen = h_ll > 0
+        return torch.where(seen, 1 / torch.where(seen, h_ll, 1.0), 0.0)
+    inverse, info = torch.linalg.inv_ex(h_ll)
+    good = (info == 0)[..., None, None] & torch.isfinite(inverse).all(-1, keepdim=True).all(-2, keepdim=True)
+    return torch.where(good, inverse, 0.0)
+
+
+def schur_solve(
+    h_pp: Tensor,
+    h_pl: Tensor,
+    h_ll: Tensor,
+    g_p: Tensor,
+    g_l: Tensor,
+    absolute: float | Tensor = 0.0,
+    relative: float | Tensor = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Solve the system at the top of this file.
+
+    Args:
+        h_pp: ``(B, P, P)``.
+        h_pl: ``(B, P, K, m)``.
+        h_ll: ``(B, K, m, m)``, damped by the caller as wished.
+        g_p: ``(B, P)``.
+        g_l: ``(B, K, m)``.
+        absolute, relative: damping of the reduced system ``S``: ``S + absolute I + relative diag(S)``.
+
+    Returns:
+        ``dp (B, P)`` and ``dl (B, K, m)``.
+    """
+    q = invert_blocks(h_ll)
+    b, p, k, m = h_pl.shape
+    flat = h_pl.reshape(b, p, k * m)
+    if m == 1:
+        weighted = flat * q.view(b, 1, k)
+    else:
+        weighted = (h_pl[..., None, :] @ q[:, None]).reshape(b, p, k * m)
+    s = h_pp - weighted @ flat.mT
+    y = g_p - (weighted @ g_l.reshape(b, k * m, 1))[..., 0]
+    dp = solve_with(*factorise(damped(s, absolute, relative)), y)
+    rest = g_l - (dp[:, None] @ flat).view(b, k, m)
+    dl = rest * q[..., 0] if m == 1 else (q @ rest[..., None])[..., 0]
+    return dp, dl

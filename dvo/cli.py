@@ -1,0 +1,101 @@
+"""The command ``dvo``: what may be typed, and how errors are said. The work is done in :mod:`dvo.commands`.
+
+Nothing heavy is imported before a command is known, so that ``dvo --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import NoReturn
+
+from dvo import __version__
+from dvo.commands import BAD_INPUT, INTERRUPTED
+from dvo.errors import DvoError
+
+EXIT_CODES = "exit codes: 0 done, 1 no frame could be tracked, 2 bad input, 130 interrupted (what was tracked is kept)"
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, as for every other bad input."""
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line. Each command names ``module:function``, called with the parsed arguments."""
+    parser = _Parser(prog="dvo", description="Learned monocular visual odometry.", epilog=EXIT_CODES)
+    parser.add_argument("--version", action="version", version=f"dvo {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    demo = commands.add_parser("demo", help="render a clip, track it and compare with the ground truth")
+    _tracking_options(demo)
+    demo.add_argument("--frames", type=_positive_int, default=180, help="length of the clip (default: %(default)s)")
+    demo.set_defaults(run="dvo.demo:demo")
+
+    run = commands.add_parser("run", help="track a video, a folder of images or a dataset sequence", epilog=EXIT_CODES)
+    run.add_argument("source", metavar="SOURCE", help="video, folder of images, or dataset sequence folder")
+    run.add_argument("--calib", metavar="FILE", help="'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML file")
+    _tracking_options(run)
+    run.add_argument("--stride", type=_positive_int, default=1, metavar="N", help="track every N-th frame")
+    times = run.add_mutually_exclusive_group()
+    times.add_argument("--times", metavar="FILE", help="time of each image in seconds, first column")
+    times.add_argument("--fps", type=_positive_float, metavar="F", help="frames a second, where nothing else says")
+    run.add_argument("--groundtruth", metavar="FILE", help="TUM trajectory (camera to world) to compare with")
+    run.set_defaults(run="dvo.commands.run:run")
+
+    weights = commands.add_parser("weights", help="list, import or describe weights")
+    verbs = weights.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs.add_parser("list", help="weights that ship with dvo").set_defaults(run="dvo.commands.weights:list_shipped")
+    importer = verbs.add_parser("import", help="convert an official DPVO checkpoint to safetensors")
+    importer.add_argument("file", metavar="FILE", help="checkpoint of DPVO (dpvo.pth)")
+    importer.add_argument("--out", metavar="FILE", help="safetensors file to write (default: FILE's name, here)")
+    importer.set_defaults(run="dvo.commands.weights:import_file")
+    info = verbs.add_parser("info", help="architecture, size and origin of weights")
+    info.add_argument("weights", metavar="NAME|FILE")
+    info.set_defaults(run="dvo.commands.weights:info")
+    return parser
+
+
+def _tracking_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
+    parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
+    parser.add_argument("--device", metavar="D", default="auto", help="torch device (default: an accelerator or cpu)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
+
+
+def _positive_int(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be 1 or more, got {text}")
+    return value
+
+
+def _positive_float(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be more than 0, got {text}")
+    return value
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command and return the exit code."""
+    try:
+        arguments = build_parser().parse_args(argv)
+        module, function = arguments.run.split(":")
+        command: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
+        return command(arguments)
+    except SystemExit as exit_:  # argparse: --help, --version, or a wrong option
+        return exit_.code if isinstance(exit_.code, int) else BAD_INPUT
+    except DvoError as error:
+        print("dvo: error:", " ".join(str(error).split()), file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("dvo: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

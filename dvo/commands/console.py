@@ -1,0 +1,119 @@
+"""What the commands share on the terminal: devices, seeds, Ctrl-C and the progress bar."""
+
+from __future__ import annotations
+
+import random
+import signal
+import threading
+import time
+from collections import deque
+from types import FrameType, TracebackType
+from typing import Any
+
+import cv2
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+from dvo.data.frame import Frame
+from dvo.errors import DvoError
+from dvo.odometry.protocol import Estimate, Status
+
+_COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red"}
+
+
+def device_of(name: str) -> torch.device:
+    """The torch device of that name; ``auto`` takes an accelerator that knows float64, else the CPU.
+
+    Raises:
+        DvoError: no such device here.
+    """
+    if name == "auto":
+        accelerator = getattr(torch, "accelerator", None)  # torch 2.6 and newer
+        if accelerator is None or not accelerator.is_available():
+            return torch.device("cpu")
+        name = accelerator.current_accelerator().type
+        try:
+            torch.zeros(1, device=name, dtype=torch.float64)
+        except (RuntimeError, TypeError):
+            name = "cpu"
+        return torch.device(name)
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise DvoError(f"cannot be used ({reason})", field=f"device '{name}'", remedy="give --device cpu") from error
+    return device
+
+
+def seed_everything(seed: int) -> None:
+    """Seed what draws from global generators: Python, torch and OpenCV's RANSAC."""
+    random.seed(seed)
+    torch.manual_seed(seed)
+    cv2.setRNGSeed(seed)
+
+
+class InterruptSwitch:
+    """While open, the first Ctrl-C only sets :attr:`pressed`; the second raises KeyboardInterrupt.
+
+    An interrupt in the middle of an update would leave the tracker half changed, so it waits for the frame to end.
+    """
+
+    def __init__(self) -> None:
+        self.pressed = False
+        self._before: Any = None
+
+    def __enter__(self) -> InterruptSwitch:
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._press)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _press(self, number: int, frame: FrameType | None) -> None:
+        if self.pressed:
+            raise KeyboardInterrupt
+        self.pressed = True
+
+
+class TrackingProgress:
+    """Progress bar with the rate of the last frames and the state of the tracker, on stderr.
+
+    Args:
+        total: frames to expect, or None.
+    """
+
+    def __init__(self, total: int | None) -> None:
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("[bold]tracking"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]:5.1f} frames/s"),
+            TextColumn("{task.fields[status]}"),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._task = self._progress.add_task("", total=total, rate=0.0, status="")
+        self._moments: deque[float] = deque([time.perf_counter()], maxlen=30)
+
+    def __enter__(self) -> TrackingProgress:
+        self._progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, frame: Frame, estimate: Estimate | None) -> None:
+        """Callback of :func:`dvo.odometry.session.run`."""
+        self._moments.append(time.perf_counter())
+        rate = (len(self._moments) - 1) / max(self._moments[-1] - self._moments[0], 1e-9)
+        fields: dict[str, Any] = {"rate": rate}
+        if estimate is not None:
+            fields["status"] = f"[{_COLOURS[estimate.status]}]{estimate.status.value}"
+        self._progress.update(self._task, advance=1, **fields)

@@ -1,0 +1,260 @@
+"""Calibration files: the common text line, and the YAML dialects that people have lying about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.errors import DvoError
+from dvo.geometry.camera import Camera, DistortionModel
+
+_LINE = "write 'fx fy cx cy [k1 k2 p1 p2 [k3]]' on one line, or a YAML with fx, fy, cx, cy"
+_MODELS: dict[str, DistortionModel] = {
+    "": "none",
+    "none": "none",
+    "pinhole": "none",
+    "radtan": "radtan",
+    "radial-tangential": "radtan",
+    "radialtangential": "radtan",
+    "plumb_bob": "radtan",
+    "opencv": "radtan",
+    "brown": "radtan",
+    "fisheye": "fisheye",
+    "equidistant": "fisheye",
+    "kannala-brandt": "fisheye",
+    "kannalabrandt8": "fisheye",
+    "kannala_brandt": "fisheye",
+    "opencv_fisheye": "fisheye",
+}
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Intrinsics in pixels, without an image yet.
+
+    Attributes:
+        fx, fy, cx, cy: pixels; pixel centres at integers.
+        model, coefficients: as in :class:`dvo.geometry.camera.Camera`.
+        width, height: the image size that it was made for, if the file says so.
+        file: where it came from, for messages.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    model: DistortionModel = "none"
+    coefficients: tuple[float, ...] = ()
+    width: int | None = None
+    height: int | None = None
+    file: Path | None = None
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The camera of images of this size.
+
+        Raises:
+            DvoError: the intrinsics do not fit: another resolution stated, a focal length below 0.1 or above 20 image
+                widths, a principal point outside of the image.
+        """
+        remedy = f"give the calibration of these {width}x{height} images"
+        if (self.width or width, self.height or height) != (width, height):
+            raise DvoError(
+                f"calibration is for {self.width}x{self.height} images, but these are {width}x{height}",
+                file=self.file,
+                field="intrinsics",
+                remedy=remedy,
+            )
+        for name, focal in (("fx", self.fx), ("fy", self.fy)):
+            if not 0.1 * width <= focal <= 20 * width:  # NaN fails too
+                raise DvoError(
+                    f"{name}={focal:g} does not fit an image {width} pixels wide",
+                    file=self.file,
+                    field="intrinsics",
+                    remedy=f"{remedy}, in pixels",
+                )
+        try:
+            return Camera(self.fx, self.fy, self.cx, self.cy, width, height, self.model, self.coefficients)
+        except DvoError as error:
+            raise DvoError(error.message, file=self.file, field=error.field, remedy=error.remedy) from None
+
+    def doubts(self, width: int, height: int) -> list[str]:
+        """What looks unusual for images of this size, in sentences; nothing in it need be wrong."""
+        found = []
+        if abs(self.cx - width / 2) > width / 4 or abs(self.cy - height / 2) > height / 4:
+            found.append(
+                f"the principal point ({self.cx:g}, {self.cy:g}) lies far from the centre of the {width}x{height} "
+                "images: is the calibration that of another resolution?"
+            )
+        if not 0.8 < self.fx / self.fy < 1.25:
+            found.append(f"fx={self.fx:g} and fy={self.fy:g} differ a lot: were the images stretched?")
+        return found
+
+
+def read_calibration(path: Path | str) -> Calibration:
+    """Read a calibration file.
+
+    Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` (radial-tangential) separated by blanks or commas, ``#`` comments;
+    or a 3x3 matrix K on three lines. YAML: ``fx, fy, cx, cy`` with optional ``width, height,
+    model: none|radtan|fisheye, coefficients``; EuRoC ``sensor.yaml``; Kalibr camchain (its ``cam0``); ROS camera_info
+    and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys.
+
+    Raises:
+        DvoError: missing or malformed file, a distortion model or a number of coefficients that dvo does not know.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    looks_yaml = path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
+    calibration = _from_yaml(text, path) if looks_yaml else _from_text(text, path)
+    values = [calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.coefficients]
+    if not np.isfinite(values).all():
+        raise DvoError("not a finite number", file=path, field="intrinsics", remedy=_LINE)
+    if calibration.fx <= 0 or calibration.fy <= 0:
+        raise DvoError("focal length must be positive", file=path, field="intrinsics", remedy=_LINE)
+    return calibration
+
+
+def _from_text(text: str, path: Path) -> Calibration:
+    rows: list[list[float]] = []
+    for line in text.splitlines():
+        fields = line.split("#")[0].replace(",", " ").replace(";", " ").split()
+        if not fields:
+            continue
+        if fields[0].rstrip(":").upper() in ("P0", "P1", "P2", "P3", "P_RECT_00", "P_RECT_02"):
+            raise DvoError(
+                "this is KITTI's calibration of four cameras",
+                file=path,
+                remedy="open the KITTI sequence folder itself, or write the fx fy cx cy of one camera into a file",
+            )
+        try:
+            rows.append([float(field) for field in fields])
+        except ValueError:
+            if ":" in line:  # a YAML with a .txt name
+                return _from_yaml(text, path)
+            raise DvoError(f"not a number in {line.strip()!r}", file=path, field="intrinsics", remedy=_LINE) from None
+    if [len(row) for row in rows] == [3, 3, 3]:
+        return _from_matrix(np.array(rows), path)
+    if len(rows) != 1 or len(rows[0]) not in (4, 8, 9):
+        counts = " + ".join(str(len(row)) for row in rows) or "no"
+        raise DvoError(f"{counts} numbers, expected 4, 8 or 9 on one line", file=path, field="intrinsics", remedy=_LINE)
+    fx, fy, cx, cy, *coefficients = rows[0]
+    model: DistortionModel = "radtan" if any(coefficients) else "none"
+    return Calibration(fx, fy, cx, cy, model, tuple(coefficients) if model == "radtan" else (), file=path)
+
+
+def _from_matrix(matrix: np.ndarray, path: Path) -> Calibration:
+    if matrix.shape != (3, 3) or matrix[1, 0] != 0 or (matrix[2] != [0, 0, 1]).any() or matrix[0, 1] != 0:
+        raise DvoError("not a pinhole matrix K", file=path, field="intrinsics", remedy=_LINE)
+    return Calibration(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]), file=path)
+
+
+def load_yaml(text: str, path: Path) -> Any:
+    """A YAML document, also with OpenCV's ``%YAML:1.0`` head and its ``!!opencv-matrix`` tags. Plain data only."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Knows one tag more than the safe loader."""
+
+    def mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+        return loader.construct_mapping(node, deep=True)
+
+    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", mapping)
+    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
+    if lines and lines[0].strip() == "---":
+        lines = lines[1:]
+    try:
+        return yaml.load("\n".join(lines), Loader=Loader)  # noqa: S506 (a subclass of SafeLoader)
+    except yaml.YAMLError as error:
+        where = getattr(error, "problem_mark", None)
+        raise DvoError(
+            "not valid YAML", file=path, field=f"line {where.line + 1}" if where else None, remedy=_LINE
+        ) from None
+
+
+def _numbers(value: Any, path: Path, field: str) -> np.ndarray:
+    if isinstance(value, dict):  # {rows, cols, data}
+        value = value.get("data")
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DvoError("not numbers", file=path, field=field, remedy=_LINE) from None
+
+
+def _find(data: dict[str, Any], *keys: str) -> Any:
+    return next((data[key] for key in keys if data.get(key) is not None), None)
+
+
+def _from_yaml(text: str, path: Path) -> Calibration:
+    data = load_yaml(text, path)
+    if isinstance(data, dict) and "cam0" in data:
+        data = data["cam0"]
+    if not isinstance(data, dict):
+        raise DvoError("no keys in it", file=path, field="intrinsics", remedy=_LINE)
+    calibration = _yaml_intrinsics(data, path)
+    resolution = _find(data, "resolution", "image_size")
+    width = _find(data, "width", "image_width", "Camera.width") if resolution is None else None
+    height = _find(data, "height", "image_height", "Camera.height") if resolution is None else None
+    pair = resolution if resolution is not None else [width or 0, height or 0]
+    size = _numbers(pair, path, "resolution")
+    if size.shape != (2,) or (size < 0).any() or not np.isfinite(size).all():
+        raise DvoError("expected width and height", file=path, field="resolution", remedy="give two whole numbers")
+    calibration = replace(calibration, width=int(size[0]) or None, height=int(size[1]) or None)
+    return _with_distortion(calibration, data, path)
+
+
+def _yaml_intrinsics(data: dict[str, Any], path: Path) -> Calibration:
+    for prefix in ("", "Camera.", "Camera1."):
+        found = [data.get(prefix + name) for name in ("fx", "fy", "cx", "cy")]
+        if all(value is not None for value in found):
+            fx, fy, cx, cy = (float(value) for value in _numbers(found, path, "intrinsics"))
+            return Calibration(fx, fy, cx, cy, file=path)
+    value = _find(data, "intrinsics", "camera_matrix", "K", "Camera matrix")
+    if value is None:
+        raise DvoError("no fx, fy, cx, cy in it", file=path, field="intrinsics", remedy=_LINE)
+    numbers = _numbers(value, path, "intrinsics")
+    if numbers.size == 9:
+        return _from_matrix(numbers.reshape(3, 3), path)
+    if numbers.shape != (4,):
+        raise DvoError("expected 4 numbers or a 3x3 matrix", file=path, field="intrinsics", remedy=_LINE)
+    fx, fy, cx, cy = (float(number) for number in numbers)
+    return Calibration(fx, fy, cx, cy, file=path)
+
+
+def _with_distortion(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:
+    name = _find(data, "distortion_model", "model", "Camera.type", "camera_model")
+    value = _find(data, "coefficients", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "D")
+    if value is None:  # ORB-SLAM writes them one by one
+        is_fisheye = _MODELS.get(str(name).lower()) == "fisheye"
+        named = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3")
+        for prefix in ("", "Camera.", "Camera1."):
+            if data.get(f"{prefix}k1") is not None:
+                value = [data.get(prefix + key) or 0 for key in named]
+                break
+    coefficients = _numbers([] if value is None else value, path, "coefficients").ravel()
+    key = str(name if name is not None else ("radtan" if len(coefficients) else "none")).lower().replace(" ", "_")
+    if key == "pinhole" and len(coefficients):
+        key = "radtan"
+    if key not in _MODELS:
+        raise DvoError(
+            f"unknown distortion model {name!r}", file=path, field="model", remedy="use none, radtan or fisheye"
+        )
+    model = _MODELS[key]
+    allowed = {"none": (0,), "radtan": (0, 4, 5), "fisheye": (0, 4)}[model]
+    most = max(allowed)
+    if len(coefficients) > most and not coefficients[most:].any():
+        coefficients = coefficients[:most]  # zeros that OpenCV and ROS append
+    if len(coefficients) not in allowed:
+        raise DvoError(
+            f"{len(coefficients)} coefficients for the model {model}",
+            file=path,
+            field="coefficients",
+            remedy="radtan has k1 k2 p1 p2 [k3], fisheye k1 k2 k3 k4",
+        )
+    if model == "radtan" and not coefficients.any():
+        model = "none"
+    kept = () if model == "none" else tuple(float(coefficient) for coefficient in coefficients)
+    return replace(calibration, model=model, coefficients=kept)

@@ -1,0 +1,143 @@
+"""EuRoC MAV (Burri et al., IJRR 2016), the ASL layout: ``mav0/cam0``, ``mav0/state_groundtruth_estimate0``.
+
+Trap: the ground truth is the pose of the body (the inertial sensor) in the world, with the quaternion as ``w x y z``.
+``T_BS`` in ``cam0/sensor.yaml`` takes camera coordinates to the body, so ``T_world_camera = T_world_body T_BS``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dvo.data.calibration import Calibration, load_yaml, read_calibration
+from dvo.data.folder import camera_images
+from dvo.data.poses import compose_poses, invert_poses, poses_from_matrices
+from dvo.data.recording import ImageRecording, Reader, Recording, Request
+from dvo.data.stamps import choose_times, read_times
+from dvo.data.trajectory import Trajectory, interpolate
+from dvo.errors import DvoError
+
+
+def _mav(path: Path) -> Path | None:
+    return next((folder for folder in (path / "mav0", path) if (folder / "cam0" / "data").is_dir()), None)
+
+
+def matches(path: Path) -> bool:
+    """A folder with ``mav0/cam0/data``, or ``mav0`` itself."""
+    return _mav(path) is not None
+
+
+def read_extrinsics(sensor: Path) -> np.ndarray | None:
+    """``(7,)`` pose ``T_BS`` (sensor to body) of a ``sensor.yaml``; None if there is no such file or key.
+
+    Raises:
+        DvoError: ``T_BS`` is no rigid 4x4 matrix.
+    """
+    if not sensor.is_file():
+        return None
+    data = load_yaml(sensor.read_text(encoding="utf-8-sig", errors="replace"), sensor)
+    value = data.get("T_BS") if isinstance(data, dict) else None
+    if value is None:
+        return None
+    try:
+        matrix = np.array(value["data"] if isinstance(value, dict) else value, dtype=np.float64).reshape(4, 4)
+    except (KeyError, TypeError, ValueError):
+        matrix = np.zeros((4, 4))
+    rotation = matrix[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise DvoError("not a rigid 4x4 matrix", file=sensor, field="T_BS", remedy="give 16 numbers, row by row")
+    return poses_from_matrices(matrix)
+
+
+def read_state_groundtruth(path: Path) -> Trajectory:
+    """Body-to-world poses of ``state_groundtruth_estimate0/data.csv``: ``ns, x, y, z, qw, qx, qy, qz, ...``.
+
+    Raises:
+        DvoError: a malformed row, or no rows.
+    """
+    times, rows = [], []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        fields = line.split("#")[0].replace(",", " ").split()
+        if not fields:
+            continue
+        try:
+            time, values = int(fields[0]), np.array([float(field) for field in fields[1:8]])
+        except ValueError:
+            time, values = 0, np.zeros(0)
+        if values.shape != (7,) or not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 1e-6:
+            raise DvoError(
+                "not 'ns, x, y, z, qw, qx, qy, qz'", file=path, field=f"line {number}", remedy="mend the row"
+            )
+        times.append(time / 1e9)
+        rows.append(values)
+    if not rows:
+        raise DvoError("no poses in it", file=path, remedy="use EuRoC's data.csv")
+    table = np.array(rows)
+    table[:, 3:] /= np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
+    return Trajectory(np.array(times), table[:, [0, 1, 2, 4, 5, 6, 3]])
+
+
+def _groundtruth(mav: Path, timestamps: np.ndarray, warnings: list[str]) -> Trajectory | None:
+    folder = mav / "state_groundtruth_estimate0"
+    if not (folder / "data.csv").is_file():
+        return None
+    body_camera = read_extrinsics(mav / "cam0" / "sensor.yaml")
+    if body_camera is None:
+        warnings.append("cam0/sensor.yaml has no T_BS: ground truth of the body was not used for the camera")
+        return None
+    body_marker = read_extrinsics(folder / "sensor.yaml")  # the identity in EuRoC, not in every copy of the layout
+    if body_marker is not None:
+        body_camera = compose_poses(invert_poses(body_marker), body_camera)
+    bodies = interpolate(read_state_groundtruth(folder / "data.csv"), timestamps)
+    if len(bodies) < len(timestamps):
+        warnings.append(f"ground truth covers {len(bodies)} of {len(timestamps)} images")
+    if len(bodies) == 0:
+        return None
+    return Trajectory(bodies.timestamps, compose_poses(bodies.poses_wc, body_camera))
+
+
+def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray | None]:
+    """Files and times of ``cam0/data.csv``, or of the names if there is none."""
+    listing = camera / "data.csv"
+    if not listing.is_file():
+        return camera_images(camera / "data", warnings), None
+    rows = []
+    for number, line in enumerate(listing.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        fields = [field.strip() for field in line.split("#")[0].split(",")]
+        if not fields[0]:
+            continue
+        if len(fields) < 2 or not fields[0].isdigit():
+            raise DvoError("not 'ns,filename'", file=listing, field=f"line {number}", remedy="mend the row")
+        rows.append((int(fields[0]), fields[1]))
+    rows.sort()
+    return [camera / "data" / name for _, name in rows], np.array([time / 1e9 for time, _ in rows])
+
+
+def open_euroc(path: Path, request: Request) -> Recording:
+    """Read the left camera of a sequence in EuRoC's layout; ground truth is that of the camera, at the images' times.
+
+    Raises:
+        DvoError: no images, or a malformed file.
+    """
+    mav = _mav(path)
+    if mav is None:
+        raise DvoError("not a EuRoC sequence", file=path, remedy="give the folder that holds mav0")
+    warnings: list[str] = []
+    images, listed = _images(mav / "cam0", warnings)
+    if listed is None:
+        times = choose_times(images, mav / "cam0" / "data", times=request.times, fps=request.fps, warnings=warnings)
+    else:
+        times = listed if request.times is None else read_times(request.times, len(images))
+        if request.fps is not None:
+            warnings.append("--fps was not used: the times come from cam0/data.csv")
+    sensor = mav / "cam0" / "sensor.yaml"
+    calibration: Calibration | None = read_calibration(sensor) if sensor.is_file() else None
+    groundtruth = _groundtruth(mav, times, warnings)
+    name = mav.resolve().parent.name if mav.resolve().name == "mav0" else None
+    return ImageRecording(
+        "euroc", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings, name=name
+    )
+
+
+READER = Reader("euroc", matches, open_euroc)

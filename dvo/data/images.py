@@ -1,0 +1,85 @@
+"""Image files: which there are, in which order, and what is in them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dvo.errors import DvoError
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts ``img_2`` before ``img_10``."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in parts if part]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files directly in a folder, in natural order; hidden ones left out."""
+    if not folder.is_dir():
+        return []
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def has_images(folder: Path) -> bool:
+    """Whether there is at least one image file directly in the folder (does not list a large folder to its end)."""
+    return folder.is_dir() and any(
+        path.suffix.lower() in SUFFIXES and not path.name.startswith(".") for path in folder.iterdir()
+    )
+
+
+def to_rgb8(image: np.ndarray) -> np.ndarray:
+    """What OpenCV decoded, ``(H, W[, 1|3|4])`` in BGR order, to ``(H, W, 3)`` uint8 RGB.
+
+    Grey is repeated, alpha dropped, 16 bit divided by 257 (a fixed factor: brightness stays comparable over frames).
+
+    Raises:
+        DvoError: another type of pixel (a depth map in float, say).
+    """
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise DvoError(f"pixels of type {image.dtype}", remedy="convert the images to 8 bit")
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_image(path: Path) -> np.ndarray | None:
+    """``(H, W, 3)`` uint8 RGB, or None if the file is corrupt or cut short. EXIF orientation is not applied.
+
+    Raises:
+        DvoError: a readable image with pixels that are no colours (float).
+    """
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    if not _is_complete(data):
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    if image is None or image.size == 0:
+        return None
+    try:
+        return to_rgb8(image)
+    except DvoError as error:
+        raise DvoError(error.message, file=path, remedy=error.remedy) from None
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether the end mark is there: the decoders return a cut file with its lower part grey, and no error."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" in data[-4096:]
+    if data.startswith(b"\xff\xd8"):  # the first half may hold a thumbnail with its own end mark
+        return b"\xff\xd9" in data[len(data) // 2 :]
+    return len(data) > 0

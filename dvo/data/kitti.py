@@ -1,0 +1,121 @@
+"""KITTI odometry (Geiger et al., CVPR 2012): ``sequences/XX`` with ``image_N``, ``calib.txt`` and ``times.txt``;
+``poses/XX.txt``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dvo.data.calibration import Calibration
+from dvo.data.images import has_images, list_images
+from dvo.data.poses import compose_poses
+from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
+from dvo.data.stamps import choose_times, read_times
+from dvo.data.trajectory import Trajectory, read_kitti_poses
+from dvo.errors import DvoError
+
+CAMERAS = ("image_0", "image_2", "image_1", "image_3")
+KITTI_FPS = 1 / 0.1037  # the laser scanner that triggers the cameras
+
+
+def read_projections(path: Path) -> dict[str, np.ndarray]:
+    """The rows ``P0: ... P3:`` of KITTI's ``calib.txt``: name to ``(3, 4)`` matrix.
+
+    Raises:
+        DvoError: such a row without 12 numbers.
+    """
+    found: dict[str, np.ndarray] = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        name, colon, rest = line.partition(":")
+        if not colon or name.strip() not in ("P0", "P1", "P2", "P3"):
+            continue
+        try:
+            found[name.strip()] = np.array([float(value) for value in rest.split()]).reshape(3, 4)
+        except ValueError:
+            raise DvoError("not 12 numbers", file=path, field=name.strip(), remedy="use KITTI's calib.txt") from None
+    return found
+
+
+def _split(path: Path) -> tuple[Path, Path] | None:
+    """Sequence folder and image folder, for a path to either; None if this is no KITTI sequence."""
+    if path.resolve().name in CAMERAS and has_images(path):
+        sequence, images = path.resolve().parent, path
+    else:
+        folders = [path / name for name in CAMERAS if has_images(path / name)]
+        if not folders:
+            return None
+        sequence, images = path, folders[0]
+    calib = sequence / "calib.txt"
+    return (sequence, images) if calib.is_file() and "P0:" in calib.read_text(errors="replace")[:4096] else None
+
+
+def matches(path: Path) -> bool:
+    """A folder with ``image_N`` and a ``calib.txt`` of rows ``P0:`` to ``P3:``, or its ``image_N``."""
+    return path.is_dir() and _split(path) is not None
+
+
+def _poses_file(sequence: Path) -> Path | None:
+    resolved = sequence.resolve()
+    options = (resolved.parent.parent / "poses" / f"{resolved.name}.txt", resolved / "poses.txt")
+    return next((option for option in options if option.is_file()), None)
+
+
+def open_kitti(path: Path, request: Request) -> Recording:
+    """Read a KITTI odometry sequence: the left grey camera, else the left colour one, or the ``image_N`` that is named.
+
+    Intrinsics are those of the camera that is read. KITTI's poses are those of camera 0; for another camera they are
+    moved by its baseline ``K^-1 P[:, 3]``.
+
+    Raises:
+        DvoError: no images, or malformed calibration, times or poses.
+    """
+    found = _split(path)
+    if found is None:
+        raise DvoError("not a KITTI sequence", file=path, remedy="give the folder sequences/XX")
+    sequence, folder = found
+    warnings: list[str] = []
+    images = list_images(folder)
+    camera = f"P{folder.resolve().name[-1]}"
+    projections = read_projections(sequence / "calib.txt")
+    if camera not in projections:
+        raise DvoError("no such row", file=sequence / "calib.txt", field=camera, remedy="use KITTI's calib.txt")
+    projection = projections[camera]
+    fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    calibration = Calibration(fx, fy, cx, cy, file=sequence / "calib.txt")
+    times = _times(sequence, folder, images, request, warnings)
+
+    groundtruth = None
+    poses_file = _poses_file(sequence)
+    if poses_file is not None:
+        poses = read_kitti_poses(poses_file)
+        rows = rows_of_images(images, len(poses))
+        if rows is None:
+            warnings.append(f"{poses_file} has {len(poses)} rows for {len(images)} images: not used as ground truth")
+        else:
+            baseline = np.array([0, 0, 0, 0, 0, 0, 1.0])
+            baseline[:3] = -np.linalg.solve(projection[:, :3], projection[:, 3])  # the camera's centre in camera 0
+            groundtruth = Trajectory(times, compose_poses(poses[rows], baseline))
+    name = sequence.resolve().name
+    return ImageRecording(
+        "kitti", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
+        name=f"kitti{name}" if name.isdigit() else name,
+    )  # fmt: skip
+
+
+def _times(sequence: Path, folder: Path, images: list[Path], request: Request, warnings: list[str]) -> np.ndarray:
+    listing = sequence / "times.txt"
+    if request.times is None and listing.is_file():
+        if request.fps is not None:
+            warnings.append(f"--fps was not used: the times come from {listing}")
+        times = read_times(listing, None)
+        rows = rows_of_images(images, len(times))
+        return times[rows] if rows is not None else read_times(listing, len(images))
+    fps = request.fps
+    if request.times is None and fps is None:
+        fps = KITTI_FPS
+        warnings.append(f"no times.txt: assuming KITTI's rate of {fps:.2f} frames a second")
+    return choose_times(images, folder, times=request.times, fps=fps, warnings=warnings)
+
+
+READER = Reader("kitti", matches, open_kitti)

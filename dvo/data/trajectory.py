@@ -1,0 +1,150 @@
+"""Trajectories and their TUM files (camera-to-world, seconds)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dvo.data.poses import pose_matrices, poses_from_matrices, slerp
+from dvo.errors import DvoError
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Timed camera-to-world poses.
+
+    Attributes:
+        timestamps: ``(N,)`` float64 seconds.
+        poses_wc: ``(N, 7)`` float64 ``tx ty tz qx qy qz qw``, camera to world.
+    """
+
+    timestamps: np.ndarray
+    poses_wc: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.timestamps.ndim != 1 or self.poses_wc.shape != (len(self.timestamps), 7):
+            raise ValueError(f"timestamps {self.timestamps.shape} and poses {self.poses_wc.shape} do not match")
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """``(N, 3)`` camera centres in the world."""
+        return self.poses_wc[:, :3]
+
+    @property
+    def path_length(self) -> float:
+        """Sum of the distances between consecutive camera centres."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write ``timestamp tx ty tz qx qy qz qw`` rows."""
+    rows = np.column_stack([trajectory.timestamps, trajectory.poses_wc])
+    with open(path, "w", encoding="utf-8") as file:
+        file.write("# timestamp tx ty tz qx qy qz qw (camera to world)\n")
+        for row in rows:
+            file.write(f"{row[0]:.9f} " + " ".join(f"{value:.9f}" for value in row[1:]) + "\n")
+
+
+def read_tum(path: Path | str) -> Trajectory:
+    """Read a TUM trajectory.
+
+    Raises:
+        DvoError: missing file, a row without 8 numbers, or a quaternion of zero length.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DvoError("no such file", file=path, remedy="give a TUM trajectory file")
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        fields = line.replace(",", " ").split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            row = [float(value) for value in fields]
+        except ValueError:
+            row = []
+        if len(row) != 8 or not np.isfinite(row).all():
+            raise DvoError(
+                "not a TUM row", file=path, field=f"line {number}", remedy="use 'timestamp tx ty tz qx qy qz qw'"
+            )
+        rows.append(row)
+    if not rows:
+        raise DvoError("no poses in it", file=path, remedy="give a TUM trajectory file")
+    table = np.array(rows, dtype=np.float64)
+    norms = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
+    if (norms < 1e-6).any():
+        raise DvoError("a quaternion has no length", file=path, field="qx qy qz qw", remedy="mend the row")
+    table[:, 4:] /= norms
+    return Trajectory(table[:, 0].copy(), table[:, 1:].copy())
+
+
+def interpolate(trajectory: Trajectory, timestamps: np.ndarray, max_gap: float = 0.1) -> Trajectory:
+    """The trajectory at other times: positions linearly, rotations by slerp between the two neighbouring poses.
+
+    Args:
+        trajectory: poses in increasing order of time.
+        timestamps: ``(M,)`` seconds.
+        max_gap: seconds; a time whose neighbours lie further apart than this, or that lies outside, gets no row.
+            A time that coincides with a pose (to a microsecond) always gets one.
+
+    Returns:
+        At most M rows, at exactly the given times.
+    """
+    times, wanted = trajectory.timestamps, np.asarray(timestamps, dtype=np.float64)
+    if len(times) == 0 or len(wanted) == 0:
+        return Trajectory(np.zeros(0), np.zeros((0, 7)))
+    right = np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)
+    left = np.clip(right - 1, 0, None)
+    nearest = np.where(np.abs(times[left] - wanted) <= np.abs(times[right] - wanted), left, right)
+    exact = np.abs(times[nearest] - wanted) <= 1e-6
+    inside = (times[left] <= wanted) & (wanted <= times[right]) & (times[right] - times[left] <= max_gap)
+    left, right = np.where(exact, nearest, left), np.where(exact, nearest, right)
+    keep = exact | inside
+    left, right, wanted = left[keep], right[keep], wanted[keep]
+    span = times[right] - times[left]
+    weight = np.where(span > 0, (wanted - times[left]) / np.where(span > 0, span, 1.0), 0.0)
+    a, b = trajectory.poses_wc[left], trajectory.poses_wc[right]
+    positions = a[:, :3] + weight[:, None] * (b[:, :3] - a[:, :3])
+    return Trajectory(wanted, np.concatenate([positions, slerp(a[:, 3:], b[:, 3:], weight)], axis=1))
+
+
+def read_kitti_poses(path: Path | str) -> np.ndarray:
+    """Read a KITTI pose file: a row-major 3x4 camera-to-world matrix a line.
+
+    Returns:
+        ``(N, 7)`` float64 poses, camera to world. The file holds no times.
+
+    Raises:
+        DvoError: missing file, no rows, or a row that is not 12 finite numbers.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DvoError("no such file", file=path, remedy="give a KITTI pose file")
+    rows = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            row = [float(value) for value in fields]
+        except ValueError:
+            row = []
+        if len(row) != 12 or not np.isfinite(row).all():
+            raise DvoError("not a KITTI row", file=path, field=f"line {number}", remedy="use 12 numbers, a 3x4 matrix")
+        rows.append(row)
+    if not rows:
+        raise DvoError("no poses in it", file=path, remedy="give a KITTI pose file")
+    return poses_from_matrices(np.array(rows).reshape(-1, 3, 4))
+
+
+def write_kitti_poses(path: Path | str, poses_wc: np.ndarray) -> None:
+    """Write ``(N, 7)`` camera-to-world poses as rows of a 3x4 matrix; times are not kept by this format."""
+    rows = pose_matrices(poses_wc)[:, :3].reshape(len(poses_wc), 12)
+    with open(path, "w", encoding="utf-8") as file:
+        for row in rows:
+            file.write(" ".join(f"{value:.9e}" for value in row) + "\n")

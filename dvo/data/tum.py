@@ -1,0 +1,94 @@
+"""TUM RGB-D (Sturm et al., IROS 2012): ``rgb.txt`` or ``rgb/``, and ``groundtruth.txt``."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dvo.data.calibration import Calibration
+from dvo.data.folder import camera_images
+from dvo.data.images import has_images
+from dvo.data.recording import ImageRecording, Reader, Recording, Request
+from dvo.data.sequence import find_calibration
+from dvo.data.stamps import choose_times, read_times
+from dvo.data.trajectory import Trajectory, interpolate, read_tum
+from dvo.errors import DvoError
+
+# The colour cameras as published with the benchmark (file_formats page); freiburg3 is delivered undistorted.
+CALIBRATIONS = {
+    "1": Calibration(517.3, 516.5, 318.6, 255.3, "radtan", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), 640, 480),
+    "2": Calibration(520.9, 521.0, 325.1, 249.7, "radtan", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172), 640, 480),
+    "3": Calibration(535.4, 539.2, 320.1, 247.6, "none", (), 640, 480),
+}
+
+
+def matches(path: Path) -> bool:
+    """A folder with ``rgb.txt``, or with ``rgb/`` and ``groundtruth.txt``."""
+    return (path / "rgb.txt").is_file() or ((path / "groundtruth.txt").is_file() and has_images(path / "rgb"))
+
+
+def default_calibration(name: str) -> Calibration | None:
+    """The published calibration for a folder name such as ``rgbd_dataset_freiburg1_xyz`` or ``fr1_xyz``."""
+    found = re.search(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)", name.lower())
+    return CALIBRATIONS[found.group(1)] if found else None
+
+
+def _listed_images(listing: Path) -> tuple[list[Path], np.ndarray]:
+    """Files and times of ``rgb.txt`` (``timestamp filename`` a row), sorted by time."""
+    rows: list[tuple[float, Path]] = []
+    for number, line in enumerate(listing.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        fields = line.split("#")[0].split(maxsplit=1)
+        if not fields:
+            continue
+        try:
+            time = float(fields[0])
+        except ValueError:
+            time = float("nan")
+        if len(fields) != 2 or not np.isfinite(time):
+            raise DvoError("not 'timestamp filename'", file=listing, field=f"line {number}", remedy="mend the row")
+        rows.append((time, listing.parent / fields[1].strip()))
+    rows.sort(key=lambda row: row[0])
+    return [path for _, path in rows], np.array([time for time, _ in rows])
+
+
+def _groundtruth(path: Path, timestamps: np.ndarray, warnings: list[str]) -> Trajectory | None:
+    if (path / "groundtruth_tum.txt").is_file():  # already at the times of the images
+        return read_tum(path / "groundtruth_tum.txt")
+    if not (path / "groundtruth.txt").is_file():
+        return None
+    found = interpolate(read_tum(path / "groundtruth.txt"), timestamps)
+    if len(found) < len(timestamps):
+        warnings.append(f"ground truth covers {len(found)} of {len(timestamps)} images")
+    return found if len(found) else None
+
+
+def open_tum(path: Path, request: Request) -> Recording:
+    """Read a TUM RGB-D sequence.
+
+    ``calib.txt`` in the folder wins over the published calibration. The motion capture runs at 100 Hz on a clock of its
+    own: ground truth is interpolated to the times of the images, those without neighbours within 0.1 s get none.
+
+    Raises:
+        DvoError: no images, or a malformed file.
+    """
+    warnings: list[str] = []
+    listing = path / "rgb.txt"
+    if listing.is_file():
+        images, times = _listed_images(listing)
+        if request.times is not None:
+            times = read_times(request.times, len(images))
+        elif request.fps is not None:
+            warnings.append(f"--fps was not used: the times come from {listing}")
+    else:
+        images = camera_images(path / "rgb", warnings)
+        times = choose_times(images, path / "rgb", times=request.times, fps=request.fps, warnings=warnings)
+    calibration = find_calibration(path) or default_calibration(f"{path.name} {path.resolve().name}")
+    groundtruth = _groundtruth(path, times, warnings)
+    return ImageRecording(
+        "tum", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings
+    )
+
+
+READER = Reader("tum", matches, open_tum)

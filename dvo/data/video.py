@@ -1,0 +1,163 @@
+"""Video files, decoded by OpenCV's FFmpeg."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dvo.data.calibration import Calibration
+from dvo.data.images import SUFFIXES, to_rgb8
+from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.stamps import NOMINAL_FPS, read_times
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+
+if TYPE_CHECKING:
+    import cv2
+
+# A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
+# Half a minute of 30 Hz video without a frame is taken for the end.
+_GIVE_UP_AFTER = 900
+
+
+def matches(path: Path) -> bool:
+    """Any file (folders are for the other readers)."""
+    return path.is_file()
+
+
+@contextmanager
+def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+    """The opened video, closed again at the end."""
+    import cv2
+
+    if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
+        raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
+    # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)
+    try:
+        # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    try:
+        if not capture.isOpened():
+            raise DvoError(
+                "this video does not decode",
+                file=path,
+                remedy="check that it plays; a recording that was cut off before its index was written must be "
+                "repaired first",
+            )
+        yield capture
+    finally:
+        capture.release()
+
+
+def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
+    """``(index, container milliseconds, failed grabs just before)`` of every frame that decodes."""
+    import cv2
+
+    index, failed = 0, 0
+    while failed <= _GIVE_UP_AFTER:
+        if capture.grab():
+            yield index, capture.get(cv2.CAP_PROP_POS_MSEC), failed
+            failed = 0
+        else:
+            failed += 1
+        index += 1
+
+
+class VideoRecording:
+    """A video file.
+
+    Times are the container's; where it has none that increase, the frame's number over the frame rate. A rate or
+    a list of times that the user gives overrides both.
+
+    Args:
+        path: the file.
+        request: the user's times or rate.
+
+    Raises:
+        DvoError: it does not open, holds no frame, or ``times`` has another number of rows than it has frames.
+    """
+
+    kind = "video"
+    calibration: Calibration | None = None
+    groundtruth: Trajectory | None = None
+
+    def __init__(self, path: Path, request: Request) -> None:
+        import cv2
+
+        if request.fps is not None and not (np.isfinite(request.fps) and request.fps > 0):
+            raise DvoError(f"{request.fps:g} frames a second", field="fps", remedy="give a positive rate")
+        self.path, self.name = path, path.stem
+        self.warnings: list[str] = []
+        with _capture(path) as capture:
+            announced, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+            first = [milliseconds for (_, milliseconds, _), _ in zip(_grabs(capture), range(3), strict=False)]
+        if not first:
+            raise DvoError("no frame of this video decodes", file=path, remedy="check that it plays, or re-encode it")
+        # containers without a count give huge or negative numbers
+        self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
+        self._times = self._read_times(request.times) if request.times is not None else None
+        self._use_container = bool(request.fps is None and (np.diff(first) > 0).all() and np.isfinite(first).all())
+        self._fps = request.fps or (rate if np.isfinite(rate) and 0 < rate < 1e5 else NOMINAL_FPS)
+        if self._times is None and not self._use_container and request.fps is None:
+            known = "the stated" if self._fps == rate else "a guessed"
+            self.warnings.append(
+                f"the video has no times: assuming {known} {self._fps:g} frames a second (or give --fps)"
+            )
+
+    def _read_times(self, file: Path) -> np.ndarray:
+        times = read_times(file, None)
+        if len(times) != self.frame_count:  # some containers only estimate: count, before calling the user wrong
+            with _capture(self.path) as capture:
+                last = max(index for index, _, _ in _grabs(capture))
+            return read_times(file, last + 1)
+        return times
+
+    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.recording.Recording`; only every ``stride``-th frame is converted."""
+        read, previous, dropped = 0, -np.inf, 0
+        with _capture(self.path) as capture:
+            for index, milliseconds, failed in _grabs(capture):
+                log.unreadable.extend(f"frame {number}" for number in range(index - failed, index))
+                read += 1
+                if index % stride:
+                    continue
+                timestamp = self._time(index, milliseconds)
+                if timestamp is None or timestamp <= previous:
+                    dropped += 1
+                    if dropped == 1:
+                        log.notes.append(f"from frame {index} on, frames not later than the one before were dropped")
+                    continue
+                decoded, image = capture.retrieve()
+                if not decoded or image is None:
+                    log.unreadable.append(f"frame {index}")
+                    continue
+                previous = timestamp
+                yield RawFrame(index, timestamp, to_rgb8(image), f"{self.path} frame {index}")
+        missing = (self.frame_count or 0) - read - len(log.unreadable)
+        if missing > 0:
+            # healthy files may be off by a frame or so: estimated counts, edit lists
+            verdict = ": it is cut short or damaged" if missing > max(1, (self.frame_count or 0) // 200) else ""
+            log.notes.append(f"the video announces {self.frame_count} frames, {read} could be read{verdict}")
+
+    def _time(self, index: int, milliseconds: float) -> float | None:
+        if self._times is not None:
+            return float(self._times[index]) if index < len(self._times) else None
+        return milliseconds / 1000 if self._use_container else index / self._fps
+
+
+def open_video(path: Path, request: Request) -> Recording:
+    """Open a video file; see :class:`VideoRecording`."""
+    return VideoRecording(path, request)
+
+
+READER = Reader("video", matches, open_video)

@@ -1,0 +1,87 @@
+"""Cameras: pinhole intrinsics, the size of the image that they belong to, and the lens distortion.
+
+Pixel centres lie at integer coordinates: the first pixel covers [-0.5, 0.5].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from dvo.errors import DvoError
+
+DistortionModel = Literal["none", "radtan", "fisheye"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera with optional distortion.
+
+    Attributes:
+        fx, fy, cx, cy: intrinsics in pixels of a ``width`` x ``height`` image.
+        width, height: image size in pixels.
+        model: ``none``, ``radtan`` (k1 k2 p1 p2 [k3], OpenCV order) or ``fisheye`` (Kannala-Brandt k1 k2 k3 k4).
+        coefficients: distortion coefficients of that model.
+
+    Raises:
+        DvoError: intrinsics that cannot belong to an image of this size.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    model: DistortionModel = "none"
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy, *self.coefficients)
+        if not np.isfinite(values).all():
+            raise DvoError("not a finite number", field="intrinsics", remedy="give fx fy cx cy in pixels")
+        if self.fx <= 0 or self.fy <= 0:
+            raise DvoError(
+                f"focal length must be positive, got fx={self.fx:g} fy={self.fy:g}",
+                field="intrinsics",
+                remedy="give fx fy cx cy in pixels",
+            )
+        if not (0 <= self.cx < self.width and 0 <= self.cy < self.height):
+            raise DvoError(
+                f"principal point ({self.cx:g}, {self.cy:g}) lies outside the {self.width}x{self.height} image",
+                field="intrinsics",
+                remedy="give the calibration of this image size, or scale it",
+            )
+
+    @property
+    def intrinsics(self) -> np.ndarray:
+        """``(4,)`` float64 ``fx fy cx cy``."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """``(3, 3)`` float64 K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def is_distorted(self) -> bool:
+        return self.model != "none" and any(c != 0 for c in self.coefficients)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of the same image resampled to ``width`` x ``height``: ``c' = (c + .5) s - .5``."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+            width=width,
+            height=height,
+        )
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of the window whose top-left pixel is ``(left, top)``."""
+        return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height)

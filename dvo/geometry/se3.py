@@ -1,0 +1,115 @@
+"""Rigid motions as tensors ``(..., 7)``: ``tx ty tz qx qy qz qw``, unit quaternion.
+
+Tangent vectors are ``(..., 6)``: ``[tau, phi]``, translation first, ``phi`` in radians. Batch dimensions broadcast.
+The retraction is a left one: ``T <- Exp(xi) T``. Gradients are the Euclidean ones of autograd through the seven numbers.
+Formulas: Sola et al., "A micro Lie theory for state estimation in robotics", appendix D.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dvo.geometry import so3
+from dvo.geometry.so3 import hat, rotate
+
+__all__ = [
+    "act",
+    "act_homogeneous",
+    "adjoint",
+    "compose",
+    "exp",
+    "from_matrix",
+    "identity",
+    "inverse",
+    "log",
+    "matrix",
+    "normalise",
+    "relative",
+    "retract",
+    "rotate",
+]
+
+
+def identity(*shape: int, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
+    """``(*shape, 7)`` poses that move nothing."""
+    pose = torch.zeros(*shape, 7, dtype=dtype, device=device)
+    pose[..., 6] = 1
+    return pose
+
+
+def exp(xi: Tensor) -> Tensor:
+    """Tangent ``(..., 6)`` to pose ``(..., 7)``."""
+    tau, phi = xi[..., :3], xi[..., 3:]
+    q, b, c = so3.exp_terms(phi)
+    first = torch.linalg.cross(phi, tau)
+    return torch.cat((tau + b * first + c * torch.linalg.cross(phi, first), q), -1)
+
+
+def log(pose: Tensor) -> Tensor:
+    """Pose ``(..., 7)`` to tangent ``(..., 6)``, rotation angle at most pi."""
+    t = pose[..., :3]
+    phi, e = so3.log_terms(pose[..., 3:])
+    first = torch.linalg.cross(phi, t)
+    return torch.cat((t - 0.5 * first + e * torch.linalg.cross(phi, first), phi), -1)
+
+
+def compose(a: Tensor, b: Tensor) -> Tensor:
+    """``a b``: first ``b``, then ``a``."""
+    t = rotate(a[..., 3:], b[..., :3]) + a[..., :3]
+    return torch.cat((t, so3.multiply(a[..., 3:], b[..., 3:])), -1)
+
+
+def inverse(pose: Tensor) -> Tensor:
+    """``pose^-1``."""
+    q = so3.conjugate(pose[..., 3:])
+    return torch.cat((-rotate(q, pose[..., :3]), q), -1)
+
+
+def relative(a: Tensor, b: Tensor) -> Tensor:
+    """``b a^-1``: with world-to-camera poses, the motion of points from camera ``a`` to camera ``b``."""
+    q = so3.multiply(b[..., 3:], so3.conjugate(a[..., 3:]))
+    return torch.cat((b[..., :3] - rotate(q, a[..., :3]), q), -1)
+
+
+def act(pose: Tensor, points: Tensor) -> Tensor:
+    """``R p + t`` on points ``(..., 3)``; batch dimensions broadcast (``pose[..., None, :]`` for many points a pose)."""
+    return rotate(pose[..., 3:], points) + pose[..., :3]
+
+
+def act_homogeneous(pose: Tensor, points: Tensor) -> Tensor:
+    """``(R x + t h, h)`` on homogeneous points ``(..., 4)`` = ``(x, h)``."""
+    x, h = points[..., :3], points[..., 3:]
+    moved = rotate(pose[..., 3:], x) + pose[..., :3] * h
+    return torch.cat((moved, h.expand(*moved.shape[:-1], 1)), -1)
+
+
+def normalise(pose: Tensor) -> Tensor:
+    """Bring the quaternion back to unit length."""
+    return torch.cat((pose[..., :3], so3.normalise(pose[..., 3:])), -1)
+
+
+def retract(pose: Tensor, xi: Tensor) -> Tensor:
+    """``Exp(xi) pose``, renormalised."""
+    return normalise(compose(exp(xi), pose))
+
+
+def matrix(pose: Tensor) -> Tensor:
+    """``(..., 4, 4)`` matrix ``[[R, t], [0, 1]]``."""
+    upper = torch.cat((so3.matrix(pose[..., 3:]), pose[..., :3, None]), -1)
+    last = torch.zeros_like(upper[..., :1, :])
+    last[..., 3] = 1
+    return torch.cat((upper, last), -2)
+
+
+def from_matrix(m: Tensor) -> Tensor:
+    """``(..., 4, 4)`` or ``(..., 3, 4)`` matrix to pose ``(..., 7)``."""
+    return torch.cat((m[..., :3, 3], so3.from_matrix(m[..., :3, :3])), -1)
+
+
+def adjoint(pose: Tensor) -> Tensor:
+    """``(..., 6, 6)`` with ``pose Exp(xi) pose^-1 = Exp(adjoint(pose) xi)``: ``[[R, [t]x R], [0, R]]``."""
+    r = so3.matrix(pose[..., 3:])
+    tr = hat(pose[..., :3]) @ r
+    upper = torch.cat((r, tr), -1)
+    return torch.cat((upper, torch.cat((torch.zeros_like(r), r), -1)), -2)

@@ -1,0 +1,153 @@
+"""Unit quaternions ``(..., 4)`` in the order ``qx qy qz qw`` and rotation vectors ``(..., 3)`` in radians.
+
+Plain functions on tensors of any batch shape; batch dimensions broadcast. Every branch is taken with ``torch.where`` on
+inputs made safe beforehand, so that values and gradients are finite at the identity, at ``q = -identity`` and at half a turn.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Below this squared angle the closed forms lose digits in their derivatives and a series of four terms is exact.
+SMALL = 1e-3
+
+
+def hat(v: Tensor) -> Tensor:
+    """``(..., 3)`` to the skew matrix ``(..., 3, 3)`` with ``hat(a) b = a x b``."""
+    x, y, z = v.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack((o, -z, y, z, o, -x, -y, x, o), -1).unflatten(-1, (3, 3))
+
+
+def cross(a: Tensor, b: Tensor, dim: int = -1) -> Tensor:
+    """Cross product along one dimension, broadcasting."""
+    return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=dim)
+
+
+def multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product ``a b`` of quaternions ``(..., 4)``: first ``b``, then ``a``."""
+    a, b = torch.broadcast_tensors(a, b)
+    av, aw = a[..., :3], a[..., 3:]
+    bv, bw = b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + torch.linalg.cross(av, bv)
+    scalar = aw * bw - (av * bv).sum(-1, keepdim=True)
+    return torch.cat((vector, scalar), -1)
+
+
+def conjugate(q: Tensor) -> Tensor:
+    """The inverse of a unit quaternion ``(..., 4)``."""
+    return torch.cat((-q[..., :3], q[..., 3:]), -1)
+
+
+def rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Turn vectors ``(..., 3)`` by unit quaternions ``(..., 4)``."""
+    u, w = q[..., :3], q[..., 3:]
+    uv = 2 * cross(u, v)
+    return v + w * uv + cross(u, uv)
+
+
+def normalise(q: Tensor) -> Tensor:
+    """Scale ``(..., 4)`` to length one; a zero quaternion stays zero, with a finite gradient."""
+    return torch.nn.functional.normalize(q, dim=-1)
+
+
+def matrix(q: Tensor) -> Tensor:
+    """Unit quaternions ``(..., 4)`` to rotation matrices ``(..., 3, 3)``."""
+    x, y, z, w = q.unbind(-1)
+    x2, y2, z2 = x + x, y + y, z + z
+    xx, yy, zz = x * x2, y * y2, z * z2
+    xy, xz, yz = x * y2, x * z2, y * z2
+    wx, wy, wz = w * x2, w * y2, w * z2
+    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def from_matrix(r: Tensor) -> Tensor:
+    """Rotation matrices ``(..., 3, 3)`` to unit quaternions with ``qw >= 0`` where it is not tiny.
+
+    Of the four textbook solutions the one with the largest divisor is taken (Shepperd 1978).
+    """
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = r.flatten(-2).unbind(-1)
+    # four times the outer product q q^T: column c is q scaled by 4 q_c
+    xx, yy, zz, ww = 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22
+    xy, xz, yz = m01 + m10, m02 + m20, m12 + m21
+    wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
+    outer = torch.stack((xx, xy, xz, wx, xy, yy, yz, wy, xz, yz, zz, wz, wx, wy, wz, ww), -1).unflatten(-1, (4, 4))
+    best = torch.stack((xx, yy, zz, ww), -1).argmax(-1)
+    q = normalise(torch.gather(outer, -2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2))
+    return torch.where(q[..., 3:] < 0, -q, q)
+
+
+def _series(s: Tensor, *coefficients: float) -> Tensor:
+    """Horner: ``c0 + c1 s + c2 s^2 + ...``."""
+    out = coefficients[-1] * s + coefficients[-2]
+    for c in coefficients[-3::-1]:
+        out = out * s + c
+    return out
+
+
+def exp_terms(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The quaternion of a rotation vector, and the two factors of the left Jacobian.
+
+    Args:
+        phi: ``(..., 3)`` radians.
+
+    Returns:
+        ``q (..., 4)``, ``b (..., 1)`` and ``c (..., 1)`` with ``V x = x + b phi x x + c phi x (phi x x)``,
+        ``b = (1 - cos t) / t^2``, ``c = (t - sin t) / t^3``.
+    """
+    s = (phi * phi).sum(-1, keepdim=True)
+    small = s < SMALL
+    safe = torch.where(small, 1.0, s)
+    t = safe.sqrt()
+    half = 0.5 * t
+    sin, cos = half.sin(), half.cos()
+    low = torch.where(small, s, 0.0)  # the series would overflow on a huge angle, and poison its gradient
+    k = torch.where(small, _series(low, 0.5, -1 / 48, 1 / 3840, -1 / 645120), sin / t)
+    w = torch.where(small, _series(low, 1.0, -1 / 8, 1 / 384, -1 / 46080), cos)
+    c = torch.where(small, _series(low, 1 / 6, -1 / 120, 1 / 5040, -1 / 362880), (t - 2 * sin * cos) / (safe * t))
+    return torch.cat((k * phi, w), -1), 2 * k * k, c
+
+
+def exp(phi: Tensor) -> Tensor:
+    """Rotation vectors ``(..., 3)`` in radians to unit quaternions ``(..., 4)``."""
+    return exp_terms(phi)[0]
+
+
+def log_terms(q: Tensor) -> tuple[Tensor, Tensor]:
+    """The rotation vector of a quaternion, and the factor of the inverse left Jacobian.
+
+    ``q`` and ``-q`` are the same rotation; the one with ``qw >= 0`` is taken, hence angles in ``[0, pi]``.
+
+    Returns:
+        ``phi (..., 3)`` radians and ``e (..., 1)`` with ``V^-1 x = x - phi x x / 2 + e phi x (phi x x)``,
+        ``e = (1 - (t/2) cot(t/2)) / t^2``.
+    """
+    q = torch.where(q[..., 3:] < 0, -q, q)
+    v, w = q[..., :3], q[..., 3:]
+    n2 = (v * v).sum(-1, keepdim=True)
+    small = n2 < SMALL * w * w
+    n = torch.where(small, 1.0, n2).sqrt()
+    safe_w = torch.where(small, w, 1.0)
+    x2 = torch.where(small, n2, 0.0) / (safe_w * safe_w)
+    closed = 2 * torch.atan2(n, w) / n
+    f = torch.where(small, _series(x2, 2.0, -2 / 3, 2 / 5, -2 / 7, 2 / 9) / safe_w, closed)
+    phi = f * v
+    s = torch.where(small, (phi * phi).sum(-1, keepdim=True), 0.0)
+    t2 = torch.where(small, 1.0, closed * closed * n2)
+    e = torch.where(small, _series(s, 1 / 12, 1 / 720, 1 / 30240, 1 / 1209600), (1 - 0.5 * closed * w) / t2)
+    return phi, e
+
+
+def log(q: Tensor) -> Tensor:
+    """Unit quaternions ``(..., 4)`` to rotation vectors ``(..., 3)`` in radians, length at most pi."""
+    return log_terms(q)[0]
+
+
+def angle(q: Tensor) -> Tensor:
+    """The rotation angle ``(...)`` in radians, in ``[0, pi]``. Its gradient at the identity is zero, not NaN."""
+    phi = log(q)
+    s = (phi * phi).sum(-1)
+    zero = s == 0
+    return torch.where(zero, 0.0, torch.where(zero, 1.0, s).sqrt())

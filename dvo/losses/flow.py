@@ -1,0 +1,32 @@
+"""Flow loss: how far the patches land from where they should (DPVO 3.3)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def flow_error(
+    estimate: Float[Tensor, "B E p p 2"], truth: Float[Tensor, "B E p p 2"], valid: Bool[Tensor, "B E p p"]
+) -> Float[Tensor, "B E"]:
+    """Smallest end-point error among the pixels of each patch, in feature pixels.
+
+    The minimum lets patches of constant depth survive depth edges: one pixel that moves right is enough. An edge
+    without a valid pixel is infinite.
+    """
+    # The square root of exactly zero has no gradient.
+    error = ((estimate - truth).square().sum(-1) + 1e-12).sqrt()
+    return error.masked_fill(~valid, torch.inf).flatten(2).amin(-1)
+
+
+def flow_loss(error: Float[Tensor, "B E"], edges: Bool[Tensor, " E"]) -> Tensor:
+    """Mean over the chosen edges with a finite error, averaged over the clips.
+
+    Args:
+        error: from :func:`flow_error`.
+        edges: which edges count; DPVO takes those with ``0 < |i - j| <= 2``.
+    """
+    used = torch.isfinite(error) & edges
+    total = torch.where(used, error, torch.zeros_like(error)).sum(1)
+    return (total / used.sum(1).clamp(min=1)).mean()

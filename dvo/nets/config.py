@@ -1,0 +1,97 @@
+"""Sizes of the patch-flow recurrent update network, and the presets."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from dvo.errors import DvoError
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Architecture of :class:`dvo.nets.patch_vo.PatchVO`.
+
+    Attributes:
+        stem_channels, trunk_channels: encoder channels at 1/2 and 1/4 of the image resolution.
+        feature_channels: matching features, compared by correlation.
+        hidden_channels: state of the update operator and context features.
+        shared_encoder: one encoder with two heads (cheap) or two encoders (DPVO).
+        patch_size: side of a patch in feature pixels.
+        radius: correlation radius in pixels of each level.
+        pyramid: down-sampling of each correlation level relative to the features.
+        training_patches: patches drawn from a frame in training.
+        self_edges: join patches with their own frame too, as DPVO does.
+    """
+
+    stem_channels: int = 32
+    trunk_channels: int = 64
+    feature_channels: int = 128
+    hidden_channels: int = 384
+    shared_encoder: bool = False
+    patch_size: int = 3
+    radius: int = 3
+    pyramid: tuple[int, ...] = (1, 4)
+    training_patches: int = 80
+    self_edges: bool = True
+
+    STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
+
+    @property
+    def correlation_channels(self) -> int:
+        return len(self.pyramid) * (2 * self.radius + 1) ** 2 * self.patch_size**2
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> ModelConfig:
+        """Build from plain values, for instance of a YAML file or of weights metadata.
+
+        Raises:
+            DvoError: a key that is no attribute.
+        """
+        unknown = sorted(set(values) - {f.name for f in fields(cls)})
+        if unknown:
+            raise DvoError("unknown model setting", field=", ".join(unknown), remedy="see dvo.nets.config.ModelConfig")
+        values = dict(values)
+        if "pyramid" in values:
+            values["pyramid"] = tuple(values["pyramid"])
+        return cls(**values)
+
+
+PRESETS: dict[str, ModelConfig] = {
+    # DPVO (Teed, Lipson, Deng 2023), tensor for tensor.
+    "full": ModelConfig(),
+    # Sized to track 320x240 video on two CPU cores and to be trained on one.
+    "small": ModelConfig(
+        stem_channels=16,
+        trunk_channels=32,
+        feature_channels=64,
+        hidden_channels=128,
+        shared_encoder=True,
+        training_patches=24,
+        self_edges=False,
+    ),
+    # For tests and controlled studies.
+    "tiny": ModelConfig(
+        stem_channels=8,
+        trunk_channels=16,
+        feature_channels=32,
+        hidden_channels=48,
+        shared_encoder=True,
+        training_patches=12,
+        self_edges=False,
+    ),
+}
+
+
+def preset(name: str) -> ModelConfig:
+    """The preset of that name.
+
+    Raises:
+        DvoError: no such preset.
+    """
+    if name not in PRESETS:
+        raise DvoError(f"no preset '{name}'", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
+    return PRESETS[name]

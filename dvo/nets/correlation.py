@@ -1,0 +1,248 @@
+"""Correlation of patches with neighbourhoods of feature maps (DPVO 3.2).
+
+For each edge and each of the ``p * p`` patch pixels, at its reprojected position: dot products of the pixel's feature
+with the ``(2r + 2)^2`` nearest map features, bilinearly blended to ``(2r + 1)^2``; zero outside the map. The
+channels of a level are ordered as DPVO's weights expect: x offset slowest, then y offset, patch row, patch column.
+
+Three ways to the same numbers:
+
+- :func:`correlate_reference`, the specification: bilinear sampling of the features, then dot products.
+- :class:`CorrelationVolume`: all products of a clip as one matrix product, then cheap look-ups. For training.
+- :func:`correlate_windows`: gathers one window of features an edge. For tracking, where the volume would not fit.
+
+They return one tensor a level; DPVO interleaves them (level fastest), which :class:`dvo.nets.update.Update` undoes on
+the weights of its first layer, a small tensor, rather than on every edge.
+
+Positions receive no gradient, as in RAFT.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from dvo.nets.patchifier import pool_levels
+
+
+def correlate_reference(
+    patches: Float[Tensor, "B K C p p"],
+    maps: Float[Tensor, "B N C h w"],
+    coords: Float[Tensor, "B E p p 2"],
+    kk: Int[Tensor, " E"],
+    jj: Int[Tensor, " E"],
+    pyramid: tuple[int, ...] = (1, 4),
+    radius: int = 3,
+) -> list[Tensor]:
+    """Plain specification, slow and memory-hungry.
+
+    Args:
+        patches: matching features of the patches.
+        maps: matching features of the frames.
+        coords: reprojected patch pixels ``x, y`` in feature pixels.
+        kk, jj: patch and target frame of each edge.
+
+    Returns:
+        ``(B, E, (2r+1)^2 * p^2)`` a level.
+    """
+    b, e, p = coords.shape[:3]
+    steps = torch.arange(-radius, radius + 1, device=coords.device, dtype=coords.dtype)
+    offsets = torch.stack(torch.meshgrid(steps, steps, indexing="ij"), dim=-1)  # (x_off, y_off, 2)
+    levels = []
+    for level, scale in zip(pool_levels(maps, pyramid), pyramid, strict=True):
+        h, w = level.shape[-2:]
+        at = coords.detach()[:, :, None, None] / scale + offsets[:, :, None, None, :]  # b e X Y p p 2
+        grid = torch.stack([2 * at[..., 0] / max(w - 1, 1) - 1, 2 * at[..., 1] / max(h - 1, 1) - 1], dim=-1)
+        target = level[:, jj].flatten(0, 1)
+        sampled = F.grid_sample(target, grid.reshape(b * e, 1, -1, 2), align_corners=True)
+        sampled = sampled.reshape(b, e, -1, *at.shape[2:6])
+        levels.append(torch.einsum("becxypq,becpq->bexypq", sampled, patches[:, kk]).flatten(2))
+    return levels
+
+
+def axis_taps(position: Tensor, size: int, radius: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Look-up along one axis.
+
+    Args:
+        position: ``(...,)`` sub-pixel position.
+
+    Returns:
+        ``(..., 2r+2)`` clamped int64 indices, and the weights ``(..., 2r+1)`` of the lower and the upper neighbour of
+        each tap; a neighbour outside ``[0, size)`` has weight 0, so that clamping its index does no harm.
+    """
+    # Far-away projections would overflow the integers; they are out of the map either way.
+    position = position.clamp(-4.0 * radius - 8, size + 4.0 * radius + 8)
+    base = position.floor()
+    fraction = (position - base)[..., None]
+    taps = torch.arange(-radius, radius + 2, device=position.device)
+    index = base.long()[..., None] + taps
+    inside = ((index >= 0) & (index < size)).to(position.dtype)
+    return index.clamp(0, size - 1), (1 - fraction) * inside[..., :-1], fraction * inside[..., 1:]
+
+
+class _Volume(torch.autograd.Function):
+    """All dot products of patch pixels and map pixels.
+
+    The gradient of the volume would be as large as the volume at every look-up. Instead each look-up adds its share
+    into one buffer and passes on a scalar token; autograd calls this backward after all of them.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, patches: Tensor, maps: Tensor, store: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(patches, maps)
+        ctx.store = store
+        volume = torch.matmul(patches, maps)
+        ctx.mark_non_differentiable(volume)
+        return volume, patches.new_zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        patches, maps = ctx.saved_tensors
+        grad = ctx.store.pop("grad", None)
+        if grad is None:
+            return None, None, None
+        grad = grad.view(*patches.shape[:-1], maps.shape[-1])
+        return torch.matmul(grad, maps.mT), torch.matmul(patches.mT, grad), None
+
+
+class _Lookup(torch.autograd.Function):
+    """Bilinear look-up of windows in slices of a volume, see :class:`CorrelationVolume`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        token: Tensor,
+        volume: Tensor,
+        start: Tensor,
+        position: Tensor,
+        size: tuple[int, int],
+        radius: int,
+        learn: Tensor | None,
+        store: dict[str, Tensor],
+    ) -> Tensor:
+        h, w = size
+        ix, ax, bx = axis_taps(position[..., 0], w, radius)
+        iy, ay, by = axis_taps(position[..., 1], h, radius)
+        # (edges, pixels, taps) -> (edges, x taps, y taps, pixels), the order of DPVO's channels
+        ix, ax, bx = (t.mT.contiguous()[:, :, None, :] for t in (ix, ax, bx))
+        iy, ay, by = (t.mT.contiguous()[:, None, :, :] for t in (iy * w + start[..., None], ay, by))
+        index = ix + iy
+        values = volume.view(-1).index_select(0, index.view(-1)).view(index.shape)  # several times faster than take
+        rows = torch.addcmul(values[:, :, :-1] * ay, values[:, :, 1:], by)
+        out = torch.addcmul(rows[:, :-1] * ax, rows[:, 1:], bx)
+        if learn is not None:
+            index, ax, bx, ay, by = (t[learn] for t in (index, ax, bx, ay, by))
+        ctx.save_for_backward(index, ax, bx, ay, by, learn)
+        ctx.store, ctx.length = store, volume.numel()
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        index, ax, bx, ay, by, learn = ctx.saved_tensors
+        grad = grads[0] if learn is None else grads[0][learn]
+        rows = F.pad(grad * ax, (0, 0, 0, 0, 0, 1)) + F.pad(grad * bx, (0, 0, 0, 0, 1, 0))
+        values = F.pad(rows * ay, (0, 0, 0, 1)) + F.pad(rows * by, (0, 0, 1, 0))
+        if "grad" not in ctx.store:
+            ctx.store["grad"] = values.new_zeros(ctx.length)
+        ctx.store["grad"].index_add_(0, index.flatten(), values.flatten())
+        return (grad.new_zeros(()), *[None] * 7)
+
+
+class CorrelationVolume:
+    """All correlations of a clip, computed once and looked up at every update.
+
+    Args:
+        patches: ``(B, K, C, p, p)`` matching features of the patches.
+        maps: ``(B, N, C, h, w)`` matching features of the frames.
+        pyramid: scale of each level.
+        radius: correlation radius.
+    """
+
+    def __init__(self, patches: Tensor, maps: Tensor, pyramid: tuple[int, ...] = (1, 4), radius: int = 3) -> None:
+        b, k, c, p, _ = patches.shape
+        self.radius, self.pyramid, self.frames = radius, pyramid, maps.shape[1]
+        self.pixels, self.patches = p * p, k
+        rows = patches.permute(0, 1, 3, 4, 2).reshape(b, k * p * p, c)
+        self.levels = []
+        for level in pool_levels(maps, pyramid):
+            columns = level.permute(0, 2, 1, 3, 4).reshape(b, c, -1)
+            store: dict[str, Tensor] = {}
+            volume, token = _Volume.apply(rows, columns, store)
+            self.levels.append((volume, token, store, (level.shape[-2], level.shape[-1])))
+
+    def lookup(
+        self,
+        coords: Float[Tensor, "B E p p 2"],
+        kk: Int[Tensor, " E"],
+        jj: Int[Tensor, " E"],
+        learn: Int[Tensor, " L"] | None = None,
+    ) -> list[Tensor]:
+        """Correlation channels ``(B, E, c)`` of each level, equal to :func:`correlate_reference`.
+
+        Args:
+            learn: indices into the flattened ``B * E`` edges that send a gradient back to the features (DPVO lets a
+                random fifth do so), or None for all.
+        """
+        b, e = coords.shape[:2]
+        position = coords.detach().reshape(b * e, self.pixels, 2)
+        pixel = torch.arange(self.pixels, device=kk.device)
+        clip = torch.arange(b, device=kk.device) * (self.patches * self.pixels)
+        row = (clip[:, None, None] + kk[:, None] * self.pixels + pixel).reshape(b * e, self.pixels)
+        frame = jj.repeat(b)[:, None]
+        levels = []
+        for (volume, token, store, (h, w)), scale in zip(self.levels, self.pyramid, strict=True):
+            start = (row * self.frames + frame) * (h * w)
+            args = (position / scale, (h, w), self.radius, learn, store)
+            levels.append(_Lookup.apply(token, volume, start, *args).reshape(b, e, -1))
+        return levels
+
+
+def correlate_windows(
+    patches: Float[Tensor, "K C p p"],
+    levels: list[Tensor],
+    coords: Float[Tensor, "E p p 2"],
+    kk: Int[Tensor, " E"],
+    jj: Int[Tensor, " E"],
+    pyramid: tuple[int, ...] = (1, 4),
+    radius: int = 3,
+    slack: int = 2,
+) -> list[Tensor]:
+    """Correlation channels ``(E, c)`` of each level for tracking, without gradients.
+
+    One window of ``2r + 2 + 2 slack`` map pixels is gathered an edge and multiplied with all patch pixels, which is
+    exact while the reprojected patch pixels lie within ``slack`` of their centre. A pixel further away (a patch seen
+    from much closer, or behind the camera) is correlated at that distance instead.
+
+    Args:
+        levels: a channels-last map ``(N, h, w, C)`` for each scale of the pyramid.
+    """
+    e, p = coords.shape[:2]
+    side = 2 * radius + 2 + 2 * slack
+    features = patches.flatten(2)[kk]  # E C pp
+    taps = torch.arange(side, device=coords.device) - radius - slack
+    out = []
+    for level, scale in zip(levels, pyramid, strict=True):
+        n, h, w, c = level.shape
+        at = coords.reshape(e, p * p, 2) / scale
+        middle = at[:, p * p // 2].clamp(-1e4, 1e4).floor()
+        index = middle.long()[:, None, :] + taps[:, None]  # E side 2
+        ix, iy = index[..., 0], index[..., 1]
+        inside = ((iy >= 0) & (iy < h))[:, :, None] & ((ix >= 0) & (ix < w))[:, None, :]
+        flat = (jj[:, None] * h + iy.clamp(0, h - 1))[:, :, None] * w + ix.clamp(0, w - 1)[:, None, :]
+        window = level.reshape(-1, c).index_select(0, flat.flatten()).view(e, side * side, c)
+        products = torch.bmm(window, features).view(e, side, side, p * p) * inside[..., None]
+        # Sub-pixel look-up inside the window, each patch pixel with its own offset from the centre.
+        local = (at - middle[:, None]).clamp(-float(slack), slack + 1 - 1e-4) + radius + slack
+        base = local.floor()
+        fraction = (local - base)[:, None, None]
+        x0, y0 = (base.long() - radius).unbind(-1)
+        steps = torch.arange(2 * radius + 2, device=coords.device)
+        pick = (y0[:, None, None, :] + steps[:, None]) * side + x0[:, None, None, :] + steps[:, None, None]
+        pick = pick * (p * p) + torch.arange(p * p, device=coords.device)  # E X Y pp
+        values = products.reshape(e, -1).gather(1, pick.reshape(e, -1)).view(pick.shape)
+        rows = torch.lerp(values[:, :, :-1], values[:, :, 1:], fraction[..., 1])
+        out.append(torch.lerp(rows[:, :-1], rows[:, 1:], fraction[..., 0]).reshape(e, -1))
+    return out

@@ -1,0 +1,53 @@
+"""Convolutional encoder at a quarter of the image resolution (DPVO 3.1; layers and names as its ``BasicEncoder4``)."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+def _norm(channels: int, kind: str) -> nn.Module:
+    return nn.InstanceNorm2d(channels) if kind == "instance" else nn.Identity()
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions with a skip; the skip is a strided 1x1 convolution where the shape changes."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, norm: str) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.norm1 = _norm(outputs, norm)
+        self.norm2 = _norm(outputs, norm)
+        self.downsample: nn.Module = nn.Identity()
+        if stride != 1 or inputs != outputs:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), _norm(outputs, norm))
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = F.relu(self.norm1(self.conv1(x)))
+        y = F.relu(self.norm2(self.conv2(y)))
+        return F.relu(self.downsample(x) + y)
+
+
+class Encoder(nn.Module):
+    """Image to features of stride 4.
+
+    All convolutions are centred, so feature ``(u, v)`` is centred on image pixel ``(4u, 4v)`` and the intrinsics of
+    the feature map are exactly those of the image divided by 4.
+    """
+
+    def __init__(self, stem: int, trunk: int, outputs: int, norm: str) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, stem, 7, stride=2, padding=3)
+        self.norm1 = _norm(stem, norm)
+        self.layer1 = nn.Sequential(ResidualBlock(stem, stem, 1, norm), ResidualBlock(stem, stem, 1, norm))
+        self.layer2 = nn.Sequential(ResidualBlock(stem, trunk, 2, norm), ResidualBlock(trunk, trunk, 1, norm))
+        self.conv2 = nn.Conv2d(trunk, outputs, 1)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n c h w"]:
+        x = F.relu(self.norm1(self.conv1(images)))
+        return self.conv2(self.layer2(self.layer1(x)))

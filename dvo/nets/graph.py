@@ -1,0 +1,94 @@
+"""Index structure of a patch graph: which edges share a patch, share a frame pair, follow each other in time.
+
+An edge ``e`` joins patch ``kk[e]``, drawn in frame ``ii[e]``, with a target frame ``jj[e]``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Groups:
+    """A partition of the edges, laid out so that a soft aggregation is a dense masked softmax.
+
+    Attributes:
+        members: ``(G, M)`` edge indices, padded with 0.
+        mask: ``(G, M, 1)`` True where a member is real.
+        group: ``(E,)`` the group of each edge.
+        full: no padding at all.
+    """
+
+    members: Tensor
+    mask: Tensor
+    group: Tensor
+    full: bool
+
+
+@dataclass(frozen=True)
+class PatchGraph:
+    """Edges with their neighbourhoods.
+
+    Attributes:
+        ii, jj, kk: ``(E,)`` source frame, target frame, patch.
+        previous, following: ``(E,)`` the edge of the same patch with the next smaller / larger target frame, 0 if none.
+        has_previous, has_following: ``(E, 1)`` bool.
+        by_patch, by_pair: edges that share a patch, and a (source, target) frame pair.
+    """
+
+    ii: Tensor
+    jj: Tensor
+    kk: Tensor
+    previous: Tensor
+    following: Tensor
+    has_previous: Tensor
+    has_following: Tensor
+    by_patch: Groups
+    by_pair: Groups
+
+    def __len__(self) -> int:
+        return len(self.ii)
+
+
+def group_edges(keys: Int[Tensor, " E"]) -> Groups:
+    """Partition edges by equal key."""
+    order = torch.argsort(keys, stable=True)
+    _, group, counts = torch.unique(keys, return_inverse=True, return_counts=True)
+    widest = int(counts.max()) if len(counts) else 0
+    first = torch.cumsum(counts, 0) - counts
+    slots = torch.arange(widest, device=keys.device)
+    mask = slots < counts[:, None]
+    members = order[(first[:, None] + slots).clamp(max=max(len(keys) - 1, 0))] if len(keys) else slots[None, :0]
+    members = torch.where(mask, members, torch.zeros_like(members))
+    return Groups(members, mask[..., None], group, bool(mask.all()))
+
+
+def build_graph(ii: Int[Tensor, " E"], jj: Int[Tensor, " E"], kk: Int[Tensor, " E"]) -> PatchGraph:
+    """Index the edges, given in any order."""
+    frames = int(torch.maximum(ii.max(), jj.max())) + 1 if len(ii) else 1
+    keys = kk * frames + jj
+    order = torch.argsort(keys, stable=True)
+    same = kk[order][1:] == kk[order][:-1]
+    previous = torch.zeros_like(kk)
+    following = torch.zeros_like(kk)
+    has_previous = torch.zeros_like(kk, dtype=torch.bool)
+    has_following = torch.zeros_like(kk, dtype=torch.bool)
+    previous[order[1:]] = torch.where(same, order[:-1], 0)
+    has_previous[order[1:]] = same
+    following[order[:-1]] = torch.where(same, order[1:], 0)
+    has_following[order[:-1]] = same
+    return PatchGraph(
+        ii,
+        jj,
+        kk,
+        previous,
+        following,
+        has_previous[:, None],
+        has_following[:, None],
+        group_edges(kk),
+        group_edges(ii * frames + jj),
+    )

@@ -1,0 +1,120 @@
+"""Patches: where they are drawn and what is kept of them (DPVO 3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from dvo.nets.config import ModelConfig
+from dvo.nets.encoder import Encoder
+
+
+@dataclass(frozen=True)
+class Features:
+    """What the encoder makes of the frames.
+
+    Attributes:
+        matching: ``(B, N, C, h, w)`` features for correlation.
+        context: ``(B, N, D, h, w)`` features for the update operator.
+    """
+
+    matching: Tensor
+    context: Tensor
+
+
+def normalise_images(images: Tensor) -> Tensor:
+    """uint8 RGB ``(..., 3, H, W)`` to float in [-0.5, 1.5], the range that DPVO feeds its encoders."""
+    return images.float() * (2.0 / 255.0) - 0.5
+
+
+def random_centres(
+    frames: int, patches: int, height: int, width: int, generator: torch.Generator | None, batch: int = 1
+) -> Tensor:
+    """Integer patch centres, uniform away from the border.
+
+    Args:
+        height, width: size of the feature map.
+        generator: on the CPU; the draw is the same whatever the device that tracks.
+
+    Returns:
+        ``(batch, frames, patches, 2)`` int64 ``x, y`` in ``[1, width - 2] x [1, height - 2]``.
+    """
+    shape = (batch, frames, patches)
+    x = torch.randint(1, width - 1, shape, generator=generator)
+    y = torch.randint(1, height - 1, shape, generator=generator)
+    return torch.stack([x, y], dim=-1)
+
+
+def crop_patches(maps: Float[Tensor, "B N C h w"], centres: Tensor, size: int) -> Float[Tensor, "B N M C p p"]:
+    """Cut ``size x size`` windows around integer centres ``(B, N, M, 2)`` that lie inside the map."""
+    b, n, c, h, w = maps.shape
+    m = centres.shape[2]
+    offsets = torch.arange(size, device=maps.device) - size // 2
+    x = centres[..., 0, None, None] + offsets
+    y = centres[..., 1, None, None] + offsets[:, None]
+    index = (y * w + x).reshape(b, n, 1, m * size * size).expand(-1, -1, c, -1)
+    patches = maps.reshape(b, n, c, h * w).gather(3, index)
+    return patches.reshape(b, n, c, m, size, size).permute(0, 1, 3, 2, 4, 5)
+
+
+class Patchifier(nn.Module):
+    """Encoders plus the cutting of patches."""
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        extra = config.hidden_channels if config.shared_encoder else 0
+        sizes = (config.stem_channels, config.trunk_channels)
+        self.fnet = Encoder(*sizes, config.feature_channels + extra, "instance")
+        if not config.shared_encoder:
+            self.inet = Encoder(*sizes, config.hidden_channels, "none")
+
+    def encode(self, images: Float[Tensor, "B N 3 H W"]) -> Features:
+        """Features of normalised images; both outputs are divided by 4 as in DPVO."""
+        b, n = images.shape[:2]
+        flat = images.flatten(0, 1)
+        if self.config.shared_encoder:
+            both = self.fnet(flat) / 4.0
+            sizes = [self.config.feature_channels, self.config.hidden_channels]
+            matching, context = both.split(sizes, dim=1)
+        else:
+            matching, context = self.fnet(flat) / 4.0, self.inet(flat) / 4.0
+        return Features(matching.unflatten(0, (b, n)), context.unflatten(0, (b, n)))
+
+    def cut(self, features: Features, centres: Tensor) -> tuple[Tensor, Tensor]:
+        """Matching and context features of patches.
+
+        Args:
+            centres: ``(B, N, M, 2)`` from :func:`random_centres`.
+
+        Returns:
+            ``(B, N*M, C, p, p)`` matching features and ``(B, N*M, D)`` context at the patch centres.
+        """
+        matching = crop_patches(features.matching, centres, self.config.patch_size).flatten(1, 2)
+        context = crop_patches(features.context, centres, 1).flatten(1, 2).flatten(2)
+        return matching, context
+
+
+def patch_coordinates(centres: Tensor, inverse_depth: Tensor, size: int) -> Float[Tensor, "B K 3 p p"]:
+    """Patch tensors ``x, y, d`` of constant inverse depth.
+
+    Args:
+        centres: ``(B, N, M, 2)`` integer centres in feature pixels.
+        inverse_depth: ``(B, N*M)``.
+    """
+    centres = centres.flatten(1, 2).to(inverse_depth.dtype)
+    offsets = torch.arange(size, device=centres.device, dtype=centres.dtype) - size // 2
+    x = (centres[..., 0, None, None] + offsets).expand(-1, -1, size, size)
+    y = (centres[..., 1, None, None] + offsets[:, None]).expand(-1, -1, size, size)
+    return torch.stack([x, y, inverse_depth[..., None, None].expand_as(x)], dim=2)
+
+
+def pool_levels(matching: Tensor, pyramid: tuple[int, ...]) -> list[Tensor]:
+    """Average-pooled copies ``(B, N, C, h / s, w / s)`` of the matching features, one a level."""
+    b, n = matching.shape[:2]
+    flat = matching.flatten(0, 1)
+    return [matching if s == 1 else F.avg_pool2d(flat, s, s).unflatten(0, (b, n)) for s in pyramid]

@@ -1,0 +1,128 @@
+"""The recurrent update operator (DPVO 3.2): correlation in, flow revision and confidence out, one state an edge."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dvo.nets.config import ModelConfig
+from dvo.nets.graph import Groups, PatchGraph
+
+
+class _ClampGradient(torch.autograd.Function):
+    """Identity; gradients lose their NaNs and are clamped, so that one bad edge cannot drown the others."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, limit: float) -> Tensor:
+        ctx.limit = limit
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        return torch.nan_to_num(grads[0], nan=0.0).clamp(-ctx.limit, ctx.limit), None
+
+
+class GradientClamp(nn.Module):
+    """Clamp of each element of the gradient to ``+-0.01`` of a batch of one; scaled with ``1 / batch``, because the
+    loss is a mean over clips."""
+
+    def forward(self, x: Float[Tensor, "B E c"]) -> Tensor:
+        return _ClampGradient.apply(x, 0.01 / x.shape[0])
+
+
+class GatedResidual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.gate = nn.Sequential(nn.Linear(channels, channels), nn.Sigmoid())
+        self.res = nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.addcmul(x, self.gate(x), self.res(x))
+
+
+class SoftAggregation(nn.Module):
+    """Per-channel softmax-weighted sum inside each group of edges, handed back to its members (DPVO 3.2)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.f = nn.Linear(channels, channels)
+        self.g = nn.Linear(channels, channels)
+        self.h = nn.Linear(channels, channels)
+
+    def forward(self, x: Float[Tensor, "B E c"], groups: Groups) -> Tensor:
+        shape = (*groups.members.shape, x.shape[-1])
+        flat = groups.members.flatten()
+        value = self.f(x).index_select(1, flat).unflatten(1, shape[:2])
+        score = self.g(x).index_select(1, flat).unflatten(1, shape[:2])
+        if not groups.full:
+            score = score.masked_fill(~groups.mask, -torch.inf)
+        pooled = (value * torch.softmax(score, dim=2)).sum(dim=2)
+        return self.h(pooled).index_select(1, groups.group)
+
+
+class Update(nn.Module):
+    """One revision of all edges.
+
+    Submodule names are those of DPVO's checkpoint.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        dim = config.hidden_channels
+        self.c1 = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, dim))
+        self.c2 = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, dim))
+        self.norm = nn.LayerNorm(dim, eps=1e-3)
+        self.agg_kk = SoftAggregation(dim)
+        self.agg_ij = SoftAggregation(dim)
+        self.gru = nn.Sequential(
+            nn.LayerNorm(dim, eps=1e-3), GatedResidual(dim), nn.LayerNorm(dim, eps=1e-3), GatedResidual(dim)
+        )
+        self.corr = nn.Sequential(
+            nn.Linear(config.correlation_channels, dim),
+            nn.ReLU(),
+            nn.Linear(dim, dim),
+            nn.LayerNorm(dim, eps=1e-3),
+            nn.ReLU(),
+            nn.Linear(dim, dim),
+        )
+        self.d = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp())
+        self.w = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp(), nn.Sigmoid())
+
+    def _correlate(self, levels: list[Tensor]) -> Tensor:
+        """The first layer on its channels, level by level: DPVO's weights interleave the levels, level fastest."""
+        first = self.corr[0]
+        weights = first.weight.unflatten(1, (-1, len(levels))).unbind(-1)
+        out = functional.linear(levels[0], weights[0], first.bias)
+        for level, weight in zip(levels[1:], weights[1:], strict=True):
+            out = out + functional.linear(level, weight)
+        return out
+
+    def forward(
+        self,
+        hidden: Float[Tensor, "B E D"],
+        context: Float[Tensor, "B E D"],
+        correlation: list[Tensor],
+        graph: PatchGraph,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Revise.
+
+        Args:
+            hidden: state, zero for a new edge.
+            context: context features of the edge's patch.
+            correlation: ``(B, E, c)`` a level, see :mod:`dvo.nets.correlation`.
+
+        Returns:
+            new state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
+        """
+        net = self.norm(hidden + context + self.corr[1:](self._correlate(correlation)))
+        # The mask multiplies the input, so an edge without a neighbour still receives c(0) (as DPVO's weights expect).
+        net = net + self.c1(net.index_select(1, graph.previous) * graph.has_previous)
+        net = net + self.c2(net.index_select(1, graph.following) * graph.has_following)
+        net = net + self.agg_kk(net, graph.by_patch)
+        net = net + self.agg_ij(net, graph.by_pair)
+        net = self.gru(net)
+        return net, self.d(net), self.w(net)

@@ -1,0 +1,168 @@
+"""One odometry over one source, from the first frame to the result, whatever happens on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dvo.data.frame import Frame
+from dvo.data.trajectory import Trajectory, interpolate
+from dvo.errors import DvoError
+from dvo.odometry.protocol import Estimate, Odometry, Result
+
+FrameCallback = Callable[[Frame, Estimate | None], None]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a session leaves behind.
+
+    Attributes:
+        result: the odometry's result, with rows for strided frames, counted in frames of the source.
+        frames_fed: frames given to the odometry (fewer than read under a stride).
+        interrupted: stopped by the user.
+        warnings: what went wrong without ending the run, a sentence each.
+        seconds: wall time spent ``reading``, ``tracking`` and ``finishing``.
+    """
+
+    result: Result
+    frames_fed: int
+    interrupted: bool
+    warnings: tuple[str, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def frames_per_second(self) -> float:
+        """Frames fed a second of wall time, reading and finishing included."""
+        return self.frames_fed / max(sum(self.seconds.values()), 1e-9)
+
+
+def run(
+    odometry: Odometry,
+    source: Iterable[Frame],
+    *,
+    stride: int = 1,
+    on_frame: FrameCallback | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Run:
+    """Feed every ``stride``-th frame, and the last one, then finish.
+
+    An interruption or a frame that cannot be read ends the feeding, not the run: what was tracked so far is finished
+    and returned, and ``warnings`` says so.
+
+    Args:
+        on_frame: called after each frame; the estimate is None for a frame passed over.
+        should_stop: asked before each frame; True ends the feeding. A caller that gives it takes care of Ctrl-C; without
+            it, a KeyboardInterrupt ends the feeding too.
+
+    Raises:
+        DvoError: a stride below 1, or no frame at all.
+    """
+    if stride < 1:
+        raise DvoError(f"must be 1 or more, got {stride}", field="stride", remedy="give a whole number of frames")
+    feeding = _Feeding(odometry, stride, on_frame)
+    interrupted = False
+    warnings: list[str] = []
+    frames = iter(source)
+    try:
+        while not (interrupted := should_stop is not None and should_stop()):
+            started = time.perf_counter()
+            frame = next(frames, None)
+            feeding.seconds["reading"] += time.perf_counter() - started
+            if frame is None:
+                break
+            feeding.take(frame)
+        feeding.flush()
+    except KeyboardInterrupt:
+        if should_stop is not None:  # the caller handles the first one, so this is an impatient second
+            raise
+        interrupted = True
+    except (DvoError, OSError) as error:
+        if not feeding.fed:
+            raise
+        warnings.append(f"stopped at frame {feeding.frames_read}: {error}")
+    if interrupted:
+        warnings.append(f"interrupted after {feeding.frames_read} frames")
+    elif not feeding.frames_read:
+        raise DvoError("no frames", file=getattr(source, "name", None), remedy="give a video or a folder with images")
+
+    started = time.perf_counter()
+    result = odometry.finish()
+    feeding.seconds["finishing"] = time.perf_counter() - started
+    trajectory = fill_skipped(result.trajectory, np.array(feeding.fed), np.array(feeding.skipped))
+    read = feeding.frames_read
+    return Run(
+        result=replace(result, trajectory=trajectory, frames_read=read, frames_lost=read - len(trajectory)),
+        frames_fed=len(feeding.fed),
+        interrupted=interrupted,
+        warnings=(*getattr(source, "warnings", ()), *warnings),
+        seconds=feeding.seconds,
+    )
+
+
+def fill_skipped(trajectory: Trajectory, fed: np.ndarray, skipped: np.ndarray) -> Trajectory:
+    """Add the frames that were read but not fed, interpolated between their neighbours.
+
+    A skipped frame gets a row when the fed frames before and after it both have one; beside a lost frame it is lost.
+
+    Args:
+        trajectory: what the odometry returned.
+        fed: ``(F,)`` increasing stamps of the frames fed, seconds.
+        skipped: ``(S,)`` stamps of the frames passed over, seconds.
+
+    Returns:
+        Trajectory with its rows in the order of time.
+    """
+    has_row = np.isin(fed, trajectory.timestamps)
+    after = np.searchsorted(fed, skipped)
+    inside = (after > 0) & (after < len(fed))
+    inside[inside] = has_row[after[inside] - 1] & has_row[after[inside]]
+    between = interpolate(trajectory, skipped[inside], max_gap=np.inf)
+    timestamps = np.concatenate([trajectory.timestamps, between.timestamps])
+    order = np.argsort(timestamps, kind="stable")
+    return Trajectory(timestamps[order], np.concatenate([trajectory.poses_wc, between.poses_wc])[order])
+
+
+class _Feeding:
+    """Applies the stride and keeps the books."""
+
+    def __init__(self, odometry: Odometry, stride: int, on_frame: FrameCallback | None) -> None:
+        self.odometry, self.stride, self.on_frame = odometry, stride, on_frame
+        self.fed: list[float] = []
+        self.skipped: list[float] = []
+        self.seconds = {"reading": 0.0, "tracking": 0.0, "finishing": 0.0}
+        self.pending: Frame | None = None  # the last frame passed over: fed after all if the source ends with it
+
+    @property
+    def frames_read(self) -> int:
+        return len(self.fed) + len(self.skipped)
+
+    def take(self, frame: Frame) -> None:
+        if self.frames_read % self.stride:
+            self.pending = frame
+            self.skipped.append(frame.timestamp)
+            self._report(frame, None)
+        else:
+            self.pending = None
+            self._report(frame, self._track(frame))
+
+    def flush(self) -> None:
+        """Track the last frame, so that the trajectory reaches to the end of the source."""
+        if self.pending is not None:
+            self._track(self.pending)
+            self.skipped.pop()
+            self.pending = None
+
+    def _track(self, frame: Frame) -> Estimate:
+        started = time.perf_counter()
+        estimate = self.odometry.track(frame)
+        self.seconds["tracking"] += time.perf_counter() - started
+        self.fed.append(frame.timestamp)
+        return estimate
+
+    def _report(self, frame: Frame, estimate: Estimate | None) -> None:
+        if self.on_frame is not None:
+            self.on_frame(frame, estimate)

@@ -1,0 +1,357 @@
+"""The learned odometry: a streaming tracker over a sliding patch graph (DPVO 3.4).
+
+For each frame: features and patches; a guess of its pose; edges between its patches and the recent frames, both ways;
+one recurrent update; bundle adjustment of the window; and, a few frames later, the decision whether it was worth
+keeping. What leaves the window is written down once and never changes again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.ba.layer import bundle_adjust
+from dvo.data.frame import Frame
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+from dvo.geometry import se3
+from dvo.geometry.projection import reproject
+from dvo.nets.edge_correlation import EdgeCorrelation
+from dvo.nets.graph import build_graph
+from dvo.nets.patch_vo import PatchVO
+from dvo.nets.patchifier import normalise_images, patch_coordinates, pool_levels, random_centres
+from dvo.nets.weights import load_weights
+from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.motion import flow_magnitude, parallax, predict_pose
+from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.window import Keyframe, Window
+from dvo.odometry.working_image import working_image
+
+
+@dataclass
+class _Record:
+    """A frame of the video: its pose is ``relative`` after that of keyframe ``anchor`` (world to camera)."""
+
+    timestamp: float
+    anchor: int
+    relative: np.ndarray
+    lost: bool = False
+
+
+class PatchOdometry:
+    """Tracks one sequence with :class:`dvo.nets.patch_vo.PatchVO`.
+
+    Args:
+        model: the network; moved to ``device`` and used in evaluation mode.
+        config: see :class:`TrackerConfig`.
+        seed: of the patch centres. The same seed on the same machine gives the same trajectory, bit for bit on the
+            CPU with a fixed number of threads.
+        device: where to compute.
+        name: how reports call it.
+    """
+
+    def __init__(
+        self,
+        model: PatchVO,
+        config: TrackerConfig,
+        *,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        name: str = "dvo",
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.device = torch.device(device)
+        self.model = model.to(self.device).eval()
+        self.seed = seed
+        self._generator = torch.Generator().manual_seed(seed)
+        c = model.config
+        self.window = Window.empty(config.patches, c.patch_size, c.hidden_channels, self.device)
+        # Sides leave room for several pixels of motion before a window must be fetched again.
+        self._correlations = [
+            EdgeCorrelation(scale, c.patch_size**2, c.radius, 20 if scale == 1 else 16, self.device)
+            for scale in c.pyramid
+        ]
+        self._records: list[_Record] = []
+        self._settled: dict[int, np.ndarray] = {}
+        self._points: list[np.ndarray] = []
+        self._colors: list[np.ndarray] = []
+        self._count = 0
+        self._initialised = False
+        self._size: tuple[int, int] | None = None
+        self._info: dict[str, object] = {}
+
+    # -- streaming -----------------------------------------------------------------------------------------------
+
+    @torch.inference_mode()
+    def track(self, frame: Frame) -> Estimate:
+        """Take the next frame.
+
+        Raises:
+            DvoError: a timestamp that does not increase, or an image of another size than the first.
+        """
+        self._check(frame)
+        keyframe, coordinates = self._observe(frame)
+        window, config = self.window, self.config
+        pose = predict_pose(window.poses_cw, [f.timestamp for f in window.frames], frame.timestamp,
+                            config.motion_damping)  # fmt: skip
+        window.append(keyframe, pose, coordinates)
+        self._connect()
+        if not self._initialised and len(window) > 1 and self._probe() < config.initial_motion:
+            return self._skip(frame)
+        self._records.append(_Record(frame.timestamp, keyframe.identifier, _IDENTITY))
+        if self._initialised:
+            for _ in range(config.updates):
+                self._update()
+        elif len(window) >= config.initial_frames:
+            self._initialise()
+        confidence = self._confidence()
+        lost = self._initialised and confidence < config.lost_confidence
+        self._records[-1].lost = lost
+        pose_wc = self._pose_wc(len(window) - 1)
+        self._reduce()
+        status = Status.LOST if lost else Status.TRACKING if self._initialised else Status.INITIALISING
+        return Estimate(frame.timestamp, pose_wc, status, confidence)
+
+    @torch.inference_mode()
+    def finish(self) -> Result:
+        """Refine the last window and write the trajectory of every frame."""
+        window, config = self.window, self.config
+        if 1 < len(window):
+            for _ in range(config.final_updates if self._initialised else config.initial_updates):
+                self._update()
+        poses = dict(self._settled)
+        for index, keyframe in enumerate(window.frames):
+            poses[keyframe.identifier] = window.poses_cw[index].double().cpu().numpy()
+            self._to_map(index)
+        kept = [record for record in self._records if not record.lost and record.anchor in poses]
+        rows = np.zeros((0, 7))
+        if kept:
+            relative = torch.from_numpy(np.stack([record.relative for record in kept]))
+            anchors = torch.from_numpy(np.stack([poses[record.anchor] for record in kept]))
+            rows = se3.normalise(se3.inverse(se3.compose(relative, anchors))).numpy()
+        times = np.array([record.timestamp for record in kept], dtype=np.float64)
+        points = np.concatenate([np.zeros((0, 3), np.float32), *self._points])
+        colors = np.concatenate([np.zeros((0, 3), np.uint8), *self._colors])
+        info = {**self._info, "keyframes": len(poses), "seed": self.seed, "initialised": self._initialised}
+        return Result(
+            Trajectory(times, rows),
+            SparseMap(points, colors),
+            len(self._records),
+            len(self._records) - len(kept),
+            {**info, "config": asdict(config)},
+        )
+
+    # -- steps of a frame ----------------------------------------------------------------------------------------
+
+    def _check(self, frame: Frame) -> None:
+        if self._records and frame.timestamp <= self._records[-1].timestamp:
+            raise DvoError(
+                f"time {frame.timestamp} does not come after {self._records[-1].timestamp}",
+                field=f"frame {frame.index}",
+                remedy="give frames in order of time",
+            )
+        size = (frame.image.shape[1], frame.image.shape[0])
+        if self._size not in (None, size):
+            raise DvoError(
+                f"is {size[0]}x{size[1]}, the frames before are {self._size[0]}x{self._size[1]}",  # type: ignore[index]
+                field=f"frame {frame.index}",
+                remedy="give frames of one size",
+            )
+        self._size = size
+
+    def _observe(self, frame: Frame) -> tuple[Keyframe, Tensor]:
+        """Features and patches of a frame."""
+        config, net = self.config, self.model
+        image, camera = working_image(frame, config.pixels)
+        self._info = {"working_size": [camera.width, camera.height], "working_intrinsics": camera.intrinsics.tolist()}
+        rgb = torch.from_numpy(image).to(self.device).permute(2, 0, 1)
+        features = net.patchify.encode(normalise_images(rgb)[None, None])
+        h, w = features.matching.shape[-2:]
+        centres = random_centres(1, config.patches, h, w, self._generator).to(self.device)
+        matching, context = net.patchify.cut(features, centres)
+        levels = [level[0, 0].permute(1, 2, 0).contiguous() for level in
+                  pool_levels(features.matching, net.config.pyramid)]  # fmt: skip
+        x, y = (centres[0, 0] * net.config.STRIDE).unbind(-1)
+        colors = rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu()
+        intrinsics = torch.tensor(camera.intrinsics / net.config.STRIDE, dtype=torch.float32, device=self.device)
+        keyframe = Keyframe(
+            self._count, frame.timestamp, levels, matching[0], context[0], colors, intrinsics
+        )
+        self._count += 1
+        depth = torch.ones(1, config.patches, device=self.device)
+        if self._initialised:
+            depth *= self.window.patches[-3 * config.patches :, 2, 0, 0].median()
+        return keyframe, patch_coordinates(centres, depth, net.config.patch_size)[0]
+
+    def _connect(self) -> None:
+        """Join recent patches with the newest frame, and its patches with recent frames."""
+        m, n = self.config.patches, len(self.window)
+        first = max(0, n - 1 - self.config.lifetime)
+        device = self.device
+        old = torch.arange(first * m, (n - 1) * m, device=device)
+        slots = [self.window.connect(old, torch.full_like(old, n - 1))]
+        new = torch.arange((n - 1) * m, n * m, device=device)
+        targets = torch.arange(first, n if self.model.config.self_edges else n - 1, device=device)
+        slots.append(self.window.connect(new.repeat_interleave(len(targets)), targets.repeat(m)))
+        for correlation in self._correlations:
+            correlation.forget(torch.cat(slots))
+
+    def _revise(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Run the network on all edges: hidden state, flow revision, confidence, current patch centres."""
+        window, net = self.window, self.model
+        graph = build_graph(window.ii, window.jj, window.kk)
+        coords = reproject(
+            window.poses_cw[None], window.patches[None], window.intrinsics[None], graph.ii, graph.jj, graph.kk
+        ).coords
+        frames = window.frames
+        levels = [torch.stack([f.levels[i] for f in frames]) for i in range(len(net.config.pyramid))]
+        matching = torch.cat([f.matching for f in frames]).flatten(2)
+        context = torch.cat([f.context for f in frames])
+        correlation = [
+            cache.lookup(coords[0], window.slots, matching, level, graph.kk, graph.jj)
+            for cache, level in zip(self._correlations, levels, strict=True)
+        ]
+        hidden, delta, weights = net.update(window.hidden[None], context[graph.kk][None], [level[None] for level in correlation], graph)
+        centre = net.config.patch_size // 2
+        return hidden[0], delta[0], weights[0], coords[0, :, centre, centre]
+
+    def _update(self) -> None:
+        """One revision of the edges and of the newest poses and their depths."""
+        window, config = self.window, self.config
+        window.hidden, delta, window.weights, centres = self._revise()
+        n = len(window)
+        height, width = window.frames[0].levels[0].shape[:2]
+        fixed = max(1, n - config.optimisation) if self._initialised else 1
+        poses, patches = bundle_adjust(
+            window.poses_cw[None],
+            window.patches[None],
+            window.intrinsics[None],
+            (centres + delta)[None],
+            window.weights[None],
+            window.ii,
+            window.jj,
+            window.kk,
+            fixed=fixed,
+            bounds=(width, height),
+        )
+        window.poses_cw, window.patches = poses[0], patches[0]
+
+    def _probe(self) -> float:
+        """Median revision of the flow from the last keyframe to the newest frame, if poses did not change."""
+        window, n = self.window, len(self.window)
+        _, delta, _, _ = self._revise()
+        edges = (window.ii == n - 2) & (window.jj == n - 1)
+        return float(delta[edges].norm(dim=-1).median())
+
+    def _skip(self, frame: Frame) -> Estimate:
+        """Before initialisation: a frame that shows too little motion shares the pose of the keyframe before it."""
+        self.window.remove(len(self.window) - 1)
+        anchor = self.window.frames[-1].identifier
+        self._records.append(_Record(frame.timestamp, anchor, _IDENTITY))
+        return Estimate(frame.timestamp, self._pose_wc(len(self.window) - 1), Status.INITIALISING)
+
+    def _initialise(self) -> None:
+        """Optimise the first window; it counts as initialised once there is parallax."""
+        for _ in range(self.config.initial_updates):
+            self._update()
+        window, n = self.window, len(self.window)
+        seen = parallax(window, 0, n - 1)
+        if n > self.config.initial_frames:
+            seen = max(seen, parallax(window, n // 2, n - 1))
+        self._initialised = seen >= self.config.initial_parallax
+
+    def _reduce(self) -> None:
+        """Drop the keyframe that adds nothing, and what is too old."""
+        window, config = self.window, self.config
+        n = len(window)
+        back = config.keyframe_index
+        if self._initialised and n > back + 1:
+            i, j = n - back - 1, n - back + 1
+            if (flow_magnitude(window, i, j) + flow_magnitude(window, j, i)) / 2 < config.keyframe_motion:
+                self._drop(n - back)
+        window.keep(window.ii >= len(window) - config.removal)
+        limit = config.removal + config.lifetime if self._initialised else config.initial_frames + 4
+        while len(window) > limit:
+            self._settle()
+
+    def _drop(self, index: int) -> None:
+        """Remove a keyframe; its frames hang on the one before it from now on."""
+        window = self.window
+        relative = se3.relative(window.poses_cw[index - 1], window.poses_cw[index]).double().cpu()
+        anchor = window.frames[index - 1].identifier
+        gone = window.remove(index).identifier
+        for record in self._recent(gone):
+            record.relative = se3.compose(torch.from_numpy(record.relative), relative).numpy()
+            record.anchor = anchor
+
+    def _recent(self, anchor: int) -> list[_Record]:
+        """The records that hang on a keyframe of the window; they are among the last ones."""
+        found: list[_Record] = []
+        oldest = self.window.frames[0].identifier
+        for record in reversed(self._records):
+            if record.anchor == anchor:
+                found.append(record)
+            elif record.anchor < oldest:
+                break
+        return found
+
+    def _settle(self) -> None:
+        """The oldest keyframe leaves the window: its pose and points are final."""
+        self._to_map(0)
+        pose = self.window.poses_cw[0].double().cpu().numpy()
+        self._settled[self.window.remove(0).identifier] = pose
+
+    def _to_map(self, index: int) -> None:
+        """Write down the points of a frame that were seen well."""
+        window, m = self.window, self.config.patches
+        frame = window.frames[index]
+        centre = self.model.config.patch_size // 2
+        x, y, d = window.patches[index * m : (index + 1) * m, :, centre, centre].unbind(-1)
+        fx, fy, cx, cy = frame.intrinsics
+        rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
+        world = se3.act(se3.inverse(window.poses_cw[index]), rays / d[:, None])
+        near = (d > 0.05 * d.median()).cpu().numpy()
+        self._points.append(world.float().cpu().numpy()[near])
+        self._colors.append(frame.colors.numpy()[near])
+
+    def _confidence(self) -> float:
+        newest = self.window.weights[self.window.jj == len(self.window) - 1]
+        return float(newest.mean()) if len(newest) else 0.0
+
+    def _pose_wc(self, index: int) -> np.ndarray:
+        return se3.inverse(self.window.poses_cw[index]).double().cpu().numpy()
+
+
+_IDENTITY = np.array([0.0, 0, 0, 0, 0, 0, 1])
+
+
+def load(
+    weights: str = "small",
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    config: TrackerConfig | None = None,
+    **overrides: object,
+) -> PatchOdometry:
+    """The learned odometry, ready to track one sequence.
+
+    Args:
+        weights: name of weights that ship with dvo, or a file.
+        device: where to compute.
+        seed: see :class:`PatchOdometry`.
+        config: settings; None takes those of the preset.
+        overrides: single settings, by the names of :class:`TrackerConfig`.
+
+    Raises:
+        DvoError: no such weights, or a file that is none; an unknown setting.
+    """
+    loaded = load_weights(weights, device)
+    config = config or TRACKER_PRESETS.get(loaded.preset, TrackerConfig())
+    if overrides:
+        TrackerConfig.from_dict(dict(overrides))
+        config = replace(config, **overrides)  # type: ignore[arg-type]
+    return PatchOdometry(loaded.model, config, seed=seed, device=device, name=f"dvo-{loaded.name}")

@@ -1,0 +1,243 @@
+"""What a scene is: flat convex surfaces with textures and baked light, and where a camera may fly among them.
+
+World frame: z up, metres. A surface is a parallelogram-bounded convex polygon in the plane
+``origin + u * u_axis + v * v_axis`` (unit axes, u and v in metres). Seen from the front, u points right and v down, as in
+an image, so that textures stand upright; ``v_axis x u_axis`` is the front normal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.synth.textures import TexturePool
+
+Array = np.ndarray
+
+
+@dataclass
+class Scene:
+    """P surfaces. Arrays are float64 unless said otherwise.
+
+    Attributes:
+        origin, u_axis, v_axis: ``(P, 3)``.
+        corners: ``(P, 4, 3)`` in the world (a triangle repeats its last corner).
+        edges: ``(P, 4, 3)`` half-planes: a point (u, v) is inside where ``edges @ (u, v, 1) >= 0``; metres.
+        two_sided: ``(P,)`` bool; others are seen from their front only.
+        texture: ``(P,)`` int64 index into the pool.
+        texture_map: ``(P, 2, 3)`` texel coordinates from (u, v, 1).
+        gain, offset: ``(P, 3)`` colour = gain * texel + offset, in [0, 1].
+        light: ``(M, 3)`` float32 light-map texels of all surfaces, multiplied onto the colour.
+        light_offset, light_size: ``(P,)``, ``(P, 2)`` int64 first texel and columns, rows of each light map.
+        light_map: ``(P, 2, 3)`` light-map coordinates from (u, v, 1).
+        pool: the textures.
+        family: name of the family that laid it out.
+        bounds: ``(2, 3)`` corners of the box in which cameras live.
+        solids: ``(K, 15)`` centre, half sizes, rotation (row-major, box to world) of boxes that cameras must not enter.
+        scale: typical viewing distance, metres.
+        hints: what the family tells path planning ("heading", "targets", "height", ...).
+    """
+
+    origin: Array
+    u_axis: Array
+    v_axis: Array
+    corners: Array
+    edges: Array
+    two_sided: Array
+    texture: Array
+    texture_map: Array
+    gain: Array
+    offset: Array
+    pool: TexturePool
+    family: str
+    bounds: Array
+    solids: Array
+    scale: float
+    light_offset: Array
+    light_size: Array
+    light_map: Array
+    light: Array = field(default_factory=lambda: np.ones((1, 3), np.float32))
+    hints: dict[str, Any] = field(default_factory=dict)
+    _cache: dict[str, dict[str, Tensor]] = field(default_factory=dict, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+    @property
+    def normal(self) -> Array:
+        """``(P, 3)`` front normals."""
+        return np.cross(self.v_axis, self.u_axis)
+
+    def tensors(self, device: torch.device | str) -> dict[str, Tensor]:
+        """What shading gathers per pixel, on a device (kept after the first call)."""
+        key = str(device)
+        if key not in self._cache:
+            linear = self.texture_map[:, :, :2]
+            columns = [linear.reshape(-1, 4), self.gain / 255, self.offset, self.light_size - 1]
+            self._cache[key] = {
+                "surface": torch.from_numpy(np.concatenate(columns, 1).astype(np.float32)).to(device),
+                "index": torch.from_numpy(np.stack([self.texture, self.light_offset], 1)).to(device),
+                "light": torch.from_numpy(self.light).to(device),
+            }
+        return self._cache[key]
+
+    def clearance(self, points: Array) -> Array:
+        """Distance ``(T,)`` from points ``(T, 3)`` to the nearest surface; -1 inside a solid or out of bounds."""
+        distance = np.full(len(points), np.inf)
+        size = np.stack(
+            [
+                ((self.corners - self.origin[:, None]) * self.u_axis[:, None]).sum(-1),
+                ((self.corners - self.origin[:, None]) * self.v_axis[:, None]).sum(-1),
+            ],
+            -1,
+        )
+        low, high = size.min(1), size.max(1)
+        axes = np.stack([self.u_axis, self.v_axis, self.normal], 1)
+        for i, point in enumerate(points):  # few points, many surfaces
+            local = np.einsum("pij,pj->pi", axes, point - self.origin)
+            over = np.maximum(np.maximum(low - local[:, :2], local[:, :2] - high), 0)
+            distance[i] = np.sqrt(((over**2).sum(1) + local[:, 2] ** 2).min())
+        distance[~self.is_free(points)] = -1
+        return distance
+
+    def is_free(self, points: Array) -> Array:
+        """``(T,)`` bool: inside the bounds and outside every solid."""
+        free = ((points >= self.bounds[0]) & (points <= self.bounds[1])).all(1)
+        for solid in self.solids:
+            local = (points - solid[:3]) @ solid[6:].reshape(3, 3)
+            free &= ~(np.abs(local) <= solid[3:6]).all(1)
+        return free
+
+
+@dataclass
+class Material:
+    """How a surface is painted.
+
+    Attributes:
+        texture: index into the pool.
+        metres: width of one texture repeat.
+        gain, offset: ``(3,)`` colour transform.
+        turn: rotation of the texture in the surface, rad.
+    """
+
+    texture: int
+    metres: float
+    gain: Array
+    offset: Array
+    turn: float = 0.0
+
+
+class SceneBuilder:
+    """Collects surfaces; ``build`` turns them into a :class:`Scene`."""
+
+    def __init__(self, rng: np.random.Generator, pool: TexturePool) -> None:
+        self.rng, self.pool = rng, pool
+        self.rows: list[dict[str, Any]] = []
+        self.solids: list[Array] = []
+
+    def material(
+        self, *tags: str, metres: tuple[float, float] = (0.6, 2.5), contrast: tuple[float, float] = (0.6, 1.2),
+        bright: float = 1.0, turn: float = 0.0,
+    ) -> Material:  # fmt: skip
+        """Pick a texture with one of the tags (any, without tags), a size, a tint and a contrast."""
+        rng = self.rng
+        texture = int(rng.choice(self.pool.tagged(*tags))) if tags else int(rng.integers(self.pool.count))
+        mean = self.pool.mean[texture]
+        strength = rng.uniform(*contrast)
+        # Pull dark and bright textures towards the middle: a scene of black walls teaches nothing.
+        level = bright * np.exp(rng.normal(0, 0.22)) * (0.45 / max(mean.mean(), 0.08)) ** 0.5
+        tint = level * np.exp(rng.normal(0, 0.06, 3))
+        repeat = float(np.exp(rng.uniform(*np.log(metres))))
+        return Material(texture, repeat, tint * strength, tint * (1 - strength) * mean, turn)
+
+    def polygon(
+        self, corners: Array, material: Material, *, up: Array | None = None, two_sided: bool = False
+    ) -> None:
+        """Add a convex planar polygon ``(3 or 4, 3)``, corners counter-clockwise seen from the front."""
+        corners = np.asarray(corners, float)
+        if len(corners) == 3:
+            corners = np.concatenate([corners, corners[2:]])
+        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        normal = normal / np.linalg.norm(normal)
+        down = -np.asarray(up, float) if up is not None else np.array([0.0, 0.0, -1.0])
+        if abs(down @ normal) > 0.99:
+            down = corners[1] - corners[0]
+        v = down - (down @ normal) * normal
+        v = v / np.linalg.norm(v)
+        u = np.cross(normal, v)
+        origin = corners.mean(0)
+        flat = np.stack([(corners - origin) @ u, (corners - origin) @ v], -1)
+        step = np.roll(flat, -1, 0) - flat
+        length = np.linalg.norm(step, axis=1)
+        inward = np.stack([step[:, 1], -step[:, 0]], -1) / np.maximum(length, 1e-12)[:, None]
+        edges = np.concatenate([inward, -(inward * flat).sum(1, keepdims=True)], 1)
+        edges[length < 1e-9] = [0, 0, 1]
+        density = self.pool.size / material.metres
+        c, s = np.cos(material.turn) * density, np.sin(material.turn) * density
+        shift = self.rng.uniform(0, 2 * self.pool.size, 2)
+        self.rows.append(
+            {
+                "origin": origin, "u_axis": u, "v_axis": v, "corners": corners, "edges": edges, "two_sided": two_sided,
+                "texture": material.texture, "texture_map": np.array([[c, -s, shift[0]], [s, c, shift[1]]]),
+                "gain": material.gain, "offset": material.offset,
+            }
+        )  # fmt: skip
+
+    def rectangle(
+        self, centre: Array, normal: Array, up: Array, width: float, height: float, material: Material,
+        *, two_sided: bool = False,
+    ) -> None:  # fmt: skip
+        """Add a rectangle facing ``normal``; ``up`` (made orthogonal to it) is the direction of its height."""
+        normal = np.asarray(normal, float) / np.linalg.norm(normal)
+        up = np.asarray(up, float) - (np.asarray(up, float) @ normal) * normal
+        up = up / np.linalg.norm(up)
+        right = np.cross(up, normal)
+        a, b = right * width / 2, up * height / 2
+        centre = np.asarray(centre, float)
+        corners = np.stack([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
+        self.polygon(corners, material, up=up, two_sided=two_sided)
+
+    def box(
+        self, centre: Array, half: Array, rotation: Array, materials: list[Material], *, inside: bool = False,
+        faces: str = "xXyYzZ",
+    ) -> None:  # fmt: skip
+        """Add a box (``inside=True``: a room seen from within). ``materials``: one, or side / top / bottom."""
+        centre, half = np.asarray(centre, float), np.asarray(half, float)
+        side, top, bottom = (materials * 3)[:3] if len(materials) == 1 else materials
+        for axis in range(3):
+            for sign, name in ((-1.0, "xyz"[axis]), (1.0, "XYZ"[axis])):
+                if name not in faces:
+                    continue
+                outward = rotation[:, axis] * sign
+                up = rotation[:, 2] if axis < 2 else rotation[:, 1]
+                width = 2 * half[1 if axis == 0 else 0]
+                height = 2 * half[2 if axis < 2 else 1]
+                paint = side if axis < 2 else top if sign > 0 else bottom
+                spot = centre + outward * half[axis]
+                self.rectangle(spot, -outward if inside else outward, up, width, height, paint)
+        if not inside:
+            self.solids.append(np.concatenate([centre, half, rotation.ravel()]))
+
+    def prism(self, foot: Array, radius: float, height: float, sides: int, material: Material) -> None:
+        """Add an upright column of ``sides`` faces with a lid."""
+        angle = np.arange(sides) * 2 * np.pi / sides + self.rng.uniform(0, 1)
+        ring = np.asarray(foot, float) + radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], -1)
+        rise = np.array([0, 0, height])
+        for a, b in zip(ring, np.roll(ring, -1, 0), strict=True):
+            self.polygon(np.stack([a, b, b + rise, a + rise]), material)
+        half = np.array([radius, radius, height / 2])
+        self.solids.append(np.concatenate([np.asarray(foot) + rise / 2, half, np.eye(3).ravel()]))
+
+    def build(self, family: str, bounds: Array, scale: float, **hints: Any) -> Scene:
+        """Stack everything (light is baked separately)."""
+        stacked: dict[str, Any] = {key: np.array([row[key] for row in self.rows]) for key in self.rows[0]}
+        solids = np.array(self.solids).reshape(-1, 15)
+        return Scene(
+            **stacked, pool=self.pool, family=family, bounds=np.asarray(bounds, float), solids=solids, scale=scale,
+            light_offset=np.zeros(len(self.rows), np.int64), light_size=np.ones((len(self.rows), 2), np.int64),
+            light_map=np.zeros((len(self.rows), 2, 3)), hints=hints,
+        )  # fmt: skip

@@ -1,0 +1,108 @@
+"""Pictures of trajectories, drawn without a display."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dvo.data.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+INK, ACCENT, TRUTH, START, PAPER = "#22272e", "#e4572e", "#4a6fa5", "#2a9d5c", "#ffffff"
+SIZE_INCHES, DPI = (7.6, 6.0), 150
+
+
+def plan_axes(positions: np.ndarray) -> tuple[int, int]:
+    """The two coordinate axes, in order, along which ``(N, 3)`` positions reach farthest."""
+    if len(positions) == 0:
+        return 0, 2
+    first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2])
+    return int(first), int(second)
+
+
+def with_gaps(trajectory: Trajectory) -> np.ndarray:
+    """``(M, 3)`` positions with a row of nan wherever frames are missing, so that no line is drawn across the gap.
+
+    A gap is a step in time beyond five median steps.
+    """
+    steps = np.diff(trajectory.timestamps)
+    if len(steps) == 0:
+        return trajectory.positions
+    holes = np.flatnonzero(steps > 5 * np.median(steps)) + 1
+    return np.insert(trajectory.positions, holes, np.nan, axis=0)
+
+
+def plot_trajectory(
+    path: Path | str,
+    estimate: Trajectory,
+    *,
+    reference: Trajectory | None = None,
+    points: np.ndarray | None = None,
+    title: str = "",
+    subtitle: str = "",
+    label: str = "dvo",
+) -> None:
+    """Draw the plan view: the plane of the two longest axes, equal scales, the start marked.
+
+    Args:
+        path: picture to write; the ending chooses the format.
+        estimate: camera to world, already aligned to the reference if there is one.
+        reference: ground truth, metres.
+        points: ``(M, 3)`` map points in the world of the estimate, drawn faintly behind it.
+        label: name of the estimate in the legend.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    truth = reference if reference is not None and len(reference) else None
+    shown = estimate if truth is None else truth
+    axes = plan_axes(shown.positions)
+    figure = Figure(figsize=SIZE_INCHES, dpi=DPI, facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    plot = figure.add_subplot()
+    _limits(plot, [part.positions for part in (estimate, truth) if part is not None and len(part)], axes)
+    if points is not None and len(points):
+        plot.scatter(points[:, axes[0]], points[:, axes[1]], s=1.2, color=INK, alpha=0.16, linewidths=0, zorder=1)
+    if truth is not None:
+        plot.plot(*with_gaps(truth)[:, axes].T, color=TRUTH, lw=2.6, alpha=0.75, label="ground truth", zorder=2)
+    if len(estimate):
+        plot.plot(*with_gaps(estimate)[:, axes].T, color=ACCENT, lw=1.5, label=label, zorder=3)
+        x, y = estimate.positions[0, axes]
+        plot.plot(x, y, "o", ms=7, color=START, mec=PAPER, mew=1.2, ls="none", label="start", zorder=4)
+    _decorate(plot, axes, "m" if truth is not None else "unit free", title, subtitle)
+    figure.savefig(path, metadata={"Software": None} if str(path).endswith(".png") else None)
+
+
+def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int]) -> None:
+    """Frame the trajectories, not the map: a few far points would shrink the path to a dot."""
+    if not tracks:
+        return
+    both = np.concatenate(tracks)[:, axes]
+    middle, size = (both.min(axis=0) + both.max(axis=0)) / 2, np.ptp(both, axis=0)
+    ratio = SIZE_INCHES[0] / SIZE_INCHES[1]
+    height = 1.2 * max(float(size[1]), float(size[0]) / ratio, 1e-6)
+    plot.set_xlim(middle[0] - height * ratio / 2, middle[0] + height * ratio / 2)
+    plot.set_ylim(middle[1] - height / 2, middle[1] + height / 2)
+
+
+def _decorate(plot: Axes, axes: tuple[int, int], unit: str, title: str, subtitle: str) -> None:
+    plot.set_aspect("equal", adjustable="box")
+    plot.set_xlabel(f"{'xyz'[axes[0]]} ({unit})", color=INK)
+    plot.set_ylabel(f"{'xyz'[axes[1]]} ({unit})", color=INK)
+    plot.tick_params(colors=INK, labelsize=9, length=3)
+    plot.grid(color=INK, alpha=0.10, lw=0.6)
+    plot.set_axisbelow(True)
+    for side, spine in plot.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color("#b8bec6")
+    if plot.get_legend_handles_labels()[0]:
+        plot.legend(loc="lower right", bbox_to_anchor=(1, 1.05), ncols=3, frameon=False, fontsize=9.5, borderaxespad=0)
+    plot.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=22 if subtitle else 8)
+    if subtitle:
+        plot.annotate(
+            subtitle, (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", fontsize=9.5, color=INK
+        )

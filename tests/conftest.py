@@ -1,0 +1,109 @@
+"""Fixtures that several rooms share."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+from dvo.data.frame import Frame
+from dvo.data.trajectory import Trajectory, write_tum
+from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+# The same examples on every run; no deadline, because machines are shared.
+settings.register_profile("dvo", deadline=None, derandomize=True)
+settings.load_profile("dvo")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread() -> None:
+    """Bit equality needs a fixed number of threads; small tensors are faster with one."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """Root of the checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """The folder of real clips: ``$DVO_DATA``, else ``../shared/data``. Skips where there is none."""
+    path = Path(os.environ.get("DVO_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not path.is_dir():
+        pytest.skip(f"no real data at {path} (set DVO_DATA to the folder that holds it)")
+    return path
+
+
+class FakeOdometry:
+    """Knows the answer: pose ``motion(t)``, with optional lost frames and a frame at which it stops the run."""
+
+    name = "fake"
+
+    def __init__(
+        self,
+        motion: Callable[[float], np.ndarray],
+        lost: tuple[int, ...] = (),
+        at_frame: dict[int, Callable[[], None]] | None = None,
+    ) -> None:
+        self.motion, self.lost, self.at_frame = motion, lost, at_frame or {}
+        self.frames: list[Frame] = []
+
+    def track(self, frame: Frame) -> Estimate:
+        self.at_frame.get(frame.index, lambda: None)()
+        self.frames.append(frame)
+        status = Status.LOST if frame.index in self.lost else Status.TRACKING
+        return Estimate(frame.timestamp, self.motion(frame.timestamp), status, 1.0)
+
+    def finish(self) -> Result:
+        kept = [frame.timestamp for frame in self.frames if frame.index not in self.lost]
+        poses = np.array([self.motion(stamp) for stamp in kept]).reshape(-1, 7)
+        points = np.linspace(-1, 1, 30, dtype=np.float32).reshape(10, 3)
+        colors = np.arange(30, dtype=np.uint8).reshape(10, 3)
+        return Result(
+            Trajectory(np.array(kept), poses),
+            SparseMap(points, colors),
+            len(self.frames),
+            len(self.frames) - len(kept),
+            {"config": {"patches": 3}, "working_size": (64, 48)},
+        )
+
+
+def curve(seconds: float) -> np.ndarray:
+    """``(7,)`` pose on a smooth curve in all three dimensions, turning."""
+    angle = 0.4 * seconds
+    position = [np.cos(angle), 0.3 * np.sin(2 * angle), np.sin(angle) + 0.2 * seconds]
+    return np.array([*position, 0.0, np.sin(angle / 2), 0.0, np.cos(angle / 2)])
+
+
+@pytest.fixture
+def fake_odometry() -> Callable[..., FakeOdometry]:
+    """``fake_odometry(lost=..., at_frame=...)`` on :func:`curve` (or ``motion=...``)."""
+    return lambda motion=curve, **options: FakeOdometry(motion, **options)
+
+
+@pytest.fixture
+def image_folder(tmp_path: Path) -> Path:
+    """Twenty 64x48 images in ``clip/images``; beside it ``calib.txt``, ``times.txt``, ``truth.txt`` (on the curve)."""
+    images = tmp_path / "clip" / "images"
+    images.mkdir(parents=True)
+    generator = np.random.default_rng(0)
+    stamps = 10.0 + 0.1 * np.arange(20)
+    for number in range(len(stamps)):
+        cv2.imwrite(str(images / f"{number:04d}.png"), generator.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    (images.parent / "calib.txt").write_text("50 50 31.5 23.5\n")
+    (images.parent / "times.txt").write_text("".join(f"{stamp:.6f}\n" for stamp in stamps))
+    truth = np.array([curve(stamp) for stamp in stamps])
+    truth[:, :3] *= 2.5  # a monocular estimate has its own scale
+    write_tum(images.parent / "truth.txt", Trajectory(stamps, truth))
+    return images

@@ -1,0 +1,106 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dvo.data import Calibration, open_source, write_kitti_poses
+from dvo.errors import DvoError
+
+
+def test_missing_source(tmp_path):
+    with pytest.raises(DvoError, match="no such file or folder"):
+        open_source(tmp_path / "nowhere.mp4")
+
+
+def test_no_images(tmp_path):
+    with pytest.raises(DvoError, match="no images"):
+        open_source(tmp_path, calib=Calibration(50, 50, 31, 23))
+
+
+def test_no_image_that_decodes(make):
+    folder = make.images("clip", ["0.png", "1.png"])
+    for image in folder.iterdir():
+        image.write_bytes(b"")
+    with pytest.raises(DvoError, match="none of the 2 images decodes"):
+        open_source(folder, calib=make.calib())
+
+
+def test_no_calibration_names_the_option_and_a_file_that_lies_near(make):
+    folder = make.images("clip", ["0.png"])
+    with pytest.raises(DvoError, match="no calibration.*--calib FILE: "):
+        open_source(folder)
+    nearby = make.calib()
+    with pytest.raises(DvoError, match="--calib FILE") as caught:
+        open_source(folder)
+    assert str(nearby) in str(caught.value)
+
+
+def test_intrinsics_that_do_not_fit_name_the_file(make):
+    folder = make.images("clip", ["0.png"])
+    file = make.text("other.txt", "500 500 320 240")
+    with pytest.raises(DvoError, match="outside the 64x48 image") as caught:
+        open_source(folder, calib=file)
+    assert caught.value.file == file
+    file = make.text("folding.txt", "20 20 32 24 -5 0 0 0")
+    with pytest.raises(DvoError, match="fold") as caught:
+        open_source(folder, calib=file)
+    assert caught.value.file == file
+
+
+def test_a_calibration_of_doubtful_resolution_is_said_aloud(make):
+    source = open_source(make.images("clip", ["0.png"]), calib=make.text("c.txt", "20 20 10 10"), fps=1)
+    assert any("principal point" in warning for warning in source.warnings)
+
+
+@pytest.mark.parametrize("option", ["calib", "times", "groundtruth"])
+def test_missing_option_files(make, option):
+    folder = make.images("clip", ["0.png"])
+    options = {"calib": make.calib(), option: "nowhere.txt"}
+    with pytest.raises(DvoError, match="no such file") as caught:
+        open_source(folder, **options)
+    assert caught.value.field == option
+
+
+def test_options_are_found_from_the_working_directory_then_from_the_source(make, monkeypatch):
+    folder = make.images("clip", ["0.png", "1.png"])
+    make.calib()
+    make.text("t.txt", "0\n1\n")
+    make.text("elsewhere/near.txt", "60 60 30 20")
+    monkeypatch.chdir(make.root / "elsewhere")
+    source = open_source(folder, calib="../calib.txt", times="../t.txt")
+    assert source.camera.fx == 50 and len(list(source)) == 2
+    assert open_source(folder, calib="near.txt").camera.fx == 60
+
+
+def test_undistort_or_not(make):
+    folder = make.images("clip", ["0.png"], 640, 480)
+    calib = make.text("c.txt", "517.3 516.5 318.6 255.3 0.2624 -0.9531 -0.0054 0.0026 1.1633")
+    source = open_source(folder, calib=calib)
+    assert not source.camera.is_distorted and source.recorded_camera.is_distorted
+    assert next(iter(source)).camera == source.camera
+    raw = open_source(folder, calib=calib, undistort=False)
+    assert raw.camera == raw.recorded_camera == source.recorded_camera
+    straight, bent = next(iter(source)).image, next(iter(raw)).image
+    assert straight.shape == bent.shape and np.abs(straight.astype(int) - bent).mean() > 1
+
+
+def test_groundtruth_option(make):
+    folder = make.images("clip", ["0.png", "1.png"])
+    tum = make.text("gt.txt", "#\n0 1 2 3 0 0 0 1\n0.1 2 2 3 0 0 0 2\n")
+    truth = open_source(folder, calib=make.calib(), groundtruth=tum, fps=10).groundtruth
+    assert truth.timestamps.tolist() == [0, 0.1] and truth.poses_wc[1].tolist() == [2, 2, 3, 0, 0, 0, 1]
+    poses = np.array([[0, 0, 0, 0, 0, 0, 1.0], [0, 0, 5, 0, 0, 0, 1]])
+    write_kitti_poses(make.root / "kitti.txt", poses)
+    truth = open_source(folder, calib=make.calib(), groundtruth="../kitti.txt", fps=10).groundtruth
+    assert truth.timestamps.tolist() == [0, 0.1] and np.allclose(truth.poses_wc, poses)
+    write_kitti_poses(make.root / "kitti.txt", poses[:1])
+    with pytest.raises(DvoError, match="1 rows without times for 2 images"):
+        open_source(folder, calib=make.calib(), groundtruth="../kitti.txt")
+    with pytest.raises(DvoError, match="not a TUM row"):
+        open_source(folder, calib=make.calib(), groundtruth=make.text("bad.txt", "1 2 3\n"))
+
+
+def test_importing_the_readers_is_light():
+    code = "import sys, dvo.data; print([m for m in ('cv2', 'torch', 'yaml', 'scipy') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

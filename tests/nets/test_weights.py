@@ -1,0 +1,135 @@
+"""Names and shapes of DPVO's checkpoint; reading and importing weights, good and bad."""
+
+import pickle
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from dvo.errors import DvoError
+from dvo.nets.config import PRESETS, ModelConfig, preset
+from dvo.nets.patch_vo import PatchVO
+from dvo.nets.weights import import_checkpoint, load_weights, save_weights, weights_info
+
+
+def dpvo_table() -> dict[str, tuple[int, ...]]:
+    """Tensors of the official network, from its published layer sizes."""
+    table: dict[str, tuple[int, ...]] = {}
+
+    def layer(name: str, *shape: int) -> None:
+        table[f"{name}.weight"], table[f"{name}.bias"] = shape, shape[:1]
+
+    for net, outputs in (("fnet", 128), ("inet", 384)):
+        at = f"patchify.{net}"
+        layer(f"{at}.conv1", 32, 3, 7, 7)
+        for block in (0, 1):
+            for conv in (1, 2):
+                layer(f"{at}.layer1.{block}.conv{conv}", 32, 32, 3, 3)
+                inputs = 32 if (block, conv) == (0, 1) else 64
+                layer(f"{at}.layer2.{block}.conv{conv}", 64, inputs, 3, 3)
+        layer(f"{at}.layer2.0.downsample.0", 64, 32, 1, 1)
+        layer(f"{at}.conv2", outputs, 64, 1, 1)
+    d = 384
+    names = [f"update.{c}.{i}" for c in ("c1", "c2") for i in (0, 2)]
+    names += [f"update.{a}.{x}" for a in ("agg_kk", "agg_ij") for x in "fgh"]
+    names += [f"update.gru.{g}.{x}" for g in (1, 3) for x in ("gate.0", "res.0", "res.2")]
+    for name in [*names, "update.corr.2", "update.corr.5"]:
+        layer(name, d, d)
+    for name in ("update.norm", "update.gru.0", "update.gru.2", "update.corr.3"):
+        layer(name, d)
+    layer("update.corr.0", d, 882)
+    layer("update.d.1", 2, d)
+    layer("update.w.1", 2, d)
+    return table
+
+
+def official(seed: int = 0) -> dict[str, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return {name: torch.randn(shape, generator=g) * 0.01 for name, shape in dpvo_table().items()}
+
+
+def test_full_preset_is_dpvo_tensor_for_tensor():
+    state = PatchVO(preset("full")).state_dict()
+    assert {name: tuple(t.shape) for name, t in state.items()} == dpvo_table()
+    assert len(state) == 94
+    assert sum(t.numel() for t in state.values()) == 3_384_324
+
+
+def test_import_strips_prefix_and_swaps_colour_channels(tmp_path):
+    state = official()
+    wrapped = {f"module.{k}": v for k, v in state.items()} | {"module.update.lmbda": torch.zeros(1)}
+    torch.save(wrapped, tmp_path / "dpvo.pth")
+    info = import_checkpoint(tmp_path / "dpvo.pth", tmp_path / "full.safetensors")
+    assert (info.preset, info.tensors, info.parameters) == ("full", 94, 3_384_324)
+    loaded = load_weights(tmp_path / "full.safetensors")
+    # BGR weights on a BGR image equal the imported ones on the RGB image.
+    image = torch.rand(1, 3, 16, 16)
+    first = loaded.model.patchify.fnet.conv1
+    expected = torch.nn.functional.conv2d(image.flip(1), state["patchify.fnet.conv1.weight"], first.bias, 2, 3)
+    torch.testing.assert_close(first(image), expected)
+    torch.testing.assert_close(loaded.model.update.corr[0].weight, state["update.corr.0.weight"])
+
+
+def test_half_precision_round_trip_keeps_card_and_architecture(tmp_path):
+    model = PatchVO(preset("tiny"))
+    save_weights(tmp_path / "t.safetensors", model, {"steps": 3})
+    info = weights_info(tmp_path / "t.safetensors")
+    assert (info.preset, info.card) == ("tiny", {"steps": 3})
+    loaded = load_weights(tmp_path / "t.safetensors").model
+    for a, b in zip(loaded.parameters(), model.parameters(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-3, rtol=1e-3)
+
+
+class Malicious:
+    def __reduce__(self):
+        return (print, ("executed",))
+
+
+def bad_files(folder):
+    (folder / "noise.safetensors").write_bytes(b"\x00" * 100)
+    with open(folder / "pickle.safetensors", "wb") as file:
+        pickle.dump(Malicious(), file)
+    config = {"config": '{"hidden_channels": 48}', "card": "{}"}
+    save_file({"a": torch.zeros(1)}, folder / "no_metadata.safetensors")
+    save_file({"a": torch.zeros(1)}, folder / "wrong_tensors.safetensors", config)
+    save_file({"a": torch.zeros(1)}, folder / "unknown_key.safetensors", {"config": '{"colour": 1}'})
+    model = PatchVO(preset("tiny"))
+    torch.nn.init.constant_(model.update.norm.weight, torch.nan)
+    save_weights(folder / "nan.safetensors", model, {})
+    return sorted(folder.glob("*.safetensors"))
+
+
+def test_bad_weights_give_one_clear_error(tmp_path, capsys):
+    files = bad_files(tmp_path)
+    assert len(files) == 6
+    for path in [*files, tmp_path / "absent.safetensors"]:
+        with pytest.raises(DvoError) as caught:
+            load_weights(path)
+        assert str(path) in str(caught.value)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("content", ["malicious", "empty", "noise", "list", "other", "misshapen"])
+def test_bad_checkpoints_are_refused_without_running_code(tmp_path, capsys, content):
+    path = tmp_path / "x.pth"
+    if content == "malicious":
+        torch.save({"module.x": Malicious()}, path)
+    elif content == "list":
+        torch.save([torch.zeros(2)], path)
+    elif content == "other":
+        torch.save({"w": torch.zeros(2)}, path)
+    elif content == "misshapen":
+        torch.save(official() | {"update.norm.weight": torch.zeros(3)}, path)
+    else:
+        path.write_bytes(b"" if content == "empty" else b"not a checkpoint")
+    with pytest.raises(DvoError) as caught:
+        import_checkpoint(path, tmp_path / "out.safetensors")
+    assert str(path) in str(caught.value)
+    assert "executed" not in capsys.readouterr().out
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_unknown_setting_is_named():
+    with pytest.raises(DvoError, match="colour"):
+        ModelConfig.from_dict({"colour": 1})
+    assert ModelConfig.from_dict(PRESETS["small"].to_dict()) == PRESETS["small"]

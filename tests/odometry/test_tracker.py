@@ -1,0 +1,109 @@
+"""The streaming tracker with an untrained network: bookkeeping, determinism, bounded memory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dvo.data.frame import Frame
+from dvo.errors import DvoError
+from dvo.geometry.camera import Camera
+from dvo.nets.config import preset
+from dvo.nets.patch_vo import PatchVO
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.protocol import Odometry, Status
+from dvo.odometry.tracker import PatchOdometry
+
+SMALL = TrackerConfig(
+    pixels=96 * 72, patches=6, lifetime=4, removal=5, optimisation=4, initial_frames=5, initial_updates=3,
+    final_updates=2, initial_motion=0.0, initial_parallax=0.0, keyframe_motion=0.0, lost_confidence=0.0,
+)  # fmt: skip
+
+
+def frames(count, seed=0, size=(96, 72)):
+    rng = np.random.default_rng(seed)
+    width, height = size
+    wall = rng.integers(0, 255, (height, width + 4 * count, 3), dtype=np.uint8)
+    camera = Camera(80.0, 80.0, width / 2, height / 2, width, height)
+    return [Frame(i, 0.1 * i, np.ascontiguousarray(wall[:, 4 * i : 4 * i + width]), camera) for i in range(count)]
+
+
+def tracker(config=SMALL, seed=0):
+    torch.manual_seed(0)
+    return PatchOdometry(PatchVO(preset("tiny")), config, seed=seed)
+
+
+def run(odometry, images):
+    estimates = [odometry.track(frame) for frame in images]
+    return estimates, odometry.finish()
+
+
+def test_is_an_odometry_with_a_pose_for_every_frame():
+    odometry = tracker()
+    assert isinstance(odometry, Odometry)
+    estimates, result = run(odometry, frames(14))
+    assert len(result.trajectory) == result.frames_read == 14
+    assert result.frames_lost == 0
+    np.testing.assert_allclose(result.trajectory.timestamps, 0.1 * np.arange(14))
+    assert np.isfinite(result.trajectory.poses_wc).all()
+    np.testing.assert_allclose(np.linalg.norm(result.trajectory.poses_wc[:, 3:], axis=1), 1)
+    assert estimates[0].status is Status.INITIALISING
+    assert estimates[-1].status is Status.TRACKING
+    assert result.map.points.shape == result.map.colors.shape
+    assert len(result.map.points) > 0
+
+
+def test_same_seed_same_bytes_and_another_seed_another_trajectory():
+    first, second, other = (run(tracker(seed=s), frames(12))[1].trajectory.poses_wc for s in (3, 3, 4))
+    assert first.tobytes() == second.tobytes()
+    assert first.tobytes() != other.tobytes()
+
+
+def test_dropped_keyframes_keep_their_frames():
+    """With a threshold that no motion passes every third-newest keyframe goes, and yet each frame has a pose."""
+    odometry = tracker(replace(SMALL, keyframe_motion=1e9))
+    _, result = run(odometry, frames(20))
+    assert len(result.trajectory) == 20
+    assert result.info["keyframes"] < 12
+
+
+def test_frames_without_motion_before_initialisation_are_back_filled():
+    odometry = tracker(replace(SMALL, initial_motion=1e9))
+    estimates, result = run(odometry, frames(9))
+    assert all(e.status is Status.INITIALISING for e in estimates)
+    assert len(result.trajectory) == 9
+    # Nothing was accepted after the first frame, so nothing may move: no invented motion.
+    np.testing.assert_allclose(result.trajectory.positions, 0, atol=1e-12)
+
+
+def test_window_does_not_grow():
+    odometry = tracker()
+    sizes = []
+    for frame in frames(40):
+        odometry.track(frame)
+        slots = max(len(c._origin) for c in odometry._correlations)
+        sizes.append((len(odometry.window), len(odometry.window.kk), slots))
+    assert max(sizes[20:]) == max(sizes[15:20])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 4])
+def test_finish_after_few_frames(count):
+    _, result = run(tracker(), frames(count))
+    assert len(result.trajectory) == result.frames_read == count
+
+
+def test_frames_out_of_order_or_of_another_size_are_refused():
+    odometry = tracker()
+    images = frames(3)
+    odometry.track(images[1])
+    with pytest.raises(DvoError, match="does not come after"):
+        odometry.track(images[0])
+    with pytest.raises(DvoError, match="64x48"):
+        odometry.track(replace(frames(1, size=(64, 48))[0], timestamp=9.0))
+    assert len(odometry.finish().trajectory) == 1
+
+
+def test_unknown_setting_is_named():
+    with pytest.raises(DvoError, match="colour"):
+        TrackerConfig.from_dict({"colour": 1})

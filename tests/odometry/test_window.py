@@ -1,0 +1,61 @@
+"""Renumbering of the window, and the motion measures."""
+
+import torch
+
+from dvo.geometry import se3
+from dvo.nets.patchifier import patch_coordinates
+from dvo.odometry.motion import flow_magnitude, parallax, predict_pose
+from dvo.odometry.window import Keyframe, Window
+
+
+def window(count=4, m=2):
+    w = Window.empty(m, 3, 5, torch.device("cpu"))
+    for index in range(count):
+        centres = torch.tensor([[[[10, 8], [20, 12]]]])
+        patches = patch_coordinates(centres, torch.full((1, m), 0.5), 3)[0]
+        intrinsics = torch.tensor([40.0, 40.0, 20.0, 15.0])
+        empty = torch.zeros(0)
+        w.append(Keyframe(index, 0.1 * index, [], empty, empty, empty, intrinsics), se3.identity(), patches)
+    return w
+
+
+def test_remove_renumbers_patches_frames_and_edges():
+    w = window()
+    w.connect(torch.arange(8).repeat_interleave(4), torch.arange(4).repeat(8))
+    w.hidden = torch.arange(32.0)[:, None].expand(-1, 5).clone()
+    before = {(int(k), int(j)): float(h) for k, j, h in zip(w.kk, w.jj, w.hidden[:, 0], strict=True)}
+    assert w.remove(1).identifier == 1
+    assert [f.identifier for f in w.frames] == [0, 2, 3]
+    after = {(int(k), int(j)): float(h) for k, j, h in zip(w.kk, w.jj, w.hidden[:, 0], strict=True)}
+    frame = [0, 2, 3]
+    expected = {(m, j): before[(frame[m // 2] * 2 + m % 2, frame[j])] for m in range(6) for j in range(3)}
+    assert after == expected
+
+
+def test_slots_are_unique_and_reused():
+    w = window()
+    first = w.connect(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 1]))
+    w.keep(torch.tensor([True, False, True]))
+    second = w.connect(torch.tensor([3, 4]), torch.tensor([1, 1]))
+    assert first.tolist() == [0, 1, 2]
+    assert second.tolist() == [1, 3]
+    assert len(set(w.slots.tolist())) == len(w.slots) == 4
+
+
+def test_prediction_goes_on_with_half_the_motion():
+    step = torch.tensor([0.2, 0.0, 0.1, 0.0, 0.04, 0.0], dtype=torch.float64)
+    a = se3.exp(torch.tensor([1.0, 2, 3, 0.1, 0.2, 0.3], dtype=torch.float64))
+    poses = torch.stack([a, se3.retract(a, step)])
+    torch.testing.assert_close(predict_pose(poses, [0.0, 0.1], 0.2, 0.5), se3.retract(poses[1], 0.5 * step))
+    torch.testing.assert_close(predict_pose(poses[:1], [0.0], 0.2, 0.5), a)
+
+
+def test_rotation_has_flow_but_no_parallax():
+    w = window(2)
+    w.poses_cw[1] = se3.exp(torch.tensor([0, 0, 0, 0, 0.1, 0.0]))
+    assert parallax(w, 0, 1) < 1e-4
+    assert flow_magnitude(w, 0, 1) > 1.5
+    w.poses_cw[1] = se3.exp(torch.tensor([0.1, 0, 0, 0, 0, 0.0]))
+    # fx * t * d = 40 * 0.1 * 0.5
+    assert abs(parallax(w, 0, 1) - 2.0) < 1e-4
+    assert abs(flow_magnitude(w, 0, 1) - 2.0) < 1e-4

@@ -1,0 +1,91 @@
+"""The arrows between the rooms, and the habits that the linter does not know."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+LIBRARY = sorted((ROOT / "dvo").rglob("*.py"))
+EVERYTHING = LIBRARY + [file for folder in ("train", "eval") for file in sorted((ROOT / folder).rglob("*.py"))]
+
+# A room may import these rooms, itself, and dvo.errors.
+ARROWS: dict[str, set[str]] = {
+    "errors": set(),
+    "allocator": set(),
+    "geometry": set(),
+    "data": {"geometry"},
+    "ba": {"geometry"},
+    "metrics": {"data", "geometry"},
+    "nets": {"geometry", "ba", "data"},
+    "synth": {"geometry", "ba", "data"},
+    "losses": {"geometry"},
+    "odometry": {"nets", "ba", "data", "geometry"},
+    "viz": {"data", "geometry", "odometry"},
+}
+TOP = {"cli", "commands", "demo", "__main__", "__init__"}  # these know everything, nobody below knows them
+
+
+def room_of(file: Path) -> str:
+    return file.relative_to(ROOT / "dvo").parts[0].removesuffix(".py")
+
+
+def imports(file: Path) -> Iterator[tuple[int, str]]:
+    """Line and full module name of every import, also inside functions."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            package = file.relative_to(ROOT).parent.parts
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (base, node.module) if part)
+            yield node.lineno, module
+            yield from ((node.lineno, f"{module}.{alias.name}") for alias in node.names)
+
+
+def name(file: Path) -> str:
+    return str(file.relative_to(ROOT))
+
+
+def test_every_room_has_its_arrows() -> None:
+    rooms = {room_of(file) for file in LIBRARY}
+    assert {"geometry", "data", "odometry"} <= rooms
+    assert rooms - set(ARROWS) <= TOP, "a new room needs a row in ARROWS, here and in the README"
+
+
+@pytest.mark.parametrize("file", LIBRARY, ids=name)
+def test_imports_follow_the_arrows(file: Path) -> None:
+    room = room_of(file)
+    for line, module in imports(file):
+        parts = module.split(".")
+        assert parts[0] not in ("train", "eval", "tests"), f"{name(file)}:{line} imports {module}"
+        if room in TOP or parts[0] != "dvo":
+            continue
+        target = parts[1] if len(parts) > 1 else "__init__"
+        if target == "__init__" or not is_module(target):
+            # `import dvo` or `from dvo import X`: only the package's own names, which need no room
+            assert parts[1:] in ([], ["__version__"], ["DvoError"]), f"{name(file)}:{line} imports {module}"
+            continue
+        allowed = ARROWS[room] | {room, "errors"}
+        assert target in allowed, f"{name(file)}:{line}: {room} must not know {target}"
+
+
+def is_module(target: str) -> bool:
+    return (ROOT / "dvo" / target).is_dir() or (ROOT / "dvo" / f"{target}.py").is_file()
+
+
+@pytest.mark.parametrize("file", EVERYTHING, ids=name)
+def test_habits(file: Path) -> None:
+    text = file.read_text(encoding="utf-8")
+    for node in ast.walk(ast.parse(text)):
+        where = f"{name(file)}:{getattr(node, 'lineno', 0)}"
+        assert not (isinstance(node, ast.ExceptHandler) and node.type is None), f"{where} bare except"
+        if isinstance(node, ast.ImportFrom):
+            assert all(alias.name != "*" for alias in node.names), f"{where} import *"
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            assert node.value != "cuda" and not node.value.startswith("cuda:"), f"{where} names a device"
+        if isinstance(node, ast.Attribute):
+            assert node.attr != "cuda", f"{where} names a device"

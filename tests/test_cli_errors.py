@@ -1,0 +1,132 @@
+"""Every bad input: exit code 2, one line on stderr that names the culprit, no traceback, no results folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import dvo
+from dvo.cli import main
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch, fake_odometry):
+    monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: fake_odometry())
+
+
+def error_of(command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    out = tmp_path / "never"
+    assert main([*command, "--out", str(out)]) == 2
+    said = capsys.readouterr()
+    (line,) = said.err.strip().splitlines()
+    assert "error: " in line and "Traceback" not in line
+    assert not out.exists(), "a failed run leaves nothing behind"
+    return line
+
+
+def calibration(folder: Path, text: str = "50 50 31.5 23.5") -> str:
+    file = folder / "some_calibration.txt"
+    file.write_text(text + "\n")
+    return str(file)
+
+
+def test_missing_source(tmp_path, capsys):
+    assert "nowhere.mp4" in error_of(["run", str(tmp_path / "nowhere.mp4")], tmp_path, capsys)
+
+
+def test_no_calibration(image_folder, tmp_path, capsys):
+    (image_folder.parent / "calib.txt").unlink()
+    line = error_of(["run", str(image_folder)], tmp_path, capsys)
+    assert "calib" in line and "--calib" in line
+
+
+def test_calibration_file_missing(image_folder, tmp_path, capsys):
+    assert "gone.txt" in error_of(["run", str(image_folder), "--calib", "gone.txt"], tmp_path, capsys)
+
+
+@pytest.mark.parametrize("text", ["", "50 50", "a b c d", "50 50 31.5 nan", "-50 50 31.5 23.5"])
+def test_malformed_calibration(image_folder, tmp_path, capsys, text):
+    file = calibration(tmp_path, text)
+    assert "some_calibration.txt" in error_of(["run", str(image_folder), "--calib", file], tmp_path, capsys)
+
+
+def test_intrinsics_that_do_not_fit_the_image(image_folder, tmp_path, capsys):
+    file = calibration(tmp_path, "525 525 319.5 239.5")
+    assert "64x48" in error_of(["run", str(image_folder), "--calib", file], tmp_path, capsys)
+
+
+def test_video_that_does_not_decode(tmp_path, capsys):
+    video = tmp_path / "noise.mp4"
+    video.write_bytes(np.random.default_rng(0).bytes(4000))
+    assert "noise.mp4" in error_of(["run", str(video), "--calib", calibration(tmp_path)], tmp_path, capsys)
+
+
+def test_video_without_frames(tmp_path, capsys):
+    video = tmp_path / "empty.avi"
+    cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (64, 48)).release()
+    assert "empty.avi" in error_of(["run", str(video), "--calib", calibration(tmp_path)], tmp_path, capsys)
+
+
+def test_empty_file(tmp_path, capsys):
+    (tmp_path / "zero.mp4").write_bytes(b"")
+    command = ["run", str(tmp_path / "zero.mp4"), "--calib", calibration(tmp_path)]
+    assert "zero.mp4" in error_of(command, tmp_path, capsys)
+
+
+def test_folder_without_images(tmp_path, capsys):
+    (tmp_path / "bare").mkdir()
+    assert "bare" in error_of(["run", str(tmp_path / "bare"), "--calib", calibration(tmp_path)], tmp_path, capsys)
+
+
+def test_folder_whose_images_do_not_decode(image_folder, tmp_path, capsys):
+    for file in image_folder.iterdir():
+        file.write_bytes(b"not an image")
+    command = ["run", str(image_folder), "--calib", calibration(tmp_path)]
+    assert "decode" in error_of(command, tmp_path, capsys)
+
+
+def test_times_of_another_length(image_folder, tmp_path, capsys):
+    times = tmp_path / "short.txt"
+    times.write_text("0.0\n0.1\n")
+    command = ["run", str(image_folder), "--calib", calibration(tmp_path), "--times", str(times)]
+    assert "short.txt" in error_of(command, tmp_path, capsys)
+
+
+def test_groundtruth_that_is_none(image_folder, tmp_path, capsys):
+    truth = tmp_path / "truth.txt"
+    truth.write_text("hello world\n")
+    command = ["run", str(image_folder), "--calib", calibration(tmp_path), "--groundtruth", str(truth)]
+    assert "truth.txt" in error_of(command, tmp_path, capsys)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--stride", "0"],
+        ["--stride", "two"],
+        ["--fps", "-3"],
+        ["--fps", "3", "--times", "t.txt"],
+        ["--device", "nonsense"],
+        ["--no-such-option"],
+    ],
+    ids=" ".join,
+)
+def test_bad_options(image_folder, tmp_path, capsys, options):
+    error_of(["run", str(image_folder), "--calib", calibration(tmp_path), *options], tmp_path, capsys)
+
+
+def test_out_that_is_a_file(image_folder, tmp_path, capsys):
+    (tmp_path / "taken").write_text("")
+    command = ["run", str(image_folder), "--calib", calibration(tmp_path), "--out", str(tmp_path / "taken")]
+    assert main(command) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "taken" in line
+
+
+@pytest.mark.parametrize("command", [[], ["fly"], ["weights"], ["run"]], ids=str)
+def test_incomplete_commands(command, capsys):
+    assert main(command) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1

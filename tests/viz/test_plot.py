@@ -1,0 +1,60 @@
+"""The plan view."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from dvo.data.trajectory import Trajectory
+from dvo.viz.plot import plan_axes, plot_trajectory, with_gaps
+
+
+def line(count: int, step: tuple[float, float, float]) -> Trajectory:
+    positions = np.arange(count)[:, None] * np.array(step)
+    rotation = np.tile([0, 0, 0, 1.0], (count, 1))
+    return Trajectory(0.1 * np.arange(count), np.hstack([positions, rotation]))
+
+
+@pytest.mark.parametrize(
+    ("step", "axes"), [((1, 0.1, 2), (0, 2)), ((0, 3, 2), (1, 2)), ((2, 1, 0), (0, 1)), ((0, 0, 0), (0, 1))]
+)
+def test_plan_is_the_plane_of_the_longest_axes(step, axes):
+    assert plan_axes(line(10, step).positions) == axes
+
+
+def test_no_line_is_drawn_across_a_gap():
+    whole = line(20, (1, 0, 0))
+    kept = np.r_[0:8, 15:20]
+    gappy = Trajectory(whole.timestamps[kept], whole.poses_wc[kept])
+    rows = with_gaps(gappy)
+    assert len(rows) == 14 and np.isnan(rows[8]).all() and np.isfinite(np.delete(rows, 8, axis=0)).all()
+    assert np.isfinite(with_gaps(whole)).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 50])
+@pytest.mark.parametrize("with_reference", [False, True])
+def test_a_picture_comes_out_whatever_the_length(tmp_path, count, with_reference):
+    reference = line(50, (1, 0, 0.2)) if with_reference else None
+    estimate, points = line(count, (1, 0, 0.2)), np.zeros((3, 3))
+    plot_trajectory(tmp_path / "p.png", estimate, reference=reference, points=points, title="t")
+    picture = cv2.imread(str(tmp_path / "p.png"))
+    assert picture is not None and picture.shape[0] > 500
+
+
+def test_the_estimate_is_drawn_where_it_is(tmp_path):
+    """Both tracks show: the picture with an estimate off the reference has pixels of both colours, well apart."""
+    reference = line(50, (1, 0, 0.3))
+    shifted = Trajectory(reference.timestamps, reference.poses_wc + np.array([0, 0, 6, 0, 0, 0, 0]))
+    plot_trajectory(tmp_path / "p.png", shifted, reference=reference)
+    picture = cv2.imread(str(tmp_path / "p.png"))[:, :, ::-1].astype(int)
+    near_accent = np.abs(picture - [0xE4, 0x57, 0x2E]).max(axis=2) < 30
+    near_truth = np.abs(picture - [0x4A, 0x6F, 0xA5]).max(axis=2) < 60
+    assert near_accent.sum() > 500 and near_truth.sum() > 500
+    assert np.flatnonzero(near_truth.any(axis=1)).mean() > np.flatnonzero(near_accent.any(axis=1)).mean() + 30
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path):
+    for name in ("a.png", "b.png"):
+        plot_trajectory(tmp_path / name, line(30, (1, 0, 2)), points=np.random.default_rng(0).normal(size=(50, 3)))
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()

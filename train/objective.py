@@ -1,0 +1,133 @@
+"""What a training step minimises: pose and flow losses summed over the updates (DPVO 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dvo.geometry.projection import reproject
+from dvo.losses.flow import flow_error, flow_loss
+from dvo.losses.pose import pose_errors
+from dvo.nets.graph import PatchGraph
+from dvo.nets.patch_vo import Mode, UpdateState
+from dvo.nets.patchifier import crop_patches
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the terms.
+
+    Attributes:
+        pose: of the mean translation (in units of median scene depth) plus rotation (rad) error.
+        flow: of the flow error after bundle adjustment, feature pixels.
+        target: of the error of the flow that bundle adjustment is asked to explain, feature pixels; trains the flow
+            head directly (DROID-SLAM's residual loss is its kin).
+        target_limit: cap of one edge's target error; beyond the reach of the correlation there is nothing to learn.
+        pose_from: first update whose poses count.
+        margin: an edge counts while the true position of its centre is within this many feature pixels of the map.
+    """
+
+    pose: float = 10.0
+    flow: float = 0.1
+    target: float = 0.1
+    target_limit: float = 8.0
+    pose_from: int = 2
+    margin: float = 4.0
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth of a batch of clips, lengths in feature pixels and median scene depths.
+
+    Attributes:
+        poses_cw: ``(B, N, 7)``.
+        inverse_depth: ``(B, N, h, w)`` at the feature positions.
+        intrinsics: ``(B, N, 4)`` of the feature map.
+    """
+
+    poses_cw: Tensor
+    inverse_depth: Tensor
+    intrinsics: Tensor
+
+
+def truth_of(batch: dict[str, Tensor], stride: int) -> Truth:
+    """Ground truth at feature resolution: feature ``(u, v)`` is centred on image pixel ``(4u, 4v)``."""
+    depth = batch["depth"][:, :, ::stride, ::stride]
+    return Truth(batch["poses_cw"], 1.0 / depth.clamp(min=1e-2), batch["intrinsics"] / stride)
+
+
+def true_reprojection(
+    truth: Truth, patches: Tensor, graph: PatchGraph, frames: int, margin: float
+) -> tuple[Tensor, Tensor]:
+    """Where the pixels of the patches really land, ``(B, E, p, p, 2)``, and which of them count ``(B, E, p, p)``."""
+    b, k, _, p, _ = patches.shape
+    centres = patches[:, :, :2, p // 2, p // 2].round().long().unflatten(1, (frames, -1))
+    disparity = crop_patches(truth.inverse_depth[:, :frames, None], centres, p).flatten(1, 2)
+    exact = torch.cat([patches[:, :, :2], disparity], dim=2)
+    poses, intrinsics = truth.poses_cw[:, :frames], truth.intrinsics[:, :frames]
+    there = reproject(poses, exact, intrinsics, graph.ii, graph.jj, graph.kk)
+    h, w = truth.inverse_depth.shape[-2:]
+    x, y = there.coords[..., p // 2, p // 2, None, None, :].unbind(-1)
+    inside = (x > -margin) & (x < w - 1 + margin) & (y > -margin) & (y < h - 1 + margin)
+    return there.coords, there.valid & inside
+
+
+@torch.no_grad()
+def _measures(prefix: str, error: Tensor, edges: Tensor) -> dict[str, Tensor]:
+    used = torch.isfinite(error) & edges
+    total = used.sum().clamp(min=1)
+    return {f"{prefix}{px}": ((error < float(px)) & used).sum() / total for px in ("0.25", "1", "4")}
+
+
+def clip_losses(
+    states: Iterable[UpdateState], truth: Truth, config: LossConfig, mode: Mode = "joint"
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss of a batch of clips and what to log.
+
+    Args:
+        states: of :meth:`dvo.nets.patch_vo.PatchVO.unroll`.
+        mode: what the updates did; the pose loss needs ``joint``, the flow after bundle adjustment any but ``flow``.
+
+    Returns:
+        the scalar loss, and detached measures of the last update: ``flow``, ``target``, ``translation``,
+        ``rotation_deg``, ``rotation_ratio`` (error over true motion) and the shares of patch flow ``px<0.25`` ...
+    """
+    total = truth.poses_cw.new_zeros(())
+    measures: dict[str, Tensor] = {}
+    there: tuple[Tensor, Tensor] | None = None
+    graph: PatchGraph | None = None
+    for update, state in enumerate(states):
+        if there is None or state.graph is not graph:
+            graph = state.graph
+            there = true_reprojection(truth, state.patches.detach(), graph, state.frames, config.margin)
+        coords, valid = there
+        distance = (graph.ii - graph.jj).abs()
+        near = (distance > 0) & (distance <= 2)
+        error = flow_error(state.coords, coords, valid)
+        flow = flow_loss(error, near)
+        p = coords.shape[2] // 2
+        wanted = (state.targets - coords[:, :, p, p]).square().sum(-1).add(1e-12).sqrt()
+        wanted = wanted.clamp(max=config.target_limit).masked_fill(~valid[:, :, p, p], torch.inf)
+        target = flow_loss(wanted, distance > 0)
+        total = total + config.target * target
+        if mode != "flow":
+            total = total + config.flow * flow
+        measures = {"flow": flow, "target": target, **_measures("px<", error, near)}
+        measures |= _measures("target_px<", wanted, near)
+        if mode == "joint":
+            poses = truth.poses_cw[:, : state.frames]
+            errors = pose_errors(state.poses_cw, poses)
+            if update >= config.pose_from:
+                total = total + config.pose * (errors.translation + errors.rotation).mean()
+            still = torch.zeros_like(poses)
+            still[..., 6] = 1
+            motion = pose_errors(still, poses).rotation
+            measures |= {
+                "translation": errors.translation.mean(),
+                "rotation_deg": errors.rotation.mean().rad2deg(),
+                "rotation_ratio": (errors.rotation / motion.clamp(min=1e-4)).median(),
+            }
+    return total, {name: value.detach() for name, value in measures.items()}

@@ -150,6 +150,15 @@ def align_trajectory(
     return transform(estimate, *fit_alignment(estimate.positions[i], reference.positions[j], align))
 
 
+def relative_rotation_errors(
+    estimate: Trajectory, reference: Trajectory, gap: int = 1, max_dt: float = 0.01
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation error of every pair ``i, i + gap`` of matched frames: time of its end (s) and error (degrees)."""
+    i, j = associate(estimate, reference, max_dt)
+    errors, _, _ = _relative_errors(estimate.poses_wc[i], reference.poses_wc[j], gap, 1.0)
+    return estimate.timestamps[i][gap:], errors
+
+
 def evaluate(
     estimate: Trajectory,
     reference: Trajectory,

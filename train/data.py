@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import signal
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import lightning as L
 import torch
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from dvo.allocator import reuse_freed_memory
 from dvo.synth.dataset import ClipDataset
@@ -26,9 +27,31 @@ class _From(Sampler[int]):
             index += 1
 
 
-def _one_thread(_: int) -> None:
+def _start_worker(_: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the training process's to handle
     torch.set_num_threads(1)
     reuse_freed_memory()
+
+
+class MixedClips(Dataset[dict[str, torch.Tensor]]):
+    """Clips whose size changes from batch to batch: clip ``i`` belongs to batch ``i // batch_size``.
+
+    Args:
+        seed: of scenes, paths and sensors.
+        sizes: ``(height, width)`` taken in turn.
+        batch_size: clips that must share a size.
+        options: further options of :class:`dvo.synth.dataset.ClipDataset`.
+    """
+
+    def __init__(self, seed: int, sizes: Sequence[tuple[int, int]], batch_size: int, **options: Any) -> None:
+        self.batch_size = batch_size
+        self.by_size = [ClipDataset(seed, 2**62, height=h, width=w, **options) for h, w in sizes]
+
+    def __len__(self) -> int:
+        return 2**62
+
+    def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
+        return self.by_size[index // self.batch_size % len(self.by_size)][index]
 
 
 class Renderings(L.LightningDataModule):
@@ -37,7 +60,8 @@ class Renderings(L.LightningDataModule):
     Args:
         seed: of scenes, paths and sensors.
         batch_size: clips a step.
-        frames, height, width: size of a clip, pixels.
+        frames: frames of a clip.
+        sizes: height and width of a clip in pixels, taken in turn by the batches.
         flow_low, flow_high: range of the mean induced flow between consecutive frames, pixels.
         workers: rendering processes; 0 renders in the training process.
     """
@@ -47,8 +71,7 @@ class Renderings(L.LightningDataModule):
         seed: int = 0,
         batch_size: int = 1,
         frames: int = 8,
-        height: int = 120,
-        width: int = 160,
+        sizes: list[tuple[int, int]] | None = None,
         flow_low: float = 2.0,
         flow_high: float = 19.0,
         workers: int = 1,
@@ -57,8 +80,8 @@ class Renderings(L.LightningDataModule):
         self.save_hyperparameters()
         self.batch_size, self.workers = batch_size, workers
         self.clips_seen = 0
-        size = {"frames": frames, "height": height, "width": width, "flow_range": (flow_low, flow_high)}
-        self.clips = ClipDataset(seed, 2**62, **size)
+        options = {"frames": frames, "flow_range": (flow_low, flow_high)}
+        self.clips = MixedClips(seed, sizes or [(120, 160)], batch_size, **options)
 
     def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
         return DataLoader(
@@ -66,7 +89,7 @@ class Renderings(L.LightningDataModule):
             batch_size=self.batch_size,
             sampler=_From(self.clips_seen),
             num_workers=self.workers,
-            worker_init_fn=_one_thread,
+            worker_init_fn=_start_worker,
             persistent_workers=self.workers > 0,
         )
 

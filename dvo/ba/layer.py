@@ -10,15 +10,16 @@ analytic Jacobians, eliminate the depths, solve for the poses, substitute back, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dvo.ba.edges import EdgePlan, free_slots, plan_edges
-from dvo.ba.normal_equations import Gate
+from dvo.ba.normal_equations import MARGIN, Gate
 from dvo.ba.step import BADamping, GaussNewtonStep, StepSetting
 from dvo.geometry import se3
+from dvo.geometry.precision import full_precision
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def bundle_adjust(
     dtype = poses_cw.dtype
     if dtype in (torch.float16, torch.bfloat16):
         dtype = torch.float32
-    with torch.autocast(poses_cw.device.type, enabled=False):
+    with full_precision(poses_cw.device):
         poses_cw, patches, intrinsics, targets, weights = (
             x.to(dtype) for x in (poses_cw, patches, intrinsics, targets, weights)
         )
@@ -141,6 +142,10 @@ def _measurements(
     rays = torch.cat((source, torch.ones_like(source[..., :1])), -1).mT.contiguous()
     target = (targets.index_select(1, plan.order).view(shape) - c_j) / f_j
     weight = weights.index_select(1, plan.order).view(shape) * (f_j * f_j)
-    weight = torch.where(plan.filled[..., None], weight, 0.0)
-    gate = Gate(max_residual, bounds, f_j.detach().mT, c_j.detach().mT)
+    # A weight that is not finite is none at all; the empty places of a group have none either.
+    weight = torch.where(plan.filled[..., None] & torch.isfinite(weight).all(-1, keepdim=True), weight, 0.0)
+    gate = Gate(max_residual, f_j.detach().mT)
+    if bounds is not None:
+        middle = xy.new_tensor(bounds) / 2
+        gate = replace(gate, offset=(c_j.detach() - middle).mT, reach=middle[:, None] + MARGIN)
     return rays, target.mT.contiguous(), weight.mT.contiguous(), gate

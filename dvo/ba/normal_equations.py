@@ -28,14 +28,15 @@ class Gate:
 
     Attributes:
         max_residual: pixels; a longer residual is an outlier.
-        bounds: ``(width, height)`` of the feature map, or None.
-        focal, centre: ``(B, G, 2, 1)`` of the target frames, to go from normalised coordinates to pixels.
+        focal: ``(B, G, 2, 1)`` of the target frames, to go from normalised coordinates to pixels.
+        offset: ``(B, G, 2, 1)`` their principal points, seen from the middle of the feature map.
+        reach: ``(2, 1)`` farthest distance from that middle along each axis, or None for no bounds.
     """
 
     max_residual: float
-    bounds: tuple[float, float] | None
     focal: Tensor
-    centre: Tensor
+    offset: Tensor | None = None
+    reach: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -71,20 +72,17 @@ def view(rotation: Tensor, t: Tensor, rays: Tensor, inverse_depth: Tensor) -> Vi
     moved = rotation @ rays + t * inverse_depth
     z = moved[..., 2:, :]
     seen = z > MIN_Z_VALID
-    inv_z = torch.where(seen, 1 / torch.where(seen, z, 1.0), 0.0)
+    inv_z = seen / torch.where(seen, z, 1.0)
     return View(moved[..., :2, :] * inv_z, inverse_depth * inv_z, inv_z, seen)
 
 
-def counts(v: View, target: Tensor, weight: Tensor, gate: Gate, part: slice) -> Tensor:
-    """Which places count: ``(B, G, 1, M)`` bool."""
-    focal, centre = gate.focal[:, part], gate.centre[:, part]
-    pixels = (target - v.xy) * focal
-    use = v.seen & ((pixels * pixels).sum(-2, keepdim=True) < gate.max_residual**2)
-    if gate.bounds is not None:
-        place = v.xy * focal + centre
-        limit = place.new_tensor(gate.bounds)[:, None] + MARGIN
-        use = use & ((place > -MARGIN) & (place < limit)).all(-2, keepdim=True)
-    return use & torch.isfinite(weight).all(-2, keepdim=True)
+def counts(v: View, residual: Tensor, gate: Gate, part: slice) -> Tensor:
+    """Which places count: ``(B, G, 1, M)`` bool. A NaN does not."""
+    focal = gate.focal[:, part]
+    use = v.seen & ((residual * focal).square().sum(-2, keepdim=True) < gate.max_residual**2)
+    if gate.offset is not None and gate.reach is not None:
+        use &= (torch.addcmul(gate.offset[:, part], v.xy, focal).abs() < gate.reach).all(-2, keepdim=True)
+    return use
 
 
 def accumulate(
@@ -132,18 +130,17 @@ def accumulate(
         depth = inverse_depth.index_select(1, kk).view(b, -1, 1, plan.size)
         motion = t.index_select(1, group)
         v = view(rotation.index_select(1, group), motion, rays[:, part], depth)
-        goal, w = target[:, part], weight[:, part]
-        use = counts(v, goal, w, gate, part)
+        residual = target[:, part] - v.xy
+        use = counts(v, residual, gate, part)
         used.append(use)
-        w = torch.where(use, w, 0.0)
-        residual = torch.where(use, goal - v.xy, 0.0)
+        w = torch.where(use, weight[:, part], 0.0)
+        residual = torch.where(use, residual, 0.0)
         j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
-        x, y = v.xy.unbind(-2)
-        h, (rx, ry), (dx, dy) = v.h[..., 0, :], residual.unbind(-2), j_d.unbind(-2)
-        xy, o = x * y, torch.zeros_like(x)
+        x, y = v.xy.split(1, -2)
+        o, xy, square = torch.zeros_like(x), x * y, v.xy * v.xy + 1
         # Rows: the six columns of J_j, then the residual, then J_d; each for the x and the y axis.
-        rows = (h, o, o, h, -h * x, -h * y, -xy, -1 - y * y, 1 + x * x, xy, -y, x, rx, ry, dx, dy)
-        f = torch.stack(rows, -2)
+        rows = (v.h, o, o, v.h, -v.h * v.xy, -xy, -square[..., 1:, :], square[..., :1, :], xy, -y, x, residual, j_d)
+        f = torch.cat(rows, -2)
         if pose_part:
             flat = f.view(*f.shape[:2], 8, 2 * plan.size)
             products = (flat[..., :6, :] * w.flatten(-2)[..., None, :]) @ flat[..., :7, :].mT
@@ -151,9 +148,7 @@ def accumulate(
             by_pair.index_add_(0, index, products.flatten(0, 1))
         if depth_part:
             wd = w * j_d
-            f = f.unflatten(-2, (8, 2))
-            products = f[..., 0, :] * wd[..., :1, :] + f[..., 1, :] * wd[..., 1:, :]
-            products = products.mT @ both_ends.index_select(1, group)
+            products = (f.unflatten(-2, (8, 2)) * wd[..., None, :, :]).sum(-2).mT @ both_ends.index_select(1, group)
             ends = torch.stack((slot[plan.pair_j[group]], slot[plan.pair_i[group]]), -1)[:, None] * k
             index = (batch * (n + 1) * k + (ends + kk.view(-1, plan.size, 1)).flatten()).flatten()
             by_both.index_add_(0, index, products.reshape(-1, 8))

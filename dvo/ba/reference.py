@@ -82,7 +82,9 @@ def bundle_adjust_reference(
         e = jac_p.mT @ (w[..., None] * jac_l)
         v = (jac_p * (w * r)[..., None]).sum(1)
         if motion_only and not structure_only and free:
-            dp = torch.linalg.solve(h_pp + torch.diag_embed(h_pp.diagonal(dim1=1, dim2=2).detach() * damping[1] + damping[0]), v)
+            dp = torch.linalg.solve(
+                h_pp + torch.diag_embed(h_pp.diagonal(dim1=1, dim2=2).detach() * damping[1] + damping[0]), v
+            )
         elif not structure_only and free:
             # Damping is defined on the reduced system, so its diagonal is needed before the joint one can be written.
             s = h_pp - e @ torch.linalg.solve(c, e.mT)

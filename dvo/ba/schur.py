@@ -9,6 +9,8 @@ landmark (``m = 1`` for an inverse depth, 3 for a point). See Triggs et al., "Bu
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -60,38 +62,51 @@ def invert_blocks(h_ll: Tensor) -> Tensor:
     return torch.where(good, inverse, 0.0)
 
 
-def schur_solve(
-    h_pp: Tensor,
-    h_pl: Tensor,
-    h_ll: Tensor,
-    g_p: Tensor,
-    g_l: Tensor,
-    absolute: float | Tensor = 0.0,
-    relative: float | Tensor = 0.0,
-) -> tuple[Tensor, Tensor]:
-    """Solve the system at the top of this file.
+@dataclass(frozen=True)
+class SchurFactor:
+    """The system at the top of this file with its landmarks eliminated, ready for any right-hand side.
+
+    Attributes:
+        h_pl: ``(B, P, K, m)``.
+        q: ``(B, K, m, m)`` inverse of ``h_ll``.
+        factor: ``(B, P, P)`` Cholesky factor of the damped reduced system.
+        ok: ``(B,)`` whether that factor is one; where not, poses do not move.
+    """
+
+    h_pl: Tensor
+    q: Tensor
+    factor: Tensor
+    ok: Tensor
+
+    def solve(self, g_p: Tensor, g_l: Tensor) -> tuple[Tensor, Tensor]:
+        """``dp (B, P)`` and ``dl (B, K, m)`` for ``g_p (B, P)`` and ``g_l (B, K, m)``."""
+        b, p, k, m = self.h_pl.shape
+        flat = self.h_pl.reshape(b, p, k * m)
+        weighted = _times_blocks(g_l[:, None], self.q).reshape(b, k * m, 1)
+        dp = solve_with(self.factor, self.ok, g_p - (flat @ weighted)[..., 0])
+        rest = g_l - (flat.mT @ dp[..., None]).view(b, k, m)
+        return dp, _times_blocks(rest[:, None], self.q)[:, 0]
+
+
+def eliminate(
+    h_pp: Tensor, h_pl: Tensor, h_ll: Tensor, absolute: float | Tensor = 0.0, relative: float | Tensor = 0.0
+) -> SchurFactor:
+    """Eliminate the landmarks and factor what is left.
 
     Args:
         h_pp: ``(B, P, P)``.
         h_pl: ``(B, P, K, m)``.
-        h_ll: ``(B, K, m, m)``, damped by the caller as wished.
-        g_p: ``(B, P)``.
-        g_l: ``(B, K, m)``.
+        h_ll: ``(B, K, m, m)``, damped by the caller as wished; a block that is not positive is taken as unobserved.
         absolute, relative: damping of the reduced system ``S``: ``S + absolute I + relative diag(S)``.
-
-    Returns:
-        ``dp (B, P)`` and ``dl (B, K, m)``.
     """
     q = invert_blocks(h_ll)
-    b, p, k, m = h_pl.shape
-    flat = h_pl.reshape(b, p, k * m)
-    if m == 1:
-        weighted = flat * q.view(b, 1, k)
-    else:
-        weighted = (h_pl[..., None, :] @ q[:, None]).reshape(b, p, k * m)
-    s = h_pp - weighted @ flat.mT
-    y = g_p - (weighted @ g_l.reshape(b, k * m, 1))[..., 0]
-    dp = solve_with(*factorise(damped(s, absolute, relative)), y)
-    rest = g_l - (dp[:, None] @ flat).view(b, k, m)
-    dl = rest * q[..., 0] if m == 1 else (q @ rest[..., None])[..., 0]
-    return dp, dl
+    weighted = _times_blocks(h_pl, q).flatten(-2)
+    factor, ok = factorise(damped(h_pp - weighted @ h_pl.flatten(-2).mT, absolute, relative))
+    return SchurFactor(h_pl, q, factor, ok)
+
+
+def _times_blocks(x: Tensor, q: Tensor) -> Tensor:
+    """Rows ``x (B, R, K, m)`` times symmetric blocks ``q (B, K, m, m)``."""
+    if q.shape[-1] == 1:
+        return x * q[:, None, :, 0]
+    return (x.transpose(1, 2) @ q).transpose(1, 2)

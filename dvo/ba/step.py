@@ -20,8 +20,9 @@ from torch import Tensor
 
 from dvo.ba.edges import EdgePlan
 from dvo.ba.normal_equations import Gate, accumulate, relative_motion, view
-from dvo.ba.schur import damped, factorise, invert_blocks, solve_with
+from dvo.ba.schur import SchurFactor, eliminate
 from dvo.geometry import se3, so3
+from dvo.geometry.precision import full_precision
 
 
 @dataclass(frozen=True)
@@ -71,54 +72,64 @@ class GaussNewtonStep(torch.autograd.Function):
             poses_cw, inverse_depth, rays, target, weight, setting.plan, setting.gate, setting.slot, free,
             setting.move_poses, setting.move_depths,
         )  # fmt: skip
-        h_pp, h_pl, g_p = system.h_pp, system.h_pl[..., 0], system.g_p
-        h_ll, g_l = system.h_ll[..., 0, 0] + damping.depth, system.g_l[..., 0]
+        h_pp, g_p, g_l = system.h_pp, system.g_p, system.g_l
+        h_ll = system.h_ll + damping.depth
         if d_value is not None and d_weight is not None:
-            h_ll, g_l = h_ll + d_weight, g_l + d_weight * (d_value - inverse_depth)
+            h_ll = h_ll + d_weight[..., None, None]
+            g_l = g_l + (d_weight * (d_value - inverse_depth))[..., None]
         if p_value is not None and p_weight is not None and setting.move_poses:
             rows = torch.zeros_like(poses_cw[:, :1, :6]).repeat(1, free + 1, 1)
             residual = se3.log(se3.relative(poses_cw, p_value))
             h_pp = h_pp + torch.diag_embed(rows.index_add(1, setting.slot, p_weight)[:, :free].flatten(1))
             g_p = g_p + rows.index_add(1, setting.slot, p_weight * residual)[:, :free].flatten(1)
-        q = invert_blocks(h_ll[..., None, None])[..., 0, 0] if setting.move_depths else torch.zeros_like(h_ll)
-        eliminated = h_pl * q[:, None]
-        reduced = damped(h_pp - eliminated @ h_pl.mT, damping.pose, damping.relative)
-        factor, ok = factorise(reduced)
-        dp = solve_with(factor, ok, g_p - (eliminated @ g_l[..., None])[..., 0])
-        dl = q * (g_l - (h_pl.mT @ dp[..., None])[..., 0])
+        if not setting.move_depths:
+            h_ll = torch.zeros_like(h_ll)  # as if nothing observed them: they get no step
+        solver = eliminate(h_pp, system.h_pl, h_ll, damping.pose, damping.relative)
+        dp, dl = solver.solve(g_p, g_l)
         ctx.setting, ctx.used = setting, used
-        ctx.save_for_backward(*inputs, factor, ok, h_pl, q, dp, dl)
-        return dp, dl
+        ctx.save_for_backward(*inputs, solver.h_pl, solver.q, solver.factor, solver.ok, dp, dl)
+        return dp, dl[..., 0]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        *inputs, factor, ok, h_pl, q, dp, dl = ctx.saved_tensors
+        *inputs, h_pl, q, factor, ok, dp, dl = ctx.saved_tensors
         setting: StepSetting = ctx.setting
-        needed = [i for i, x in enumerate(inputs) if x is not None and ctx.needs_input_grad[i + 1]]
         out: list[Tensor | None] = [None] * len(inputs)
-        if not needed:
-            return None, *out
-        lp = solve_with(factor, ok, grads[0] - ((h_pl * q[:, None]) @ grads[1][..., None])[..., 0])
-        ll = q * (grads[1] - (h_pl.mT @ lp[..., None])[..., 0])
-        directions = (setting.spread(lp), setting.spread(dp), ll, dl)
-        with torch.enable_grad():
-            leaves = [None if x is None else x.detach().requires_grad_(i in needed) for i, x in enumerate(inputs)]
-            terms = [_prior_terms(setting, leaves, directions)]
-            found = _gradients(terms, leaves, needed)
-            for part, use in zip(setting.plan.chunks(), ctx.used, strict=True):
-                more = _gradients([_edge_terms(setting, leaves, directions, part, use)], leaves, needed)
-                found = [a if b is None else b if a is None else a + b for a, b in zip(found, more, strict=True)]
-        for i, gradient in zip(needed, found, strict=True):
-            out[i] = gradient
+        needed = [i for i, x in enumerate(inputs) if x is not None and ctx.needs_input_grad[i + 1]]
+        with full_precision(dp.device):
+            lp, ll = SchurFactor(h_pl, q, factor, ok).solve(grads[0], grads[1][..., None])
+            directions = (setting.spread(lp), setting.spread(dp), ll[..., 0], dl[..., 0])
+            for i, gradient in zip(needed, _adjoint(setting, ctx.used, inputs, needed, directions), strict=True):
+                out[i] = gradient
         return None, *out
 
 
-def _gradients(terms: list[Tensor], leaves: list[Tensor | None], needed: list[int]) -> list[Tensor | None]:
+def _adjoint(
+    setting: StepSetting,
+    used: list[Tensor],
+    inputs: list[Tensor | None],
+    needed: list[int],
+    directions: tuple[Tensor, ...],
+) -> list[Tensor | None]:
+    """Gradient of phi by the inputs that need one. Chunk by chunk, so that only one chunk's graph is alive."""
+    found: list[Tensor | None] = [None] * len(needed)
+    if not needed:
+        return found
+    with torch.enable_grad():
+        leaves = [None if x is None else x.detach().requires_grad_(i in needed) for i, x in enumerate(inputs)]
+        if any(x is not None for x in inputs[5:]):
+            found = _gradients(_prior_terms(setting, leaves, directions), leaves, needed)
+        for part, use in zip(setting.plan.chunks(), used, strict=True):
+            more = _gradients(_edge_terms(setting, leaves, directions, part, use), leaves, needed)
+            found = [a if b is None else b if a is None else a + b for a, b in zip(found, more, strict=True)]
+    return found
+
+
+def _gradients(term: Tensor, leaves: list[Tensor | None], needed: list[int]) -> list[Tensor | None]:
     wanted = [leaves[i] for i in needed]
-    terms = [x for x in terms if x.requires_grad]
-    if not terms:
+    if not term.requires_grad:
         return [None] * len(wanted)
-    return list(torch.autograd.grad(terms, wanted, allow_unused=True))  # type: ignore[arg-type]
+    return list(torch.autograd.grad(term, wanted, allow_unused=True))  # type: ignore[arg-type]
 
 
 def _prior_terms(setting: StepSetting, leaves: list[Any], directions: tuple[Tensor, ...]) -> Tensor:
@@ -144,22 +155,23 @@ def _edge_terms(
     kk = plan.kk[part.start * plan.size : part.stop * plan.size]
     rotation, t = relative_motion(poses_cw, plan)
     # Per pair: the motion of frame j relative to frame i along both directions, xi_j - Ad_ij xi_i
-    xi = torch.stack((lp, dp), -1)
-    xi_i, xi_j = xi.index_select(1, plan.pair_i), xi.index_select(1, plan.pair_j)
-    phi_i = rotation @ xi_i[..., 3:, :]
-    tau = xi_j[..., :3, :] - rotation @ xi_i[..., :3, :] - so3.cross(t.expand_as(phi_i), phi_i, dim=-2)
-    turn = so3.hat((xi_j[..., 3:, :] - phi_i).mT)  # (B, P, 2, 3, 3)
-    o = torch.zeros_like(t)
-    tt = torch.stack((torch.cat((t, o), -1), torch.cat((o, t), -1)), 2)  # (B, P, 2, 3, 2)
-    rate = torch.cat((turn, tau.mT[..., None], tt), -1).flatten(2, 3).index_select(1, group)  # (B, G, 6, 6)
+    xi = torch.cat((lp, dp), -1).unflatten(-1, (4, 3)).mT  # columns tau, phi of lambda, then of delta
+    moved = rotation @ xi.index_select(1, plan.pair_i)
+    rate = xi.index_select(1, plan.pair_j) - moved
+    tau = rate[..., 0::2] - so3.hat(t[..., 0]) @ moved[..., 1::2]
+    turn = so3.hat(rate[..., 1::2].mT)
+    rate = torch.cat((turn, tau.mT[..., None]), -1).flatten(2, 3).index_select(1, group)  # (B, G, 2 x 3, 4)
 
     depth = inverse_depth.index_select(1, kk).view(len(rays), -1, 1, plan.size)
-    v = view(rotation.index_select(1, group), t.index_select(1, group), rays[:, part], depth)
-    steps = torch.stack((ll, dl), 1).index_select(2, kk).view(len(rays), 2, -1, plan.size).transpose(1, 2)
+    motion = t.index_select(1, group)
+    v = view(rotation.index_select(1, group), motion, rays[:, part], depth)
     # Velocity of the point over Z, (B, G, 2 directions, 3, M); then of its projection
-    velocity = rate @ torch.cat((v.xy, torch.ones_like(v.h), v.h, steps * v.inv_z), 2)
-    velocity = velocity.unflatten(2, (2, 3))
+    velocity = (rate @ torch.cat((v.xy, torch.ones_like(v.h), v.h), 2)).unflatten(2, (2, 3))
     flow = velocity[..., :2, :] - v.xy[:, :, None] * velocity[..., 2:, :]
+    if setting.move_depths:
+        j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
+        steps = torch.stack((ll, dl), 1).index_select(2, kk).view(len(rays), 2, -1, plan.size).transpose(1, 2)
+        flow = flow + j_d[:, :, None] * steps[..., None, :]
     residual = torch.where(use, target[:, part] - v.xy, 0.0)
     weight = torch.where(use, weight[:, part], 0.0)
     return (weight * flow[:, :, 0] * (residual - flow[:, :, 1])).sum()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3, so3
+from dvo.geometry.precision import full_precision
 
 MIN_Z_DIVISION = 0.1
 """The projection divides by ``max(Z, this)``."""
@@ -41,83 +42,64 @@ class Reprojection:
     jac_d: Tensor | None = None
 
 
-def projection_matrices(
-    poses_cw: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor, target_intrinsics: Tensor | None = None
-) -> Tensor:
-    """``(B, E, 3, 4)`` matrices M with ``Z (u, v, 1) = M (x, y, d, 1)`` from pixels of frame i to pixels of frame j.
+def motion_matrices(poses_cw: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor) -> Tensor:
+    """``(B, E, 3, 4)`` matrices M with ``X' = M (x, y, d, 1)``: from pixels of frame i to points in frame j.
 
     Args:
         poses_cw: ``(B, N, 7)`` world to camera.
         intrinsics: ``(B, N, 4)`` fx fy cx cy.
         ii, jj: ``(E,)`` source and target frames.
-        target_intrinsics: the same for the role of frame j, if they differ (units: normalised coordinates come out).
     """
     b, n = poses_cw.shape[:2]
     rotation, t = so3.matrix(poses_cw[..., 3:]), poses_cw[..., :3, None]
     fx, fy, cx, cy = intrinsics.unbind(-1)
     one, zero = torch.ones_like(fx), torch.zeros_like(fx)
-    fu, fv, cu, cv = (intrinsics if target_intrinsics is None else target_intrinsics).unbind(-1)
-    k = torch.stack((fu, zero, cu, zero, fv, cv, zero, zero, one), -1).unflatten(-1, (3, 3))
     ix, iy = 1 / fx, 1 / fy
-    # columns x, y, d, 1 of the back-projection into (X, Y, Z, d)
+    # Back-projection of (x, y, d, 1) to the ray (X, Y, 1), then to the world, where the last row keeps d.
     rows = (ix, zero, zero, -cx * ix, zero, iy, zero, -cy * iy, zero, zero, zero, one)
     k_inv = torch.stack(rows, -1).unflatten(-1, (3, 4))
-    to_camera = k @ torch.cat((rotation, t), -1)  # (B, N, 3, 4): world (scaled by d) to pixels
+    d_row = torch.stack((zero, zero, one, zero), -1)[..., None, :]
     back = rotation.mT
-    d_column = torch.stack((zero, zero, one, zero), -1)[..., None, :]
-    to_world = torch.cat((back @ k_inv - (back @ t) * d_column, d_column), -2)  # (B, N, 4, 4)
+    to_world = torch.cat((back @ k_inv - (back @ t) * d_row, d_row), -2)  # (B, N, 4, 4)
+    to_camera = torch.cat((rotation, t), -1)
     if n * n > ii.shape[0]:
         return to_camera.index_select(1, jj) @ to_world.index_select(1, ii)
     # All pairs in one product, then one gather: much cheaper than a small product per edge.
     pairs = to_camera.reshape(b, n * 3, 4) @ to_world.permute(0, 2, 1, 3).reshape(b, 4, n * 4)
     pairs = pairs.view(b, n, 3, n, 4).transpose(2, 3).reshape(b, n * n, 12)
-    return pairs.index_select(1, jj * n + ii).view(b, -1, 3, 4)
+    return gather(pairs, jj * n + ii).view(b, -1, 3, 4)
 
 
-def project(matrices: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply :func:`projection_matrices`.
-
-    Args:
-        matrices: ``(..., 3, 4)``.
-        pixels: ``(..., 3, P)`` rows x, y, d.
-
-    Returns:
-        ``(..., 2, P)`` pixels in frame j (division by ``max(Z, 0.1)``), and ``Z (..., 1, P)``.
-    """
-    lead, count = pixels.shape[:-2], pixels.shape[-1]
-    m = matrices.reshape(-1, 3, 4)
-    moved = torch.baddbmm(m[..., 3:], m[..., :3], pixels.reshape(-1, 3, count)).view(*lead, 3, count)
-    z = moved[..., 2:, :]
-    return moved[..., :2, :] / z.clamp(min=MIN_Z_DIVISION), z
+def gather(table: Tensor, index: Tensor) -> Tensor:
+    """``table (B, N, C)`` at ``index (E,)`` of the second dimension. The sum in its backward is far faster over dimension 0."""
+    b, n, c = table.shape
+    if b > 1:
+        index = (index + torch.arange(b, device=index.device)[:, None] * n).flatten()
+    return table.reshape(b * n, c).index_select(0, index).view(b, -1, c)
 
 
-def centre_jacobians(
-    matrices: Tensor, uv: Tensor, z: Tensor, inverse_depth: Tensor, intrinsics_j: Tensor
-) -> tuple[Tensor, Tensor]:
+def centre_jacobians(point: Tensor, inverse_depth: Tensor, translation: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of projected pixels by the target pose and by the inverse depth.
 
     Args:
-        matrices: ``(..., 3, 4)`` of :func:`projection_matrices`.
-        uv: ``(..., 2)`` projected pixels.
-        z: ``(...)`` their Z.
+        point: ``(..., 3)`` X' in frame j.
         inverse_depth: ``(...)`` of the source.
-        intrinsics_j: ``(..., 4)`` of the target frame.
+        translation: ``(..., 3)`` of the motion from frame i to frame j.
+        focal: ``(..., 2)`` fx fy of frame j.
 
     Returns:
-        ``jac_j (..., 2, 6)`` and ``jac_d (..., 2)``, zero where ``Z <= 0.2``.
+        ``jac_j (..., 2, 6)`` and ``jac_d (..., 2, 1)``, zero where ``Z <= 0.2``.
     """
+    z = point[..., 2:]
     seen = z > MIN_Z_VALID
-    inv_z = torch.where(seen, 1 / torch.where(seen, z, 1.0), 0.0)
-    f, c = intrinsics_j[..., :2], intrinsics_j[..., 2:]
-    # Of an unseen point all is made zero, so that no huge coordinate enters a product.
-    xy = torch.where(seen[..., None], (uv - c) / f, 0.0)
+    inv_z = seen / torch.where(seen, z, 1.0)
+    xy = point[..., :2] * inv_z
     x, y = xy.unbind(-1)
-    h = inverse_depth * inv_z
-    o, s, r = torch.zeros_like(x), seen.to(x.dtype), x * y
-    unit = torch.stack((h, o, -h * x, -r, s + x * x, -y, o, h, -h * y, -s - y * y, r, x), -1)
-    jac_j = unit.unflatten(-1, (2, 6)) * f[..., None]
-    jac_d = (matrices[..., :2, 2] - uv * matrices[..., 2:, 2]) * inv_z[..., None]
-    return jac_j, jac_d
+    h = inverse_depth * inv_z[..., 0]
+    o, s, r = torch.zeros_like(x), seen[..., 0].to(x), x * y
+    unit = torch.stack((h, o, -h * x, -r, s + x * x, -y, o, h, -h * y, -s - y * y, r, x), -1).unflatten(-1, (2, 6))
+    jac_d = (translation[..., :2] - xy * translation[..., 2:]) * inv_z
+    return unit * focal[..., None], (jac_d * focal)[..., None]
 
 
 def reproject(
@@ -138,20 +120,23 @@ def reproject(
         ii, jj, kk: ``(E,)`` source frame, target frame, patch; shared by the batch.
         jacobians: also fill ``jac_i``, ``jac_j``, ``jac_d``.
     """
-    b, k, _, p, _ = patches.shape
-    matrices = projection_matrices(poses_cw, intrinsics, ii, jj)
-    source = patches.reshape(b, k, 3 * p * p).index_select(1, kk).view(b, -1, 3, p * p)
-    uv, z = project(matrices, source)
-    shape = (b, ii.shape[0], p, p)
-    coords = uv.transpose(-1, -2).reshape(*shape, 2)
-    depth = z.view(shape)
-    valid = depth > MIN_Z_VALID
-    if not jacobians:
-        return Reprojection(coords, depth, valid)
-    centre = (p // 2) * p + p // 2
-    jac_j, jac_d = centre_jacobians(
-        matrices, uv[..., centre], z[..., 0, centre], source[..., 2, centre], intrinsics.index_select(1, jj)
-    )
-    g_ij = se3.relative(poses_cw.index_select(1, ii), poses_cw.index_select(1, jj))
-    jac_i = -jac_j @ se3.adjoint(g_ij)
-    return Reprojection(coords, depth, valid, jac_i, jac_j, jac_d[..., None])
+    with full_precision(poses_cw.device):
+        b, k, _, p, _ = patches.shape
+        matrices = motion_matrices(poses_cw, intrinsics, ii, jj)
+        source = gather(patches.reshape(b, k, 3 * p * p), kk).view(b, -1, 3, p * p)
+        focal, principal = gather(intrinsics, jj)[..., None].split(2, 2)
+        m = matrices.view(-1, 3, 4)
+        point = torch.baddbmm(m[..., 3:], m[..., :3], source.view(-1, 3, p * p)).view(source.shape)
+        z = point[..., 2:, :]
+        uv = torch.addcmul(principal, focal, point[..., :2, :] / z.clamp(min=MIN_Z_DIVISION))
+        shape = (b, ii.shape[0], p, p)
+        coords = uv.mT.reshape(*shape, 2)
+        depth = z.view(shape)
+        valid = depth > MIN_Z_VALID
+        if not jacobians:
+            return Reprojection(coords, depth, valid)
+        centre = (p // 2) * p + p // 2
+        jac_j, jac_d = centre_jacobians(point[..., centre], source[..., 2, centre], matrices[..., 2], focal[..., 0])
+        g_ij = se3.relative(poses_cw.index_select(1, ii), poses_cw.index_select(1, jj))
+        jac_i = -jac_j @ se3.adjoint(g_ij)
+        return Reprojection(coords, depth, valid, jac_i, jac_j, jac_d)

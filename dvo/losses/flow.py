@@ -27,6 +27,6 @@ def flow_loss(error: Float[Tensor, "B E"], edges: Bool[Tensor, " E"]) -> Tensor:
         error: from :func:`flow_error`.
         edges: which edges count; DPVO takes those with ``0 < |i - j| <= 2``.
     """
-    used = torch.isfinite(error) & edges
+    used = ~torch.isposinf(error) & edges  # a NaN must show in the loss
     total = torch.where(used, error, torch.zeros_like(error)).sum(1)
     return (total / used.sum(1).clamp(min=1)).mean()

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dvo.ba.cold_start import damping_at
 from dvo.ba.layer import bundle_adjust
 from dvo.geometry.projection import reproject
 from dvo.nets.config import ModelConfig
@@ -110,7 +111,7 @@ class PatchVO(nn.Module):
         hidden = context.new_zeros(b, len(stages[0].graph), config.hidden_channels)
         coords: Tensor | None = None
 
-        for stage in stages:
+        for update, stage in enumerate(stages):
             graph = stage.graph
             poses, patches = poses.detach(), patches.detach()
             if stage.carry is not None:
@@ -147,6 +148,7 @@ class PatchVO(nn.Module):
                     graph.kk,
                     fixed=1,
                     iterations=ba_iterations,
+                    damping=damping_at(update),
                     structure_only=mode == "structure",
                     bounds=(width, height),
                 )

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.cold_start import COLD_UPDATES, damping_at, robust_cost, solve_from_nothing
 from dvo.ba.layer import bundle_adjust
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
@@ -121,8 +122,8 @@ class PatchOdometry:
         """Refine the last window and write the trajectory of every frame."""
         window, config = self.window, self.config
         if 1 < len(window):
-            for _ in range(config.final_updates if self._initialised else config.initial_updates):
-                self._update()
+            for age in range(config.final_updates if self._initialised else config.initial_updates):
+                self._update(COLD_UPDATES if self._initialised else age)
         poses = dict(self._settled)
         for index, keyframe in enumerate(window.frames):
             poses[keyframe.identifier] = window.poses_cw[index].double().cpu().numpy()
@@ -219,8 +220,8 @@ class PatchOdometry:
         centre = net.config.patch_size // 2
         return hidden[0], delta[0], weights[0], coords[0, :, centre, centre]
 
-    def _update(self) -> None:
-        """One revision of the edges and of the newest poses and their depths."""
+    def _update(self, age: int = COLD_UPDATES) -> None:
+        """One revision of the edges and of the newest poses and their depths; ``age`` counts the updates so far."""
         window, config = self.window, self.config
         window.hidden, delta, window.weights, centres = self._revise()
         n = len(window)
@@ -236,6 +237,7 @@ class PatchOdometry:
             window.jj,
             window.kk,
             fixed=fixed,
+            damping=damping_at(age),
             bounds=(width, height),
         )
         window.poses_cw, window.patches = poses[0], patches[0]
@@ -256,13 +258,27 @@ class PatchOdometry:
 
     def _initialise(self) -> None:
         """Optimise the first window; it counts as initialised once there is parallax."""
-        for _ in range(self.config.initial_updates):
-            self._update()
+        for age in range(self.config.initial_updates):
+            self._update(age)
+            if age == self.config.initial_updates // 2:
+                self._begin_again()
         window, n = self.window, len(self.window)
         seen = parallax(window, 0, n - 1)
         if n > self.config.initial_frames:
             seen = max(seen, parallax(window, n // 2, n - 1))
         self._initialised = seen >= self.config.initial_parallax
+
+    def _begin_again(self) -> None:
+        """Solve the first window from nothing with the flow as now seen, and keep what explains it better."""
+        window = self.window
+        _, delta, weights, centres = self._revise()
+        height, width = window.frames[0].levels[0].shape[:2]
+        seen = ((centres + delta)[None], weights[None], window.ii, window.jj, window.kk)
+        intrinsics = window.intrinsics[None]
+        poses, patches, cost = solve_from_nothing(window.patches[None], intrinsics, *seen, bounds=(width, height))
+        if cost < robust_cost(window.poses_cw[None], window.patches[None], intrinsics, *seen):
+            window.poses_cw = se3.normalise(se3.compose(poses[0], window.poses_cw[0]))
+            window.patches = patches[0]
 
     def _reduce(self) -> None:
         """Drop the keyframe that adds nothing, and what is too old."""

@@ -211,7 +211,7 @@ def _tree(b: SceneBuilder, spot: Array) -> None:
 def street(rng: np.random.Generator, pool: TexturePool) -> Scene:
     """Road between houses, with pavements, markings, cars, poles, trees and sky; y is along the street."""
     b = SceneBuilder(rng, pool)
-    length, road = rng.uniform(60, 110), rng.uniform(3, 7)
+    length, road = rng.uniform(35, 60), rng.uniform(3, 7)
     kerb = rng.uniform(1.5, 5)
     sky = _sky(b, 600.0)
     b.rectangle([0, 0, 0], UP, [0, 1, 0], 400, 400, b.material("ground", "stone", metres=(2, 6)))

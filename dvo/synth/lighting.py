@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvo.synth.scene import Scene
+from dvo.synth.scene import CELL, Scene
 
 Array = np.ndarray
 MAX_OCCLUDERS = 48  # the largest surfaces cast shadows; small ones would hardly show
@@ -54,7 +54,7 @@ def bake(
     size = np.stack([(flat * axis[:, None]).sum(-1) for axis in (scene.u_axis, scene.v_axis)], -1)
     low, high = size.min(1), size.max(1)
     extent = high - low
-    cells = np.clip(np.ceil(extent / (texel * scene.scale * 0.25)), 1, 22).astype(np.int64) + 1
+    cells = np.clip(np.ceil(extent / (texel * scene.scale * 0.25)), 1, CELL - 1).astype(np.int64) + 1
     cells[glow] = 2
     total = cells.prod(1)
     offset = np.concatenate([[0], np.cumsum(total)[:-1]])
@@ -100,14 +100,14 @@ def bake(
         if shadows:
             lit = np.flatnonzero(strength > 0.03)
             begin = (points[lit] + 2e-3 * scene.scale * normal[lit]).astype(np.float32)
-            end = spot.astype(np.float32) if not distant else None
-            target = np.broadcast_to(end, begin.shape) if end is not None else begin + (50 * scene.scale * ray[lit] / distance[lit, None]).astype(np.float32)
-            dark = _blocked(begin, target, scene, occluders)
+            reach = np.minimum(distance[lit], 50 * scene.scale) / distance[lit]
+            end = (points[lit] + reach[:, None] * ray[lit]).astype(np.float32)
+            dark = _blocked(begin, end, scene, occluders)
             strength[lit[dark]] *= rng.uniform(0.0, 0.3)
         light = light + strength[:, None] * tint
     visible = ~glow[owner]
     level = np.median(light[visible].mean(1)) if visible.any() else 1.0
     light = light / max(level, 1e-6)
     light[~visible] = 1.0
-    scene.light = np.clip(light, 0.12, 2.2).astype(np.float32)
-    scene.light_offset, scene.light_size, scene.light_map = offset.astype(np.int64), cells, mapping
+    scene.light[owner, local // cells[owner, 0], local % cells[owner, 0]] = np.clip(light, 0.12, 1.9)
+    scene.light_map = mapping

@@ -44,7 +44,8 @@ def grain(rng: Rng, image: np.ndarray, amount: float) -> np.ndarray:
     """Overlay fine and coarse grain so that no area is exactly constant."""
     size = image.shape[0]
     field = noise(rng, size, rng.uniform(0.3, 1.4)) * 0.7 + noise(rng, size, 1.8) * 0.5
-    return np.clip(image * (1 + amount * field[..., None]), 0, 1).astype(np.float32)
+    # Contiguous, because broadcasting leaves layouts that OpenCV cannot draw on.
+    return np.ascontiguousarray(np.clip(image * (1 + amount * field[..., None]), 0, 1), np.float32)
 
 
 def fractal(rng: Rng, size: int) -> np.ndarray:
@@ -60,7 +61,7 @@ def stains(rng: Rng, size: int) -> np.ndarray:
     image = np.broadcast_to(colour(rng, low=0.3), (size, size, 3)).astype(np.float32)
     for _ in range(int(rng.integers(2, 6))):
         field = noise(rng, size, rng.uniform(1.2, 2.6))
-        edge = 1 / (1 + np.exp(-(field - rng.normal(0.4, 0.6)) * rng.uniform(3, 40)))
+        edge = 0.5 + 0.5 * np.tanh((field - rng.normal(0.4, 0.6)) * rng.uniform(1.5, 20))
         image = image + edge[..., None] * rng.uniform(0.3, 1) * (colour(rng) - image)
     return grain(rng, image, rng.uniform(0.02, 0.12))
 
@@ -229,7 +230,8 @@ def text(rng: Rng, size: int) -> np.ndarray:
     for _ in range(int(rng.integers(0, 4))):
         x, y, w, h = rng.uniform(0.05, 0.6, 4) * size
         cv2.rectangle(image, (int(x), int(y)), (int(x + w), int(y + h)), colour(rng, 0.5).tolist(), -1)
-    ink, y = colour(rng, 0.4, 0, 0.35), 0.0
+    ink, y = colour(rng, 0.4, 0, 0.35) * 255, 0.0
+    image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)  # the only depth that putText takes
     while y < size:
         scale = float(np.exp(rng.uniform(np.log(0.3), np.log(2.5))))
         y += 30 * scale
@@ -237,7 +239,7 @@ def text(rng: Rng, size: int) -> np.ndarray:
         spot = (int(rng.uniform(-0.05, 0.3) * size), int(y))
         font = int(rng.choice([cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX]))
         cv2.putText(image, word, spot, font, scale, ink.tolist(), max(1, int(2 * scale)), cv2.LINE_AA)
-    return grain(rng, image, rng.uniform(0.01, 0.06))
+    return grain(rng, image.astype(np.float32) / 255, rng.uniform(0.01, 0.06))
 
 
 def shelf(rng: Rng, size: int) -> np.ndarray:

@@ -8,6 +8,7 @@ an image, so that textures stand upright; ``v_axis x u_axis`` is the front norma
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,12 @@ from torch import Tensor
 from dvo.synth.textures import TexturePool
 
 Array = np.ndarray
+CELL = 24  # texels along a light map at most
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """``a x b`` along the last axis; several times faster than np.cross on small arrays."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 @dataclass
@@ -31,8 +38,7 @@ class Scene:
         texture: ``(P,)`` int64 index into the pool.
         texture_map: ``(P, 2, 3)`` texel coordinates from (u, v, 1).
         gain, offset: ``(P, 3)`` colour = gain * texel + offset, in [0, 1].
-        light: ``(M, 3)`` float32 light-map texels of all surfaces, multiplied onto the colour.
-        light_offset, light_size: ``(P,)``, ``(P, 2)`` int64 first texel and columns, rows of each light map.
+        light: ``(P, CELL, CELL, 3)`` float32 light map of each surface, multiplied onto the colour.
         light_map: ``(P, 2, 3)`` light-map coordinates from (u, v, 1).
         pool: the textures.
         family: name of the family that laid it out.
@@ -57,59 +63,70 @@ class Scene:
     bounds: Array
     solids: Array
     scale: float
-    light_offset: Array
-    light_size: Array
+    light: Array
     light_map: Array
-    light: Array = field(default_factory=lambda: np.ones((1, 3), np.float32))
     hints: dict[str, Any] = field(default_factory=dict)
     _cache: dict[str, dict[str, Tensor]] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.origin)
 
-    @property
+    @cached_property
     def normal(self) -> Array:
         """``(P, 3)`` front normals."""
-        return np.cross(self.v_axis, self.u_axis)
+        return _cross(self.v_axis, self.u_axis)
 
     def tensors(self, device: torch.device | str) -> dict[str, Tensor]:
-        """What shading gathers per pixel, on a device (kept after the first call)."""
+        """What shading gathers per pixel, on a device (kept after the first call).
+
+        ``surface (13, P)``: linear part of the texture map (4), gain (3), offset (3), left and top of the texture's
+        cell, left edge of the light map's cell; ``light (1, 3, CELL, P CELL)``.
+        """
         key = str(device)
         if key not in self._cache:
-            linear = self.texture_map[:, :, :2]
-            columns = [linear.reshape(-1, 4), self.gain / 255, self.offset, self.light_size - 1]
+            row, column = np.divmod(self.texture, self.pool.columns)
+            size = self.pool.size
+            columns = [
+                self.texture_map[:, :, :2].reshape(-1, 4), self.gain, self.offset,
+                (column * size)[:, None], (row * size * 3 // 2)[:, None], (np.arange(len(self)) * CELL)[:, None],
+            ]  # fmt: skip
+            table = np.ascontiguousarray(np.concatenate(columns, 1).T, np.float32)
+            picture = self.light.transpose(3, 1, 0, 2).reshape(1, 3, CELL, -1)
             self._cache[key] = {
-                "surface": torch.from_numpy(np.concatenate(columns, 1).astype(np.float32)).to(device),
-                "index": torch.from_numpy(np.stack([self.texture, self.light_offset], 1)).to(device),
-                "light": torch.from_numpy(self.light).to(device),
+                "surface": torch.from_numpy(table).to(device),
+                "light": torch.from_numpy(np.ascontiguousarray(picture)).to(device),
             }
         return self._cache[key]
 
+    @cached_property
+    def spheres(self) -> tuple[Array, Array]:
+        """Bounding spheres: centres ``(P, 3)``, radii ``(P,)``."""
+        centre = self.corners.mean(1)
+        return centre, np.linalg.norm(self.corners - centre[:, None], axis=-1).max(1)
+
+    @cached_property
+    def _frames(self) -> tuple[Array, Array, Array]:
+        """Axes u, v, normal ``(P, 3, 3)`` and the bounds of (u, v) ``(P, 2)`` each."""
+        flat = self.corners - self.origin[:, None]
+        size = np.stack([(flat * axis[:, None]).sum(-1) for axis in (self.u_axis, self.v_axis)], -1)
+        return np.stack([self.u_axis, self.v_axis, self.normal], 1), size.min(1), size.max(1)
+
     def clearance(self, points: Array) -> Array:
         """Distance ``(T,)`` from points ``(T, 3)`` to the nearest surface; -1 inside a solid or out of bounds."""
-        distance = np.full(len(points), np.inf)
-        size = np.stack(
-            [
-                ((self.corners - self.origin[:, None]) * self.u_axis[:, None]).sum(-1),
-                ((self.corners - self.origin[:, None]) * self.v_axis[:, None]).sum(-1),
-            ],
-            -1,
-        )
-        low, high = size.min(1), size.max(1)
-        axes = np.stack([self.u_axis, self.v_axis, self.normal], 1)
-        for i, point in enumerate(points):  # few points, many surfaces
-            local = np.einsum("pij,pj->pi", axes, point - self.origin)
+        distance = np.full(len(points), -1.0)
+        axes, low, high = self._frames
+        for i in np.flatnonzero(self.is_free(points)):
+            local = (axes @ (points[i] - self.origin)[..., None])[..., 0]
             over = np.maximum(np.maximum(low - local[:, :2], local[:, :2] - high), 0)
             distance[i] = np.sqrt(((over**2).sum(1) + local[:, 2] ** 2).min())
-        distance[~self.is_free(points)] = -1
         return distance
 
     def is_free(self, points: Array) -> Array:
         """``(T,)`` bool: inside the bounds and outside every solid."""
         free = ((points >= self.bounds[0]) & (points <= self.bounds[1])).all(1)
-        for solid in self.solids:
-            local = (points - solid[:3]) @ solid[6:].reshape(3, 3)
-            free &= ~(np.abs(local) <= solid[3:6]).all(1)
+        if len(self.solids):
+            local = (points[:, None] - self.solids[:, :3])[:, :, None] @ self.solids[:, 6:].reshape(-1, 3, 3)
+            free &= ~(np.abs(local[:, :, 0]) <= self.solids[:, 3:6]).all(2).any(1)
         return free
 
 
@@ -161,29 +178,14 @@ class SceneBuilder:
         corners = np.asarray(corners, float)
         if len(corners) == 3:
             corners = np.concatenate([corners, corners[2:]])
-        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-        normal = normal / np.linalg.norm(normal)
-        down = -np.asarray(up, float) if up is not None else np.array([0.0, 0.0, -1.0])
-        if abs(down @ normal) > 0.99:
-            down = corners[1] - corners[0]
-        v = down - (down @ normal) * normal
-        v = v / np.linalg.norm(v)
-        u = np.cross(normal, v)
-        origin = corners.mean(0)
-        flat = np.stack([(corners - origin) @ u, (corners - origin) @ v], -1)
-        step = np.roll(flat, -1, 0) - flat
-        length = np.linalg.norm(step, axis=1)
-        inward = np.stack([step[:, 1], -step[:, 0]], -1) / np.maximum(length, 1e-12)[:, None]
-        edges = np.concatenate([inward, -(inward * flat).sum(1, keepdims=True)], 1)
-        edges[length < 1e-9] = [0, 0, 1]
         density = self.pool.size / material.metres
         c, s = np.cos(material.turn) * density, np.sin(material.turn) * density
         shift = self.rng.uniform(0, 2 * self.pool.size, 2)
         self.rows.append(
             {
-                "origin": origin, "u_axis": u, "v_axis": v, "corners": corners, "edges": edges, "two_sided": two_sided,
-                "texture": material.texture, "texture_map": np.array([[c, -s, shift[0]], [s, c, shift[1]]]),
-                "gain": material.gain, "offset": material.offset,
+                "corners": corners, "down": np.array([0.0, 0.0, -1.0]) if up is None else -np.asarray(up, float),
+                "two_sided": two_sided, "texture": material.texture,
+                "texture_map": [[c, -s, shift[0]], [s, c, shift[1]]], "gain": material.gain, "offset": material.offset,
             }
         )  # fmt: skip
 
@@ -192,10 +194,11 @@ class SceneBuilder:
         *, two_sided: bool = False,
     ) -> None:  # fmt: skip
         """Add a rectangle facing ``normal``; ``up`` (made orthogonal to it) is the direction of its height."""
-        normal = np.asarray(normal, float) / np.linalg.norm(normal)
-        up = np.asarray(up, float) - (np.asarray(up, float) @ normal) * normal
-        up = up / np.linalg.norm(up)
-        right = np.cross(up, normal)
+        normal, up = np.asarray(normal, float), np.asarray(up, float)
+        normal = normal / np.sqrt(normal @ normal)
+        up = up - (up @ normal) * normal
+        up = up / np.sqrt(up @ up)
+        right = _cross(up, normal)
         a, b = right * width / 2, up * height / 2
         centre = np.asarray(centre, float)
         corners = np.stack([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
@@ -233,11 +236,28 @@ class SceneBuilder:
         self.solids.append(np.concatenate([np.asarray(foot) + rise / 2, half, np.eye(3).ravel()]))
 
     def build(self, family: str, bounds: Array, scale: float, **hints: Any) -> Scene:
-        """Stack everything (light is baked separately)."""
-        stacked: dict[str, Any] = {key: np.array([row[key] for row in self.rows]) for key in self.rows[0]}
-        solids = np.array(self.solids).reshape(-1, 15)
+        """Stack everything and derive axes and edges (light is baked separately)."""
+        rows: dict[str, Any] = {key: np.array([row[key] for row in self.rows]) for key in self.rows[0]}
+        corners, down = rows["corners"], rows.pop("down")
+        first = corners[:, 1] - corners[:, 0]
+        normal = _cross(first, corners[:, 2] - corners[:, 0])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        flat_lying = np.abs((down * normal).sum(1)) > 0.99
+        down = np.where(flat_lying[:, None], first, down)
+        v = down - (down * normal).sum(1, keepdims=True) * normal
+        v /= np.linalg.norm(v, axis=1, keepdims=True)
+        u = _cross(normal, v)
+        origin = corners.mean(1)
+        offset = corners - origin[:, None]
+        flat = np.stack([(offset * u[:, None]).sum(-1), (offset * v[:, None]).sum(-1)], -1)
+        step = np.roll(flat, -1, 1) - flat
+        length = np.linalg.norm(step, axis=-1)
+        inward = np.stack([step[..., 1], -step[..., 0]], -1) / np.maximum(length, 1e-12)[..., None]
+        edges = np.concatenate([inward, -(inward * flat).sum(-1, keepdims=True)], -1)
+        edges[length < 1e-9] = [0, 0, 1]  # the edge that a triangle lacks
+        count = len(corners)
         return Scene(
-            **stacked, pool=self.pool, family=family, bounds=np.asarray(bounds, float), solids=solids, scale=scale,
-            light_offset=np.zeros(len(self.rows), np.int64), light_size=np.ones((len(self.rows), 2), np.int64),
-            light_map=np.zeros((len(self.rows), 2, 3)), hints=hints,
+            **rows, origin=origin, u_axis=u, v_axis=v, edges=edges, pool=self.pool, family=family,
+            bounds=np.asarray(bounds, float), solids=np.array(self.solids).reshape(-1, 15), scale=scale,
+            light=np.ones((count, CELL, CELL, 3), np.float32), light_map=np.zeros((count, 2, 3)), hints=hints,
         )  # fmt: skip

@@ -117,8 +117,8 @@ class KltPnp:
             frames_read=len(self._times),
             frames_lost=len(self._times) - len(rows),
             info={
-                "resolution": f"{self._size[0]}x{self._size[1]}",
-                "intrinsics": self._intrinsics.tolist(),
+                "working_size": list(self._size),
+                "working_intrinsics": self._intrinsics.tolist(),
                 "maps_started": self._starts,
                 "config": asdict(self.config),
             },
@@ -165,9 +165,7 @@ class KltPnp:
 
     def _try_start(self, frame: Frame, grey: np.ndarray, index: int) -> None:
         c, tracks = self.config, self._tracks
-        pair = two_view.relative_pose(
-            tracks.anchor_uv, tracks.uv, self._intrinsics, c.epipolar, self._seed + index
-        )
+        pair = two_view.relative_pose(tracks.anchor_uv, tracks.uv, self._intrinsics, c.epipolar, self._seed + index)
         focal = float(self._intrinsics[:2].mean())
         if pair is not None and pair.parallax > c.start_parallax * focal and self._start(pair, index):
             self._update_points(index)
@@ -187,7 +185,9 @@ class KltPnp:
             for uv, T in ((tracks.anchor_uv, first), (tracks.uv, second))
         ]
         points = two_view.solve_points(terms[0] + terms[1])
-        good = pair.inliers & self._seen_well(points, tracks.anchor_uv, first) & self._seen_well(points, tracks.uv, second)
+        good = (
+            pair.inliers & self._seen_well(points, tracks.anchor_uv, first) & self._seen_well(points, tracks.uv, second)
+        )
         if good.sum() < max(c.start_points, 0.5 * len(tracks)):
             return False
         depth = float(np.median(two_view.project(points[good], first, self._intrinsics)[1]))
@@ -213,8 +213,7 @@ class KltPnp:
 
     def _last_pose(self) -> np.ndarray:
         """Pose of the newest frame that has one, as the place where a new map starts; identity for the first map."""
-        known = [T for T in self._T_cw if T is not None]
-        return known[-1].copy() if known else np.eye(4)
+        return next((T.copy() for T in reversed(self._T_cw) if T is not None), np.eye(4))
 
     # --- poses and points ---------------------------------------------------------------------------------------------
 

@@ -156,7 +156,14 @@ def pose_from_points(
     cv2.setRNGSeed(seed)
     pixels = np.ascontiguousarray(uv, np.float64)
     ok, rvec, tvec, index = cv2.solvePnPRansac(
-        points, pixels, K, None, iterationsCount=300, reprojectionError=threshold, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
+        points,
+        pixels,
+        K,
+        None,
+        iterationsCount=300,
+        reprojectionError=threshold,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_AP3P,
     )
     if not ok or index is None or len(index) < 6:
         return None

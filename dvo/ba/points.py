@@ -1,0 +1,135 @@
+"""Bundle adjustment of camera poses and 3-D points: Levenberg-Marquardt with acceptance of steps.
+
+The second entry to the Schur solver of this room: landmarks are points with 3x3 blocks instead of inverse depths. Intrinsics
+and distortion are held. Not differentiable; for maps and for problems from files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dvo.ba.bal import PointProblem
+from dvo.ba.schur import eliminate
+from dvo.geometry import se3, so3
+
+MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32
+"""Bounds of what the damping is a fraction of, as in Ceres: a direction that nothing measures is damped all the same."""
+
+
+@dataclass(frozen=True)
+class PointSolution:
+    """Outcome of :func:`solve_points`.
+
+    Attributes:
+        problem: with the new poses and points.
+        initial_cost, cost: half the sum of squared residuals, pixels squared, before and after.
+        iterations: steps tried.
+        converged: whether a criterion was met before the limit of iterations.
+    """
+
+    problem: PointProblem
+    initial_cost: float
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def residuals(problem: PointProblem) -> Tensor:
+    """``(O, 2)`` pixels: where the point was seen, less where it projects to."""
+    return _project(problem)[0]
+
+
+def _project(problem: PointProblem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Residuals ``(O, 2)``, points in the camera ``(O, 3)``, and d pixel / d point ``(O, 2, 3)``, rotations ``(C, 3, 3)``."""
+    rotation = so3.matrix(problem.poses_cw[:, 3:])
+    seen = (rotation[problem.camera] @ problem.points[problem.point][..., None])[..., 0]
+    seen = seen + problem.poses_cw[problem.camera, :3]
+    z = seen[:, 2:]
+    z = torch.where(z.abs() < 1e-12, 1e-12, z)
+    xy = seen[:, :2] / z
+    focal, centre = problem.intrinsics[problem.camera].split(2, -1)
+    k1, k2 = problem.radial[problem.camera].split(1, -1)
+    r2 = (xy * xy).sum(-1, keepdim=True)
+    bend = 1 + r2 * (k1 + r2 * k2)
+    residual = problem.pixels - (focal * bend * xy + centre)
+    by_xy = (2 * (k1 + 2 * k2 * r2) * xy)[..., None, :] * xy[..., None] + torch.diag_embed(bend.expand(-1, 2))
+    xy_by_point = torch.cat((torch.diag_embed(1 / z.expand(-1, 2)), -(xy / z)[..., None]), -1)
+    return residual, seen, focal[..., None] * (by_xy @ xy_by_point), rotation
+
+
+def _normal_equations(problem: PointProblem, fixed: int) -> tuple[Tensor, ...]:
+    """``h_pp (1, 6n, 6n)``, ``h_pl (1, 6n, K, 3)``, ``h_ll (1, K, 3, 3)``, ``g_p``, ``g_l`` of the free cameras and all points."""
+    residual, seen, by_point, rotation = _project(problem)
+    cameras, points = len(problem.poses_cw), len(problem.points)
+    j_p = torch.cat((by_point, -by_point @ so3.hat(seen)), -1)  # left perturbation: d point = tau + phi x point
+    j_l = by_point @ rotation[problem.camera]
+    zeros = problem.points.new_zeros
+    blocks = zeros(cameras, 6, 6).index_add(0, problem.camera, j_p.mT @ j_p)
+    g_p = zeros(cameras, 6).index_add(0, problem.camera, (j_p.mT @ residual[..., None])[..., 0])
+    h_ll = zeros(points, 3, 3).index_add(0, problem.point, j_l.mT @ j_l)
+    g_l = zeros(points, 3).index_add(0, problem.point, (j_l.mT @ residual[..., None])[..., 0])
+    cell = problem.camera * points + problem.point
+    h_pl = zeros(cameras * points, 6, 3).index_add(0, cell, j_p.mT @ j_l).view(cameras, points, 6, 3)
+    h_pp = torch.block_diag(*blocks[fixed:]) if fixed < cameras else zeros(0, 0)
+    h_pl = h_pl[fixed:].transpose(1, 2).reshape(-1, points, 3)
+    return tuple(x[None] for x in (h_pp, h_pl, h_ll, g_p[fixed:].flatten(), g_l))
+
+
+def solve_points(
+    problem: PointProblem,
+    *,
+    fixed: int = 0,
+    max_iterations: int = 100,
+    tolerance: float = 1e-6,
+    damping: float = 1e-4,
+) -> PointSolution:
+    """Minimise half the sum of squared reprojection errors over poses and points.
+
+    Damping is a fraction of the Hessian's diagonal and follows the gain ratio (Nielsen 1999); a step that does not lower the
+    cost is undone. The gauge is left to the damping unless cameras are fixed.
+
+    Args:
+        fixed: how many leading cameras stay.
+        max_iterations: steps tried at most.
+        tolerance: relative decrease of the cost by an accepted step below which it has converged.
+        damping: at the start.
+    """
+    cost = initial = _cost(problem)
+    growth, converged, tried = 2.0, False, 0
+    system = _normal_equations(problem, fixed)
+    for tried in range(1, max_iterations + 1):
+        h_pp, h_pl, h_ll, g_p, g_l = system
+        d_p = damping * h_pp.diagonal(dim1=1, dim2=2).clamp(MIN_DIAGONAL, MAX_DIAGONAL)
+        d_l = damping * h_ll.diagonal(dim1=2, dim2=3).clamp(MIN_DIAGONAL, MAX_DIAGONAL)
+        solver = eliminate(h_pp + torch.diag_embed(d_p), h_pl, h_ll + torch.diag_embed(d_l))
+        dp, dl = solver.solve(g_p, g_l)
+        moved = _moved(problem, dp[0], dl[0], fixed)
+        new_cost = _cost(moved)
+        predicted = 0.5 * float((dp * (d_p * dp + g_p)).sum() + (dl * (d_l * dl + g_l)).sum())
+        gain = (cost - new_cost) / predicted if predicted > 0 else -1.0
+        if new_cost < cost:  # False for NaN
+            decrease, problem, cost = cost - new_cost, moved, new_cost
+            damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
+            if decrease <= tolerance * cost:
+                converged = True
+                break
+            system = _normal_equations(problem, fixed)
+        else:
+            damping, growth = damping * growth, growth * 2
+            if damping > 1e16 or predicted <= 1e-15 * cost:
+                converged = predicted <= tolerance * cost
+                break
+    return PointSolution(problem, initial, cost, tried, converged)
+
+
+def _cost(problem: PointProblem) -> float:
+    return 0.5 * float(residuals(problem).square().sum())
+
+
+def _moved(problem: PointProblem, dp: Tensor, dl: Tensor, fixed: int) -> PointProblem:
+    poses = problem.poses_cw
+    poses = torch.cat((poses[:fixed], se3.retract(poses[fixed:], dp.view(-1, 6))))
+    return problem.moved(poses, problem.points + dl)

@@ -1,0 +1,40 @@
+"""Clips as a map-style torch dataset."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from dvo.synth.clip import make_clip
+from dvo.synth.textures import texture_pool
+
+
+class ClipDataset(Dataset[dict[str, Tensor]]):
+    """``length`` clips of stream ``seed``; the same bytes for any number of workers.
+
+    Args:
+        seed: names the stream.
+        length: number of clips.
+        start: index of the first clip (to resume).
+        options: passed to :func:`dvo.synth.clip.make_clip`.
+
+    Items are ``images (N, 3, H, W)`` uint8, ``depth (N, H, W)``, ``poses_cw (N, 7)``, ``intrinsics (N, 4)``. Neighbouring
+    indices share a scene (``clips_per_scene``), so reading in order is faster than shuffled.
+    """
+
+    def __init__(self, seed: int, length: int, *, start: int = 0, **options: Any) -> None:
+        self.seed, self.length, self.start, self.options = seed, length, start, options
+        texture_pool(seed)  # drawn before workers fork, so that they share it
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        if not 0 <= index < self.length:
+            raise IndexError(index)
+        clip = make_clip(self.seed, self.start + index, **self.options)
+        return {
+            "images": clip.images, "depth": clip.depth, "poses_cw": clip.poses_cw, "intrinsics": clip.intrinsics,
+        }  # fmt: skip

@@ -1,0 +1,307 @@
+"""The renderer: flat surfaces rasterised exactly, textured and lit, in plain torch.
+
+In the camera of frame n a plane has an inverse depth that is linear in the pixel, and so are u / Z and v / Z of its
+surface coordinates and Z-scaled distances to its edges. So per frame and surface there are a few 3-vectors (computed in
+float64), a pixel (x, y, 1) is covered where all edge functions are positive, and the surface of largest inverse depth
+wins. Depth, identity and surface coordinates are exact; nothing is interpolated over pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.errors import DvoError
+from dvo.synth.poses import split
+from dvo.synth.scene import CELL, Scene
+from dvo.synth.textures import sample
+
+NEAR = 1e-3  # metres; cameras keep farther away than this from everything
+SLACK = 1e-5  # rad by which surfaces are fattened, so that walls sharing an edge leave no crack
+PIECE = 9600  # pixels shaded at once on a CPU
+Array = np.ndarray
+
+
+@dataclass
+class Rendering:
+    """What N cameras see.
+
+    Attributes:
+        images: ``(N, 3, H, W)`` float32 RGB in [0, 1].
+        depth: ``(N, H, W)`` float32 Z along the optical axis, world units; 0 where no surface is hit.
+        surface: ``(N, H, W)`` int64 index of the surface, -1 where none is hit.
+        uv: ``(N, H, W, 2)`` float32 coordinates in the surface, world units (see :class:`Scene`).
+    """
+
+    images: Tensor
+    depth: Tensor
+    surface: Tensor
+    uv: Tensor
+
+
+@dataclass
+class _View:
+    """Linear functions of the pixel (x, y, 1) for N frames and the Q surfaces in sight of any of them, float64.
+
+    ``index (Q,)`` surfaces, ``basis (N, Q, 3, 3)`` rows u/Z, v/Z, 1/Z, ``edges (N, Q, 4, 3)``, ``seen (N, Q)`` bool and
+    ``window (N, Q, 4)`` x0 y0 x1 y1 pixel bounds.
+    """
+
+    index: Array
+    basis: Array
+    edges: Array
+    seen: Array
+    window: Array
+
+
+def _in_sight(scene: Scene, rotation: Array, centre: Array, intrinsics: Array, size: tuple[int, int] | None) -> Array:
+    """Surfaces that may show in any frame: facing it and with a bounding sphere that meets the viewing cone."""
+    height = -((scene.origin - centre[:, None]) * scene.normal).sum(-1)
+    seen = (np.abs(height) > 1e-9) & (scene.two_sided | (height > 0))
+    middle, radius = scene.spheres
+    local = (middle - centre[:, None]) @ rotation
+    seen &= local[..., 2] > NEAR - radius
+    if size is not None:
+        fx, fy, cx, cy = (column[:, None] for column in intrinsics.T)
+        for axis, f, c, extent in ((0, fx, cx, size[1]), (1, fy, cy, size[0])):
+            for edge, sign in (((-1.0 - c) / f, 1), ((extent - c) / f, -1)):
+                plane = sign * (local[..., axis] - edge * local[..., 2]) / np.hypot(1, edge)
+                seen &= plane > -radius
+    return seen
+
+
+def _project(scene: Scene, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None) -> _View:
+    """Build the linear functions; ``size`` (height, width) culls what cannot show, None keeps whatever faces a camera."""
+    rotation, centre = split(poses_wc)  # (N, 3, 3) camera to world, (N, 3)
+    seen = _in_sight(scene, rotation, centre, intrinsics, size)
+    index = np.flatnonzero(seen.any(0))
+    seen = seen[:, index]
+    n = len(poses_wc)
+    fx, fy, cx, cy = intrinsics.T
+    k_inverse = np.zeros((n, 3, 3))
+    k_inverse[:, 0, 0], k_inverse[:, 0, 2] = 1 / fx, -cx / fx
+    k_inverse[:, 1, 1], k_inverse[:, 1, 2], k_inverse[:, 2, 2] = 1 / fy, -cy / fy, 1
+    ray = rotation @ k_inverse  # world direction of a pixel: ray @ (x, y, 1)
+    normal, u_axis, v_axis = scene.normal[index], scene.u_axis[index], scene.v_axis[index]
+    offset = scene.origin[index] - centre[:, None]  # (N, Q, 3)
+    height = (offset * normal).sum(-1)
+    inverse_depth = (normal @ ray) / np.where(np.abs(height) < 1e-9, 1e-9, height)[..., None]
+    u = u_axis @ ray - (offset * u_axis).sum(-1)[..., None] * inverse_depth
+    v = v_axis @ ray - (offset * v_axis).sum(-1)[..., None] * inverse_depth
+    basis = np.stack([u, v, inverse_depth], 2)
+    # Pixel bounds: the corners in front of the camera and the points where the outline crosses the near plane.
+    local = ((scene.corners[index].reshape(-1, 3) - centre[:, None]) @ rotation).reshape(n, -1, 4, 3)
+    following = np.roll(local, -1, 2)
+    z, z_next = local[..., 2], following[..., 2]
+    crosses = (z > NEAR) != (z_next > NEAR)
+    share = np.where(crosses, (NEAR - z) / np.where(crosses, z_next - z, 1), 0)
+    points = np.concatenate([local, local + share[..., None] * (following - local)], 2)
+    usable = np.concatenate([z > NEAR, crosses], 2)
+    scale = 1 / np.where(usable, np.maximum(points[..., 2], NEAR), 1)
+    x = points[..., 0] * scale * fx[:, None, None] + cx[:, None, None]
+    y = points[..., 1] * scale * fy[:, None, None] + cy[:, None, None]
+    low = [np.where(usable, c, 1e9).min(-1) for c in (x, y)]
+    high = [np.where(usable, c, -1e9).max(-1) for c in (x, y)]
+    window = np.stack([*low, *high], -1)
+    return _View(index, basis, scene.edges[index] @ basis, seen & usable.any(-1), window)
+
+
+def _cast(view: _View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor]:
+    """Largest inverse depth ``(N, H, W)`` and the position in ``view.index`` of its surface (int32, -1 for none)."""
+    n = len(view.seen)
+    slack = 0.02  # pixels; the windows are exact but for rounding and SLACK
+    x0, y0 = (np.clip(np.ceil(view.window[..., i] - slack), 0, m).astype(int) for i, m in ((0, width), (1, height)))
+    x1, y1 = (np.clip(np.floor(view.window[..., i] + slack) + 1, 0, m).astype(int) for i, m in ((2, width), (3, height)))
+    seen = view.seen & (x1 > x0) & (y1 > y0)
+    functions = np.concatenate([view.basis[:, :, 2:], view.edges], 2)  # (N, Q, 5, 3)
+    functions[~seen] = [0.0, 0.0, -1.0]  # hidden from this camera, but seen by another one of the batch
+    table = torch.from_numpy(functions.astype(np.float32)).to(device)
+    nearest = torch.full((n, height, width), 1e-12, device=device)
+    surface = torch.full((n, height, width), -1, dtype=torch.int32, device=device)
+    xs = torch.arange(width, dtype=torch.float32, device=device)
+    ys = torch.arange(height, dtype=torch.float32, device=device)
+    big = np.iinfo(np.int64).max
+    left, top = np.where(seen, x0, big).min(0), np.where(seen, y0, big).min(0)
+    right, bottom = np.where(seen, x1, 0).max(0), np.where(seen, y1, 0).max(0)
+    for q in np.flatnonzero(seen.any(0)).tolist():
+        a, b, c, d = int(left[q]), int(right[q]), int(top[q]), int(bottom[q])
+        which = np.flatnonzero(seen[:, q])
+        n0, n1 = int(which[0]), int(which[-1]) + 1
+        rows = table[n0:n1, q]
+        value = torch.addcmul(rows[..., 2:], rows[..., 1:2], ys[c:d])[..., None] + (rows[..., :1] * xs[a:b])[..., None, :]
+        inverse, best = value[:, 0], nearest[n0:n1, c:d, a:b]
+        hit = (value[:, 1:].amin(1) >= -SLACK) & (inverse > best)
+        best.copy_(torch.where(hit, inverse, best))
+        surface[n0:n1, c:d, a:b].masked_fill_(hit, q)
+    return nearest, surface
+
+
+def _linear(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Evaluate functions ``(3, M)`` at pixels ``(M,)``."""
+    return torch.addcmul(torch.addcmul(rows[2], rows[0], x), rows[1], y)
+
+
+def _functions(scene: Scene, view: _View, device: torch.device | str) -> Tensor:
+    """Coefficients ``(N Q, 15)`` of 1/Z, s/Z, t/Z and of the light-map coordinates over Z."""
+    texture = scene.texture_map[view.index] @ view.basis
+    light = scene.light_map[view.index] @ view.basis
+    packed = np.concatenate([view.basis[:, :, 2:], texture, light], 2).astype(np.float32)
+    return torch.from_numpy(packed.reshape(-1, 15)).to(device)
+
+
+def _shade(scene: Scene, functions: Tensor, row: Tensor, surface: Tensor, x: Tensor, y: Tensor, taps: int) -> Tensor:
+    """Colour ``(3, M)`` in [0, 1] of M pixels (x, y) that show ``surface (M,)`` with coefficients ``functions[row]``."""
+    tables = scene.tensors(surface.device)
+    f = functions.index_select(0, row).t().contiguous().view(5, 3, -1)
+    about = tables["surface"].index_select(1, surface)
+    z = 1 / _linear(f[0], x, y)
+    s, t = _linear(f[1], x, y) * z, _linear(f[2], x, y) * z
+    # Jacobian of texel coordinates by pixel, from the quotient rule.
+    sx, sy = torch.addcmul(f[1, 0], s, f[0, 0], value=-1) * z, torch.addcmul(f[1, 1], s, f[0, 1], value=-1) * z
+    tx, ty = torch.addcmul(f[2, 0], t, f[0, 0], value=-1) * z, torch.addcmul(f[2, 1], t, f[0, 1], value=-1) * z
+    along_x, along_y = torch.hypot(sx, tx), torch.hypot(sy, ty)
+    major = torch.maximum(along_x, along_y)
+    minor = (sx * ty - sy * tx).abs_() / major.clamp_min(1e-9)
+    footprint = torch.maximum(minor, major / taps)
+    wide = along_x >= along_y
+    shift = ((torch.arange(taps, device=x.device) + 0.5) / taps - 0.5)[:, None]
+    places_s, places_t = s + shift * torch.where(wide, sx, sy), t + shift * torch.where(wide, tx, ty)
+    colour = sample(scene.pool, about[10], about[11], places_s, places_t, footprint)
+    colour = torch.addcmul(about[7:10], colour, about[4:7])
+    light = tables["light"]
+    across, down = light.shape[3], light.shape[2]
+    lx = (_linear(f[3], x, y) * z).clamp_(0, CELL - 1).add_(about[12]).mul_(2 / (across - 1)).sub_(1)
+    ly = (_linear(f[4], x, y) * z).clamp_(0, CELL - 1).mul_(2 / (down - 1)).sub_(1)
+    grid = torch.stack([lx, ly], -1).view(1, 1, -1, 2)
+    shine = torch.nn.functional.grid_sample(light, grid, padding_mode="border", align_corners=True)
+    return colour.mul_(shine.view(3, -1)).clamp_(0, 1)
+
+
+def _cameras(poses_wc: object, intrinsics: object) -> tuple[Array, Array]:
+    def to_numpy(value: object) -> Array:
+        if isinstance(value, Tensor):
+            value = value.detach().cpu().numpy()
+        return np.asarray(value, np.float64)
+
+    poses, k = to_numpy(poses_wc), to_numpy(intrinsics)
+    if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
+        raise DvoError(f"expected finite poses of shape (N, 7), got {poses.shape}", field="poses_wc")
+    if k.shape not in ((4,), (len(poses), 4)):
+        raise DvoError(f"expected shape (4,) or ({len(poses)}, 4), got {k.shape}", field="intrinsics")
+    if not np.isfinite(k).all() or (k[..., :2] <= 0).any():
+        raise DvoError("focal lengths must be positive and all numbers finite", field="intrinsics")
+    return poses, np.broadcast_to(k, (len(poses), 4))
+
+
+def render_depth(
+    scene: Scene, poses_wc: object, intrinsics: object, height: int, width: int, *, device: torch.device | str = "cpu"
+) -> tuple[Tensor, Tensor]:
+    """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
+    poses, k = _cameras(poses_wc, intrinsics)
+    view = _project(scene, poses, k, (height, width))
+    nearest, local = _cast(view, height, width, device)
+    return torch.where(local >= 0, 1 / nearest, 0.0), _named(view, local)
+
+
+def _named(view: _View, local: Tensor) -> Tensor:
+    """Positions in ``view.index`` -> surfaces of the scene, int64; -1 stays."""
+    names = torch.from_numpy(np.append(view.index, -1).astype(np.int64)).to(local.device)
+    return names[local.long()]
+
+
+def _colours(scene: Scene, view: _View, local: Tensor, taps: int) -> Tensor:
+    """Images ``(N, 3, H, W)`` of a cast grid, in pieces that stay in the processor's cache."""
+    n, height, width = local.shape
+    device = local.device
+    images = torch.empty(n, 3, height * width, device=device)
+    functions = _functions(scene, view, device)
+    x = torch.arange(width, dtype=torch.float32, device=device).expand(height, width).reshape(-1)
+    y = torch.arange(height, dtype=torch.float32, device=device)[:, None].expand(height, width).reshape(-1)
+    names = torch.from_numpy(view.index).to(device)
+    piece = height * width if torch.device(device).type != "cpu" else PIECE
+    for frame in range(n):
+        flat = local[frame].reshape(-1).long()
+        hit = flat >= 0
+        flat.clamp_min_(0)
+        for a in range(0, flat.numel(), piece):
+            part = slice(a, a + piece)
+            row = flat[part] + frame * len(view.index)
+            images[frame, :, part] = _shade(scene, functions, row, names[flat[part]], x[part], y[part], taps)
+        if not hit.all():
+            images[frame].masked_fill_(~hit, 0.0)
+    return images.view(n, 3, height, width)
+
+
+def render(
+    scene: Scene,
+    poses_wc: object,
+    intrinsics: object,
+    height: int,
+    width: int,
+    *,
+    supersample: int = 1,
+    device: torch.device | str = "cpu",
+    taps: int = 2,
+) -> Rendering:
+    """Render N frames.
+
+    Args:
+        scene: what to render.
+        poses_wc: ``(N, 7)`` camera to world, tensor or array.
+        intrinsics: ``(N, 4)`` or ``(4,)`` fx fy cx cy in pixels of the ``height`` x ``width`` image.
+        height, width: image size in pixels.
+        supersample: rays per pixel edge for the colours (depth, surface and uv are always those of pixel centres).
+        device: where to render.
+        taps: texture samples along the longer axis of a pixel's footprint (anisotropic filter).
+
+    Raises:
+        DvoError: poses or intrinsics of the wrong shape or not finite.
+    """
+    poses, k = _cameras(poses_wc, intrinsics)
+    view = _project(scene, poses, k, (height, width))
+    nearest, local = _cast(view, height, width, device)
+    depth = torch.where(local >= 0, 1 / nearest, 0.0)
+    if supersample == 1:
+        images = _colours(scene, view, local, taps)
+    else:
+        m = supersample
+        fine = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
+        fine_view = _project(scene, poses, fine, (height * m, width * m))
+        _, fine_local = _cast(fine_view, height * m, width * m, device)
+        images = torch.nn.functional.avg_pool2d(_colours(scene, fine_view, fine_local, taps), m)
+    n = len(poses)
+    uv = torch.from_numpy(view.basis[:, :, :2].astype(np.float32).reshape(-1, 6)).to(device)
+    frame = torch.arange(n, device=device)[:, None, None] * len(view.index)
+    chosen = uv[(frame + local.clamp_min(0)).reshape(-1)].view(n, height, width, 2, 3)
+    xs = torch.arange(width, dtype=torch.float32, device=device)[:, None]
+    ys = torch.arange(height, dtype=torch.float32, device=device)[:, None, None]
+    coordinates = (chosen[..., 0] * xs + chosen[..., 1] * ys + chosen[..., 2]) * depth[..., None]
+    return Rendering(images, depth, _named(view, local), coordinates)
+
+
+def trace(scene: Scene, poses_wc: object, intrinsics: object, pixels: Array) -> tuple[Array, Array, Array]:
+    """What single rays hit, in float64: the reference for tests and for tracks.
+
+    Args:
+        scene: what to look at.
+        poses_wc: ``(N, 7)``; intrinsics: ``(N, 4)`` or ``(4,)``.
+        pixels: ``(N, M, 2)`` x, y (need not be integers nor inside an image).
+
+    Returns:
+        depth ``(N, M)``, surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
+    """
+    poses, k = _cameras(poses_wc, intrinsics)
+    view = _project(scene, poses, k, None)
+    homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1).swapaxes(1, 2)  # (N, 3, M)
+    inverse = view.basis[:, :, 2] @ homogeneous  # (N, Q, M)
+    inside = (view.edges @ homogeneous[:, None]).min(2) >= -SLACK
+    inverse = np.where(inside & view.seen[..., None] & (inverse > 0), inverse, 0)
+    chosen = inverse.argmax(1)
+    best = inverse.max(1)
+    depth = np.divide(1, best, out=np.zeros_like(best), where=best > 0)
+    rows = view.basis[np.arange(len(poses))[:, None], chosen, :2]  # (N, M, 2, 3)
+    uv = (rows @ homogeneous.swapaxes(1, 2)[..., None])[..., 0] * depth[..., None]
+    return depth, np.where(best > 0, view.index[chosen], -1), uv

@@ -1,0 +1,160 @@
+"""Suites of sequences (configs/eval/*.yaml) and where their data lie."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import yaml
+
+from dvo.data.source import Source, open_source
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+from dvo.metrics import Alignment, associate
+
+ROOT = Path(__file__).resolve().parent.parent
+SUITES = ROOT / "configs" / "eval"
+Judge = Literal["ate_percent", "rpe_rot_deg"]
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """One recording with ground truth.
+
+    Attributes:
+        name: in the tables.
+        path: folder or file, relative to the data folder.
+        judged_by: the column that decides between systems: ``ate_percent`` or, where scale is weak, ``rpe_rot_deg``.
+        about: a few words.
+        calib, times, groundtruth: files relative to the folder, where the layout itself does not say.
+    """
+
+    name: str
+    path: str
+    judged_by: Judge = "ate_percent"
+    about: str = ""
+    calib: str | None = None
+    times: str | None = None
+    groundtruth: str | None = None
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Sequences and the protocol under which systems are compared on them.
+
+    Attributes:
+        name: of the suite, in results.csv.
+        label: what the figures are good for; printed above the table.
+        sequences: in the order of the table.
+        alignment: fitted before errors are taken.
+        rpe_gap: frame gap of the relative errors; their median is reported.
+        stride: every how many-th image is fed.
+        lost_below: a run with poses for a smaller part of the frames counts as failed.
+        time_limit: seconds for one run.
+    """
+
+    name: str
+    label: str
+    sequences: tuple[Sequence, ...]
+    alignment: Alignment = "sim3"
+    rpe_gap: int = 2
+    stride: int = 1
+    lost_below: float = 0.5
+    time_limit: float = 1800.0
+
+    def only(self, names: list[str]) -> Suite:
+        """The suite with these sequences.
+
+        Raises:
+            DvoError: a name that is not in it.
+        """
+        known = {sequence.name: sequence for sequence in self.sequences}
+        for name in names:
+            if name not in known:
+                raise DvoError(
+                    f"no sequence '{name}' in the suite '{self.name}'",
+                    field="--sequences",
+                    remedy=f"choose from {', '.join(known)}",
+                )
+        return replace(self, sequences=tuple(known[name] for name in names))
+
+
+def read_suite(name_or_file: str | Path) -> Suite:
+    """A suite by name (configs/eval/NAME.yaml) or from a file.
+
+    Raises:
+        DvoError: no such suite, or a file with unknown or missing settings.
+    """
+    path = Path(name_or_file)
+    if path.suffix not in (".yaml", ".yml"):
+        path = SUITES / f"{name_or_file}.yaml"
+    if not path.is_file():
+        names = ", ".join(sorted(file.stem for file in SUITES.glob("*.yaml")))
+        raise DvoError("no such suite", file=path, field="--suite", remedy=f"give a file, or one of: {names}")
+    try:
+        table = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="mend the file") from error
+    if not isinstance(table, dict) or not isinstance(table.get("sequences"), list):
+        raise DvoError("no list of sequences", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
+    sequences = tuple(_build(Sequence, entry, path) for entry in table.pop("sequences"))
+    suite: Suite = _build(Suite, {**table, "sequences": sequences}, path)
+    _check(suite.alignment, get_args(Alignment), "alignment", path)
+    for sequence in sequences:
+        _check(sequence.judged_by, get_args(Judge), f"{sequence.name}: judged_by", path)
+    return suite
+
+
+def data_folder(given: str | Path | None = None) -> Path:
+    """Where recordings lie: the argument, else ``$DVO_DATA``, else ``../shared/data`` beside the checkout.
+
+    Raises:
+        DvoError: not there.
+    """
+    path = Path(given or os.environ.get("DVO_DATA") or ROOT.parent / "shared" / "data")
+    if not path.is_dir():
+        raise DvoError("no such data folder", file=path, field="--data", remedy="set DVO_DATA or give --data DIR")
+    return path
+
+
+def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, Trajectory]:
+    """The frames of a sequence and its ground truth.
+
+    Raises:
+        DvoError: the data are not there, or hold no ground truth.
+    """
+    source = open_source(
+        data / sequence.path,
+        calib=sequence.calib,
+        times=sequence.times,
+        groundtruth=sequence.groundtruth,
+        stride=stride,
+    )
+    if source.groundtruth is None:
+        raise DvoError("no ground truth", file=data / sequence.path, remedy="name its file under 'groundtruth'")
+    return source, source.groundtruth
+
+
+def reference_for(groundtruth: Trajectory, stamps: np.ndarray, max_dt: float = 0.02) -> Trajectory:
+    """The ground truth of exactly the frames that were fed: one row for each that has one, at the frame's time."""
+    fed, rows = associate(Trajectory(stamps, np.zeros((len(stamps), 7))), groundtruth, max_dt)
+    return Trajectory(stamps[fed], groundtruth.poses_wc[rows])
+
+
+def _build(kind: type, entry: Any, path: Path) -> Any:
+    known = {field.name for field in fields(kind)}
+    if not isinstance(entry, dict) or not set(entry) <= known:
+        unknown = ", ".join(sorted(set(entry) - known)) if isinstance(entry, dict) else repr(entry)
+        raise DvoError(f"unknown setting {unknown}", file=path, remedy=f"known are {', '.join(sorted(known))}")
+    try:
+        return kind(**entry)
+    except TypeError as error:
+        raise DvoError(f"incomplete {kind.__name__.lower()} ({error})", file=path, remedy="add it") from error
+
+
+def _check(value: str, allowed: tuple[str, ...], field: str, path: Path) -> None:
+    if value not in allowed:
+        raise DvoError(f"'{value}'", file=path, field=field, remedy=f"choose one of {', '.join(allowed)}")

@@ -1,0 +1,123 @@
+"""The systems that can be chosen by name, each behind :class:`dvo.odometry.protocol.Odometry`.
+
+``klt-pnp`` and ``null`` are here; ``dvo-NAME`` is the learned tracker with weights NAME of the package, ``dvo:FILE``
+the same with a weights file. A system that cannot run says why instead of raising.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import dvo
+from dvo.errors import DvoError
+from dvo.odometry.protocol import Odometry
+
+
+@dataclass(frozen=True)
+class System:
+    """One entry of the registry.
+
+    Attributes:
+        name: as on the command line and in the tables.
+        licence: of the code that runs.
+        about: one line.
+        build: ``build(seed, device)`` gives a fresh odometry for one sequence.
+        version: gives the version of what would run.
+        missing: gives the reason why it cannot run, or None.
+    """
+
+    name: str
+    licence: str
+    about: str
+    build: Callable[[int, str], Odometry]
+    version: Callable[[], str]
+    missing: Callable[[], str | None]
+
+
+DEFAULT = ("dvo-small", "klt-pnp", "null")
+
+
+def find_system(name: str, weights: str | None = None) -> System:
+    """Look a system up.
+
+    Args:
+        name: see the module.
+        weights: weights file for ``dvo-...`` systems in place of the package's own.
+
+    Raises:
+        DvoError: no such system.
+    """
+    if name in _CLASSICAL:
+        return _CLASSICAL[name]
+    if name.startswith("dvo:"):
+        return _learned(name, name.removeprefix("dvo:"))
+    if name.startswith("dvo-"):
+        return _learned(name, weights or name.removeprefix("dvo-"))
+    raise DvoError(
+        f"no system '{name}'", field="--systems", remedy=f"choose from {', '.join(_CLASSICAL)}, dvo-NAME, dvo:FILE"
+    )
+
+
+def list_systems() -> list[System]:
+    """Everything that has a name here, the package's own weights included."""
+    from dvo.nets.weights import list_weights
+
+    names = dict.fromkeys(["dvo-small", *(f"dvo-{info.name}" for info in list_weights())])
+    return [find_system(name) for name in names] + list(_CLASSICAL.values())
+
+
+def _klt_pnp(seed: int, device: str) -> Odometry:
+    from eval.baselines.klt_pnp import KltPnp
+
+    return KltPnp(seed=seed)
+
+
+def _null(seed: int, device: str) -> Odometry:
+    from eval.baselines.null import NullMotion
+
+    return NullMotion(seed)
+
+
+def _learned(name: str, weights: str) -> System:
+    def build(seed: int, device: str) -> Odometry:
+        return dvo.load(weights, seed=seed, device=device)
+
+    def version() -> str:
+        from dvo.nets.weights import weights_info
+
+        return f"{dvo.__version__}+{weights_info(weights).sha256[:8]}"
+
+    def missing() -> str | None:
+        from dvo.nets.weights import find_weights
+
+        try:
+            find_weights(weights)
+        except DvoError as error:
+            return str(error)
+        return None
+
+    return System(name, "MIT", "learned patch flow and differentiable bundle adjustment", build, version, missing)
+
+
+_CLASSICAL = {
+    system.name: system
+    for system in (
+        System(
+            "klt-pnp",
+            "MIT",
+            "KLT tracks, five-point essential matrix, triangulation, PnP (OpenCV)",
+            _klt_pnp,
+            lambda: dvo.__version__,
+            lambda: None,
+        ),
+        System(
+            "null",
+            "MIT",
+            "straight line at constant speed, no rotation, images unread",
+            _null,
+            lambda: dvo.__version__,
+            lambda: None,
+        ),
+    )
+}

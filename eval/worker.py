@@ -1,0 +1,24 @@
+"""One run in a process of its own: ``python -m eval.worker JOB.json`` (started by :func:`eval.predict.predict`)."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+
+from eval.predict import Job, predict_here
+from eval.sequences import Sequence
+
+
+def main(path: str) -> None:
+    """Do the job in the file; the prediction lies in the job's folder afterwards."""
+    entry = json.loads(Path(path).read_text(encoding="utf-8"))
+    job = Job(**{**entry, "sequence": Sequence(**entry["sequence"])})
+    cv2.setNumThreads(job.threads)
+    predict_here(job)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

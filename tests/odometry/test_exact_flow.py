@@ -1,0 +1,64 @@
+"""The tracker around a perfect network: what it loses then is its own fault."""
+
+import numpy as np
+import torch
+
+from dvo.data.frame import Frame
+from dvo.data.trajectory import Trajectory
+from dvo.geometry import se3
+from dvo.geometry.camera import Camera
+from dvo.geometry.projection import reproject
+from dvo.metrics import evaluate
+from dvo.nets.config import preset
+from dvo.nets.graph import build_graph
+from dvo.nets.patch_vo import PatchVO
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.protocol import Status
+from dvo.odometry.tracker import PatchOdometry
+from dvo.synth.clip import make_clip
+
+CONFIG = TrackerConfig(pixels=0, initial_motion=0.3, initial_parallax=0.3, keyframe_motion=2.0)
+
+
+class Perfect(PatchOdometry):
+    """Sees the true flow of every edge whose target lies in the image."""
+
+    def __init__(self, clip, config):
+        torch.manual_seed(0)
+        super().__init__(PatchVO(preset("tiny")), config)
+        self.clip = clip
+
+    def _revise(self):
+        window = self.window
+        graph = build_graph(window.ii, window.jj, window.kk)
+        edges = (graph.ii, graph.jj, graph.kk)
+        now = reproject(window.poses_cw[None], window.patches[None], window.intrinsics[None], *edges).coords
+        at = torch.tensor([round(f.timestamp * 10) for f in window.frames])
+        exact = window.patches[None].clone()
+        x, y = exact[0, :, 0, 1, 1].long() * 4, exact[0, :, 1, 1, 1].long() * 4
+        frame = at.repeat_interleave(self.config.patches)
+        exact[0, :, 2] = 1 / self.clip.depth[frame, y, x][:, None, None]
+        true = reproject(self.clip.poses_cw[at][None], exact, window.intrinsics[None], *edges)
+        target, centre = true.coords[0, :, 1, 1], now[0, :, 1, 1]
+        h, w = window.frames[0].levels[0].shape[:2]
+        seen = true.valid[0, :, 1, 1] & (target >= 0).all(-1) & (target[:, 0] < w) & (target[:, 1] < h)
+        return window.hidden, target - centre, seen[:, None].float().expand(-1, 2), centre
+
+
+def test_exact_flow_gives_the_exact_trajectory():
+    for index in (0, 2, 6):
+        clip = make_clip(21, index, frames=40, height=96, width=128, flow_range=(2.0, 4.0), sensor=False)
+        fx, fy, cx, cy = clip.intrinsics[0].tolist()
+        camera = Camera(fx, fy, cx, cy, 128, 96)
+        odometry = Perfect(clip, CONFIG)
+        states = []
+        for i, image in enumerate(clip.images):
+            frame = Frame(i, 0.1 * i, image.permute(1, 2, 0).contiguous().numpy(), camera)
+            states.append(odometry.track(frame).status)
+        result = odometry.finish()
+        truth = se3.inverse(clip.poses_cw.double()).numpy()
+        m = evaluate(result.trajectory, Trajectory(0.1 * np.arange(40), truth), rpe_gap=1)
+        assert states[-1] is Status.TRACKING
+        assert m.matched == 40
+        assert m.ate_percent < 1.0
+        assert m.rotation_error_ratio < 0.05

@@ -1,0 +1,90 @@
+"""The training objective: exact estimates cost nothing, and bundle adjustment of exact targets finds the motion."""
+
+import pytest
+import torch
+
+from dvo.ba.cold_start import damping_at
+from dvo.ba.layer import bundle_adjust
+from dvo.geometry import se3
+from dvo.geometry.projection import reproject
+from dvo.losses.pose import pose_errors
+from dvo.nets.patch_vo import UpdateState
+from dvo.nets.patchifier import patch_coordinates, random_centres
+from dvo.nets.schedule import full_graph
+from dvo.synth.clip import make_clip
+from train.objective import LossConfig, clip_losses, true_reprojection, truth_of
+
+PATCHES = 24
+
+
+def rendered(index, **options):
+    clip = make_clip(11, index, sensor=False, **options)
+    names = ("images", "depth", "poses_cw", "intrinsics")
+    return {name: torch.as_tensor(getattr(clip, name))[None] for name in names}
+
+
+def patches_of(truth, generator):
+    b, n, h, w = truth.inverse_depth.shape
+    centres = random_centres(n, PATCHES, h, w, generator)
+    return centres, patch_coordinates(centres, torch.ones(b, n * PATCHES), 3)
+
+
+def test_exact_estimates_cost_nothing():
+    truth = truth_of(rendered(0, frames=4, height=64, width=80), 4)
+    graph = full_graph(4, PATCHES, self_edges=False)
+    centres, patches = patches_of(truth, torch.Generator().manual_seed(0))
+    coords, _ = true_reprojection(truth, patches, graph, 4, 4.0)
+    state = UpdateState(graph, 4, truth.poses_cw, patches, coords, coords[:, :, 1, 1], torch.ones(1, len(graph), 2))
+    loss, measures = clip_losses([state] * 3, truth, LossConfig())
+    assert loss < 1e-3
+    assert measures["px<0.25"] == 1
+    assert measures["rotation_ratio"] < 1e-2
+
+
+def test_flow_mode_counts_the_target_alone():
+    truth = truth_of(rendered(0, frames=4, height=64, width=80), 4)
+    graph = full_graph(4, PATCHES, self_edges=False)
+    _, patches = patches_of(truth, torch.Generator().manual_seed(0))
+    coords, _ = true_reprojection(truth, patches, graph, 4, 4.0)
+    off = coords[:, :, 1, 1] + torch.tensor([3.0, 4.0])
+    state = UpdateState(graph, 4, se3.identity(1, 4), patches, coords + 1, off, torch.ones(1, len(graph), 2))
+    loss, measures = clip_losses([state], truth, LossConfig(target=0.1), "flow")
+    torch.testing.assert_close(loss, torch.tensor(0.5), atol=1e-4, rtol=1e-4)  # 0.1 x 5 px
+    assert "rotation_deg" not in measures
+
+
+@pytest.mark.parametrize("clips", [pytest.param(20, id="20"), pytest.param(50, id="50", marks=pytest.mark.slow)])
+def test_exact_targets_from_identity_find_the_rotation(clips):
+    """Inverse depths start at 1: at least 90 % of rendered clips end with a rotation error under 2 % of the motion."""
+    graph = full_graph(8, PATCHES, self_edges=False)
+    good = 0
+    for index in range(clips):
+        truth = truth_of(rendered(index), 4)
+        _, patches = patches_of(truth, torch.Generator().manual_seed(index))
+        coords, valid = true_reprojection(truth, patches, graph, 8, 4.0)
+        poses = se3.identity(1, 8)
+        h, w = truth.inverse_depth.shape[-2:]
+        for update in range(10):
+            poses, patches = bundle_adjust(
+                poses, patches, truth.intrinsics, coords[:, :, 1, 1], valid[:, :, 1, 1, None].float().expand(-1, -1, 2),
+                graph.ii, graph.jj, graph.kk, bounds=(w, h), damping=damping_at(update),
+            )  # fmt: skip
+        error = pose_errors(poses, truth.poses_cw).rotation
+        motion = pose_errors(se3.identity(1, 8), truth.poses_cw).rotation
+        good += bool(error < 0.02 * motion)
+    assert good >= 0.9 * clips
+
+
+def test_truth_lies_on_the_feature_grid():
+    """Feature (u, v) is centred on image pixel (4u, 4v), and a patch projected to its own frame stays put."""
+    batch = rendered(1, frames=3, height=64, width=80)
+    truth = truth_of(batch, 4)
+    torch.testing.assert_close(1 / truth.inverse_depth[0, 1, 3, 5], batch["depth"][0, 1, 12, 20])
+    graph = full_graph(3, PATCHES, self_edges=True)
+    centres, patches = patches_of(truth, torch.Generator().manual_seed(0))
+    coords, valid = true_reprojection(truth, patches, graph, 3, 4.0)
+    own = graph.ii == graph.jj
+    torch.testing.assert_close(coords[:, own].movedim(-1, 2), patches[:, graph.kk[own], :2], atol=1e-3, rtol=0)
+    assert valid[:, own].all()
+    there = reproject(truth.poses_cw, patches, truth.intrinsics, graph.ii, graph.jj, graph.kk).coords
+    assert there.shape == coords.shape

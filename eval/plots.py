@@ -11,7 +11,7 @@ from dvo.metrics import align_trajectory, associate, relative_rotation_errors
 from dvo.viz.plot import INK, PAPER, plan_axes, with_gaps
 from eval.sequences import Sequence, Suite
 
-COLORS = ("#e4572e", "#4a6fa5", "#8a8f98", "#2a9d5c", "#b5679e", "#c79a2b")
+COLORS = ("#e4572e", "#4a6fa5", "#c79a2b", "#2a9d5c", "#b5679e", "#56b4c8")
 
 
 def plot_sequence(
@@ -31,7 +31,7 @@ def plot_sequence(
     plan, error = figure.subplots(1, 2, width_ratios=(1.15, 1))
     first, second = plan_axes(groundtruth.positions)
     start = groundtruth.timestamps[0]
-    plan.plot(*groundtruth.positions[:, [first, second]].T, color=INK, lw=3.2, alpha=0.55, label="ground truth")
+    plan.plot(*groundtruth.positions[:, [first, second]].T, color="#aab1ba", lw=4, label="ground truth")
     plan.plot(*groundtruth.positions[0, [first, second]], "o", color=INK, ms=7, zorder=5)
     by_rotation = sequence.judged_by == "rpe_rot_deg"
     for position, (name, estimate) in enumerate(estimates.items()):

@@ -15,7 +15,7 @@ import numpy as np
 from eval.score import COLUMNS, Row
 from eval.sequences import Suite
 
-# Column of the table, field of the row, digits. ATE and RPE are missing for a failed run, which then counts as infinite.
+# Column of the table, field of the row, digits.
 FIGURES = (
     ("ATE %", "ate_percent", 2),
     ("ATE m", "ate_rmse", 3),
@@ -82,6 +82,7 @@ def protocol(suite: Suite, rows: list[Row], threads: int, device: str) -> str:
     }
     worked = "; ".join(f"{name}: {size}" for name, size in sizes.items() if size)
     turned = [sequence.name for sequence in suite.sequences if sequence.judged_by == "rpe_rot_deg"]
+    judges = "by ATE in percent of the path" + (f", {', '.join(turned)} by RPE in degrees" if turned else "")
     sentences = [
         f"**{suite.label}** (suite `{suite.name}`).",
         f"Alignment {suite.alignment}; every {suite.stride}. image fed;"
@@ -89,7 +90,7 @@ def protocol(suite: Suite, rows: list[Row], threads: int, device: str) -> str:
         else f"Alignment {suite.alignment}; stride 1;",
         f"seeds {', '.join(map(str, seeds))}: median [min–max].",
         f"RPE over {suite.rpe_gap} frames, median over the sequence; errors by evo.",
-        f"Sequences are judged by ATE in percent of the path{', ' + ', '.join(turned) + ' by RPE in degrees' if turned else ''}.",
+        f"Sequences are judged {judges} (bold: best).",
         f"A run fails if it crashes, takes over {suite.time_limit:g} s, leaves poses that are not finite or poses for "
         f"fewer than {100 * suite.lost_below:g} % of the frames; failed runs count as infinite errors.",
         f"Working resolution: {worked}." if worked else "",

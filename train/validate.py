@@ -8,19 +8,28 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import torch
 
+from dvo.data.frame import Frame
 from dvo.data.source import open_source
+from dvo.data.trajectory import Trajectory
+from dvo.geometry import se3
+from dvo.geometry.camera import Camera
 from dvo.metrics import Metrics, evaluate
 from dvo.nets.patch_vo import PatchVO
 from dvo.nets.weights import load_weights
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.protocol import Odometry
 from dvo.odometry.tracker import PatchOdometry
+from dvo.synth.clip import make_clip
 from train.export import averaged_model
 
+VALIDATION_SEED = 900_001  # training seeds are small numbers
 SEQUENCES = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr1_rpy_60")
 
 
@@ -31,18 +40,30 @@ def data_root() -> Path:
 
 
 def track_sequence(
-    model: PatchVO, config: TrackerConfig, path: Path, seed: int, frames: int | None, device: str
+    odometry: Odometry, frames: Iterable[Frame], truth: Trajectory | None
 ) -> tuple[Metrics, float, int]:
     """Metrics (Sim(3); relative errors over a gap of 2 frames), frames per second, and frames lost."""
-    source = open_source(path)
-    odometry = PatchOdometry(model, config, seed=seed, device=device)
     start = time.perf_counter()
-    for frame in islice(source, frames):
+    for frame in frames:
         odometry.track(frame)
     result = odometry.finish()
     rate = result.frames_read / (time.perf_counter() - start)
-    assert source.groundtruth is not None
-    return evaluate(result.trajectory, source.groundtruth, rpe_gap=2), rate, result.frames_lost
+    assert truth is not None
+    return evaluate(result.trajectory, truth, rpe_gap=2), rate, result.frames_lost
+
+
+def rendered_frames(index: int, frames: int, height: int, width: int) -> tuple[list[Frame], Trajectory]:
+    """A rendered clip of the validation seed, as frames at 10 Hz, and its true trajectory."""
+    flow = (2.0 * width / 160, 8.0 * width / 160)
+    clip = make_clip(VALIDATION_SEED, index, frames=frames, height=height, width=width, flow_range=flow)
+    fx, fy, cx, cy = clip.intrinsics[0].tolist()
+    camera = Camera(fx, fy, cx, cy, width, height)
+    times = 0.1 * np.arange(frames)
+    images = clip.images.permute(0, 2, 3, 1).contiguous().numpy()
+    truth = se3.inverse(clip.poses_cw.double()).numpy()
+    return [Frame(i, t, image, camera) for i, (t, image) in enumerate(zip(times, images, strict=True))], Trajectory(
+        times, truth
+    )
 
 
 def main(arguments: list[str]) -> None:
@@ -50,6 +71,7 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m train validate", description=__doc__)
     parser.add_argument("weights", help="a training checkpoint (.ckpt, .pt), or weights by name or file")
     parser.add_argument("--frames", type=int, help="only the first frames of each sequence")
+    parser.add_argument("--rendered", type=int, default=0, help="number of rendered validation clips")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--sequences", nargs="*", default=SEQUENCES)
     parser.add_argument("--device", default="cpu")
@@ -68,12 +90,24 @@ def main(arguments: list[str]) -> None:
         settings[name] = type(settings[name])(float(value))
     config = TrackerConfig.from_dict(settings)
     torch.set_grad_enabled(False)
+    def ready(seed: int) -> Odometry:
+        return PatchOdometry(model, config, seed=seed, device=options.device)
+
     for name in options.sequences:
         for seed in range(options.seeds):
-            m, rate, lost = track_sequence(model, config, data_root() / name, seed, options.frames, options.device)
+            source = open_source(data_root() / name)
+            m, rate, lost = track_sequence(ready(seed), islice(source, options.frames), source.groundtruth)
             print(
                 f"{name:24s} seed {seed} ATE {m.ate_percent:7.2f} % of {m.path_length:6.2f} m  RPE rot "
                 f"{m.rpe_rot_deg:6.3f} deg  rotation error/motion {m.rotation_error_ratio:5.3f}  scale drift "
                 f"{m.scale_drift:+.2f}  lost {lost}  {rate:5.1f} fps",
                 flush=True,
             )
+    found = []
+    for index in range(options.rendered):
+        frames, truth = rendered_frames(index, 40, 240, 320)
+        m, _, _ = track_sequence(ready(0), frames, truth)
+        found.append((m.ate_percent, m.rotation_error_ratio))
+        print(f"rendered clip {index}: ATE {m.ate_percent:.2f} %, rotation error/motion {m.rotation_error_ratio:.3f}")
+    if found:
+        print("rendered, median: ATE {:.2f} %, rotation error/motion {:.3f}".format(*np.nanmedian(found, axis=0)))

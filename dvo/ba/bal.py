@@ -2,10 +2,10 @@
 
 Two text formats are told apart by their length:
 
-* BAL (Agarwal et al., "Bundle Adjustment in the Large", 2010): per camera an angle-axis rotation, a translation, f, k1, k2;
-  the camera looks down its negative z axis and measures y upwards from the image centre.
-* the one of Ortiz et al. ("Bundle Adjustment on a Graph Processor", 2020): fx fy cx cy once; per camera a translation and
-  an angle-axis rotation, world to camera, z forward.
+* BAL (Agarwal et al., "Bundle Adjustment in the Large", 2010): per camera an angle-axis rotation, a translation, f,
+  k1, k2; the camera looks down its negative z axis and measures y upwards from the image centre.
+* the one of Ortiz et al. ("Bundle Adjustment on a Graph Processor", 2020): fx fy cx cy once; per camera a translation
+  and an angle-axis rotation, world to camera, z forward.
 """
 
 from __future__ import annotations

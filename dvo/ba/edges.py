@@ -64,7 +64,8 @@ def plan_edges(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) ->
         return EdgePlan(frames, patches, none, none, none, none, none.view(0, 1).bool(), none)
     by_pair, order = (ii * frames + jj).sort(stable=True)
     pairs, count = torch.unique_consecutive(by_pair, return_counts=True)
-    # Groups as long as the longest pair if pairs are alike; else shorter, so that at most two thirds of the places are empty.
+    # Groups as long as the longest pair if pairs are alike; else shorter, so that at most two thirds of the places
+    # are empty.
     size = min(int(count.max()), max(4, -(-2 * edges // len(pairs))), CHUNK)
     needed = torch.div(count + size - 1, size, rounding_mode="floor")
     pair = torch.arange(len(pairs), device=device)

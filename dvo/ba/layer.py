@@ -1,10 +1,10 @@
 """The differentiable dense bundle adjustment layer.
 
-Unknowns are camera poses and one inverse depth per patch; measurements are where each patch centre is seen in other frames.
-Residual of an edge (i, j, k): ``r = target - project(T_j T_i^-1 backproject(patch k))``, weighted by a 2-vector. Each
-iteration is a damped Gauss-Newton step without acceptance test, hence differentiable from end to end: linearise with
-analytic Jacobians, eliminate the depths, solve for the poses, substitute back, retract.
-(Tang and Tan, "BA-Net", 2019; Teed et al., "Deep Patch Visual Odometry", 2023.)
+Unknowns are camera poses and one inverse depth per patch; measurements are where each patch centre is seen in other
+frames. Residual of an edge (i, j, k): ``r = target - project(T_j T_i^-1 backproject(patch k))``, weighted by a
+2-vector. Each iteration is a damped Gauss-Newton step without acceptance test, hence differentiable from end to end:
+linearise with analytic Jacobians, eliminate the depths, solve for the poses, substitute back, retract. (Tang and
+Tan, "BA-Net", 2019; Teed et al., "Deep Patch Visual Odometry", 2023.)
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from torch import Tensor
 
 from dvo.ba.edges import EdgePlan, free_slots, plan_edges
 from dvo.ba.normal_equations import MARGIN, Gate
-from dvo.ba.step import BADamping, GaussNewtonStep, StepSetting
+from dvo.ba.setting import BADamping, StepSetting
+from dvo.ba.step import GaussNewtonStep
 from dvo.geometry import se3
 from dvo.geometry.precision import full_precision
 

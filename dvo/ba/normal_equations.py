@@ -1,10 +1,11 @@
 """From edges to normal equations: residuals, analytic Jacobians, and their sums by frame and by patch.
 
-Everything is in normalised camera coordinates of the target frame; the focal lengths enter with the weights. The Jacobian by
-the source pose is ``J_i = -J_j Ad(G_ij)``, and the adjoint depends on the frame pair only, so that the blocks of the source
-frame are made from the sums over a pair rather than from a second Jacobian of each edge.
+Everything is in normalised camera coordinates of the target frame; the focal lengths enter with the weights. The
+Jacobian by the source pose is ``J_i = -J_j Ad(G_ij)``, and the adjoint depends on the frame pair only, so that the
+blocks of the source frame are made from the sums over a pair rather than from a second Jacobian of each edge.
 
-Shapes: ``B`` batch, ``G`` groups of ``M`` places (see :mod:`dvo.ba.edges`), ``P`` pairs, ``K`` patches, ``n`` free frames.
+Shapes: ``B`` batch, ``G`` groups of ``M`` places (see :mod:`dvo.ba.edges`), ``P`` pairs, ``K`` patches, ``n`` free
+frames.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def relative_motion(poses_cw: Tensor, plan: EdgePlan) -> tuple[Tensor, Tensor]:
 
 
 def view(rotation: Tensor, t: Tensor, rays: Tensor, inverse_depth: Tensor) -> View:
-    """Move ``rays (B, G, 3, M)`` = (x, y, 1) with ``inverse_depth (B, G, 1, M)`` by the motion of each group, and project."""
+    """Move ``rays (B, G, 3, M)`` = (x, y, 1) with ``inverse_depth (B, G, 1, M)`` by each group's motion; project."""
     moved = rotation @ rays + t * inverse_depth
     z = moved[..., 2:, :]
     seen = z > MIN_Z_VALID
@@ -83,6 +84,13 @@ def counts(v: View, residual: Tensor, gate: Gate, part: slice) -> Tensor:
     if gate.offset is not None and gate.reach is not None:
         use &= (torch.addcmul(gate.offset[:, part], v.xy, focal).abs() < gate.reach).all(-2, keepdim=True)
     return use
+
+
+def pose_jacobian(v: View) -> tuple[Tensor, ...]:
+    """Rows of ``J_j``: for each of the six tangent components the x and the y axis; 12 rows ``(B, G, ., M)`` in all."""
+    x, y = v.xy.split(1, -2)
+    o, xy, square = torch.zeros_like(x), x * y, v.xy * v.xy + 1
+    return v.h, o, o, v.h, -v.h * v.xy, -xy, -square[..., 1:, :], square[..., :1, :], xy, -y, x
 
 
 def accumulate(
@@ -136,11 +144,8 @@ def accumulate(
         w = torch.where(use, weight[:, part], 0.0)
         residual = torch.where(use, residual, 0.0)
         j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
-        x, y = v.xy.split(1, -2)
-        o, xy, square = torch.zeros_like(x), x * y, v.xy * v.xy + 1
         # Rows: the six columns of J_j, then the residual, then J_d; each for the x and the y axis.
-        rows = (v.h, o, o, v.h, -v.h * v.xy, -xy, -square[..., 1:, :], square[..., :1, :], xy, -y, x, residual, j_d)
-        f = torch.cat(rows, -2)
+        f = torch.cat((*pose_jacobian(v), residual, j_d), -2)
         if pose_part:
             flat = f.view(*f.shape[:2], 8, 2 * plan.size)
             products = (flat[..., :6, :] * w.flatten(-2)[..., None, :]) @ flat[..., :7, :].mT

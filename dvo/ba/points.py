@@ -1,7 +1,7 @@
 """Bundle adjustment of camera poses and 3-D points: Levenberg-Marquardt with acceptance of steps.
 
-The second entry to the Schur solver of this room: landmarks are points with 3x3 blocks instead of inverse depths. Intrinsics
-and distortion are held. Not differentiable; for maps and for problems from files.
+The second entry to the Schur solver of this room: landmarks are points with 3x3 blocks instead of inverse depths.
+Intrinsics and distortion are held. Not differentiable; for maps and for problems from files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dvo.ba.schur import eliminate
 from dvo.geometry import se3, so3
 
 MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32
-"""Bounds of what the damping is a fraction of, as in Ceres: a direction that nothing measures is damped all the same."""
+"""Bounds of what the damping is a fraction of, as in Ceres: what nothing measures is damped all the same."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def residuals(problem: PointProblem) -> Tensor:
 
 
 def _project(problem: PointProblem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Residuals ``(O, 2)``, points in the camera ``(O, 3)``, and d pixel / d point ``(O, 2, 3)``, rotations ``(C, 3, 3)``."""
+    """Residuals ``(O, 2)``, points in the camera ``(O, 3)``, d pixel / d point ``(O, 2, 3)``, R ``(C, 3, 3)``"""
     rotation = so3.matrix(problem.poses_cw[:, 3:])
     seen = (rotation[problem.camera] @ problem.points[problem.point][..., None])[..., 0]
     seen = seen + problem.poses_cw[problem.camera, :3]
@@ -61,7 +61,7 @@ def _project(problem: PointProblem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _normal_equations(problem: PointProblem, fixed: int) -> tuple[Tensor, ...]:
-    """``h_pp (1, 6n, 6n)``, ``h_pl (1, 6n, K, 3)``, ``h_ll (1, K, 3, 3)``, ``g_p``, ``g_l`` of the free cameras and all points."""
+    """``h_pp (1, 6n, 6n)``, ``h_pl (1, 6n, K, 3)``, ``h_ll (1, K, 3, 3)``, ``g_p (1, 6n)``, ``g_l (1, K, 3)``."""
     residual, seen, by_point, rotation = _project(problem)
     cameras, points = len(problem.poses_cw), len(problem.points)
     j_p = torch.cat((by_point, -by_point @ so3.hat(seen)), -1)  # left perturbation: d point = tau + phi x point
@@ -88,8 +88,8 @@ def solve_points(
 ) -> PointSolution:
     """Minimise half the sum of squared reprojection errors over poses and points.
 
-    Damping is a fraction of the Hessian's diagonal and follows the gain ratio (Nielsen 1999); a step that does not lower the
-    cost is undone. The gauge is left to the damping unless cameras are fixed.
+    Damping is a fraction of the Hessian's diagonal and follows the gain ratio (Nielsen 1999); a step that does not
+    lower the cost is undone. The gauge is left to the damping unless cameras are fixed.
 
     Args:
         fixed: how many leading cameras stay.
@@ -98,9 +98,11 @@ def solve_points(
         damping: at the start.
     """
     cost = initial = _cost(problem)
-    growth, converged, tried = 2.0, False, 0
+    growth, converged = 2.0, False
+    tried = 0
     system = _normal_equations(problem, fixed)
-    for tried in range(1, max_iterations + 1):
+    while tried < max_iterations:
+        tried += 1
         h_pp, h_pl, h_ll, g_p, g_l = system
         d_p = damping * h_pp.diagonal(dim1=1, dim2=2).clamp(MIN_DIAGONAL, MAX_DIAGONAL)
         d_l = damping * h_ll.diagonal(dim1=2, dim2=3).clamp(MIN_DIAGONAL, MAX_DIAGONAL)

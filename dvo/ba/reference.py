@@ -1,7 +1,7 @@
 """The plain twin of :mod:`dvo.ba.layer`: dense normal equations from explicit Jacobians. Slow; the specification.
 
-Nothing here is shared with the fast path but the Lie algebra: the residual is written out edge by edge in pixels, ``J_i`` and
-``J_j`` are formed for every edge, and poses and depths are solved together in one dense system. As there, the diagonal that the damping is relative to counts as a constant.
+Nothing here is shared with the fast path but the Lie algebra: the residual is written out edge by edge in pixels,
+``J_i`` and ``J_j`` are formed for every edge, and poses and depths are solved together in one dense system.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dvo.geometry import se3
 def residuals_and_jacobians(
     poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor, kk: Tensor, targets: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Per edge: residual ``(B, E, 2)``, ``J_i, J_j (B, E, 2, 6)``, ``J_d (B, E, 2)``, ``Z (B, E)``, pixel ``(B, E, 2)``."""
+    """Residuals ``(B, E, 2)``, ``J_i, J_j (B, E, 2, 6)``, ``J_d (B, E, 2)``, ``Z (B, E)``, pixels ``(B, E, 2)``."""
     centre = patches.shape[-1] // 2
     x, y, d = patches[:, kk, :, centre, centre].unbind(-1)
     fx, fy, cx, cy = intrinsics[:, ii].unbind(-1)
@@ -82,14 +82,12 @@ def bundle_adjust_reference(
         e = jac_p.mT @ (w[..., None] * jac_l)
         v = (jac_p * (w * r)[..., None]).sum(1)
         if motion_only and not structure_only and free:
-            dp = torch.linalg.solve(
-                h_pp + torch.diag_embed(h_pp.diagonal(dim1=1, dim2=2).detach() * damping[1] + damping[0]), v
-            )
+            dp = torch.linalg.solve(h_pp + torch.diag_embed(h_pp.diagonal(dim1=1, dim2=2) * damping[1] + damping[0]), v)
         elif not structure_only and free:
             # Damping is defined on the reduced system, so its diagonal is needed before the joint one can be written.
             s = h_pp - e @ torch.linalg.solve(c, e.mT)
             joint = torch.cat((torch.cat((h_pp, e), -1), torch.cat((e.mT, c), -1)), -2)
-            extra = s.diagonal(dim1=1, dim2=2).detach() * damping[1] + damping[0]
+            extra = s.diagonal(dim1=1, dim2=2) * damping[1] + damping[0]
             joint = joint + torch.diag_embed(torch.cat((extra, torch.zeros_like(u)), -1))
             both = torch.linalg.solve(joint, torch.cat((v, u), -1))
             dp = both[:, :free]

@@ -3,8 +3,9 @@
     [ H_pp   H_pl ] [ dp ]   [ g_p ]
     [ H_pl^T H_ll ] [ dl ] = [ g_l ]
 
-``P`` pose unknowns are few, ``K`` landmarks are many and do not couple among themselves: ``H_ll`` has one ``m x m`` block per
-landmark (``m = 1`` for an inverse depth, 3 for a point). See Triggs et al., "Bundle adjustment - a modern synthesis", 6.1.
+``P`` pose unknowns are few, ``K`` landmarks are many and do not couple among themselves: ``H_ll`` has one ``m x m``
+block per landmark (``m = 1`` for an inverse depth, 3 for a point). See Triggs et al., "Bundle adjustment - a modern
+synthesis", 6.1.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ RETRIES = 6
 def factorise(s: Tensor) -> tuple[Tensor, Tensor]:
     """Cholesky factors of symmetric ``s (B, P, P)``, and which of them are good ``(B,)``.
 
-    Where the factorisation fails, damping of 1e-6 to 0.1 of the largest diagonal entry is tried; where that fails too, or
-    ``s`` is not finite, the factor is the identity.
+    Where the factorisation fails, damping of 1e-6 to 0.1 of the largest diagonal entry is tried; where that fails
+    too, or ``s`` is not finite, the factor is the identity.
     """
     factor, info = torch.linalg.cholesky_ex(s)
     ok = (info == 0) & torch.isfinite(factor).all(-1).all(-1)

@@ -25,8 +25,10 @@ class Clip(Protocol):
     """What is tracked: :class:`dvo.data.Source`, or the clip that the demo renders."""
 
     name: str
-    frame_count: int | None
     groundtruth: Trajectory | None
+
+    @property
+    def frame_count(self) -> int | None: ...
 
     @property
     def warnings(self) -> Sequence[str]: ...

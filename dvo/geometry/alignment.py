@@ -25,15 +25,17 @@ def align(source: Tensor | np.ndarray, target: Tensor | np.ndarray, mode: AlignM
         mode: ``none``; ``scale`` (about the common origin, no rotation, no translation); ``se3``; ``sim3``.
 
     Returns:
-        ``(8,)`` float64 similarity, see :mod:`dvo.geometry.sim3`. What the points do not determine is left alone: the scale
-        is 1 if either set has no extent, and of the rotations that lay one line over another the smallest is taken.
+        ``(8,)`` float64 similarity, see :mod:`dvo.geometry.sim3`. What the points do not determine is left alone: the
+        scale is 1 if either set has no extent, and of the rotations that lay one line over another the smallest is
+        taken.
 
     Raises:
         DvoError: shapes that differ, no points, numbers that are not finite, or an unknown mode.
     """
     x, y = (torch.as_tensor(p).detach().to("cpu", torch.float64) for p in (source, target))
     if mode not in get_args(AlignMode):
-        raise DvoError(f"unknown alignment {mode!r}", field="align", remedy=f"use one of {', '.join(get_args(AlignMode))}")
+        known = ", ".join(get_args(AlignMode))
+        raise DvoError(f"unknown alignment {mode!r}", field="align", remedy=f"use one of {known}")
     if x.shape != y.shape or x.dim() != 2 or x.shape[-1] != 3 or len(x) == 0:
         raise DvoError(f"cannot align points of shapes {tuple(x.shape)} and {tuple(y.shape)}", remedy="give two (N, 3)")
     if not bool(torch.isfinite(x).all() and torch.isfinite(y).all()):

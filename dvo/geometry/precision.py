@@ -10,10 +10,13 @@ import torch
 
 @contextmanager
 def full_precision(device: torch.device) -> Iterator[None]:
-    """Switch autocast and TF32 matrix products off: ten bits of mantissa are a pixel in a thousand."""
-    before = torch.get_float32_matmul_precision() if device.type == "cuda" else "highest"
-    if before != "highest":
-        torch.set_float32_matmul_precision("highest")
+    """Switch autocast and TF32 matrix products off: with ten bits of mantissa a pixel is lost in a thousand."""
+    matmul = torch.backends.cuda.matmul
+    name, exact = ("fp32_precision", "ieee") if hasattr(matmul, "fp32_precision") else ("allow_tf32", False)
+    before = getattr(matmul, name)
+    change = device.type == "cuda" and before != exact
+    if change:
+        setattr(matmul, name, exact)
     try:
         if torch.is_autocast_enabled(device.type):
             with torch.autocast(device.type, enabled=False):
@@ -21,5 +24,5 @@ def full_precision(device: torch.device) -> Iterator[None]:
         else:
             yield
     finally:
-        if before != "highest":
-            torch.set_float32_matmul_precision(before)
+        if change:
+            setattr(matmul, name, before)

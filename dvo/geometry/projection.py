@@ -1,8 +1,9 @@
 """Reprojection of patches from frame i into frame j, with analytic Jacobians at the patch centre.
 
-A pixel ``(x, y)`` with inverse depth ``d`` is the homogeneous point ``X = ((x - cx)/fx, (y - cy)/fy, 1, d)`` of frame i.
-In frame j it is ``X' = R X_{1..3} + t d`` with ``(R, t) = T_j T_i^-1``, that is, the true point scaled by ``d``, which stays
-finite for points at infinity (Teed et al., "Deep Patch Visual Odometry", 2023). Its third coordinate is ``Z``.
+A pixel ``(x, y)`` with inverse depth ``d`` is the homogeneous point ``X = ((x - cx)/fx, (y - cy)/fy, 1, d)`` of frame
+i. In frame j it is ``X' = R X_{1..3} + t d`` with ``(R, t) = T_j T_i^-1``, that is, the true point scaled by ``d``,
+which stays finite for points at infinity (Teed et al., "Deep Patch Visual Odometry", 2023). Its third coordinate is
+``Z``.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ class Reprojection:
         coords: ``(B, E, p, p, 2)`` pixels x, y in frame j.
         depth: ``(B, E, p, p)`` ``Z``, the depth in frame j over the depth in frame i.
         valid: ``(B, E, p, p)`` bool, ``Z > 0.2``.
-        jac_i, jac_j: ``(B, E, 2, 6)`` derivative of the centre pixel by a left perturbation ``[tau, phi]`` of ``T_cw[ii]``
-            and ``T_cw[jj]``; zero where the centre is not valid. None unless asked for.
+        jac_i, jac_j: ``(B, E, 2, 6)`` derivative of the centre pixel by a left perturbation ``[tau, phi]`` of
+            ``T_cw[ii]`` and ``T_cw[jj]``; zero where the centre is not valid. None unless asked for.
         jac_d: ``(B, E, 2, 1)`` the same by the inverse depth.
     """
 
@@ -71,7 +72,7 @@ def motion_matrices(poses_cw: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor
 
 
 def gather(table: Tensor, index: Tensor) -> Tensor:
-    """``table (B, N, C)`` at ``index (E,)`` of the second dimension. The sum in its backward is far faster over dimension 0."""
+    """``table (B, N, C)`` at ``index (E,)`` of dimension 1, over dimension 0: its backward is far faster."""
     b, n, c = table.shape
     if b > 1:
         index = (index + torch.arange(b, device=index.device)[:, None] * n).flatten()

@@ -1,7 +1,8 @@
 """Rigid motions as tensors ``(..., 7)``: ``tx ty tz qx qy qz qw``, unit quaternion.
 
 Tangent vectors are ``(..., 6)``: ``[tau, phi]``, translation first, ``phi`` in radians. Batch dimensions broadcast.
-The retraction is a left one: ``T <- Exp(xi) T``. Gradients are the Euclidean ones of autograd through the seven numbers.
+The retraction is a left one: ``T <- Exp(xi) T``. Gradients are the Euclidean ones of autograd through the seven
+numbers.
 Formulas: Sola et al., "A micro Lie theory for state estimation in robotics", appendix D.
 """
 
@@ -73,7 +74,7 @@ def relative(a: Tensor, b: Tensor) -> Tensor:
 
 
 def act(pose: Tensor, points: Tensor) -> Tensor:
-    """``R p + t`` on points ``(..., 3)``; batch dimensions broadcast (``pose[..., None, :]`` for many points a pose)."""
+    """``R p + t`` on points ``(..., 3)``; batch dimensions broadcast: ``pose[..., None, :]`` for many points."""
     return rotate(pose[..., 3:], points) + pose[..., :3]
 
 

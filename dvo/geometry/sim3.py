@@ -1,7 +1,8 @@
 """Similarities as tensors ``(..., 8)``: ``tx ty tz qx qy qz qw s``, unit quaternion, scale ``s > 0``.
 
-Tangent vectors are ``(..., 7)``: ``[tau, phi, sigma]``, ``s = exp(sigma)``. A point goes to ``s R p + t``. Batch dimensions
-broadcast; the retraction is a left one. (Strasdat, "Local accuracy and global consistency for efficient visual SLAM", 2012.)
+Tangent vectors are ``(..., 7)``: ``[tau, phi, sigma]``, ``s = exp(sigma)``. A point goes to ``s R p + t``. Batch
+dimensions broadcast; the retraction is a left one. (Strasdat, "Local accuracy and global consistency for efficient
+visual SLAM", 2012.)
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ from torch import Tensor
 
 from dvo.geometry import se3, so3
 
-# The left Jacobian is the integral of s^u R^u over u in [0, 1]. Its closed form divides by differences that vanish at small
-# angles and at small log-scales; sixteen Gauss nodes give it to the last digit for all angles and |sigma| < 10 without a branch.
+# The left Jacobian is the integral of s^u R^u over u in [0, 1]. Its closed form divides by differences that vanish at
+# small angles and at small log-scales; sixteen Gauss nodes give it to the last digit for all angles and |sigma| < 10
+# without a branch.
 _NODES, _NODE_WEIGHTS = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(16))
 
 
@@ -66,7 +68,7 @@ def act(sim: Tensor, points: Tensor) -> Tensor:
 
 
 def act_on_pose(sim: Tensor, poses_wc: Tensor) -> Tensor:
-    """Camera-to-world poses ``(..., 7)`` in the transformed world: the centre is moved and scaled, the camera only turned."""
+    """Camera-to-world poses ``(..., 7)`` in the new world: the centre is moved and scaled, the camera only turned."""
     return torch.cat((act(sim, poses_wc[..., :3]), so3.multiply(sim[..., 3:7], poses_wc[..., 3:])), -1)
 
 

@@ -1,7 +1,8 @@
 """Unit quaternions ``(..., 4)`` in the order ``qx qy qz qw`` and rotation vectors ``(..., 3)`` in radians.
 
 Plain functions on tensors of any batch shape; batch dimensions broadcast. Every branch is taken with ``torch.where`` on
-inputs made safe beforehand, so that values and gradients are finite at the identity, at ``q = -identity`` and at half a turn.
+inputs made safe beforehand, so that values and gradients are finite at the identity, at ``q = -identity`` and at half
+a turn.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ SMALL = 1e-3
 
 
 # A product of quaternions, the matrix of one, and the matrix of a cross product are fixed linear maps of the (pairs of)
-# numbers. Written as one matrix product they take a tenth of the calls, which is what counts on the few poses of a window.
+# numbers. Written as one matrix product they take a tenth of the calls, which is what counts on the few poses of a
+# window.
 _MULTIPLY = torch.zeros(4, 4, 4)  # [a, b, out]
 for _a, _b, _out, _sign in (
     *((3, 0, 0, 1), (0, 3, 0, 1), (1, 2, 0, 1), (2, 1, 0, -1), (3, 1, 1, 1), (0, 2, 1, -1), (1, 3, 1, 1), (2, 0, 1, 1)),

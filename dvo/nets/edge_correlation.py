@@ -60,7 +60,7 @@ class EdgeCorrelation:
             slots: of the edges.
             features: patch features, pixels last.
             maps: of the frames, at this level.
-            kk, jj: patch and target frame.
+            kk, jj: patch, and index of the target frame among the maps.
         """
         e = len(slots)
         at = coords.reshape(e, self.pixels, 2) / self.scale

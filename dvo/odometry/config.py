@@ -41,7 +41,7 @@ class TrackerConfig:
     initial_updates: int = 12
     final_updates: int = 8
     updates: int = 1
-    initial_motion: float = 1.0
+    initial_motion: float = 0.5
     initial_parallax: float = 1.0
     keyframe_motion: float = 5.0
     keyframe_index: int = 4

@@ -21,7 +21,6 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.nets.edge_correlation import EdgeCorrelation
-from dvo.nets.graph import build_graph
 from dvo.nets.patch_vo import PatchVO
 from dvo.nets.patchifier import normalise_images, patch_coordinates, pool_levels, random_centres
 from dvo.nets.weights import load_weights
@@ -76,6 +75,7 @@ class PatchOdometry:
             EdgeCorrelation(scale, c.patch_size**2, c.radius, 20 if scale == 1 else 16, self.device)
             for scale in c.pyramid
         ]
+        self._maps: list[Tensor] = []  # (slots, h, w, C) for each level
         self._records: list[_Record] = []
         self._settled: dict[int, np.ndarray] = {}
         self._points: list[np.ndarray] = []
@@ -174,19 +174,29 @@ class PatchOdometry:
         h, w = features.matching.shape[-2:]
         centres = random_centres(1, config.patches, h, w, self._generator).to(self.device)
         matching, context = net.patchify.cut(features, centres)
-        levels = [level[0, 0].permute(1, 2, 0).contiguous() for level in
-                  pool_levels(features.matching, net.config.pyramid)]  # fmt: skip
+        slot = self.window.free_slot()
+        for index, level in enumerate(pool_levels(features.matching, net.config.pyramid)):
+            self._keep_map(index, slot, level[0, 0].permute(1, 2, 0))
         x, y = (centres[0, 0] * net.config.STRIDE).unbind(-1)
         colors = rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu()
         intrinsics = torch.tensor(camera.intrinsics / net.config.STRIDE, dtype=torch.float32, device=self.device)
         keyframe = Keyframe(
-            self._count, frame.timestamp, levels, matching[0], context[0], colors, intrinsics
+            self._count, frame.timestamp, slot, matching[0], context[0], colors, intrinsics
         )
         self._count += 1
         depth = torch.ones(1, config.patches, device=self.device)
         if self._initialised:
             depth *= self.window.patches[-3 * config.patches :, 2, 0, 0].median()
         return keyframe, patch_coordinates(centres, depth, net.config.patch_size)[0]
+
+    def _keep_map(self, index: int, slot: int, level: Tensor) -> None:
+        """Write a feature map ``(h, w, C)`` into its place; the store grows while the window fills."""
+        if index == len(self._maps):
+            self._maps.append(level.new_empty(0, *level.shape))
+        have = len(self._maps[index])
+        if slot >= have:
+            self._maps[index] = torch.cat([self._maps[index], level.new_empty(slot + 1 - have, *level.shape)])
+        self._maps[index][slot] = level
 
     def _connect(self) -> None:
         """Join recent patches with the newest frame, and its patches with recent frames."""
@@ -204,17 +214,17 @@ class PatchOdometry:
     def _revise(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Run the network on all edges: hidden state, flow revision, confidence, current patch centres."""
         window, net = self.window, self.model
-        graph = build_graph(window.ii, window.jj, window.kk)
+        graph = window.graph
         coords = reproject(
             window.poses_cw[None], window.patches[None], window.intrinsics[None], graph.ii, graph.jj, graph.kk
         ).coords
         frames = window.frames
-        levels = [torch.stack([f.levels[i] for f in frames]) for i in range(len(net.config.pyramid))]
         matching = torch.cat([f.matching for f in frames]).flatten(2)
         context = torch.cat([f.context for f in frames])
+        slots = torch.tensor([f.slot for f in frames], device=self.device)[graph.jj]
         correlation = [
-            cache.lookup(coords[0], window.slots, matching, level, graph.kk, graph.jj)
-            for cache, level in zip(self._correlations, levels, strict=True)
+            cache.lookup(coords[0], window.slots, matching, level, graph.kk, slots)
+            for cache, level in zip(self._correlations, self._maps, strict=True)
         ]
         hidden, delta, weights = net.update(window.hidden[None], context[graph.kk][None], [level[None] for level in correlation], graph)
         centre = net.config.patch_size // 2
@@ -225,7 +235,7 @@ class PatchOdometry:
         window, config = self.window, self.config
         window.hidden, delta, window.weights, centres = self._revise()
         n = len(window)
-        height, width = window.frames[0].levels[0].shape[:2]
+        height, width = self._maps[0].shape[1:3]
         fixed = max(1, n - config.optimisation) if self._initialised else 1
         poses, patches = bundle_adjust(
             window.poses_cw[None],
@@ -272,7 +282,7 @@ class PatchOdometry:
         """Solve the first window from nothing with the flow as now seen, and keep what explains it better."""
         window = self.window
         _, delta, weights, centres = self._revise()
-        height, width = window.frames[0].levels[0].shape[:2]
+        height, width = self._maps[0].shape[1:3]
         seen = ((centres + delta)[None], weights[None], window.ii, window.jj, window.kk)
         intrinsics = window.intrinsics[None]
         poses, patches, cost = solve_from_nothing(window.patches[None], intrinsics, *seen, bounds=(width, height))

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from dvo.nets.graph import PatchGraph, build_graph
+
 
 @dataclass
 class Keyframe:
@@ -19,7 +21,7 @@ class Keyframe:
     Attributes:
         identifier: running number of the keyframe, never reused.
         timestamp: seconds.
-        levels: channels-last matching features ``(h, w, C)``, one a scale.
+        slot: where the feature maps of the frame lie.
         matching: ``(M, C, p, p)`` features of its patches.
         context: ``(M, D)``.
         colors: ``(M, 3)`` uint8.
@@ -28,7 +30,7 @@ class Keyframe:
 
     identifier: int
     timestamp: float
-    levels: list[Tensor]
+    slot: int
     matching: Tensor
     context: Tensor
     colors: Tensor
@@ -48,6 +50,7 @@ class Window:
         hidden: ``(E, D)``.
         weights: ``(E, 2)`` confidence of the last update.
         slots: ``(E,)`` where caches keep what belongs to an edge; the number stays with the edge for its life.
+        graph: index structure of the edges, built when first asked for after a change.
     """
 
     per_frame: int
@@ -59,6 +62,7 @@ class Window:
     kk: Tensor
     slots: Tensor
     frames: list[Keyframe] = field(default_factory=list)
+    _graph: PatchGraph | None = None
 
     @classmethod
     def empty(cls, per_frame: int, patch_size: int, hidden: int, device: torch.device) -> Window:
@@ -81,6 +85,17 @@ class Window:
         """``(n, 4)``."""
         return torch.stack([frame.intrinsics for frame in self.frames])
 
+    @property
+    def graph(self) -> PatchGraph:
+        if self._graph is None:
+            self._graph = build_graph(self.ii, self.jj, self.kk)
+        return self._graph
+
+    def free_slot(self) -> int:
+        """The lowest number that no frame of the window has."""
+        used = {frame.slot for frame in self.frames}
+        return next(slot for slot in range(len(used) + 1) if slot not in used)
+
     def append(self, frame: Keyframe, pose_cw: Tensor, patches: Tensor) -> None:
         self.frames.append(frame)
         self.poses_cw = torch.cat([self.poses_cw, pose_cw[None]])
@@ -88,6 +103,7 @@ class Window:
 
     def connect(self, kk: Tensor, jj: Tensor) -> Tensor:
         """Add edges with an empty state; returns their slots, the lowest free ones."""
+        self._graph = None
         count = len(kk)
         free = torch.ones(len(self.slots) + count, dtype=torch.bool, device=kk.device)
         used = self.slots[self.slots < len(free)]
@@ -101,6 +117,7 @@ class Window:
 
     def keep(self, mask: Tensor) -> None:
         """Drop the edges where ``mask`` is False."""
+        self._graph = None
         self.kk, self.jj = self.kk[mask], self.jj[mask]
         self.hidden, self.weights, self.slots = self.hidden[mask], self.weights[mask], self.slots[mask]
 

@@ -1,4 +1,4 @@
-"""Training clips and long sequences: scene, path, intrinsics and sensor drawn from a seed.
+"""Training clips: scene, path, intrinsics and sensor drawn from a seed.
 
 A clip is a few frames whose mean induced flow between neighbours is a number drawn from a range, as DPVO samples its
 training data (REFERENCE 1.12), with depth normalised to median 1.
@@ -18,7 +18,8 @@ from dvo.synth.paths import Path, find_start, random_path
 from dvo.synth.poses import compose, inverse, split
 from dvo.synth.renderer import render, render_depth
 from dvo.synth.scene import Scene
-from dvo.synth.sensor import Sensor, expose, random_sensor
+from dvo.synth.sensor import Sensor, expose, random_intrinsics, random_sensor
+from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.synth.textures import texture_pool
 
 Array = np.ndarray
@@ -42,16 +43,6 @@ class Clip:
     intrinsics: torch.Tensor
 
 
-def random_intrinsics(rng: np.random.Generator, height: int, width: int) -> Array:
-    """``(4,)`` fx fy cx cy: horizontal field of view 40-100 degrees, slightly off centre, slightly anisotropic."""
-    view = np.deg2rad(rng.uniform(40, 100))
-    fx = 0.5 * width / np.tan(view / 2)
-    fy = fx * np.exp(rng.normal(0, 0.01))
-    cx = (width - 1) / 2 + np.clip(rng.normal(0, 0.012), -0.04, 0.04) * width
-    cy = (height - 1) / 2 + np.clip(rng.normal(0, 0.012), -0.04, 0.04) * height
-    return np.array([fx, fy, cx, cy])
-
-
 def induced_flow(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Array, Array]:
     """Mean flow and visible share between neighbouring frames, by depth and pose.
 
@@ -62,18 +53,24 @@ def induced_flow(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Arra
     Returns:
         ``(N-1,)`` mean flow in pixels over pixels that stay in view, ``(N-1,)`` share of pixels that do.
     """
+    flow, inside = flow_field(depth, poses_wc, intrinsics)
+    length = np.where(inside, np.hypot(flow[..., 0], flow[..., 1]), 0)
+    count = inside.sum((1, 2))
+    return length.sum((1, 2)) / np.maximum(count, 1), count / inside[0].size
+
+
+def flow_field(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Array, Array]:
+    """Flow from each frame to the next ``(N-1, h, w, 2)`` in pixels, and where it stays in view ``(N-1, h, w)``."""
     _, h, w = depth.shape
     fx, fy, cx, cy = intrinsics
     y, x = np.mgrid[:h, :w]
-    ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones((h, w))], -1)
     r, t = split(compose(inverse(poses_wc[1:]), poses_wc[:-1]))
-    points = np.einsum("nij,nhwj->nhwi", r, ray * depth[:-1, ..., None]) + t[:, None, None]
-    z = np.where(points[..., 2] > 1e-6, points[..., 2], np.inf)
-    u, v = fx * points[..., 0] / z + cx, fy * points[..., 1] / z + cy
-    inside = (points[..., 2] > 1e-6) & (u > -0.5) & (u < w - 0.5) & (v > -0.5) & (v < h - 0.5) & (depth[:-1] > 0)
-    length = np.where(inside, np.hypot(u - x, v - y), 0)
-    count = inside.sum((1, 2))
-    return length.sum((1, 2)) / np.maximum(count, 1), count / (h * w)
+    ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones((h, w))])
+    points = (r @ ray.reshape(3, -1)).reshape(-1, 3, h, w) * depth[:-1, None] + t[:, :, None, None]
+    z = np.where(points[:, 2] > 1e-6, points[:, 2], np.inf)
+    u, v = fx * points[:, 0] / z + cx, fy * points[:, 1] / z + cy
+    inside = (points[:, 2] > 1e-6) & (u > -0.5) & (u < w - 0.5) & (v > -0.5) & (v < h - 0.5) & (depth[:-1] > 0)
+    return np.stack([u - x, v - y], -1), inside
 
 
 @dataclass
@@ -210,7 +207,13 @@ def make_clip(
     rendering = render(scene, poses_wc, intrinsics, height, width, supersample=supersample, device=device)
     images = rendering.images
     if sensor:
-        images = expose(images, random_sensor(rng), rng)
+        camera = random_sensor(rng)
+        flow: torch.Tensor | None = None
+        if camera.shutter > 0:
+            field, _ = flow_field(rendering.depth.cpu().numpy(), poses_wc, intrinsics)
+            field = np.clip(np.concatenate([field, field[-1:]]), -width / 3, width / 3)
+            flow = torch.from_numpy(field.astype(np.float32))
+        images = expose(images, camera, rng, flow)
     scale = float(rendering.depth.median())
     relative = compose(inverse(poses_wc), poses_wc[:1])  # world := first camera
     relative[:, :3] /= scale
@@ -235,4 +238,6 @@ def _rhythm(rng: np.random.Generator, frames: int) -> Array:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-__all__ = ["Clip", "Sensor", "make_clip", "induced_flow", "random_intrinsics"]
+__all__ = [
+    "Clip", "Sensor", "SyntheticSequence", "induced_flow", "make_clip", "make_sequence", "random_intrinsics",
+]  # fmt: skip

@@ -8,7 +8,6 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dvo.synth.clip import make_clip
-from dvo.synth.textures import texture_pool
 
 
 class ClipDataset(Dataset[dict[str, Tensor]]):
@@ -26,7 +25,6 @@ class ClipDataset(Dataset[dict[str, Tensor]]):
 
     def __init__(self, seed: int, length: int, *, start: int = 0, **options: Any) -> None:
         self.seed, self.length, self.start, self.options = seed, length, start, options
-        texture_pool(seed)  # drawn before workers fork, so that they share it
 
     def __len__(self) -> int:
         return self.length

@@ -15,9 +15,10 @@ Pattern = Callable[[Rng, int], np.ndarray]
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789&%#+"
 
 
-def colour(rng: Rng, saturation: float = 0.35, low: float = 0.1, high: float = 0.9) -> np.ndarray:
-    """One plausible colour ``(3,)``: random hue, moderate saturation."""
-    hue, sat, value = rng.uniform(0, 6), min(1.0, abs(rng.normal(0, saturation))), rng.uniform(low, high)
+def colour(rng: Rng, saturation: float = 0.3, low: float = 0.1, high: float = 0.9) -> np.ndarray:
+    """One plausible colour ``(3,)``: mostly earthy, at times of any hue; moderate saturation."""
+    hue = rng.uniform(0, 6) if rng.random() < 0.4 else rng.normal(0.6, 0.4)
+    sat, value = min(0.9, abs(rng.normal(0, saturation))), rng.uniform(low, high)
     ramp = np.clip(np.abs((hue + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
     return value * (1 - sat * (1 - ramp))
 
@@ -75,19 +76,25 @@ def plain(rng: Rng, size: int) -> np.ndarray:
 
 def cells(rng: Rng, size: int) -> np.ndarray:
     """Voronoi cells with joints: cobbles, flagstones, gravel."""
-    count = int(np.exp(rng.uniform(np.log(12), np.log(260))))
-    points = rng.uniform(0, size, (count, 2))
-    tiled = (points[None] + size * np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)])[:, None]).reshape(-1, 2)
-    near = np.all((tiled > -size * 0.3) & (tiled < size * 1.3), 1)
-    owner, tiled = np.tile(np.arange(count), 9)[near], tiled[near]
-    from scipy.spatial import cKDTree  # here: scipy takes a second to import and only the pool needs it
-
-    y, x = np.mgrid[:size, :size]
-    distance, index = cKDTree(tiled).query(np.stack([y, x], -1).reshape(-1, 2) + 0.5, k=2)
-    gap = (distance[:, 1] - distance[:, 0]).reshape(size, size)
+    across = int(np.exp(rng.uniform(np.log(4), np.log(17))))
+    y, x = np.mgrid[:size, :size].astype(np.float32) / size * across
+    seeds = rng.uniform(0.0, 1.0, (across, across, 2)).astype(np.float32)
+    row, column = np.floor(y).astype(int), np.floor(x).astype(int)
+    first, second = np.full(x.shape, 9.0, np.float32), np.full(x.shape, 9.0, np.float32)
+    owner = np.zeros(x.shape, int)
+    for i in (-1, 0, 1):  # one seed a grid square: the two nearest lie in the squares around (nearly always)
+        for j in (-1, 0, 1):
+            r, c = (row + i) % across, (column + j) % across
+            away = np.hypot(row + i + seeds[r, c, 0] - y, column + j + seeds[r, c, 1] - x)
+            nearer = away < first
+            second = np.where(nearer, first, np.minimum(second, away))
+            first = np.where(nearer, away, first)
+            owner = np.where(nearer, r * across + c, owner)
+    gap = (second - first) * size / across
+    count = across * across
     base, joint = colour(rng, low=0.25), colour(rng, 0.2, 0.05, 0.5)
     tint = np.clip(base * np.exp(rng.normal(0, rng.uniform(0.05, 0.35), (count, 1)) + rng.normal(0, 0.05, (count, 3))), 0, 1)
-    image = tint[owner[index[:, 0]]].reshape(size, size, 3)
+    image = tint[owner]
     solid = np.clip(gap / rng.uniform(1.5, 8), 0, 1)[..., None]
     return grain(rng, joint + solid * (image - joint), rng.uniform(0.05, 0.2))
 

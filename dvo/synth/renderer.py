@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from dvo.errors import DvoError
+from dvo.synth.antialias import smooth_outlines
 from dvo.synth.poses import split
 from dvo.synth.scene import CELL, Scene
 from dvo.synth.textures import sample
@@ -109,8 +110,10 @@ def _project(scene: Scene, poses_wc: Array, intrinsics: Array, size: tuple[int, 
     return _View(index, basis, scene.edges[index] @ basis, seen & usable.any(-1), window)
 
 
-def _cast(view: _View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor]:
-    """Largest inverse depth ``(N, H, W)`` and the position in ``view.index`` of its surface (int32, -1 for none)."""
+def _cast(view: _View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
+    """Largest inverse depth ``(N, H, W)``, the position in ``view.index`` of its surface (int32, -1 for none), and the
+    functions ``(N, Q, 5, 3)`` that decided it: inverse depth and edges.
+    """
     n = len(view.seen)
     slack = 0.02  # pixels; the windows are exact but for rounding and SLACK
     x0, y0 = (np.clip(np.ceil(view.window[..., i] - slack), 0, m).astype(int) for i, m in ((0, width), (1, height)))
@@ -136,7 +139,7 @@ def _cast(view: _View, height: int, width: int, device: torch.device | str) -> t
         hit = (value[:, 1:].amin(1) >= -SLACK) & (inverse > best)
         best.copy_(torch.where(hit, inverse, best))
         surface[n0:n1, c:d, a:b].masked_fill_(hit, q)
-    return nearest, surface
+    return nearest, surface, table
 
 
 def _linear(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
@@ -202,7 +205,7 @@ def render_depth(
     """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
     poses, k = _cameras(poses_wc, intrinsics)
     view = _project(scene, poses, k, (height, width))
-    nearest, local = _cast(view, height, width, device)
+    nearest, local, _ = _cast(view, height, width, device)
     return torch.where(local >= 0, 1 / nearest, 0.0), _named(view, local)
 
 
@@ -245,6 +248,7 @@ def render(
     supersample: int = 1,
     device: torch.device | str = "cpu",
     taps: int = 2,
+    antialias: bool = True,
 ) -> Rendering:
     """Render N frames.
 
@@ -256,21 +260,24 @@ def render(
         supersample: rays per pixel edge for the colours (depth, surface and uv are always those of pixel centres).
         device: where to render.
         taps: texture samples along the longer axis of a pixel's footprint (anisotropic filter).
+        antialias: smooth outlines by coverage (with one ray a pixel; more rays smooth by themselves).
 
     Raises:
         DvoError: poses or intrinsics of the wrong shape or not finite.
     """
     poses, k = _cameras(poses_wc, intrinsics)
     view = _project(scene, poses, k, (height, width))
-    nearest, local = _cast(view, height, width, device)
+    nearest, local, functions = _cast(view, height, width, device)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
     if supersample == 1:
         images = _colours(scene, view, local, taps)
+        if antialias:
+            smooth_outlines(images, local, functions, SLACK)
     else:
         m = supersample
         fine = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
         fine_view = _project(scene, poses, fine, (height * m, width * m))
-        _, fine_local = _cast(fine_view, height * m, width * m, device)
+        _, fine_local, _ = _cast(fine_view, height * m, width * m, device)
         images = torch.nn.functional.avg_pool2d(_colours(scene, fine_view, fine_local, taps), m)
     n = len(poses)
     uv = torch.from_numpy(view.basis[:, :, :2].astype(np.float32).reshape(-1, 6)).to(device)

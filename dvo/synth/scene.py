@@ -84,11 +84,10 @@ class Scene:
         """
         key = str(device)
         if key not in self._cache:
-            row, column = np.divmod(self.texture, self.pool.columns)
-            size = self.pool.size
+            cells = np.array([self.pool.cell(int(texture)) for texture in self.texture])
             columns = [
                 self.texture_map[:, :, :2].reshape(-1, 4), self.gain, self.offset,
-                (column * size)[:, None], (row * size * 3 // 2)[:, None], (np.arange(len(self)) * CELL)[:, None],
+                cells[:, 1:], cells[:, :1], (np.arange(len(self)) * CELL)[:, None],
             ]  # fmt: skip
             table = np.ascontiguousarray(np.concatenate(columns, 1).T, np.float32)
             picture = self.light.transpose(3, 1, 0, 2).reshape(1, 3, CELL, -1)
@@ -139,6 +138,7 @@ class Material:
         metres: width of one texture repeat.
         gain, offset: ``(3,)`` colour transform.
         turn: rotation of the texture in the surface, rad.
+        whole: a picture that looks wrong when repeated: stretched to most of the surface.
     """
 
     texture: int
@@ -146,6 +146,7 @@ class Material:
     gain: Array
     offset: Array
     turn: float = 0.0
+    whole: bool = False
 
 
 class SceneBuilder:
@@ -163,13 +164,14 @@ class SceneBuilder:
         """Pick a texture with one of the tags (any, without tags), a size, a tint and a contrast."""
         rng = self.rng
         texture = int(rng.choice(self.pool.tagged(*tags))) if tags else int(rng.integers(self.pool.count))
-        mean = self.pool.mean[texture]
+        mean = self.pool.use(texture)
         strength = rng.uniform(*contrast)
         # Pull dark and bright textures towards the middle: a scene of black walls teaches nothing.
         level = bright * np.exp(rng.normal(0, 0.22)) * (0.45 / max(mean.mean(), 0.08)) ** 0.5
         tint = level * np.exp(rng.normal(0, 0.06, 3))
         repeat = float(np.exp(rng.uniform(*np.log(metres))))
-        return Material(texture, repeat, tint * strength, tint * (1 - strength) * mean, turn)
+        whole = self.pool.tags[texture] in ("photo", "poster") and rng.random() < 0.8
+        return Material(texture, repeat, tint * strength, tint * (1 - strength) * mean, turn, whole)
 
     def polygon(
         self, corners: Array, material: Material, *, up: Array | None = None, two_sided: bool = False
@@ -178,7 +180,10 @@ class SceneBuilder:
         corners = np.asarray(corners, float)
         if len(corners) == 3:
             corners = np.concatenate([corners, corners[2:]])
-        density = self.pool.size / material.metres
+        metres = material.metres
+        if material.whole:
+            metres = max(metres, 0.8 * float(np.ptp(corners, axis=0).max()))
+        density = self.pool.size / metres
         c, s = np.cos(material.turn) * density, np.sin(material.turn) * density
         shift = self.rng.uniform(0, 2 * self.pool.size, 2)
         self.rows.append(

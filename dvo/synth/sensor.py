@@ -24,6 +24,8 @@ class Sensor:
         flicker: standard deviation of the frame-to-frame drift of log gain.
         vignette: darkening in the corners, 0 to 1.
         blur: Gaussian radius in pixels, 0 for none.
+        shutter: share of the time between frames during which light is gathered, 0 for no motion blur; the blur follows
+            the flow between frames (an approximation; poses and depth are those of mid-exposure).
         shot, read: noise deviation at full brightness (grows with the root of brightness) and in the dark.
     """
 
@@ -35,8 +37,19 @@ class Sensor:
     flicker: float = 0.0
     vignette: float = 0.0
     blur: float = 0.0
+    shutter: float = 0.0
     shot: float = 0.0
     read: float = 0.0
+
+
+def random_intrinsics(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
+    """``(4,)`` fx fy cx cy: horizontal field of view 40-100 degrees, slightly off centre, slightly anisotropic."""
+    view = np.deg2rad(rng.uniform(40, 100))
+    fx = 0.5 * width / np.tan(view / 2)
+    fy = fx * np.exp(rng.normal(0, 0.01))
+    cx = (width - 1) / 2 + np.clip(rng.normal(0, 0.012), -0.04, 0.04) * width
+    cy = (height - 1) / 2 + np.clip(rng.normal(0, 0.012), -0.04, 0.04) * height
+    return np.array([fx, fy, cx, cy])
 
 
 def random_sensor(rng: np.random.Generator) -> Sensor:
@@ -51,6 +64,7 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
         flicker=float(abs(rng.normal(0, 0.05 if poor else 0.015))),
         vignette=float(rng.uniform(0, 0.35)) if rng.random() < 0.5 else 0.0,
         blur=float(rng.uniform(0.3, 0.9 if poor else 0.6)) if rng.random() < 0.6 else 0.0,
+        shutter=float(rng.uniform(0.1, 0.6)) if rng.random() < 0.25 else 0.0,
         shot=float(rng.uniform(0, 0.04 if poor else 0.012)),
         read=float(rng.uniform(0, 0.02 if poor else 0.006)),
     )
@@ -58,26 +72,48 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
 
 def _blurred(images: Tensor, radius: float) -> Tensor:
     half = max(1, int(np.ceil(2.5 * radius)))
-    taps = torch.exp(-0.5 * (torch.arange(-half, half + 1, device=images.device) / radius) ** 2)
-    taps = (taps / taps.sum()).view(1, 1, -1)
-    n, c, h, w = images.shape
-    flat = F.pad(images.reshape(n * c, 1, h, w), (half, half, half, half), mode="replicate")
-    return F.conv2d(F.conv2d(flat, taps[..., None, :]), taps[..., None]).view(n, c, h, w)
+    taps = np.exp(-0.5 * (np.arange(half + 1) / radius) ** 2)
+    taps /= taps[0] + 2 * taps[1:].sum()
+    for axis in (2, 3):
+        size = images.shape[axis]
+        pad = (0, 0, half, half) if axis == 2 else (half, half, 0, 0)
+        padded = F.pad(images, pad, mode="replicate")
+        images = images * float(taps[0])
+        for k in range(1, half + 1):  # shifted sums: for few taps much faster than a convolution
+            images.add_(padded.narrow(axis, half - k, size), alpha=float(taps[k]))
+            images.add_(padded.narrow(axis, half + k, size), alpha=float(taps[k]))
+    return images
 
 
-def expose(images: Tensor, sensor: Sensor, rng: np.random.Generator) -> Tensor:
+def _smeared(images: Tensor, motion: Tensor, taps: int = 5) -> Tensor:
+    """Mean of the images along ``motion (N, H, W, 2)`` pixels, centred."""
+    _, _, h, w = images.shape
+    size = torch.tensor([2 / (w - 1), 2 / (h - 1)], device=images.device)
+    y, x = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
+    grid, step = torch.stack([x, y], -1).to(images.device), motion * size
+    total = torch.zeros_like(images)
+    for k in range(taps):
+        place = grid + (k / (taps - 1) - 0.5) * step
+        total += F.grid_sample(images, place, padding_mode="border", align_corners=True)
+    return total / taps
+
+
+def expose(images: Tensor, sensor: Sensor, rng: np.random.Generator, flow: Tensor | None = None) -> Tensor:
     """Apply a sensor to clean frames of one clip.
 
     Args:
         images: ``(N, 3, H, W)`` float RGB in [0, 1].
         sensor: the camera.
         rng: draws flicker and noise.
+        flow: ``(N, H, W, 2)`` pixels from each frame to the next, wanted by motion blur.
 
     Returns:
         ``(N, 3, H, W)`` float RGB in [0, 1].
     """
     n, _, height, width = images.shape
     device = images.device
+    if sensor.shutter > 0 and flow is not None:
+        images = _smeared(images, flow.to(device) * sensor.shutter)
     if sensor.blur > 0:
         images = _blurred(images, sensor.blur)
     gain = np.exp(np.cumsum(rng.normal(0, 1, n)) * sensor.flicker)[:, None] * np.array(sensor.balance)[None]

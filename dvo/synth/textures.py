@@ -1,13 +1,12 @@
 """The texture pool: procedural patterns and photographs as one mip-mapped atlas, and its antialiased sampling.
 
-A pool is drawn once per (seed, count, size) and shared by all scenes of a process; a surface picks a texture, a random
-window of it, a tint and a contrast.
+A pool belongs to (seed, count, size) and is shared by all scenes of a process; a surface picks a texture, a random window
+of it, a tint and a contrast. Textures are drawn when they are first used.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,50 +23,11 @@ PHOTOGRAPHS = {
     "astronaut.png": "photo", "brick.png": "wall", "camera.png": "photo", "chelsea.png": "photo",
     "coffee.png": "photo", "coins.png": "photo", "grass.png": "ground", "gravel.png": "stone",
     "hubble_deep_field.jpg": "photo", "ihc.png": "busy", "moon.png": "stone", "motorcycle_left.png": "photo",
-    "retina.jpg": "photo", "rocket.jpg": "photo", "color.png": "photo",
+    "retina.jpg": "photo", "rocket.jpg": "photo",
     "cell.png": "stone", "clock_motion.png": "photo",
 }  # fmt: skip
 # How often each pattern is drawn in a pool, relative to the others.
 WEIGHTS = {"plain": 2.0, "leaves": 2.0, "fractal": 2.0, "facade": 2.0, "asphalt": 1.5, "stains": 2.0, "clouds": 0.7}
-
-
-@dataclass
-class TexturePool:
-    """Mip-mapped textures laid out in one picture.
-
-    Every texture has a cell of ``size`` x ``1.5 size`` texels: level 0 on top, the smaller levels side by side below it.
-
-    Attributes:
-        atlas: ``(3, H, W)`` float32 in [0, 1].
-        count, size, levels: number of textures, edge length of level 0 in texels, mip levels (down to 2 texels).
-        mean: ``(count, 3)`` mean colour in [0, 1].
-        tags: what each texture suits ("wall", "floor", "photo", ...).
-    """
-
-    atlas: Tensor
-    count: int
-    size: int
-    levels: int
-    mean: np.ndarray
-    tags: list[str]
-    _moved: dict[str, Tensor] = field(default_factory=dict, repr=False)
-
-    @property
-    def columns(self) -> int:
-        """Cells in a row of the atlas."""
-        return self.atlas.shape[2] // self.size
-
-    def on(self, device: torch.device | str) -> Tensor:
-        """The atlas ``(1, 3, H, W)`` on a device (kept after the first call)."""
-        key = str(device)
-        if key not in self._moved:
-            self._moved[key] = self.atlas[None].to(device)
-        return self._moved[key]
-
-    def tagged(self, *tags: str) -> np.ndarray:
-        """Indices of the textures with any of the tags; all of them if there is none."""
-        found = np.flatnonzero([tag in tags for tag in self.tags])
-        return found if len(found) else np.arange(self.count)
 
 
 def photographs() -> list[tuple[np.ndarray, str]]:
@@ -109,43 +69,90 @@ def _fill_cell(cell: np.ndarray, image: np.ndarray, levels: int) -> None:
         left += half
 
 
-@lru_cache(maxsize=4)
-def texture_pool(seed: int, count: int = 224, size: int = 256) -> TexturePool:
-    """Draw a pool. About a third photographs where scikit-image is installed, the rest procedural.
+class TexturePool:
+    """Mip-mapped textures laid out in one picture; about a third are photographs where scikit-image is installed.
+
+    Every texture has a cell of ``size`` x ``1.5 size`` texels: level 0 on top, the smaller levels side by side below it.
 
     Args:
-        seed: same seed, same pool (on one machine, with the same packages).
+        seed: same seed, same textures (on one machine, with the same packages).
         count: number of textures.
-        size: edge length in texels, a power of two.
+        size: edge length of level 0 in texels, a power of two.
+
+    Attributes:
+        atlas: ``(3, H, W)`` float32 in [0, 1]; cells of textures that were never used are black.
+        levels: mip levels, down to 2 texels.
+        tags: what each texture suits ("wall", "floor", "photo", ...).
     """
-    levels = size.bit_length() - 1
-    photos = photographs()
-    names = list(PATTERNS)
-    weights = np.array([WEIGHTS.get(name, 1.0) for name in names])
-    # Every pattern at least once, then by weight.
-    chooser = np.random.default_rng([seed, 7001])
-    plan = [*names, *chooser.choice(names, count, p=weights / weights.sum())]
-    columns = int(np.ceil(np.sqrt(1.5 * count)))
-    rows = -(-count // columns)
-    atlas = np.zeros((3, rows * size * 3 // 2, columns * size), np.float32)
-    means, tags = [], []
-    for index in range(count):
-        rng = np.random.default_rng([seed, 7002, index])
-        if photos and index % 3 == 2:
-            photo, tag = photos[index // 3 % len(photos)]
-            image = _window(rng, photo, size)
-        else:
-            pattern, tag = PATTERNS[plan[index - (index + 1) // 3 if photos else index]]
-            image = pattern(rng, size)
-        top, left = index // columns * size * 3 // 2, index % columns * size
-        _fill_cell(atlas[:, top : top + size * 3 // 2, left : left + size], np.clip(image, 0, 1), levels)
-        means.append(image.mean((0, 1)))
-        tags.append(tag)
-    return TexturePool(torch.from_numpy(atlas), count, size, levels, np.stack(means), tags)
+
+    def __init__(self, seed: int, count: int, size: int) -> None:
+        self.seed, self.count, self.size, self.levels = seed, count, size, size.bit_length() - 1
+        self.columns = int(np.ceil(np.sqrt(1.5 * count)))
+        rows = -(-count // self.columns)
+        self.atlas = torch.zeros(3, rows * size * 3 // 2, self.columns * size)
+        self._photos = photographs()
+        self._ready = np.zeros(count, bool)
+        self._mean = np.zeros((count, 3))
+        self._copies: dict[str, tuple[Tensor, np.ndarray]] = {}
+        # Every pattern at least once, then by weight.
+        names = list(PATTERNS)
+        weights = np.array([WEIGHTS.get(name, 1.0) for name in names])
+        chooser = np.random.default_rng([seed, 7001])
+        plan = iter([*names, *chooser.choice(names, count, p=weights / weights.sum())])
+        self._sources: list[str | int] = [
+            i // 3 % len(self._photos) if self._photos and i % 3 == 2 else str(next(plan)) for i in range(count)
+        ]
+        self.tags = [self._photos[s][1] if isinstance(s, int) else PATTERNS[s][1] for s in self._sources]
+
+    def cell(self, index: int) -> tuple[int, int]:
+        """Top and left of a texture's cell in the atlas."""
+        return index // self.columns * self.size * 3 // 2, index % self.columns * self.size
+
+    def use(self, index: int) -> np.ndarray:
+        """See to it that a texture is drawn; returns its mean colour ``(3,)``."""
+        if not self._ready[index]:
+            rng = np.random.default_rng([self.seed, 7002, index])
+            source = self._sources[index]
+            if isinstance(source, int):
+                image = _window(rng, self._photos[source][0], self.size)
+            else:
+                image = PATTERNS[source][0](rng, self.size)
+            top, left = self.cell(index)
+            cell = self.atlas[:, top : top + self.size * 3 // 2, left : left + self.size].numpy()
+            _fill_cell(cell, np.clip(image, 0, 1), self.levels)
+            self._mean[index] = image.mean((0, 1))
+            self._ready[index] = True
+        return self._mean[index]
+
+    def on(self, device: torch.device | str) -> Tensor:
+        """The atlas ``(1, 3, H, W)`` on a device; only cells that are new there are copied."""
+        if torch.device(device).type == "cpu":
+            return self.atlas[None]
+        key = str(device)
+        if key not in self._copies:
+            self._copies[key] = (torch.zeros_like(self.atlas, device=device), np.zeros(self.count, bool))
+        copy, there = self._copies[key]
+        for index in np.flatnonzero(self._ready & ~there).tolist():
+            top, left = self.cell(index)
+            window = (slice(None), slice(top, top + self.size * 3 // 2), slice(left, left + self.size))
+            copy[window] = self.atlas[window].to(device)
+        there |= self._ready
+        return copy[None]
+
+    def tagged(self, *tags: str) -> np.ndarray:
+        """Indices of the textures with any of the tags; all of them if there is none."""
+        found = np.flatnonzero([tag in tags for tag in self.tags])
+        return found if len(found) else np.arange(self.count)
+
+
+@lru_cache(maxsize=4)
+def texture_pool(seed: int, count: int = 224, size: int = 256) -> TexturePool:
+    """The pool of a seed, one object per process."""
+    return TexturePool(seed, count, size)
 
 
 def sample(
-    pool: TexturePool, left: Tensor, top: Tensor, s: Tensor, t: Tensor, footprint: Tensor, *, bias: float = -0.3
+    pool: TexturePool, left: Tensor, top: Tensor, s: Tensor, t: Tensor, footprint: Tensor, *, bias: float = 0.0
 ) -> Tensor:
     """Trilinear sampling with mirrored repeat.
 

@@ -82,18 +82,20 @@ def follow(
     """
     if len(uv) == 0:
         return uv, np.zeros(0, bool)
-    options = {
-        "winSize": (window, window),
-        "maxLevel": levels,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
-    }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, uv.reshape(-1, 1, 2), None, **options)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **options)
-    there, back = there.reshape(-1, 2), back.reshape(-1, 2)
+
+    def flow(first: np.ndarray, second: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        end = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(
+            first, second, at, np.empty_like(at), winSize=(window, window), maxLevel=levels, criteria=end
+        )
+        return np.asarray(there).reshape(-1, 2), np.asarray(found).ravel() == 1
+
+    there, found = flow(before, after, uv)
+    back, returned = flow(after, before, there)
     height, width = after.shape
     inside = ((there >= 0) & (there <= np.array([width - 1, height - 1]))).all(axis=1)
     closed = np.linalg.norm(back - uv, axis=1) < tolerance
-    return there, (found.ravel() == 1) & (returned.ravel() == 1) & inside & closed
+    return there, found & returned & inside & closed
 
 
 def detect(grey: np.ndarray, existing: np.ndarray, wanted: int, *, quality: float, spacing: float) -> np.ndarray:

@@ -17,6 +17,7 @@ from dvo.data.poses import poses_from_matrices
 from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from eval.baselines import two_view
+from eval.baselines.back_fill import back_fill
 from eval.baselines.klt import Tracks, detect, follow
 
 
@@ -40,11 +41,11 @@ class KltPnpConfig:
 
     corners: int = 800
     refill: float = 0.85
-    quality: float = 0.005
-    window: int = 21
+    quality: float = 0.001
+    window: int = 15
     levels: int = 4
     closed: float = 0.7
-    start_parallax: float = 0.03
+    start_parallax: float = 0.04
     start_points: int = 40
     angle: float = 1.0
     epipolar: float = 1.0
@@ -107,7 +108,7 @@ class KltPnp:
 
     def finish(self) -> Result:
         self._retire(np.ones(len(self._tracks), bool))
-        poses = self._filled()
+        poses = back_fill(self._T_cw, self._turns, self._lost)
         rows = [index for index, pose in enumerate(poses) if pose is not None]
         matrices = np.array([np.linalg.inv(poses[index]) for index in rows]).reshape(-1, 4, 4)  # type: ignore[arg-type]
         points, colors = (np.concatenate(part) for part in zip(*self._map, strict=True)) if self._map else ((), ())
@@ -176,7 +177,7 @@ class KltPnp:
             self._pending.append((index, tracks.ids.copy(), tracks.uv.copy()))
 
     def _start(self, pair: two_view.RelativePose, index: int) -> bool:
-        """Points from the two views; poses of the frames between them by PnP. False if the points are not convincing."""
+        """Points from the two views, poses of the frames between by PnP. False if the points are not convincing."""
         c, tracks = self.config, self._tracks
         first = self._last_pose()
         second = pair.T_21 @ first
@@ -265,8 +266,8 @@ class KltPnp:
         new = np.flatnonzero(~tracks.has_point & (tracks.anchor != index))
         if len(new):
             anchors = [self._T_cw[a] for a in tracks.anchor[new]]
-            R = np.array([a[:3, :3] for a in anchors])  # type: ignore[index]
-            centres = np.array([_centre(a) for a in anchors])  # type: ignore[arg-type]
+            R = np.array([a[:3, :3] for a in anchors])
+            centres = np.array([_centre(a) for a in anchors])
             one = np.einsum("nji,nj->ni", R, two_view.rays(tracks.anchor_uv[new], self._intrinsics))
             two = two_view.rays(tracks.uv[new], self._intrinsics) @ T[:3, :3]
             ones = np.ones(len(new))
@@ -305,22 +306,6 @@ class KltPnp:
         T = self._T_cw[-1]
         pose = None if T is None else poses_from_matrices(np.linalg.inv(T))
         return Estimate(self._times[-1], pose, status, confidence)
-
-    def _filled(self) -> list[np.ndarray | None]:
-        """Poses with the frames of the start filled in: turned by the measured rotations, standing at the neighbour."""
-        poses = list(self._T_cw)
-        if poses and not any(T is not None for T in poses):
-            poses[0] = np.eye(4)
-        for order, step in ((range(1, len(poses)), 1), (range(len(poses) - 2, -1, -1), -1)):
-            for i in order:
-                neighbour = poses[i - step]
-                turn = self._turns[i] if step > 0 else self._turns[i + 1]
-                if poses[i] is None and i not in self._lost and neighbour is not None and turn is not None:
-                    poses[i] = np.eye(4)
-                    poses[i][:3, :3] = turn if step > 0 else turn.T  # type: ignore[index]
-                    poses[i][:3, 3] = 0  # type: ignore[index]
-                    poses[i] = poses[i] @ neighbour
-        return poses
 
 
 def _centre(T_cw: np.ndarray) -> np.ndarray:

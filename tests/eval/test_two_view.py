@@ -37,23 +37,40 @@ def test_rotation_between_is_exact_for_a_turn(rotvec, seed):
     np.testing.assert_allclose(found, T[:3, :3], atol=1e-9)
 
 
+def views(rotvec: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels in two views 0.4 apart, and the pose of the second."""
+    centre = np.random.default_rng(seed).normal(size=3)
+    T = pose(rotvec, 0.4 * centre / np.linalg.norm(centre))
+    first, second = (two_view.project(cloud(seed), view, INTRINSICS)[0] for view in (np.eye(4), T))
+    return first, second, T
+
+
+def pose_errors(found: np.ndarray, T: np.ndarray) -> tuple[float, float]:
+    """Degrees of rotation and of the translation's direction."""
+    turn = Rotation.from_matrix(found[:3, :3] @ T[:3, :3].T).magnitude()
+    sine = np.linalg.norm(np.cross(found[:3, 3], T[:3, 3])) / np.linalg.norm(T[:3, 3])
+    return np.degrees(turn), np.degrees(np.arctan2(sine, found[:3, 3] @ T[:3, 3]))
+
+
+@settings(max_examples=20)
+@given(rotvec=small, seed=st.integers(0, 50))
+def test_relative_pose_of_exact_pairs_is_exact(rotvec, seed):
+    first, second, T = views(rotvec, seed)
+    found = two_view.relative_pose(first, second, INTRINSICS, threshold=1.0, seed=3)
+    assert found is not None and found.inliers.mean() > 0.95 and found.parallax > 3
+    assert max(pose_errors(found.T_21, T)) < 1e-3
+
+
 @settings(max_examples=15)
 @given(rotvec=small, seed=st.integers(0, 50))
 def test_relative_pose_with_outliers(rotvec, seed):
-    rng = np.random.default_rng(seed)
-    points = cloud(seed)
-    centre = rng.normal(size=3)
-    centre *= 0.4 / np.linalg.norm(centre)
-    T = pose(rotvec, centre)
-    first, second = (two_view.project(points, view, INTRINSICS)[0] for view in (np.eye(4), T))
-    second[:20] += rng.uniform(20, 60, (20, 2))
+    """Some outliers lie along their epipolar line and cannot be told from inliers."""
+    first, second, T = views(rotvec, seed)
+    second[:20] += np.random.default_rng(seed).uniform(20, 60, (20, 2))
     found = two_view.relative_pose(first, second, INTRINSICS, threshold=1.0, seed=3)
-    assert found is not None
-    turn = Rotation.from_matrix(found.T_21[:3, :3] @ T[:3, :3].T).magnitude()
-    assert np.degrees(turn) < 0.1
-    assert found.T_21[:3, 3] @ T[:3, 3] / 0.4 > np.cos(np.radians(2))
-    assert found.inliers[20:].mean() > 0.9 and found.inliers[:20].mean() < 0.3
-    assert found.parallax > 5
+    assert found is not None and found.inliers[20:].mean() > 0.9 and found.inliers[:20].mean() < 0.3
+    turn, direction = pose_errors(found.T_21, T)
+    assert turn < 0.1 and direction < 2
 
 
 def test_parallax_of_a_turn_is_small():

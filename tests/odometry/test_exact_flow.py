@@ -10,7 +10,6 @@ from dvo.geometry.camera import Camera
 from dvo.geometry.projection import reproject
 from dvo.metrics import evaluate
 from dvo.nets.config import preset
-from dvo.nets.graph import build_graph
 from dvo.nets.patch_vo import PatchVO
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.protocol import Status
@@ -30,7 +29,7 @@ class Perfect(PatchOdometry):
 
     def _revise(self):
         window = self.window
-        graph = build_graph(window.ii, window.jj, window.kk)
+        graph = window.graph
         edges = (graph.ii, graph.jj, graph.kk)
         now = reproject(window.poses_cw[None], window.patches[None], window.intrinsics[None], *edges).coords
         at = torch.tensor([round(f.timestamp * 10) for f in window.frames])
@@ -40,7 +39,7 @@ class Perfect(PatchOdometry):
         exact[0, :, 2] = 1 / self.clip.depth[frame, y, x][:, None, None]
         true = reproject(self.clip.poses_cw[at][None], exact, window.intrinsics[None], *edges)
         target, centre = true.coords[0, :, 1, 1], now[0, :, 1, 1]
-        h, w = window.frames[0].levels[0].shape[:2]
+        h, w = self._maps[0].shape[1:3]
         seen = true.valid[0, :, 1, 1] & (target >= 0).all(-1) & (target[:, 0] < w) & (target[:, 1] < h)
         return window.hidden, target - centre, seen[:, None].float().expand(-1, 2), centre
 

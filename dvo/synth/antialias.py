@@ -1,0 +1,56 @@
+"""Smooth outlines without shading more: a pixel beside an outline is a mix of its neighbours' colours by exact coverage."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))  # rotated grid, pixels
+
+
+def smooth_outlines(images: Tensor, surface: Tensor, functions: Tensor, slack: float) -> None:
+    """Blend the pixels at outlines, in place.
+
+    At four places of each such pixel the nearest surface is looked for among those of the pixel and its four neighbours;
+    the place takes the colour that this surface has there, at the neighbour's centre. Depth and surfaces stay those of
+    pixel centres.
+
+    Args:
+        images: ``(N, 3, H, W)``.
+        surface: ``(N, H, W)`` int32 row of the functions of what each pixel shows, -1 for nothing.
+        functions: ``(N, Q, 5, 3)`` inverse depth and four edge functions, linear in (x, y, 1).
+        slack: edge functions above ``-slack`` are inside.
+    """
+    for frame in range(len(images)):  # one at a time: small enough for the processor's cache
+        _smooth_frame(images[frame], surface[frame], functions[frame], slack)
+
+
+def _smooth_frame(image: Tensor, surface: Tensor, functions: Tensor, slack: float) -> None:
+    height, width = surface.shape
+    across, down = surface[:, 1:] != surface[:, :-1], surface[1:] != surface[:-1]
+    outline = torch.zeros_like(surface, dtype=torch.bool)
+    outline[:, 1:] |= across
+    outline[:, :-1] |= across
+    outline[1:] |= down
+    outline[:-1] |= down
+    at = outline.view(-1).nonzero()[:, 0]
+    if at.numel() == 0:
+        return
+    y, x = at // width, at % width
+    left, right = at - (x > 0).long(), at + (x < width - 1).long()
+    up, below = at - width * (y > 0).long(), at + width * (y < height - 1).long()
+    places = torch.stack([at, left, right, up, below])  # (5, M) where each candidate's colour comes from
+    names = surface.view(-1)[places].long()
+    rows = functions.view(-1, 15).index_select(0, names.clamp_min(0).view(-1))
+    rows = rows.t().contiguous().view(5, 3, *places.shape)  # function, coefficient, candidate, pixel
+    centre = rows[:, 0] * x.float() + rows[:, 1] * y.float() + rows[:, 2]
+    colours = image.view(3, -1)
+    total = torch.zeros(3, at.numel(), device=image.device)
+    for dx, dy in OFFSETS:
+        value = centre + dx * rows[:, 0] + dy * rows[:, 1]
+        inside = (value[1:].amin(0) >= -slack) & (names >= 0)
+        # What a surface hides counts for nothing; where no candidate covers the place, the pixel's own colour stays.
+        score = torch.where(inside, value[0], -1.0)
+        score[0].clamp_min_(-0.5)
+        total += colours[:, places.gather(0, score.argmax(0)[None])[0]]
+    colours[:, at] = total / len(OFFSETS)

@@ -1,0 +1,92 @@
+"""Time the BA layer against its plain twin: ``python -m eval.benchmarks.ba_layer [--batch 1 4] [--device cpu]``.
+
+Prints milliseconds of processor time (CPU) or wall time for two iterations, forward alone and with backward, the
+fastest of several runs, and the ratio to the dense normal equations of :mod:`dvo.ba.reference`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from dvo.ba.edges import plan_edges
+from dvo.ba.layer import bundle_adjust
+from dvo.ba.reference import bundle_adjust_reference
+from dvo.geometry import se3
+from dvo.geometry.projection import reproject
+
+
+def training_clip(batch: int, frames: int, per_frame: int, device: torch.device) -> tuple[list[Tensor], list[Tensor]]:
+    """Tensors and edges for ``bundle_adjust``: a clip whose patches are all seen in every other frame."""
+    generator = torch.Generator().manual_seed(0)
+    count = frames * per_frame
+    poses = se3.exp(0.05 * torch.randn(batch, frames, 6, generator=generator))
+    centres = torch.rand(batch, count, 2, generator=generator) * torch.tensor([40.0, 30.0])
+    patches = torch.cat((centres, 0.3 + torch.rand(batch, count, 1, generator=generator)), -1)[..., None, None]
+    patches = patches.expand(-1, -1, -1, 3, 3)
+    intrinsics = torch.tensor([35.0, 35, 20, 15]).expand(batch, frames, 4)
+    kk = torch.arange(count).repeat_interleave(frames)
+    ii, jj = kk // per_frame, torch.arange(frames).repeat(count)
+    other = ii != jj
+    ii, jj, kk = ii[other], jj[other], kk[other]
+    targets = reproject(poses, patches, intrinsics, ii, jj, kk).coords[:, :, 1, 1]
+    start = se3.retract(poses, 0.02 * torch.randn(batch, frames, 6, generator=generator))
+    weights = torch.rand(targets.shape, generator=generator)
+    floats = (start, patches, intrinsics, targets, weights)
+    return [x.to(device) for x in floats], [x.to(device) for x in (ii, jj, kk)]
+
+
+def fastest(run: Callable[[], None], device: torch.device, repeats: int) -> float:
+    """Milliseconds."""
+    clock = time.process_time if device.type == "cpu" else time.perf_counter
+    best = float("inf")
+    for _ in range(repeats):
+        start = clock()
+        run()
+        if device.type != "cpu":
+            torch.accelerator.synchronize(device)
+        best = min(best, clock() - start)
+    return best * 1e3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--batch", type=int, nargs="+", default=[1, 4])
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--patches", type=int, default=24, help="per frame")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    device = torch.device(options.device)
+    print(f"{'batch':>5} {'edges':>6} {'pass':>18} {'layer ms':>9} {'twin ms':>9} {'ratio':>6}")
+    for batch in options.batch:
+        floats, edges = training_clip(batch, options.frames, options.patches, device)
+        ii, jj, kk = edges
+        plan = plan_edges(ii, jj, kk, options.frames, options.frames * options.patches)
+        for backward in (False, True):
+            leaves = [x.clone().requires_grad_(backward) for x in floats]
+
+            def layer(leaves: list[Tensor] = leaves, backward: bool = backward) -> None:
+                a, b, c, d, e = leaves
+                poses, patches = bundle_adjust(a, b, c, d, e, ii, jj, kk, plan=plan)  # noqa: B023 (called in this turn)
+                if backward:
+                    (poses.sum() + patches.sum()).backward()
+
+            def twin(leaves: list[Tensor] = leaves, backward: bool = backward) -> None:
+                a, b, c, d, e = leaves
+                poses, patches = bundle_adjust_reference(a, b, c, d, e, ii, jj, kk)  # noqa: B023
+                if backward:
+                    (poses.sum() + patches.sum()).backward()
+
+            ours, theirs = fastest(layer, device, 30), fastest(twin, device, 3)
+            name = "forward, backward" if backward else "forward"
+            print(f"{batch:5d} {len(ii):6d} {name:>18} {ours:9.2f} {theirs:9.2f} {theirs / ours:6.1f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,137 @@
+"""Problems without a solution: something finite comes out, with finite gradients, and no harm is done elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from dvo.ba.layer import BADamping
+from dvo.geometry import se3
+
+Maker = Callable[..., Any]
+NO_DAMPING = BADamping(pose=0.0, relative=0.0, depth=0.0)
+
+
+def no_parallax(p: Any) -> Any:
+    still = p.poses[:, :1].expand_as(p.poses)
+    same = p.intrinsics[:, :1].expand_as(p.intrinsics)
+    return replace(p, poses=still, intrinsics=same, targets=p.patches[:, p.kk, :2, 1, 1])
+
+
+def pure_rotation(p: Any) -> Any:
+    turned = p.poses.clone()
+    turned[..., :3] = 0
+    return replace(p, poses=turned)
+
+
+def one_edge(p: Any) -> Any:
+    return p.edges(torch.tensor([5]))
+
+
+def no_edge(p: Any) -> Any:
+    return p.edges(torch.zeros(0, dtype=torch.long))
+
+
+def behind(p: Any) -> Any:
+    turn = torch.tensor([0, 0, 0, 0, torch.pi, 0], dtype=p.poses.dtype)
+    return replace(p, poses=torch.cat((p.poses[:, :2], se3.retract(p.poses[:, 2:], turn)), 1))
+
+
+def at_the_camera(p: Any) -> Any:
+    """The second camera sits where the first sees its points, so that Z passes zero."""
+    poses = p.poses.clone()
+    poses[:, 1, 2] -= 1 / p.patches[:, 0, 2, 1, 1]
+    return replace(p, poses=poses)
+
+
+def zero_weights(p: Any) -> Any:
+    return replace(p, weights=torch.zeros_like(p.weights))
+
+
+def wild_targets(p: Any) -> Any:
+    return replace(p, targets=p.targets * 1e6)
+
+
+def huge_weights(p: Any) -> Any:
+    return replace(p, weights=p.weights * 1e12)
+
+
+def zero_depths(p: Any) -> Any:
+    patches = p.patches.clone()
+    patches[:, :, 2] = 0
+    return replace(p, patches=patches)
+
+
+KINDS = [
+    no_parallax,
+    pure_rotation,
+    one_edge,
+    no_edge,
+    behind,
+    at_the_camera,
+    zero_weights,
+    wild_targets,
+    huge_weights,
+    zero_depths,
+]
+
+
+@pytest.mark.parametrize("damping", [BADamping(), NO_DAMPING], ids=["damped", "undamped"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("kind", KINDS)
+def test_finite_forward_and_backward(problem: Maker, kind: Any, dtype: torch.dtype, damping: BADamping) -> None:
+    for options in ({}, {"fixed": 0}, {"structure_only": True}, {"motion_only": True}):
+        p = kind(problem(dtype=dtype)).leaves()
+        poses, patches = p.solve(damping=damping, bounds=(40, 30), **options)
+        (poses.sum() + patches.sum()).backward()
+        assert torch.isfinite(poses).all() and torch.isfinite(patches).all()
+        assert patches[:, :, 2].min() >= 0 and patches[:, :, 2].max() <= 10
+        torch.testing.assert_close(poses[..., 3:].norm(dim=-1), torch.ones_like(poses[..., 0]))
+        for name in ("poses", "patches", "intrinsics", "targets", "weights"):
+            gradient = getattr(p, name).grad
+            assert gradient is None or torch.isfinite(gradient).all(), name
+
+
+@pytest.mark.parametrize("kind", [zero_weights, no_edge, wild_targets])
+def test_nothing_to_go_by_moves_nothing(problem: Maker, kind: Any) -> None:
+    p = kind(problem())
+    poses, patches = p.solve()
+    torch.testing.assert_close(poses, p.poses)
+    torch.testing.assert_close(patches, p.patches)
+
+
+def test_no_parallax_keeps_the_poses(problem: Maker) -> None:
+    p = no_parallax(problem())
+    poses, patches = p.solve(iterations=5)
+    torch.testing.assert_close(poses, p.poses)
+    torch.testing.assert_close(patches, p.patches)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["targets", "weights"])
+def test_a_broken_edge_is_left_out(problem: Maker, name: str, value: float) -> None:
+    p = problem(noise=0.5)
+    broken = getattr(p, name).clone()
+    broken[:, 7, 1] = value
+    found = replace(p, **{name: broken}).solve()
+    expected = p.edges(torch.arange(len(p.ii)) != 7).solve()
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-10, rtol=0)
+
+
+def test_one_bad_element_of_a_batch_does_not_harm_the_other(problem: Maker) -> None:
+    p = problem(noise=0.5)
+    good = p.element(0).leaves()
+    sum(x.sum() for x in good.solve()).backward()
+    weights = p.weights.clone()
+    weights[1] = 0
+    mixed = replace(p, weights=weights).leaves()
+    poses, patches = mixed.solve(damping=BADamping(pose=0.1))
+    (poses.sum() + patches.sum()).backward()
+    torch.testing.assert_close(poses[:1].detach(), good.solve()[0].detach())
+    torch.testing.assert_close(mixed.targets.grad[:1], good.targets.grad, atol=1e-10, rtol=0)
+    assert torch.isfinite(mixed.weights.grad).all()

@@ -1,0 +1,112 @@
+"""Clips: determinism, free space, flow, normalisation, sensor."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from dvo.errors import DvoError
+from dvo.synth.clip import Clip, induced_flow, make_clip
+from dvo.synth.dataset import ClipDataset
+from dvo.synth.poses import inverse
+
+SMALL = {"frames": 4, "height": 60, "width": 80, "flow_range": (1.0, 8.0)}
+SEED = 5
+
+
+@pytest.fixture(scope="module")
+def clips() -> list[Clip]:
+    return [make_clip(SEED, i, **SMALL) for i in range(16)]
+
+
+def digest(tensors: list[torch.Tensor]) -> str:
+    return hashlib.sha256(b"".join(t.numpy().tobytes() for t in tensors)).hexdigest()
+
+
+def parts(clip: Clip) -> list[torch.Tensor]:
+    return [clip.images, clip.depth, clip.poses_cw, clip.intrinsics]
+
+
+def test_shapes_and_types(clips: list[Clip]) -> None:
+    clip = clips[0]
+    assert clip.images.shape == (4, 3, 60, 80) and clip.images.dtype == torch.uint8
+    assert clip.depth.shape == (4, 60, 80) and clip.depth.dtype == torch.float32
+    assert clip.poses_cw.shape == (4, 7) and clip.intrinsics.shape == (4, 4)
+    assert clip.poses_cw[0].tolist() == [0, 0, 0, 0, 0, 0, 1]
+
+
+def test_same_bytes_for_same_seed_and_index(clips: list[Clip]) -> None:
+    for index in (7, 2):  # out of order, so that what was drawn before does not matter
+        assert digest(parts(make_clip(SEED, index, **SMALL))) == digest(parts(clips[index]))
+    assert len({digest(parts(clip)) for clip in clips}) == len(clips)
+
+
+def test_workers_do_not_change_bytes(clips: list[Clip]) -> None:
+    dataset = ClipDataset(SEED, 4, start=2, **SMALL)
+    loader = DataLoader(dataset, batch_size=2, num_workers=2)
+    keys = ("images", "depth", "poses_cw", "intrinsics")
+    rows = [[batch[key][b] for key in keys] for batch in loader for b in range(2)]
+    assert [digest(row) for row in rows] == [digest(parts(clip)) for clip in clips[2:6]]
+
+
+def test_depth_is_normalised_and_complete(clips: list[Clip]) -> None:
+    for clip in clips:
+        assert float(clip.depth.median()) == pytest.approx(1, rel=1e-5)
+        assert (clip.depth > 0.02).all(), "the camera is inside something"
+        assert torch.isfinite(clip.poses_cw).all()
+        assert np.quantile(clip.depth.numpy(), 0.02) > 0.05
+
+
+def test_flow_is_in_range_and_neighbours_overlap(clips: list[Clip]) -> None:
+    means = []
+    for clip in clips:
+        poses_wc = inverse(clip.poses_cw.numpy().astype(float))
+        flow, overlap = induced_flow(clip.depth.numpy(), poses_wc, clip.intrinsics[0].numpy().astype(float))
+        means.append(flow.mean())
+        assert 0.8 < flow.mean() < 9.5
+        assert overlap.min() > 0.4
+    assert max(means) > 2 * min(means), "the range is not used"
+
+
+def test_frames_carry_the_motion(clips: list[Clip]) -> None:
+    """Warping by depth and pose explains the pictures better than standing still does."""
+    better = 0
+    for clip in clips:
+        depth, k = clip.depth[1].numpy().astype(float), clip.intrinsics[1].numpy().astype(float)
+        y, x = np.mgrid[:60, :80]
+        ray = np.stack([(x - k[2]) / k[0], (y - k[3]) / k[1], np.ones_like(depth)], -1)
+        from dvo.synth.poses import compose, split
+
+        r, t = split(compose(clip.poses_cw[0].numpy().astype(float), inverse(clip.poses_cw[1].numpy().astype(float))))
+        points = (ray * depth[..., None]) @ r.T + t
+        u, v = (points[..., i] / points[..., 2] * k[i] + k[2 + i] for i in (0, 1))
+        grid = torch.from_numpy(np.stack([u / 39.5 - 1, v / 29.5 - 1], -1).astype(np.float32))[None]
+        warped = torch.nn.functional.grid_sample(clip.images[:1].float(), grid, align_corners=True)[0]
+        mask = torch.from_numpy((points[..., 2] > 0) & (abs(u / 39.5 - 1) < 1) & (abs(v / 29.5 - 1) < 1))
+        moved, still = ((a - clip.images[1]).abs().mean(0)[mask].mean() for a in (warped, clip.images[0].float()))
+        better += int(moved < still)
+    assert better >= 15
+
+
+def test_sensor_changes_pictures_only() -> None:
+    noisy, clean = (make_clip(SEED, 3, sensor=on, **SMALL) for on in (True, False))
+    assert not torch.equal(noisy.images, clean.images)
+    assert torch.equal(noisy.depth, clean.depth) and torch.equal(noisy.poses_cw, clean.poses_cw)
+
+
+def test_brightness_is_sensible(clips: list[Clip]) -> None:
+    for clip in clips:
+        image = clip.images.float() / 255
+        assert 0.08 < image.mean() < 0.9
+        assert image.std() > 0.01
+
+
+def test_bad_options() -> None:
+    with pytest.raises(DvoError, match="flow_range"):
+        make_clip(SEED, 0, flow_range=(3.0, 1.0))
+    with pytest.raises(DvoError, match="frames"):
+        make_clip(SEED, 0, frames=1)

@@ -111,7 +111,8 @@ def _summary(values: list[float], digits: int) -> str:
     known = [value for value in values if not math.isnan(value)]
     if not known or not math.isfinite(np.median(known)):
         return "–"
-    middle, low, high = (f"{function(known):.{digits}f}" for function in (np.median, np.min, np.max))
+    figures = (float(function(known)) for function in (np.median, np.min, np.max))
+    middle, low, high = (f"{value:.{digits}f}" if math.isfinite(value) else "∞" for value in figures)
     return middle if low == high else f"{middle} [{low}–{high}]"
 
 

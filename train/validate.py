@@ -21,7 +21,6 @@ from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.geometry.camera import Camera
 from dvo.metrics import Metrics, evaluate
-from dvo.nets.patch_vo import PatchVO
 from dvo.nets.weights import load_weights
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.protocol import Odometry

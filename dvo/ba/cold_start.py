@@ -1,10 +1,10 @@
 """How strongly to damp the first steps from nothing.
 
 From identity poses and constant depth, rotation and sideways translation explain the flow almost equally well. An
-undamped first step takes a huge difference of the two, and the depths then settle on the wrong side of it (the bas-relief
-ambiguity). Damping relative to the diagonal of the reduced system holds such directions back until the depths have
-begun to tell them apart. With exact targets, 8 frames and 10 updates of 2 steps, 13 of 24 rendered clips ended within
-2 % of the rotation without this and 22 with it; ``tests/train/test_objective.py`` asks for 90 % of 50.
+undamped first step takes a huge difference of the two, and the depths then settle on the wrong side of it (the
+bas-relief ambiguity). Damping relative to the diagonal of the reduced system holds such directions back until the
+depths have begun to tell them apart. With exact targets, 8 frames and 10 updates of 2 steps, about half of rendered
+clips ended within 2 % of the rotation without this, and nine tenths with it (``tests/train/test_objective.py``).
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def solve_from_nothing(
     """Bundle adjustment without a starting point: the better of two ways to begin.
 
     One begins with poses and depths together under strong damping; the other finds the rotations first, as if
-    everything were far away. They fail on different clips: with exact targets, 46 and 47 of 50 rendered clips end within
-    2 % of the rotation, and the better of the two, told by the residual alone, in all 50.
+    everything were far away. They fail on different clips: with exact targets, 46 and 47 of 50 rendered clips end
+    within 2 % of the rotation, and the better of the two, told by the residual alone, in all 50.
 
     Args:
         patches: ``(B, K, 3, p, p)``; only ``x, y`` are used, depths begin at 1.

@@ -19,6 +19,7 @@ from dvo.ba.edges import EdgePlan, free_slots, plan_edges
 from dvo.ba.normal_equations import MARGIN, Gate
 from dvo.ba.setting import BADamping, StepSetting
 from dvo.ba.step import GaussNewtonStep
+from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.precision import full_precision
 
@@ -88,7 +89,11 @@ def bundle_adjust(
 
     Returns:
         New ``poses_cw`` and ``patches``.
+
+    Raises:
+        DvoError: shapes that do not belong together.
     """
+    _check(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk)
     dtype = poses_cw.dtype
     if dtype in (torch.float16, torch.bfloat16):
         dtype = torch.float32
@@ -124,6 +129,27 @@ def bundle_adjust(
             row = inverse_depth[:, :, None, None, None].expand_as(patches[:, :, :1])
             patches = torch.cat((patches[:, :, :2], row), 2)
         return poses_cw, patches
+
+
+def _check(
+    poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, targets: Tensor, weights: Tensor, *edges: Tensor
+) -> None:
+    """Shapes only: looking at the indices would make an accelerator wait."""
+    b, n = poses_cw.shape[:2] if poses_cw.dim() == 3 else (-1, -1)
+    count = len(edges[0])
+    wanted: dict[str, tuple[Tensor, tuple[int, ...]]]
+    wanted = {"poses_cw": (poses_cw, (b, n, 7)), "intrinsics": (intrinsics, (b, n, 4))}
+    wanted |= {"targets": (targets, (b, count, 2)), "weights": (weights, (b, count, 2))}
+    wanted |= {name: (x, (count,)) for name, x in zip(("ii", "jj", "kk"), edges, strict=True)}
+    if patches.dim() == 5:
+        wanted["patches"] = (patches, (b, patches.shape[1], 3, *patches.shape[3:]))
+    else:
+        wanted["patches"] = (patches, (b, -1, 3, -1, -1))
+    for name, (tensor, shape) in wanted.items():
+        if tensor.shape != shape:
+            raise DvoError(
+                f"has shape {tuple(tensor.shape)}, not {shape}", field=name, remedy="see the help of bundle_adjust"
+            )
 
 
 def _measurements(

@@ -83,9 +83,9 @@ class PatchVO(nn.Module):
                 unless poses are held as given.
             inverse_depth: of each patch at the start, 1 if None (clips are normalised to median depth 1; a random
                 start ruins bundle adjustment at small resolution).
-            mode: ``joint`` refines poses and depths; ``structure`` holds the poses; ``flow`` leaves bundle adjustment out
-                and moves each edge by its own revision alone, the cheapest way to learn to see motion (for a schedule
-                in which no frame joins later).
+            mode: ``joint`` refines poses and depths; ``structure`` holds the poses; ``flow`` leaves bundle adjustment
+                out and moves each edge by its own revision alone, the cheapest way to learn to see motion (for a
+                schedule in which no frame joins later).
             generator: draws patch centres and the edges that train the features; on the CPU.
             correlation_gradient: share of the edges whose correlation sends a gradient to the features.
             ba_iterations: Gauss-Newton steps an update.

@@ -6,6 +6,7 @@ The schedule does not depend on the data: it is built once and shared by all cli
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,10 +89,10 @@ def to_device(stages: list[Stage], device: torch.device | str) -> list[Stage]:
 
     def move(graph: PatchGraph) -> PatchGraph:
         if id(graph) not in moved:
-            values = {f.name: getattr(graph, f.name) for f in fields(graph)}
-            moved[id(graph)] = PatchGraph(
-                **{k: move_groups(v) if isinstance(v, Groups) else v.to(device) for k, v in values.items()}
-            )
+            values: dict[str, Any] = {f.name: getattr(graph, f.name) for f in fields(graph)}
+            for name, value in values.items():
+                values[name] = move_groups(value) if isinstance(value, Groups) else value.to(device)
+            moved[id(graph)] = PatchGraph(**values)
         return moved[id(graph)]
 
     return [Stage(move(s.graph), s.frames, None if s.carry is None else s.carry.to(device)) for s in stages]

@@ -95,6 +95,7 @@ class Update(nn.Module):
     def _correlate(self, levels: list[Tensor]) -> Tensor:
         """The first layer on its channels, level by level: DPVO's weights interleave the levels, level fastest."""
         first = self.corr[0]
+        assert isinstance(first, nn.Linear)
         weights = first.weight.unflatten(1, (-1, len(levels))).unbind(-1)
         out = functional.linear(levels[0], weights[0], first.bias)
         for level, weight in zip(levels[1:], weights[1:], strict=True):

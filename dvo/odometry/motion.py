@@ -29,7 +29,7 @@ def predict_pose(poses_cw: Tensor, times: list[float], time: float, damping: flo
 
 
 def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tensor, Tensor]:
-    """Where the patches of frame ``i`` go in frame ``j``, and where rotation alone (or translation alone) takes them."""
+    """Where the patches of frame ``i`` go in frame ``j``, and where rotation (or translation) alone takes them."""
     m = window.per_frame
     device = window.patches.device
     patches = window.patches[None, i * m : (i + 1) * m]

@@ -7,7 +7,7 @@ and the tests know nothing else.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import StrEnum
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,7 +16,7 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 
 
-class Status(str, Enum):
+class Status(StrEnum):
     """State of the tracker after a frame."""
 
     INITIALISING = "initialising"

@@ -55,7 +55,7 @@ def run(
 
     Args:
         on_frame: called after each frame; the estimate is None for a frame passed over.
-        should_stop: asked before each frame; True ends the feeding. A caller that gives it takes care of Ctrl-C; without
+        should_stop: asked before each frame; True ends the feeding. A caller that gives it handles Ctrl-C; without
             it, a KeyboardInterrupt ends the feeding too.
 
     Raises:

@@ -121,7 +121,7 @@ class PatchOdometry:
     def finish(self) -> Result:
         """Refine the last window and write the trajectory of every frame."""
         window, config = self.window, self.config
-        if 1 < len(window):
+        if len(window) > 1:
             for age in range(config.final_updates if self._initialised else config.initial_updates):
                 self._update(COLD_UPDATES if self._initialised else age)
         poses = dict(self._settled)
@@ -156,9 +156,9 @@ class PatchOdometry:
                 remedy="give frames in order of time",
             )
         size = (frame.image.shape[1], frame.image.shape[0])
-        if self._size not in (None, size):
+        if self._size is not None and self._size != size:
             raise DvoError(
-                f"is {size[0]}x{size[1]}, the frames before are {self._size[0]}x{self._size[1]}",  # type: ignore[index]
+                f"is {size[0]}x{size[1]}, the frames before are {self._size[0]}x{self._size[1]}",
                 field=f"frame {frame.index}",
                 remedy="give frames of one size",
             )
@@ -223,10 +223,10 @@ class PatchOdometry:
         context = torch.cat([f.context for f in frames])
         slots = torch.tensor([f.slot for f in frames], device=self.device)[graph.jj]
         correlation = [
-            cache.lookup(coords[0], window.slots, matching, level, graph.kk, slots)
+            cache.lookup(coords[0], window.slots, matching, level, graph.kk, slots)[None]
             for cache, level in zip(self._correlations, self._maps, strict=True)
         ]
-        hidden, delta, weights = net.update(window.hidden[None], context[graph.kk][None], [level[None] for level in correlation], graph)
+        hidden, delta, weights = net.update(window.hidden[None], context[graph.kk][None], correlation, graph)
         centre = net.config.patch_size // 2
         return hidden[0], delta[0], weights[0], coords[0, :, centre, centre]
 

@@ -1,4 +1,4 @@
-"""Smooth outlines without shading more: a pixel beside an outline is a mix of its neighbours' colours by exact coverage."""
+"""Smooth outlines without shading more: a pixel beside an outline is a mix of its neighbours' colours by coverage."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))  
 def smooth_outlines(images: Tensor, surface: Tensor, functions: Tensor, slack: float) -> None:
     """Blend the pixels at outlines, in place.
 
-    At four places of each such pixel the nearest surface is looked for among those of the pixel and its four neighbours;
+    At four places of each such pixel the nearest surface is looked for among those of the pixel and of its neighbours;
     the place takes the colour that this surface has there, at the neighbour's centre. Depth and surfaces stay those of
     pixel centres.
 

@@ -96,7 +96,7 @@ def _meet(path: Path, rhythm: Array, target: float, speed: float, depth: Array, 
 
 
 def _timing(path: Path, rhythm: Array, speed: float) -> tuple[Array, Path]:
-    """Frame times and path at a speed: a longer step as far as shake is still sampled twice a period, then more gain."""
+    """Frame times and path at a speed: a longer step while shake is still sampled twice a period, then more gain."""
     longest = 0.45 / (path.frequency.max() / (2 * np.pi))
     return min(speed, longest) * rhythm, path.scaled(max(1.0, speed / longest))
 
@@ -110,7 +110,7 @@ def _plan(
     scene: Scene, path: Path, rhythm: Array, flow_range: tuple[float, float], target: float, intrinsics: Array,
     size: tuple[int, int],
 ) -> _Plan | None:  # fmt: skip
-    """Choose time step and gain so that the mean flow meets ``target``, or less where space is short; None if nothing fits."""
+    """Choose time step and gain so that the mean flow meets ``target``, or less where space is short; None if none."""
     height, width = size[0] // LOW, size[1] // LOW
     low = (intrinsics + [0, 0, 0.5, 0.5]) / LOW - [0, 0, 0.5, 0.5]
     depth = np.full((len(rhythm), height, width), path.depth)  # a first guess without rendering

@@ -19,8 +19,8 @@ class ClipDataset(Dataset[dict[str, Tensor]]):
         start: index of the first clip (to resume).
         options: passed to :func:`dvo.synth.clip.make_clip`.
 
-    Items are ``images (N, 3, H, W)`` uint8, ``depth (N, H, W)``, ``poses_cw (N, 7)``, ``intrinsics (N, 4)``. Neighbouring
-    indices share a scene (``clips_per_scene``), so reading in order is faster than shuffled.
+    Items are ``images (N, 3, H, W)`` uint8, ``depth (N, H, W)``, ``poses_cw (N, 7)``, ``intrinsics (N, 4)``.
+    Neighbouring indices share a scene (``clips_per_scene``), so reading in order is faster than shuffled.
     """
 
     def __init__(self, seed: int, length: int, *, start: int = 0, **options: Any) -> None:

@@ -59,7 +59,7 @@ def fractal(rng: Rng, size: int) -> np.ndarray:
 
 def stains(rng: Rng, size: int) -> np.ndarray:
     """Thresholded blobs at several scales: plaster, camouflage, worn paint."""
-    image = np.broadcast_to(colour(rng, low=0.3), (size, size, 3)).astype(np.float32)
+    image: np.ndarray = np.broadcast_to(colour(rng, low=0.3), (size, size, 3)).astype(np.float32)
     for _ in range(int(rng.integers(2, 6))):
         field = noise(rng, size, rng.uniform(1.2, 2.6))
         edge = 0.5 + 0.5 * np.tanh((field - rng.normal(0.4, 0.6)) * rng.uniform(1.5, 20))
@@ -69,7 +69,7 @@ def stains(rng: Rng, size: int) -> np.ndarray:
 
 def plain(rng: Rng, size: int) -> np.ndarray:
     """Nearly textureless: painted wall with a faint mottle."""
-    image = np.broadcast_to(colour(rng, 0.2, 0.4, 0.95), (size, size, 3)).astype(np.float32)
+    image: np.ndarray = np.broadcast_to(colour(rng, 0.2, 0.4, 0.95), (size, size, 3)).astype(np.float32)
     image = image * (1 + rng.uniform(0.005, 0.05) * noise(rng, size, rng.uniform(1.5, 2.5))[..., None])
     return grain(rng, image, rng.uniform(0.003, 0.03))
 
@@ -93,7 +93,9 @@ def cells(rng: Rng, size: int) -> np.ndarray:
     gap = (second - first) * size / across
     count = across * across
     base, joint = colour(rng, low=0.25), colour(rng, 0.2, 0.05, 0.5)
-    tint = np.clip(base * np.exp(rng.normal(0, rng.uniform(0.05, 0.35), (count, 1)) + rng.normal(0, 0.05, (count, 3))), 0, 1)
+    tint = np.clip(
+        base * np.exp(rng.normal(0, rng.uniform(0.05, 0.35), (count, 1)) + rng.normal(0, 0.05, (count, 3))), 0, 1
+    )
     image = tint[owner]
     solid = np.clip(gap / rng.uniform(1.5, 8), 0, 1)[..., None]
     return grain(rng, joint + solid * (image - joint), rng.uniform(0.05, 0.2))
@@ -107,7 +109,9 @@ def bricks(rng: Rng, size: int) -> np.ndarray:
     row = np.floor(y * rows).astype(int)
     shifted = x * per_row + (row % 2) * 0.5
     column = np.floor(shifted).astype(int) % per_row
-    jitter = np.exp(rng.normal(0, rng.uniform(0.04, 0.22), (rows, per_row, 1)) + rng.normal(0, 0.04, (rows, per_row, 3)))
+    jitter = np.exp(
+        rng.normal(0, rng.uniform(0.04, 0.22), (rows, per_row, 1)) + rng.normal(0, 0.04, (rows, per_row, 3))
+    )
     image = np.clip(base * jitter, 0, 1)[row, column]
     width = rng.uniform(0.03, 0.09)
     fy, fx = y * rows % 1, shifted % 1
@@ -145,7 +149,7 @@ def wood(rng: Rng, size: int) -> np.ndarray:
 
 def stripes(rng: Rng, size: int) -> np.ndarray:
     """Stripes or plaid."""
-    image = np.broadcast_to(colour(rng), (size, size, 3)).astype(np.float32)
+    image: np.ndarray = np.broadcast_to(colour(rng), (size, size, 3)).astype(np.float32)
     for axis in (0, 1)[: int(rng.integers(1, 3))]:
         for _ in range(int(rng.integers(1, 5))):
             period = size / int(rng.integers(2, 20))
@@ -159,7 +163,7 @@ def stripes(rng: Rng, size: int) -> np.ndarray:
 def leaves(rng: Rng, size: int, palette: Callable[[], np.ndarray] | None = None) -> np.ndarray:
     """Dead leaves: occluding shapes with power-law sizes, which share the statistics of natural images."""
     draw = palette or (lambda: colour(rng, 0.4))
-    image = np.broadcast_to(draw(), (size, size, 3)).astype(np.float32).copy()
+    image: np.ndarray = np.broadcast_to(draw(), (size, size, 3)).astype(np.float32).copy()
     smallest, kind = rng.uniform(0.012, 0.04), int(rng.integers(0, 4))
     for _ in range(int(rng.integers(250, 900))):
         radius = size * smallest / np.sqrt(rng.uniform(smallest**2 / 0.09, 1))
@@ -172,7 +176,9 @@ def leaves(rng: Rng, size: int, palette: Callable[[], np.ndarray] | None = None)
             cv2.ellipse(image, spot, axes, rng.uniform(0, 360), 0, 360, tint.tolist(), -1, cv2.LINE_AA)
         else:
             corners = int(rng.integers(3, 7)) if shape == 1 else 4
-            angle = np.sort(rng.uniform(0, 2 * np.pi, corners)) if shape == 1 else np.arange(4) * np.pi / 2 + rng.random()
+            angle = (
+                np.sort(rng.uniform(0, 2 * np.pi, corners)) if shape == 1 else np.arange(4) * np.pi / 2 + rng.random()
+            )
             points = centre + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
             cv2.fillPoly(image, [points.astype(np.int32)], tint.tolist(), cv2.LINE_AA)
     return grain(rng, image, rng.uniform(0.02, 0.15))
@@ -192,7 +198,9 @@ def grass(rng: Rng, size: int) -> np.ndarray:
 def asphalt(rng: Rng, size: int) -> np.ndarray:
     """Road: fine aggregate, patches, cracks."""
     base = colour(rng, 0.06, 0.22, 0.5)
-    field = noise(rng, size, rng.uniform(0.2, 0.7)) * rng.uniform(0.04, 0.14) + noise(rng, size, 1.9) * rng.uniform(0.03, 0.12)
+    field = noise(rng, size, rng.uniform(0.2, 0.7)) * rng.uniform(0.04, 0.14) + noise(rng, size, 1.9) * rng.uniform(
+        0.03, 0.12
+    )
     image = np.clip(base * (1 + field[..., None]), 0, 1).astype(np.float32)
     for _ in range(int(rng.integers(0, 7))):
         walk = rng.uniform(0, size, 2) + np.cumsum(rng.normal(rng.normal(0, 4, 2), 5, (40, 2)), 0)
@@ -233,7 +241,7 @@ def facade(rng: Rng, size: int) -> np.ndarray:
 
 def text(rng: Rng, size: int) -> np.ndarray:
     """A poster: headline, lines of letters, a picture block."""
-    image = np.broadcast_to(colour(rng, 0.4, 0.5, 1), (size, size, 3)).astype(np.float32).copy()
+    image: np.ndarray = np.broadcast_to(colour(rng, 0.4, 0.5, 1), (size, size, 3)).astype(np.float32).copy()
     for _ in range(int(rng.integers(0, 4))):
         x, y, w, h = rng.uniform(0.05, 0.6, 4) * size
         cv2.rectangle(image, (int(x), int(y)), (int(x + w), int(y + h)), colour(rng, 0.5).tolist(), -1)

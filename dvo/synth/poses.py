@@ -1,7 +1,7 @@
 """Rigid motions in numpy float64, for laying out scenes and camera paths.
 
-Poses are ``(..., 7)`` ``tx ty tz qx qy qz qw``; matrices map camera to world where named ``_wc``. The renderer builds its
-per-frame coefficients in float64 here, so that float32 images stay consistent over scenes of hundreds of metres.
+Poses are ``(..., 7)`` ``tx ty tz qx qy qz qw``; matrices map camera to world where named ``_wc``. The renderer builds
+its per-frame coefficients in float64 here, so that float32 images stay consistent over scenes of hundreds of metres.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def quaternion_to_matrix(q: np.ndarray) -> np.ndarray:
 
 
 def matrix_to_quaternion(m: np.ndarray) -> np.ndarray:
-    """``(..., 3, 3)`` -> ``(..., 4)`` ``qx qy qz qw`` with ``qw >= 0``; picks the largest of four pivots for accuracy."""
+    """``(..., 3, 3)`` -> ``(..., 4)`` ``qx qy qz qw``, ``qw >= 0``; picks the largest of four pivots for accuracy."""
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     dx, dy, dz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]

@@ -16,12 +16,10 @@ from torch import Tensor
 
 from dvo.errors import DvoError
 from dvo.synth.antialias import smooth_outlines
-from dvo.synth.poses import split
 from dvo.synth.scene import CELL, Scene
 from dvo.synth.textures import sample
+from dvo.synth.view import SLACK, View, look
 
-NEAR = 1e-3  # metres; cameras keep farther away than this from everything
-SLACK = 1e-5  # rad by which surfaces are fattened, so that walls sharing an edge leave no crack
 PIECE = 9600  # pixels shaded at once on a CPU
 Array = np.ndarray
 
@@ -43,81 +41,16 @@ class Rendering:
     uv: Tensor
 
 
-@dataclass
-class _View:
-    """Linear functions of the pixel (x, y, 1) for N frames and the Q surfaces in sight of any of them, float64.
-
-    ``index (Q,)`` surfaces, ``basis (N, Q, 3, 3)`` rows u/Z, v/Z, 1/Z, ``edges (N, Q, 4, 3)``, ``seen (N, Q)`` bool and
-    ``window (N, Q, 4)`` x0 y0 x1 y1 pixel bounds.
-    """
-
-    index: Array
-    basis: Array
-    edges: Array
-    seen: Array
-    window: Array
-
-
-def _in_sight(scene: Scene, rotation: Array, centre: Array, intrinsics: Array, size: tuple[int, int] | None) -> Array:
-    """Surfaces that may show in any frame: facing it and with a bounding sphere that meets the viewing cone."""
-    height = -((scene.origin - centre[:, None]) * scene.normal).sum(-1)
-    seen = (np.abs(height) > 1e-9) & (scene.two_sided | (height > 0))
-    middle, radius = scene.spheres
-    local = (middle - centre[:, None]) @ rotation
-    seen &= local[..., 2] > NEAR - radius
-    if size is not None:
-        fx, fy, cx, cy = (column[:, None] for column in intrinsics.T)
-        for axis, f, c, extent in ((0, fx, cx, size[1]), (1, fy, cy, size[0])):
-            for edge, sign in (((-1.0 - c) / f, 1), ((extent - c) / f, -1)):
-                plane = sign * (local[..., axis] - edge * local[..., 2]) / np.hypot(1, edge)
-                seen &= plane > -radius
-    return seen
-
-
-def _project(scene: Scene, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None) -> _View:
-    """Build the linear functions; ``size`` (height, width) culls what cannot show, None keeps whatever faces a camera."""
-    rotation, centre = split(poses_wc)  # (N, 3, 3) camera to world, (N, 3)
-    seen = _in_sight(scene, rotation, centre, intrinsics, size)
-    index = np.flatnonzero(seen.any(0))
-    seen = seen[:, index]
-    n = len(poses_wc)
-    fx, fy, cx, cy = intrinsics.T
-    k_inverse = np.zeros((n, 3, 3))
-    k_inverse[:, 0, 0], k_inverse[:, 0, 2] = 1 / fx, -cx / fx
-    k_inverse[:, 1, 1], k_inverse[:, 1, 2], k_inverse[:, 2, 2] = 1 / fy, -cy / fy, 1
-    ray = rotation @ k_inverse  # world direction of a pixel: ray @ (x, y, 1)
-    normal, u_axis, v_axis = scene.normal[index], scene.u_axis[index], scene.v_axis[index]
-    offset = scene.origin[index] - centre[:, None]  # (N, Q, 3)
-    height = (offset * normal).sum(-1)
-    inverse_depth = (normal @ ray) / np.where(np.abs(height) < 1e-9, 1e-9, height)[..., None]
-    u = u_axis @ ray - (offset * u_axis).sum(-1)[..., None] * inverse_depth
-    v = v_axis @ ray - (offset * v_axis).sum(-1)[..., None] * inverse_depth
-    basis = np.stack([u, v, inverse_depth], 2)
-    # Pixel bounds: the corners in front of the camera and the points where the outline crosses the near plane.
-    local = ((scene.corners[index].reshape(-1, 3) - centre[:, None]) @ rotation).reshape(n, -1, 4, 3)
-    following = np.roll(local, -1, 2)
-    z, z_next = local[..., 2], following[..., 2]
-    crosses = (z > NEAR) != (z_next > NEAR)
-    share = np.where(crosses, (NEAR - z) / np.where(crosses, z_next - z, 1), 0)
-    points = np.concatenate([local, local + share[..., None] * (following - local)], 2)
-    usable = np.concatenate([z > NEAR, crosses], 2)
-    scale = 1 / np.where(usable, np.maximum(points[..., 2], NEAR), 1)
-    x = points[..., 0] * scale * fx[:, None, None] + cx[:, None, None]
-    y = points[..., 1] * scale * fy[:, None, None] + cy[:, None, None]
-    low = [np.where(usable, c, 1e9).min(-1) for c in (x, y)]
-    high = [np.where(usable, c, -1e9).max(-1) for c in (x, y)]
-    window = np.stack([*low, *high], -1)
-    return _View(index, basis, scene.edges[index] @ basis, seen & usable.any(-1), window)
-
-
-def _cast(view: _View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
+def _cast(view: View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
     """Largest inverse depth ``(N, H, W)``, the position in ``view.index`` of its surface (int32, -1 for none), and the
     functions ``(N, Q, 5, 3)`` that decided it: inverse depth and edges.
     """
     n = len(view.seen)
     slack = 0.02  # pixels; the windows are exact but for rounding and SLACK
     x0, y0 = (np.clip(np.ceil(view.window[..., i] - slack), 0, m).astype(int) for i, m in ((0, width), (1, height)))
-    x1, y1 = (np.clip(np.floor(view.window[..., i] + slack) + 1, 0, m).astype(int) for i, m in ((2, width), (3, height)))
+    x1, y1 = (
+        np.clip(np.floor(view.window[..., i] + slack) + 1, 0, m).astype(int) for i, m in ((2, width), (3, height))
+    )
     seen = view.seen & (x1 > x0) & (y1 > y0)
     functions = np.concatenate([view.basis[:, :, 2:], view.edges], 2)  # (N, Q, 5, 3)
     functions[~seen] = [0.0, 0.0, -1.0]  # hidden from this camera, but seen by another one of the batch
@@ -134,7 +67,9 @@ def _cast(view: _View, height: int, width: int, device: torch.device | str) -> t
         which = np.flatnonzero(seen[:, q])
         n0, n1 = int(which[0]), int(which[-1]) + 1
         rows = table[n0:n1, q]
-        value = torch.addcmul(rows[..., 2:], rows[..., 1:2], ys[c:d])[..., None] + (rows[..., :1] * xs[a:b])[..., None, :]
+        value = (
+            torch.addcmul(rows[..., 2:], rows[..., 1:2], ys[c:d])[..., None] + (rows[..., :1] * xs[a:b])[..., None, :]
+        )
         inverse, best = value[:, 0], nearest[n0:n1, c:d, a:b]
         hit = (value[:, 1:].amin(1) >= -SLACK) & (inverse > best)
         best.copy_(torch.where(hit, inverse, best))
@@ -147,7 +82,7 @@ def _linear(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return torch.addcmul(torch.addcmul(rows[2], rows[0], x), rows[1], y)
 
 
-def _functions(scene: Scene, view: _View, device: torch.device | str) -> Tensor:
+def _functions(scene: Scene, view: View, device: torch.device | str) -> Tensor:
     """Coefficients ``(N Q, 15)`` of 1/Z, s/Z, t/Z and of the light-map coordinates over Z."""
     texture = scene.texture_map[view.index] @ view.basis
     light = scene.light_map[view.index] @ view.basis
@@ -156,7 +91,7 @@ def _functions(scene: Scene, view: _View, device: torch.device | str) -> Tensor:
 
 
 def _shade(scene: Scene, functions: Tensor, row: Tensor, surface: Tensor, x: Tensor, y: Tensor, taps: int) -> Tensor:
-    """Colour ``(3, M)`` in [0, 1] of M pixels (x, y) that show ``surface (M,)`` with coefficients ``functions[row]``."""
+    """Colour ``(3, M)`` in [0, 1] of M pixels (x, y) that show ``surface (M,)``, with functions in ``row (M,)``."""
     tables = scene.tensors(surface.device)
     f = functions.index_select(0, row).t().contiguous().view(5, 3, -1)
     about = tables["surface"].index_select(1, surface)
@@ -204,18 +139,18 @@ def render_depth(
 ) -> tuple[Tensor, Tensor]:
     """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
     poses, k = _cameras(poses_wc, intrinsics)
-    view = _project(scene, poses, k, (height, width))
+    view = look(scene, poses, k, (height, width))
     nearest, local, _ = _cast(view, height, width, device)
     return torch.where(local >= 0, 1 / nearest, 0.0), _named(view, local)
 
 
-def _named(view: _View, local: Tensor) -> Tensor:
+def _named(view: View, local: Tensor) -> Tensor:
     """Positions in ``view.index`` -> surfaces of the scene, int64; -1 stays."""
     names = torch.from_numpy(np.append(view.index, -1).astype(np.int64)).to(local.device)
     return names[local.long()]
 
 
-def _colours(scene: Scene, view: _View, local: Tensor, taps: int) -> Tensor:
+def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:
     """Images ``(N, 3, H, W)`` of a cast grid, in pieces that stay in the processor's cache."""
     n, height, width = local.shape
     device = local.device
@@ -266,7 +201,7 @@ def render(
         DvoError: poses or intrinsics of the wrong shape or not finite.
     """
     poses, k = _cameras(poses_wc, intrinsics)
-    view = _project(scene, poses, k, (height, width))
+    view = look(scene, poses, k, (height, width))
     nearest, local, functions = _cast(view, height, width, device)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
     if supersample == 1:
@@ -276,7 +211,7 @@ def render(
     else:
         m = supersample
         fine = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
-        fine_view = _project(scene, poses, fine, (height * m, width * m))
+        fine_view = look(scene, poses, fine, (height * m, width * m))
         _, fine_local, _ = _cast(fine_view, height * m, width * m, device)
         images = torch.nn.functional.avg_pool2d(_colours(scene, fine_view, fine_local, taps), m)
     n = len(poses)
@@ -301,7 +236,7 @@ def trace(scene: Scene, poses_wc: object, intrinsics: object, pixels: Array) -> 
         depth ``(N, M)``, surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
     """
     poses, k = _cameras(poses_wc, intrinsics)
-    view = _project(scene, poses, k, None)
+    view = look(scene, poses, k, None)
     homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1).swapaxes(1, 2)  # (N, 3, M)
     inverse = view.basis[:, :, 2] @ homogeneous  # (N, Q, M)
     inside = (view.edges @ homogeneous[:, None]).min(2) >= -SLACK

@@ -1,8 +1,8 @@
 """What a scene is: flat convex surfaces with textures and baked light, and where a camera may fly among them.
 
 World frame: z up, metres. A surface is a parallelogram-bounded convex polygon in the plane
-``origin + u * u_axis + v * v_axis`` (unit axes, u and v in metres). Seen from the front, u points right and v down, as in
-an image, so that textures stand upright; ``v_axis x u_axis`` is the front normal.
+``origin + u * u_axis + v * v_axis`` (unit axes, u and v in metres). Seen from the front, u points right and v down, as
+in an image, so that textures stand upright; ``v_axis x u_axis`` is the front normal.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dvo.synth.textures import TexturePool
@@ -174,7 +175,7 @@ class SceneBuilder:
         return Material(texture, repeat, tint * strength, tint * (1 - strength) * mean, turn, whole)
 
     def polygon(
-        self, corners: Array, material: Material, *, up: Array | None = None, two_sided: bool = False
+        self, corners: ArrayLike, material: Material, *, up: Array | None = None, two_sided: bool = False
     ) -> None:
         """Add a convex planar polygon ``(3 or 4, 3)``, corners counter-clockwise seen from the front."""
         corners = np.asarray(corners, float)
@@ -195,22 +196,22 @@ class SceneBuilder:
         )  # fmt: skip
 
     def rectangle(
-        self, centre: Array, normal: Array, up: Array, width: float, height: float, material: Material,
+        self, centre: ArrayLike, normal: ArrayLike, up: ArrayLike, width: float, height: float, material: Material,
         *, two_sided: bool = False,
     ) -> None:  # fmt: skip
         """Add a rectangle facing ``normal``; ``up`` (made orthogonal to it) is the direction of its height."""
-        normal, up = np.asarray(normal, float), np.asarray(up, float)
-        normal = normal / np.sqrt(normal @ normal)
-        up = up - (up @ normal) * normal
-        up = up / np.sqrt(up @ up)
-        right = _cross(up, normal)
-        a, b = right * width / 2, up * height / 2
-        centre = np.asarray(centre, float)
-        corners = np.stack([centre - a - b, centre + a - b, centre + a + b, centre - a + b])
-        self.polygon(corners, material, up=up, two_sided=two_sided)
+        front, rise = np.asarray(normal, float), np.asarray(up, float)
+        front = front / np.sqrt(front @ front)
+        rise = rise - (rise @ front) * front
+        rise = rise / np.sqrt(rise @ rise)
+        a, b = _cross(rise, front) * width / 2, rise * height / 2
+        spot = np.asarray(centre, float)
+        self.polygon(
+            np.stack([spot - a - b, spot + a - b, spot + a + b, spot - a + b]), material, up=rise, two_sided=two_sided
+        )
 
     def box(
-        self, centre: Array, half: Array, rotation: Array, materials: list[Material], *, inside: bool = False,
+        self, centre: ArrayLike, half: ArrayLike, rotation: Array, materials: list[Material], *, inside: bool = False,
         faces: str = "xXyYzZ",
     ) -> None:  # fmt: skip
         """Add a box (``inside=True``: a room seen from within). ``materials``: one, or side / top / bottom."""
@@ -230,7 +231,7 @@ class SceneBuilder:
         if not inside:
             self.solids.append(np.concatenate([centre, half, rotation.ravel()]))
 
-    def prism(self, foot: Array, radius: float, height: float, sides: int, material: Material) -> None:
+    def prism(self, foot: ArrayLike, radius: float, height: float, sides: int, material: Material) -> None:
         """Add an upright column of ``sides`` faces with a lid."""
         angle = np.arange(sides) * 2 * np.pi / sides + self.rng.uniform(0, 1)
         ring = np.asarray(foot, float) + radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], -1)

@@ -1,6 +1,7 @@
 """What a camera does to a clean rendering: exposure, colour, vignetting, blur, noise. Light version.
 
-Everything is drawn from a seed; the drawing and the noise are made on the CPU, so that a clip does not depend on the device.
+Everything is drawn from a seed; the drawing and the noise are made on the CPU, so that a clip does not depend on the
+device.
 """
 
 from __future__ import annotations

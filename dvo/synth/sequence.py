@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -13,11 +13,11 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth.families import random_scene
-from dvo.synth.paths import SplinePath, long_path
 from dvo.synth.renderer import Rendering, render
 from dvo.synth.scene import Scene
 from dvo.synth.sensor import Sensor, expose, random_intrinsics, random_sensor
 from dvo.synth.textures import texture_pool
+from dvo.synth.walks import SplinePath, long_path
 
 
 @dataclass
@@ -55,9 +55,7 @@ class SyntheticSequence:
     def rendering(self, index: int) -> Rendering:
         """Clean picture, depth, surfaces and texture coordinates of one frame (batch of 1)."""
         pose, size = self.groundtruth.poses_wc[index : index + 1], (self.camera.height, self.camera.width)
-        return render(
-            self.scene, pose, self.camera.intrinsics, *size, supersample=self.supersample, device=self.device
-        )
+        return render(self.scene, pose, self.camera.intrinsics, *size, supersample=self.supersample, device=self.device)
 
     def frame(self, index: int) -> Frame:
         """One frame as a camera would deliver it."""
@@ -120,8 +118,6 @@ def make_sequence(
 
 def fixed_exposure(sensor: Sensor, scene: Scene, poses_wc: np.ndarray, camera: Camera) -> Sensor:
     """The sensor with its automatic exposure frozen at the mean brightness of some views."""
-    from dataclasses import replace
-
     small = camera.resized(40, 30)
     bright = float(render(scene, poses_wc, small.intrinsics, 30, 40).images.mean())
     gain = (sensor.exposure / max(bright, 0.02)) ** 0.8 if sensor.exposure is not None else 1.0

@@ -1,7 +1,7 @@
 """The texture pool: procedural patterns and photographs as one mip-mapped atlas, and its antialiased sampling.
 
-A pool belongs to (seed, count, size) and is shared by all scenes of a process; a surface picks a texture, a random window
-of it, a tint and a contrast. Textures are drawn when they are first used.
+A pool belongs to (seed, count, size) and is shared by all scenes of a process; a surface picks a texture, a random
+window of it, a tint and a contrast. Textures are drawn when they are first used.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _fill_cell(cell: np.ndarray, image: np.ndarray, levels: int) -> None:
 class TexturePool:
     """Mip-mapped textures laid out in one picture; about a third are photographs where scikit-image is installed.
 
-    Every texture has a cell of ``size`` x ``1.5 size`` texels: level 0 on top, the smaller levels side by side below it.
+    Every texture has a cell of ``size`` x ``1.5 size`` texels: level 0 on top, the smaller levels in a row below it.
 
     Args:
         seed: same seed, same textures (on one machine, with the same packages).

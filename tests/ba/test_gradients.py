@@ -77,9 +77,9 @@ def test_a_network_can_learn_through_the_layer(problem: Maker) -> None:
     """Descent on the targets alone brings the poses that come out to where they ought to be."""
     p = problem(batch=1, noise=1.0)
     targets = p.targets.clone().requires_grad_()
-    optimiser = torch.optim.Adam([targets], lr=0.05)
+    optimiser = torch.optim.Adam([targets], lr=0.1)
     losses = []
-    for _ in range(40):
+    for _ in range(20):
         poses, _ = bundle_adjust(p.poses, p.patches, p.intrinsics, targets, p.weights, p.ii, p.jj, p.kk)
         loss = se3.log(se3.relative(poses, p.true_poses)).square().sum()
         optimiser.zero_grad()

@@ -14,6 +14,7 @@ from dvo.ba import edges as edges_module
 from dvo.ba.edges import plan_edges
 from dvo.ba.layer import BADamping, DepthPrior, PosePrior
 from dvo.ba.reference import bundle_adjust_reference
+from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 
@@ -209,6 +210,13 @@ def test_inverse_depths_stay_in_range(problem: Maker) -> None:
     p = problem(noise=20.0)
     _, patches = p.solve(depth_range=(0.5, 0.8))
     assert patches[:, :, 2].min() == 0.5 and patches[:, :, 2].max() == 0.8
+
+
+@pytest.mark.parametrize("name", ["poses", "patches", "intrinsics", "targets", "weights", "jj", "kk"])
+def test_shapes_that_do_not_belong_together(problem: Maker, name: str) -> None:
+    p = problem()
+    with pytest.raises(DvoError, match="shape"):
+        replace(p, **{name: getattr(p, name)[:1]}).solve()
 
 
 def test_half_precision_and_autocast_are_left_at_the_door(problem: Maker) -> None:

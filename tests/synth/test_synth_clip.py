@@ -20,7 +20,7 @@ SEED = 5
 
 @pytest.fixture(scope="module")
 def clips() -> list[Clip]:
-    return [make_clip(SEED, i, **SMALL) for i in range(16)]
+    return [make_clip(SEED, i, **SMALL) for i in range(12)]
 
 
 def digest(tensors: list[torch.Tensor]) -> str:
@@ -89,7 +89,7 @@ def test_frames_carry_the_motion(clips: list[Clip]) -> None:
         mask = torch.from_numpy((points[..., 2] > 0) & (abs(u / 39.5 - 1) < 1) & (abs(v / 29.5 - 1) < 1))
         moved, still = ((a - clip.images[1]).abs().mean(0)[mask].mean() for a in (warped, clip.images[0].float()))
         better += int(moved < still)
-    assert better >= 15
+    assert better >= 11
 
 
 def test_sensor_changes_pictures_only() -> None:

@@ -28,18 +28,18 @@ def two_views(pool: TexturePool, family: str, seed: int = 4) -> tuple[Scene, np.
     return scene, path.poses_wc(np.array([0.0, 0.2]))
 
 
-def world_points(depth: np.ndarray, pose_wc: np.ndarray) -> np.ndarray:
-    y, x = np.mgrid[:H, :W]
-    ray = np.stack([(x - K[2]) / K[0], (y - K[3]) / K[1], np.ones((H, W))], -1)
+def world_points(depth: np.ndarray, pose_wc: np.ndarray, k: np.ndarray = K) -> np.ndarray:
+    y, x = np.mgrid[: depth.shape[0], : depth.shape[1]]
+    ray = np.stack([(x - k[2]) / k[0], (y - k[3]) / k[1], np.ones(depth.shape)], -1)
     rotation, centre = split(pose_wc)
     return (ray * depth[..., None]) @ rotation.T + centre
 
 
-def into(points: np.ndarray, pose_wc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def into(points: np.ndarray, pose_wc: np.ndarray, k: np.ndarray = K) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and depth of world points in a camera."""
     rotation, centre = split(inverse(pose_wc))
     local = points @ rotation.T + centre
-    return local[..., :2] / local[..., 2:] * K[:2] + K[2:], local[..., 2]
+    return local[..., :2] / local[..., 2:] * k[:2] + k[2:], local[..., 2]
 
 
 @pytest.mark.parametrize("family", list(FAMILIES))
@@ -60,26 +60,32 @@ def test_pixel_lands_on_same_surface_and_texture_coordinate(pool: TexturePool, f
     # Where frame j's texture coordinate, placed in frame i, misses the pixel it came from, is the error.
     start = frames.uv[0].numpy()[inside].astype(float)
     for coordinates in (start, uv[0]):
-        spot = scene.origin[labels] + coordinates[:, :1] * scene.u_axis[labels] + coordinates[:, 1:] * scene.v_axis[labels]
+        across, down = coordinates[:, :1] * scene.u_axis[labels], coordinates[:, 1:] * scene.v_axis[labels]
+        spot = scene.origin[labels] + across + down
         error = np.linalg.norm(into(spot, poses[1])[0] - pixels[inside], axis=-1)[same]
         assert error.max() < 1e-3
 
 
-@pytest.mark.parametrize("family", list(FAMILIES))
-def test_warp_is_photometrically_consistent(pool: TexturePool, family: str) -> None:
-    scene, poses = two_views(pool, family)
-    frames = render(scene, poses, K, H, W, supersample=2)
-    points = world_points(frames.depth[0].numpy().astype(float), poses[0])
-    pixels, depth = into(points, poses[1])
-    grid = torch.from_numpy((pixels / [(W - 1) / 2, (H - 1) / 2] - 1).astype(np.float32))[None]
-    sampled = torch.nn.functional.grid_sample(frames.images[1:], grid, align_corners=True)[0]
-    there = torch.nn.functional.grid_sample(frames.depth[1:, None], grid, align_corners=True)[0, 0].numpy()
-    mask = (np.abs(pixels / [W - 1, H - 1] - 0.5) < 0.5).all(-1) & (np.abs(there / depth - 1) < 0.01)
-    assert mask.mean() > 0.3
-    error = (sampled - frames.images[0]).abs().amax(0).numpy()[mask]
-    still = (frames.images[1] - frames.images[0]).abs().amax(0).numpy()[mask]
-    # Pictures that are busy at the scale of a pixel lose something in interpolation: bound the median by the clip's own.
-    assert np.median(error) < max(1 / 255, 0.25 * np.median(still))
+def test_warp_is_photometrically_consistent() -> None:
+    """Frame i warped to j by depth and pose equals frame j outside occlusions, in every family."""
+    pool = texture_pool(11)
+    errors, changes = [], []
+    for seed, family in enumerate(FAMILIES):
+        scene, poses = two_views(pool, family, seed)
+        k = 2 * K + [0, 0, 0.5, 0.5]
+        frames = render(scene, poses, k, 2 * H, 2 * W)
+        points = world_points(frames.depth[0].numpy().astype(float), poses[0], k)
+        pixels, depth = into(points, poses[1], k)
+        grid = torch.from_numpy((pixels / [W - 0.5, H - 0.5] - 1).astype(np.float32))[None]
+        sampled = torch.nn.functional.grid_sample(frames.images[1:], grid, align_corners=True)[0]
+        there = torch.nn.functional.grid_sample(frames.depth[1:, None], grid, align_corners=True)[0, 0].numpy()
+        mask = (np.abs(grid[0].numpy()) < 1).all(-1) & (np.abs(there / depth - 1) < 0.01)
+        assert mask.mean() > 0.3
+        errors.append(np.median((sampled - frames.images[0]).abs().mean(0).numpy()[mask]))
+        changes.append(np.median((frames.images[1] - frames.images[0]).abs().mean(0).numpy()[mask]))
+    # What is left is interpolation of pictures that are busy at the scale of a pixel.
+    assert np.median(errors) < 1 / 255 and max(errors) < 3 / 255
+    assert np.median(np.array(changes) / errors) > 3, "the frames hardly differ: the test shows nothing"
 
 
 def test_smooth_texture_warps_below_one_grey_level() -> None:
@@ -108,8 +114,9 @@ def test_depth_of_known_plane_and_texture_is_upright() -> None:
     rotation = look_rotation(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     frames = render(scene, pose_from(rotation, np.zeros(3))[None], K, H, W)
     hit = frames.surface[0] == 0
+    images = render(scene, pose_from(rotation, np.zeros(3))[None], K, H, W, antialias=False).images
     assert torch.allclose(frames.depth[0][hit], torch.tensor(2.0), rtol=1e-6)
-    assert (frames.depth[0][~hit] == 0).all() and (frames.images[0][:, ~hit] == 0).all()
+    assert (frames.depth[0][~hit] == 0).all() and (images[0][:, ~hit] == 0).all()
     rows, columns = np.nonzero(hit.numpy())
     assert len(rows) == pytest.approx(1.0 / 2 * K[0] * 0.5 / 2 * K[1], rel=0.1)
     uv = frames.uv[0].numpy()[hit.numpy()]

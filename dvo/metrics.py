@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dvo.data.poses import poses_from_matrices
+from dvo.data.poses import pose_matrices, poses_from_matrices
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 
@@ -90,32 +90,10 @@ def associate(estimate: Trajectory, reference: Trajectory, max_dt: float = 0.01)
     return (pairs[1], pairs[0]) if swap else pairs
 
 
-def umeyama(source: np.ndarray, target: np.ndarray, with_scale: bool) -> tuple[float, np.ndarray, np.ndarray]:
-    """Least-squares ``target ~ s R source + t`` (Umeyama 1991, eq. 34-43).
-
-    Args:
-        source, target: ``(N, 3)`` points. Points on one line are fine: the turn about the line stays arbitrary.
-        with_scale: fit ``s``; otherwise it is 1.
-
-    Returns:
-        ``s``, ``R (3, 3)``, ``t (3,)``. ``s`` is nan when the source stands still.
-    """
-    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
-    centred_source, centred_target = source - mean_source, target - mean_target
-    u, d, vt = np.linalg.svd(centred_target.T @ centred_source / len(source))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = (u * sign) @ vt
-    variance = float((centred_source**2).sum() / len(source))
-    scale = 1.0
-    if with_scale:
-        scale = float((d * sign).sum() / variance) if variance > 0 else float("nan")
-    return scale, rotation, mean_target - scale * rotation @ mean_source
-
-
 def fit_alignment(
     source: np.ndarray, target: np.ndarray, mode: Alignment = "sim3"
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The similarity ``s, R, t`` that a table's alignment stands for, from matched positions ``(N, 3)``.
+    """The similarity ``s, R, t`` with ``target ~ s R source + t`` that an alignment stands for, from ``(N, 3)`` positions.
 
     ``scale`` takes the scale of the Sim(3) fit and leaves the pose alone, as evo does.
 
@@ -128,8 +106,13 @@ def fit_alignment(
         )
     if mode == "none":
         return 1.0, np.eye(3), np.zeros(3)
-    scale, rotation, translation = umeyama(source, target, with_scale=mode != "se3")
-    return (scale, np.eye(3), np.zeros(3)) if mode == "scale" else (scale, rotation, translation)
+    from dvo.geometry.alignment import align  # here, because it brings torch along
+
+    fitted = align(source, target, "se3" if mode == "se3" else "sim3").numpy()
+    if mode == "scale":
+        return float(fitted[7]), np.eye(3), np.zeros(3)
+    matrix = pose_matrices(fitted[:7])
+    return float(fitted[7]), matrix[:3, :3], matrix[:3, 3]
 
 
 def transform(trajectory: Trajectory, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Trajectory:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from dvo.metrics import align_trajectory, associate, relative_rotation_errors
 from dvo.viz.plot import INK, PAPER, plan_axes, with_gaps
 from eval.sequences import Sequence, Suite
 
-COLORS = ("#e4572e", "#4a6fa5", "#c79a2b", "#2a9d5c", "#b5679e", "#56b4c8")
+# A system keeps its colour from picture to picture; those without one of their own take the rest in turn.
+COLORS = {"dvo-small": "#e4572e", "klt-pnp": "#4a6fa5", "null": "#c79a2b"}
+OTHERS = ("#2a9d5c", "#b5679e", "#56b4c8", "#7a5c3e")
 
 
 def plot_sequence(
@@ -34,8 +37,10 @@ def plot_sequence(
     plan.plot(*groundtruth.positions[:, [first, second]].T, color="#aab1ba", lw=4, label="ground truth")
     plan.plot(*groundtruth.positions[0, [first, second]], "o", color=INK, ms=7, zorder=5)
     by_rotation = sequence.judged_by == "rpe_rot_deg"
-    for position, (name, estimate) in enumerate(estimates.items()):
-        style = {"color": COLORS[position % len(COLORS)], "lw": 1.6}
+    others = [name for name in estimates if name not in COLORS]
+    for name, estimate in estimates.items():
+        color = COLORS[name] if name in COLORS else OTHERS[others.index(name) % len(OTHERS)]
+        style: dict[str, Any] = {"color": color, "lw": 1.6}
         if len(estimate) < 2:
             plan.plot([], [], **style, label=f"{name}: no trajectory")
             continue

@@ -34,8 +34,8 @@ class TrackerConfig:
 
     pixels: int = 320 * 240
     patches: int = 24
-    lifetime: int = 8
-    removal: int = 10
+    lifetime: int = 7
+    removal: int = 9
     optimisation: int = 8
     initial_frames: int = 8
     initial_updates: int = 12

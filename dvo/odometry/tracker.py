@@ -72,7 +72,7 @@ class PatchOdometry:
         self.window = Window.empty(config.patches, c.patch_size, c.hidden_channels, self.device)
         # Sides leave room for several pixels of motion before a window must be fetched again.
         self._correlations = [
-            EdgeCorrelation(scale, c.patch_size**2, c.radius, 20 if scale == 1 else 16, self.device)
+            EdgeCorrelation(scale, c.patch_size**2, c.radius, 16 if scale == 1 else 14, self.device)
             for scale in c.pyramid
         ]
         self._maps: list[Tensor] = []  # (slots, h, w, C) for each level

@@ -15,7 +15,7 @@ import torch
 
 from dvo.allocator import reuse_freed_memory
 from dvo.odometry.tracker import PatchOdometry, load
-from dvo.synth.clip import make_sequence
+from dvo.synth.sequence import make_sequence
 
 STAGES = {
     "encoder and patches": ("tracker.py", "_observe"),

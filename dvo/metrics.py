@@ -93,7 +93,7 @@ def associate(estimate: Trajectory, reference: Trajectory, max_dt: float = 0.01)
 def fit_alignment(
     source: np.ndarray, target: np.ndarray, mode: Alignment = "sim3"
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The similarity ``s, R, t`` with ``target ~ s R source + t`` that an alignment stands for, from ``(N, 3)`` positions.
+    """The ``s, R, t`` of ``target ~ s R source + t`` that an alignment stands for, from positions ``(N, 3)``.
 
     ``scale`` takes the scale of the Sim(3) fit and leaves the pose alone, as evo does.
 

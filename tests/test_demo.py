@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -39,3 +42,14 @@ def test_demo_reports_the_error_against_ground_truth(monkeypatch, fake_odometry,
     assert written["ate_rmse"] == pytest.approx(0, abs=1e-6) and written["scale"] == pytest.approx(1 / 3, rel=1e-6)
     said = capsys.readouterr().out
     assert "ATE" in said and str(tmp_path / "out") in said
+
+
+@pytest.mark.slow
+def test_demo_takes_less_than_two_minutes(tmp_path, repository):
+    """The real command with the shipped weights, as after an install."""
+    started = time.perf_counter()
+    command = [sys.executable, "-m", "dvo", "demo", "--device", "cpu", "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, cwd=repository, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert time.perf_counter() - started < 120
+    assert "ATE" in done.stdout and (tmp_path / "out" / "trajectory.png").is_file()

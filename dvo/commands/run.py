@@ -54,6 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         "source": str(arguments.source),
         "kind": getattr(source, "kind", None),
         "calibration": arguments.calib,
+        "groundtruth": arguments.groundtruth,
         "weights": arguments.weights,
         "device": str(device),
         "seed": arguments.seed,

@@ -52,5 +52,9 @@ def _smooth_frame(image: Tensor, surface: Tensor, functions: Tensor, slack: floa
         # What a surface hides counts for nothing; where no candidate covers the place, the pixel's own colour stays.
         score = torch.where(inside, value[0], -1.0)
         score[0].clamp_min_(-0.5)
-        total += colours[:, places.gather(0, score.argmax(0)[None])[0]]
+        best, chosen = score[0], places[0]
+        for k in range(1, len(places)):  # an argmax over five rows, which torch is slow at
+            better = score[k] > best
+            best, chosen = torch.where(better, score[k], best), torch.where(better, places[k], chosen)
+        total += colours[:, chosen]
     colours[:, at] = total / len(OFFSETS)

@@ -204,7 +204,9 @@ def make_clip(
             f"no path in clip {index} meets the flow range {flow_range}", field="flow_range", remedy="ask for less flow"
         )
     poses_wc = plan.path.poses_wc(plan.times)
-    rendering = render(scene, poses_wc, intrinsics, height, width, supersample=supersample, device=device)
+    rendering = render(
+        scene, poses_wc, intrinsics, height, width, supersample=supersample, device=device, coordinates=False
+    )
     images = rendering.images
     if sensor:
         camera = random_sensor(rng)

@@ -184,6 +184,7 @@ def render(
     device: torch.device | str = "cpu",
     taps: int = 2,
     antialias: bool = True,
+    coordinates: bool = True,
 ) -> Rendering:
     """Render N frames.
 
@@ -196,6 +197,7 @@ def render(
         device: where to render.
         taps: texture samples along the longer axis of a pixel's footprint (anisotropic filter).
         antialias: smooth outlines by coverage (with one ray a pixel; more rays smooth by themselves).
+        coordinates: fill ``uv`` too; without, it is empty ``(N, 0, 0, 2)``.
 
     Raises:
         DvoError: poses or intrinsics of the wrong shape or not finite.
@@ -214,14 +216,20 @@ def render(
         fine_view = look(scene, poses, fine, (height * m, width * m))
         _, fine_local, _ = _cast(fine_view, height * m, width * m, device)
         images = torch.nn.functional.avg_pool2d(_colours(scene, fine_view, fine_local, taps), m)
-    n = len(poses)
+    uv = _coordinates(view, local, depth) if coordinates else torch.zeros(len(poses), 0, 0, 2, device=device)
+    return Rendering(images, depth, _named(view, local), uv)
+
+
+def _coordinates(view: View, local: Tensor, depth: Tensor) -> Tensor:
+    """Surface coordinates ``(N, H, W, 2)`` of a cast grid."""
+    n, height, width = local.shape
+    device = local.device
     uv = torch.from_numpy(view.basis[:, :, :2].astype(np.float32).reshape(-1, 6)).to(device)
     frame = torch.arange(n, device=device)[:, None, None] * len(view.index)
     chosen = uv[(frame + local.clamp_min(0)).reshape(-1)].view(n, height, width, 2, 3)
     xs = torch.arange(width, dtype=torch.float32, device=device)[:, None]
     ys = torch.arange(height, dtype=torch.float32, device=device)[:, None, None]
-    coordinates = (chosen[..., 0] * xs + chosen[..., 1] * ys + chosen[..., 2]) * depth[..., None]
-    return Rendering(images, depth, _named(view, local), coordinates)
+    return (chosen[..., 0] * xs + chosen[..., 1] * ys + chosen[..., 2]) * depth[..., None]
 
 
 def trace(scene: Scene, poses_wc: object, intrinsics: object, pixels: Array) -> tuple[Array, Array, Array]:

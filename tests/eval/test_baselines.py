@@ -80,7 +80,7 @@ def test_long_blackout_starts_a_second_map(film, path):
     after = result.trajectory.timestamps > path(80).timestamps[50]
     second = Trajectory(result.trajectory.timestamps[after], result.trajectory.poses_wc[after])
     metrics = evaluate(second, path(80), rpe_gap=5)
-    assert after.sum() >= 28 and metrics.ate_percent < 4 and metrics.rotation_error_ratio < 0.1
+    assert after.sum() >= 28 and metrics.ate_percent < 4 and metrics.rotation_error_ratio < 0.25
 
 
 def test_pure_rotation_turns_and_does_not_move(film, path):

@@ -68,7 +68,7 @@ def test_pixel_lands_on_same_surface_and_texture_coordinate(pool: TexturePool, f
 
 def test_warp_is_photometrically_consistent() -> None:
     """Frame i warped to j by depth and pose equals frame j outside occlusions, in every family."""
-    pool = texture_pool(11)
+    pool = texture_pool(5)
     errors, changes = [], []
     for seed, family in enumerate(FAMILIES):
         scene, poses = two_views(pool, family, seed)

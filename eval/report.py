@@ -88,7 +88,7 @@ def protocol(suite: Suite, rows: list[Row], threads: int, device: str) -> str:
         f"Alignment {suite.alignment}; every {suite.stride}. image fed;"
         if suite.stride > 1
         else f"Alignment {suite.alignment}; stride 1;",
-        f"seeds {', '.join(map(str, seeds))}: median [min–max].",
+        f"seeds {', '.join(map(str, seeds))}: median [min–max]." if len(seeds) > 1 else f"seed {seeds[0]}.",
         f"RPE over {suite.rpe_gap} frames, median over the sequence; errors by evo.",
         f"Sequences are judged {judges} (bold: best).",
         f"A run fails if it crashes, takes over {suite.time_limit:g} s, leaves poses that are not finite or poses for "

@@ -43,10 +43,9 @@ def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tenso
     intrinsics = window.intrinsics[[i, j, j]][None]
     kk = torch.arange(m, device=device)
     c = patches.shape[-1] // 2
-    whole, only = (
-        reproject(poses, patches, intrinsics, torch.zeros_like(kk), torch.full_like(kk, t), kk).coords[0, :, c, c]
-        for t in (1, 2)
-    )
+    targets = torch.tensor([1, 2], device=device).repeat_interleave(m)
+    there = reproject(poses, patches, intrinsics, torch.zeros_like(targets), targets, kk.repeat(2)).coords
+    whole, only = there[0, :, c, c].split(m)
     return whole, only
 
 

@@ -4,11 +4,12 @@ For each edge and each of the ``p * p`` patch pixels, at its reprojected positio
 with the ``(2r + 2)^2`` nearest map features, bilinearly blended to ``(2r + 1)^2``; zero outside the map. The
 channels of a level are ordered as DPVO's weights expect: x offset slowest, then y offset, patch row, patch column.
 
-Three ways to the same numbers:
+Ways to the same numbers:
 
 - :func:`correlate_reference`, the specification: bilinear sampling of the features, then dot products.
 - :class:`CorrelationVolume`: all products of a clip as one matrix product, then cheap look-ups. For training.
-- :func:`correlate_windows`: gathers one window of features an edge. For tracking, where the volume would not fit.
+- :func:`correlate_windows`: gathers one window of features an edge, where the volume would not fit;
+  :class:`dvo.nets.edge_correlation.EdgeCorrelation`, which the tracker uses, remembers such windows between updates.
 
 They return one tensor a level; DPVO interleaves them (level fastest), which :class:`dvo.nets.update.Update` undoes on
 the weights of its first layer, a small tensor, rather than on every edge.

@@ -48,6 +48,14 @@ class Encoder(nn.Module):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
+    def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
+        """All but the last layer, which is linear in each pixel: whoever needs few pixels applies it to those."""
+        return self.layer2(self.layer1(F.relu(self.norm1(self.conv1(images)))))
+
+    def head(self, outputs: slice) -> tuple[Tensor, Tensor]:
+        """Weight ``(c, t)`` and bias ``(c,)`` of some outputs of the last layer."""
+        assert self.conv2.bias is not None
+        return self.conv2.weight[outputs, :, 0, 0], self.conv2.bias[outputs]
+
     def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n c h w"]:
-        x = F.relu(self.norm1(self.conv1(images)))
-        return self.conv2(self.layer2(self.layer1(x)))
+        return self.conv2(self.trunk(images))

@@ -19,11 +19,11 @@ class Features:
 
     Attributes:
         matching: ``(B, N, C, h, w)`` features for correlation.
-        context: ``(B, N, D, h, w)`` features for the update operator.
+        trunk: ``(B, N, t, h, w)`` from which the context of the update operator is computed where it is needed.
     """
 
     matching: Tensor
-    context: Tensor
+    trunk: Tensor
 
 
 def normalise_images(images: Tensor) -> Tensor:
@@ -74,16 +74,16 @@ class Patchifier(nn.Module):
             self.inet = Encoder(*sizes, config.hidden_channels, "none")
 
     def encode(self, images: Float[Tensor, "B N 3 H W"]) -> Features:
-        """Features of normalised images; both outputs are divided by 4 as in DPVO."""
+        """Features of normalised images; divided by 4 as in DPVO."""
         b, n = images.shape[:2]
         flat = images.flatten(0, 1)
-        if self.config.shared_encoder:
-            both = self.fnet(flat) / 4.0
-            sizes = [self.config.feature_channels, self.config.hidden_channels]
-            matching, context = both.split(sizes, dim=1)
-        else:
-            matching, context = self.fnet(flat) / 4.0, self.inet(flat) / 4.0
-        return Features(matching.unflatten(0, (b, n)), context.unflatten(0, (b, n)))
+        trunk = self.fnet.trunk(flat)
+        weight, bias = self.fnet.head(slice(self.config.feature_channels))
+        matching = torch.matmul(weight / 4.0, trunk.flatten(2)) + (bias / 4.0)[:, None]
+        matching = matching.unflatten(2, trunk.shape[-2:])
+        if not self.config.shared_encoder:
+            trunk = self.inet.trunk(flat)
+        return Features(matching.unflatten(0, (b, n)), trunk.unflatten(0, (b, n)))
 
     def cut(self, features: Features, centres: Tensor) -> tuple[Tensor, Tensor]:
         """Matching and context features of patches.
@@ -92,11 +92,15 @@ class Patchifier(nn.Module):
             centres: ``(B, N, M, 2)`` from :func:`random_centres`.
 
         Returns:
-            ``(B, N*M, C, p, p)`` matching features and ``(B, N*M, D)`` context at the patch centres.
+            ``(B, N*M, C, p, p)`` matching features and ``(B, N*M, D)`` context at the patch centres, divided by 4.
         """
         matching = crop_patches(features.matching, centres, self.config.patch_size).flatten(1, 2)
-        context = crop_patches(features.context, centres, 1).flatten(1, 2).flatten(2)
-        return matching, context
+        trunk = crop_patches(features.trunk, centres, 1).flatten(1, 2).flatten(2)
+        if self.config.shared_encoder:
+            weight, bias = self.fnet.head(slice(self.config.feature_channels, None))
+        else:
+            weight, bias = self.inet.head(slice(None))
+        return matching, F.linear(trunk, weight, bias) / 4.0
 
 
 def patch_coordinates(centres: Tensor, inverse_depth: Tensor, size: int) -> Float[Tensor, "B K 3 p p"]:

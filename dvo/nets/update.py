@@ -73,6 +73,7 @@ class Update(nn.Module):
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         dim = config.hidden_channels
+        self.taps = 2 * config.radius + 1
         self.c1 = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, dim))
         self.c2 = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, dim))
         self.norm = nn.LayerNorm(dim, eps=1e-3)
@@ -92,11 +93,14 @@ class Update(nn.Module):
         self.d = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp())
         self.w = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp(), nn.Sigmoid())
 
-    def _correlate(self, levels: list[Tensor]) -> Tensor:
+    def _correlate(self, levels: list[Tensor], pixels_first: bool) -> Tensor:
         """The first layer on its channels, level by level: DPVO's weights interleave the levels, level fastest."""
         first = self.corr[0]
         assert isinstance(first, nn.Linear)
-        weights = first.weight.unflatten(1, (-1, len(levels))).unbind(-1)
+        table = first.weight.unflatten(1, (-1, len(levels)))
+        if pixels_first:
+            table = table.unflatten(1, (self.taps, self.taps, -1)).permute(0, 3, 2, 1, 4).flatten(1, 3)
+        weights = table.unbind(-1)
         out = functional.linear(levels[0], weights[0], first.bias)
         for level, weight in zip(levels[1:], weights[1:], strict=True):
             out = out + functional.linear(level, weight)
@@ -108,6 +112,8 @@ class Update(nn.Module):
         context: Float[Tensor, "B E D"],
         correlation: list[Tensor],
         graph: PatchGraph,
+        *,
+        pixels_first: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Revise.
 
@@ -115,11 +121,13 @@ class Update(nn.Module):
             hidden: state, zero for a new edge.
             context: context features of the edge's patch.
             correlation: ``(B, E, c)`` a level, see :mod:`dvo.nets.correlation`.
+            pixels_first: channels are ordered patch row, patch column, y offset, x offset, as
+                :class:`dvo.nets.edge_correlation.EdgeCorrelation` finds them, rather than as DPVO's weights expect.
 
         Returns:
             new state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
         """
-        net = self.norm(hidden + context + self.corr[1:](self._correlate(correlation)))
+        net = self.norm(hidden + context + self.corr[1:](self._correlate(correlation, pixels_first)))
         # The mask multiplies the input, so an edge without a neighbour still receives c(0) (as DPVO's weights expect).
         net = net + self.c1(net.index_select(1, graph.previous) * graph.has_previous)
         net = net + self.c2(net.index_select(1, graph.following) * graph.has_following)

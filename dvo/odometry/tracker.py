@@ -75,7 +75,7 @@ class PatchOdometry:
             EdgeCorrelation(scale, c.patch_size**2, c.radius, 16 if scale == 1 else 14, self.device)
             for scale in c.pyramid
         ]
-        self._maps: list[Tensor] = []  # (slots, h, w, C) for each level
+        self._bounds = (0, 0)  # width and height of the feature map
         self._records: list[_Record] = []
         self._settled: dict[int, np.ndarray] = {}
         self._points: list[np.ndarray] = []
@@ -175,8 +175,9 @@ class PatchOdometry:
         centres = random_centres(1, config.patches, h, w, self._generator).to(self.device)
         matching, context = net.patchify.cut(features, centres)
         slot = self.window.free_slot()
-        for index, level in enumerate(pool_levels(features.matching, net.config.pyramid)):
-            self._keep_map(index, slot, level[0, 0].permute(1, 2, 0))
+        self._bounds = (w, h)
+        for cache, level in zip(self._correlations, pool_levels(features.matching, net.config.pyramid), strict=True):
+            cache.keep_map(slot, level[0, 0])
         x, y = (centres[0, 0] * net.config.STRIDE).unbind(-1)
         colors = rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu()
         intrinsics = torch.tensor(camera.intrinsics / net.config.STRIDE, dtype=torch.float32, device=self.device)
@@ -188,15 +189,6 @@ class PatchOdometry:
         if self._initialised:
             depth *= self.window.patches[-3 * config.patches :, 2, 0, 0].median()
         return keyframe, patch_coordinates(centres, depth, net.config.patch_size)[0]
-
-    def _keep_map(self, index: int, slot: int, level: Tensor) -> None:
-        """Write a feature map ``(h, w, C)`` into its place; the store grows while the window fills."""
-        if index == len(self._maps):
-            self._maps.append(level.new_empty(0, *level.shape))
-        have = len(self._maps[index])
-        if slot >= have:
-            self._maps[index] = torch.cat([self._maps[index], level.new_empty(slot + 1 - have, *level.shape)])
-        self._maps[index][slot] = level
 
     def _connect(self) -> None:
         """Join recent patches with the newest frame, and its patches with recent frames."""
@@ -223,10 +215,11 @@ class PatchOdometry:
         context = torch.cat([f.context for f in frames])
         slots = torch.tensor([f.slot for f in frames], device=self.device)[graph.jj]
         correlation = [
-            cache.lookup(coords[0], window.slots, matching, level, graph.kk, slots)[None]
-            for cache, level in zip(self._correlations, self._maps, strict=True)
+            cache.lookup(coords[0], window.slots, matching, graph.kk, slots)[None] for cache in self._correlations
         ]
-        hidden, delta, weights = net.update(window.hidden[None], context[graph.kk][None], correlation, graph)
+        hidden, delta, weights = net.update(
+            window.hidden[None], context[graph.kk][None], correlation, graph, pixels_first=True
+        )
         centre = net.config.patch_size // 2
         return hidden[0], delta[0], weights[0], coords[0, :, centre, centre]
 
@@ -235,7 +228,6 @@ class PatchOdometry:
         window, config = self.window, self.config
         window.hidden, delta, window.weights, centres = self._revise()
         n = len(window)
-        height, width = self._maps[0].shape[1:3]
         fixed = max(1, n - config.optimisation) if self._initialised else 1
         poses, patches = bundle_adjust(
             window.poses_cw[None],
@@ -248,7 +240,7 @@ class PatchOdometry:
             window.kk,
             fixed=fixed,
             damping=damping_at(age),
-            bounds=(width, height),
+            bounds=self._bounds,
         )
         window.poses_cw, window.patches = poses[0], patches[0]
 
@@ -282,10 +274,9 @@ class PatchOdometry:
         """Solve the first window from nothing with the flow as now seen, and keep what explains it better."""
         window = self.window
         _, delta, weights, centres = self._revise()
-        height, width = self._maps[0].shape[1:3]
         seen = ((centres + delta)[None], weights[None], window.ii, window.jj, window.kk)
         intrinsics = window.intrinsics[None]
-        poses, patches, cost = solve_from_nothing(window.patches[None], intrinsics, *seen, bounds=(width, height))
+        poses, patches, cost = solve_from_nothing(window.patches[None], intrinsics, *seen, bounds=self._bounds)
         if cost < robust_cost(window.poses_cw[None], window.patches[None], intrinsics, *seen):
             window.poses_cw = se3.normalise(se3.compose(poses[0], window.poses_cw[0]))
             window.patches = patches[0]

@@ -72,6 +72,11 @@ def test_only_the_chosen_edges_train_the_features():
         torch.testing.assert_close(a, b)
 
 
+def as_dpvo(channels):
+    """Channels ordered pixel, y, x -> x, y, pixel."""
+    return channels.view(-1, 9, 7, 7).permute(0, 3, 2, 1).flatten(1)
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_windows_and_remembered_windows_equal_reference(seed):
     patches, maps, coords, kk, jj = problem(batch=1, seed=seed)
@@ -80,6 +85,10 @@ def test_windows_and_remembered_windows_equal_reference(seed):
     caches = [EdgeCorrelation(1, 9, 3, 14, "cpu"), EdgeCorrelation(4, 9, 3, 12, "cpu")]
     for cache in caches:
         cache._products = cache._products.double()
+    for cache, level in zip(caches, pool_levels(maps.detach(), (1, 4)), strict=True):
+        for frame in range(3):
+            cache.keep_map(frame, level[0, frame])
+    for cache in caches:
         cache.forget(torch.arange(20))
     slots = torch.randperm(20, generator=torch.Generator().manual_seed(seed))[: len(kk)]
     generator = torch.Generator().manual_seed(seed)
@@ -88,7 +97,7 @@ def test_windows_and_remembered_windows_equal_reference(seed):
         coords = coords + size * torch.randn(1, len(kk), 1, 1, 2, generator=generator, dtype=coords.dtype)
         slow = [c[0] for c in correlate_reference(patches, maps, coords, kk, jj)]
         direct = correlate_windows(patches[0], levels, coords[0], kk, jj)
-        kept = [c.lookup(coords[0], slots, features, m, kk, jj) for c, m in zip(caches, levels, strict=True)]
+        kept = [as_dpvo(cache.lookup(coords[0], slots, features, kk, jj)) for cache in caches]
         for a, b, c in zip(slow, direct, kept, strict=True):
             torch.testing.assert_close(b, a)
             torch.testing.assert_close(c, a)

@@ -76,7 +76,9 @@ def test_first_layer_by_levels_equals_dpvos_interleaved_channels():
     update = Update(preset("tiny")).double()
     levels = [torch.randn(1, 5, 441).double() for _ in range(2)]
     interleaved = torch.stack(levels, -1).flatten(2)
-    torch.testing.assert_close(update._correlate(levels), update.corr[0](interleaved))
+    torch.testing.assert_close(update._correlate(levels, False), update.corr[0](interleaved))
+    turned = [level.view(1, 5, 7, 7, 9).permute(0, 1, 4, 3, 2).flatten(2) for level in levels]  # pixel, y, x
+    torch.testing.assert_close(update._correlate(turned, True), update.corr[0](interleaved))
 
 
 def test_gradient_clamp_removes_nan_and_scales_with_the_batch():

@@ -39,7 +39,7 @@ class Perfect(PatchOdometry):
         exact[0, :, 2] = 1 / self.clip.depth[frame, y, x][:, None, None]
         true = reproject(self.clip.poses_cw[at][None], exact, window.intrinsics[None], *edges)
         target, centre = true.coords[0, :, 1, 1], now[0, :, 1, 1]
-        h, w = self._maps[0].shape[1:3]
+        w, h = self._bounds
         seen = true.valid[0, :, 1, 1] & (target >= 0).all(-1) & (target[:, 0] < w) & (target[:, 1] < h)
         return window.hidden, target - centre, seen[:, None].float().expand(-1, 2), centre
 

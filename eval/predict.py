@@ -9,8 +9,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
-import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass, field
@@ -23,10 +21,12 @@ from dvo.data.trajectory import Trajectory, read_tum, write_tum
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.results import jsonable, peak_memory_mb
+from eval.blackout import dark_spans, is_dark
+from eval.process import run_limited
 from eval.sequences import ROOT, Sequence, open_sequence
 from eval.systems import find_system
 
-RECORD, TRAJECTORY = "prediction.json", "trajectory.txt"
+RECORD, TRAJECTORY, LOG = "prediction.json", "trajectory.txt", "log.txt"
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Job:
         sequence, data, stride: on what.
         folder: where the prediction is written.
         time_limit: seconds.
+        parallel: runs at the same time on the machine; above 1, timings are those of a machine that is shared.
     """
 
     system: str
@@ -50,6 +51,7 @@ class Job:
     device: str = "cpu"
     threads: int = 2
     time_limit: float = 1800.0
+    parallel: int = 1
 
 
 @dataclass
@@ -67,6 +69,8 @@ class Prediction:
         fps: frames fed per second inside ``track`` and ``finish``; reading is not counted.
         latency_p95_ms: 95th percentile of the time of one ``track``.
         peak_memory_mb: of the whole process.
+        threads, device, parallel, time_limit: of the job, under which the resources were measured.
+        dark: stretches of frames that show nothing, between lit ones: first and last stamp of each.
         info: what the system says of itself.
     """
 
@@ -79,6 +83,11 @@ class Prediction:
     fps: float | None = None
     latency_p95_ms: float | None = None
     peak_memory_mb: float | None = None
+    threads: int = 0
+    device: str = ""
+    parallel: int = 1
+    time_limit: float | None = None
+    dark: list[list[float]] = field(default_factory=list)
     info: dict[str, Any] = field(default_factory=dict)
 
 
@@ -90,19 +99,17 @@ def predict(job: Job) -> Prediction:
     system = find_system(job.system, job.weights)
     reason = system.missing()
     if reason is not None:
-        return _write(folder, Prediction("unavailable", reason))
+        return write_prediction(job, Prediction("unavailable", reason))
     (folder / "job.json").write_text(json.dumps(asdict(job), indent=1), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     environment |= {name: str(job.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
     command = [sys.executable, "-m", "eval.worker", str(folder / "job.json")]
-    try:
-        done = subprocess.run(command, env=environment, timeout=job.time_limit, capture_output=True, text=True)
-    except subprocess.TimeoutExpired:
-        return _write(folder, Prediction("timeout", f"not done after {job.time_limit:g} s", system.version()))
+    ending = run_limited(command, environment, job.time_limit, folder / LOG)
+    if ending.code is None:
+        late = Prediction("timeout", f"not done after {job.time_limit:g} s", system.version())
+        return write_prediction(job, late)
     if not (folder / RECORD).is_file():
-        tail = (done.stderr.strip().splitlines() or [""])[-1]
-        how = f"killed by {signal.Signals(-done.returncode).name}" if done.returncode < 0 else f"exit {done.returncode}"
-        return _write(folder, Prediction("crashed", f"{how} {tail}".strip(), system.version()))
+        return write_prediction(job, Prediction("crashed", str(ending), system.version()))
     return read_prediction(folder)
 
 
@@ -114,26 +121,27 @@ def predict_here(job: Job) -> Prediction:
     try:
         source, _ = open_sequence(job.sequence, Path(job.data), job.stride)
     except DvoError as error:
-        return _write(folder, Prediction("no data", str(error)))
+        return write_prediction(job, Prediction("no data", str(error)))
     try:
         version = system.version()
         prediction, trajectory = drive(system.build(job.seed, job.device), source)
     except Exception as error:  # whatever a system raises is its result, and becomes a row
-        return _write(folder, Prediction("crashed", f"{type(error).__name__}: {error}", version))
+        return write_prediction(job, Prediction("crashed", f"{type(error).__name__}: {error}", version))
     prediction.version = version
     if prediction.status == "ok":
         write_tum(folder / TRAJECTORY, trajectory)
-    return _write(folder, prediction)
+    return write_prediction(job, prediction)
 
 
 def drive(odometry: Odometry, source: Any) -> tuple[Prediction, Trajectory]:
     """Feed every frame of a source to an odometry, with a clock."""
-    stamps, seconds, resolution = [], [], ""
+    stamps, seconds, dark, resolution = [], [], [], ""
     for frame in source:
         begin = time.perf_counter()
         odometry.track(frame)
         seconds.append(time.perf_counter() - begin)
         stamps.append(frame.timestamp)
+        dark.append(is_dark(frame.image))
         resolution = f"{frame.camera.width}x{frame.camera.height}"
     begin = time.perf_counter()
     result = odometry.finish()
@@ -147,6 +155,7 @@ def drive(odometry: Odometry, source: Any) -> tuple[Prediction, Trajectory]:
         fps=len(stamps) / max(total, 1e-9),
         latency_p95_ms=1000 * float(np.percentile(seconds, 95)) if seconds else None,
         peak_memory_mb=process_peak_mb(),
+        dark=[list(span) for span in dark_spans(np.array(stamps), np.array(dark, dtype=bool))],
         info=result.info,
     )
     broken = int((~np.isfinite(result.trajectory.poses_wc)).any(axis=1).sum())
@@ -188,7 +197,12 @@ def process_peak_mb() -> float | None:
     return peak_memory_mb()
 
 
-def _write(folder: Path, prediction: Prediction) -> Prediction:
-    text = json.dumps(jsonable(prediction), indent=1, allow_nan=False)
-    (folder / RECORD).write_text(text + "\n", encoding="utf-8")
+def write_prediction(job: Job, prediction: Prediction) -> Prediction:
+    """Put a record into the job's folder, whole or not at all."""
+    prediction.threads, prediction.device = job.threads, job.device
+    prediction.parallel, prediction.time_limit = job.parallel, job.time_limit
+    path = Path(job.folder) / RECORD
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(jsonable(prediction), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(part, path)
     return prediction

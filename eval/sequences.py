@@ -54,6 +54,7 @@ class Suite:
         stride: every how many-th image is fed.
         lost_below: a run with poses for a smaller part of the frames counts as failed.
         time_limit: seconds for one run.
+        download: where the data can be had, if they are public.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Suite:
     stride: int = 1
     lost_below: float = 0.5
     time_limit: float = 1800.0
+    download: str = ""
 
     def only(self, names: list[str]) -> Suite:
         """The suite with these sequences.

@@ -1,7 +1,8 @@
 """The systems that can be chosen by name, each behind :class:`dvo.odometry.protocol.Odometry`.
 
 ``klt-pnp`` and ``null`` are here; ``dvo-NAME`` is the learned tracker with weights NAME of the package, ``dvo:FILE``
-the same with a weights file. A system that cannot run says why instead of raising.
+the same with a weights file, ``FILE.py:NAME`` a system of one's own (:mod:`eval.plugin`). A system that cannot run says
+why instead of raising.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 import dvo
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Odometry
+from eval import plugin
 
 
 @dataclass(frozen=True)
@@ -50,12 +52,16 @@ def find_system(name: str, weights: str | None = None) -> System:
     """
     if name in _CLASSICAL:
         return _CLASSICAL[name]
+    if plugin.is_plugin(name):
+        return _own(name)
     if name.startswith("dvo:"):
         return _learned(name, name.removeprefix("dvo:"))
     if name.startswith("dvo-"):
         return _learned(name, weights or name.removeprefix("dvo-"))
     raise DvoError(
-        f"no system '{name}'", field="--systems", remedy=f"choose from {', '.join(_CLASSICAL)}, dvo-NAME, dvo:FILE"
+        f"no system '{name}'",
+        field="--systems",
+        remedy=f"choose from {', '.join(_CLASSICAL)}, dvo-NAME, dvo:FILE, FILE.py:NAME",
     )
 
 
@@ -77,6 +83,17 @@ def _null(seed: int, device: str) -> Odometry:
     from eval.baselines.null import NullMotion
 
     return NullMotion(seed)
+
+
+def _own(name: str) -> System:
+    return System(
+        name,
+        "the user's",
+        "a system of one's own",
+        lambda seed, device: plugin.build(name, seed, device),
+        lambda: plugin.version(name),
+        lambda: plugin.missing(name),
+    )
 
 
 def _learned(name: str, weights: str) -> System:

@@ -9,13 +9,15 @@ from pathlib import Path
 import cv2
 
 from eval.predict import Job, predict_here
-from eval.sequences import Sequence
+from eval.process import die_with_parent
+from eval.suites import sequence_from
 
 
 def main(path: str) -> None:
     """Do the job in the file; the prediction lies in the job's folder afterwards."""
+    die_with_parent()
     entry = json.loads(Path(path).read_text(encoding="utf-8"))
-    job = Job(**{**entry, "sequence": Sequence(**entry["sequence"])})
+    job = Job(**{**entry, "sequence": sequence_from(entry["sequence"])})
     cv2.setNumThreads(job.threads)
     predict_here(job)
 

@@ -1,0 +1,117 @@
+"""Sequences that go dark for a while: where, how well each lit part was tracked, how soon the way was found again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvo.data.trajectory import Trajectory
+from dvo.metrics import Alignment, associate, fit_alignment, transform
+
+DARK_MEAN, DARK_SPREAD = 20.0, 6.0  # grey levels of 255
+SHORTEST = 5  # frames; a flicker is no blackout
+SEGMENT_FRAMES = 10  # frames with a pose that a lit part needs to be judged
+NEAR_PERCENT, NEAR_DEGREES = 10.0, 10.0  # found again: within this part of the path before, and this angle
+
+
+@dataclass(frozen=True)
+class BlackoutErrors:
+    """How a run took the dark.
+
+    Attributes:
+        blackouts: how many.
+        segment_ate_percent: every lit part aligned on its own; root mean square error in percent of the lit path; inf
+            if a lit part has no trajectory. This asks whether tracking works again, in whatever world.
+        recovery_s: mean time from the return of light until the pose is right again in the world of before the dark.
+            inf if it never is: only a system that relocalises has a number here, or one that has guessed the motion.
+    """
+
+    blackouts: int = 0
+    segment_ate_percent: float = math.nan
+    recovery_s: float = math.nan
+
+
+def is_dark(image: np.ndarray) -> bool:
+    """Whether a ``(H, W, 3)`` uint8 image shows nothing."""
+    sample = image[::4, ::4].astype(np.float32)
+    return float(sample.mean()) < DARK_MEAN and float(sample.std()) < DARK_SPREAD
+
+
+def dark_spans(stamps: np.ndarray, dark: np.ndarray) -> list[tuple[float, float]]:
+    """Stretches of at least five dark frames with light before and after: first and last dark stamp of each, seconds.
+
+    Args:
+        stamps: ``(N,)`` of the frames fed.
+        dark: ``(N,)`` bool.
+    """
+    edges = np.diff(np.concatenate([[0], dark.astype(np.int8), [0]]))
+    pairs = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1, strict=True)
+    return [
+        (float(stamps[first]), float(stamps[last]))
+        for first, last in pairs
+        if last - first + 1 >= SHORTEST and first > 0 and last < len(stamps) - 1
+    ]
+
+
+def blackout_errors(
+    estimate: Trajectory, reference: Trajectory, spans: list[tuple[float, float]], align: Alignment
+) -> BlackoutErrors:
+    """Judge a run on a sequence with stretches of dark (``spans``, from :func:`dark_spans`)."""
+    if not spans or not len(reference):
+        return BlackoutErrors()
+    return BlackoutErrors(
+        len(spans),
+        _segment_ate(estimate, reference, spans, align),
+        float(np.mean([_recovery(estimate, reference, spans, number, align) for number in range(len(spans))])),
+    )
+
+
+def _segment_ate(
+    estimate: Trajectory, reference: Trajectory, spans: list[tuple[float, float]], align: Alignment
+) -> float:
+    bounds = [-math.inf, *(edge for span in spans for edge in span), math.inf]
+    squares, path = [], 0.0
+    for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
+        truth, track = _between(reference, begin, end), _between(estimate, begin, end)
+        if len(truth) < SEGMENT_FRAMES:
+            continue
+        i, j = associate(track, truth)
+        if len(i) < SEGMENT_FRAMES:
+            return math.inf
+        scale, rotation, shift = fit_alignment(track.positions[i], truth.positions[j], align)
+        aligned = scale * track.positions[i] @ rotation.T + shift
+        squares.append(((aligned - truth.positions[j]) ** 2).sum(axis=1))
+        path += truth.path_length
+    if not squares or path <= 0:
+        return math.nan
+    return 100 * float(np.sqrt(np.concatenate(squares).mean())) / path
+
+
+def _recovery(
+    estimate: Trajectory, reference: Trajectory, spans: list[tuple[float, float]], number: int, align: Alignment
+) -> float:
+    """Seconds from the end of a span; inf if the pose is never right again before the next span or the end."""
+    light = spans[number][1]
+    until = spans[number + 1][0] if number + 1 < len(spans) else math.inf
+    since = spans[number - 1][1] if number else -math.inf
+    before, lit = _between(reference, since, spans[number][0]), _between(reference, light, until)
+    i, j = associate(estimate, before)
+    if len(i) < SEGMENT_FRAMES:
+        return math.inf
+    world = transform(estimate, *fit_alignment(estimate.positions[i], before.positions[j], align))
+    i, j = associate(world, lit)
+    if not len(i):
+        return math.inf
+    off = np.linalg.norm(world.positions[i] - lit.positions[j], axis=1)
+    cosine = np.abs((world.poses_wc[i, 3:] * lit.poses_wc[j, 3:]).sum(axis=1))
+    turned = np.degrees(2 * np.arccos(np.clip(cosine, 0, 1)))
+    near = (off <= NEAR_PERCENT / 100 * before.path_length) & (turned <= NEAR_DEGREES)
+    return float(lit.timestamps[j][near][0] - light) if near.any() else math.inf
+
+
+def _between(trajectory: Trajectory, begin: float, end: float) -> Trajectory:
+    """Rows strictly between two times."""
+    keep = (trajectory.timestamps > begin) & (trajectory.timestamps < end)
+    return Trajectory(trajectory.timestamps[keep], trajectory.poses_wc[keep])

@@ -1,0 +1,94 @@
+"""Programs with a time limit, ended together with whatever they have started."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+_running: set[subprocess.Popen[bytes]] = set()
+_lock = threading.Lock()
+_stopped = threading.Event()
+
+
+class StoppedError(Exception):
+    """The program was ended because the whole evaluation was: this says nothing of the program."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a program ended.
+
+    Attributes:
+        code: exit code, minus the number of the signal that killed it; None if the time ran out.
+        last_line: of what it wrote.
+    """
+
+    code: int | None
+    last_line: str
+
+    def __str__(self) -> str:
+        if self.code is None:
+            return "out of time"
+        how = f"killed by {signal.Signals(-self.code).name}" if self.code < 0 else f"exit {self.code}"
+        return f"{how} {self.last_line}".strip()
+
+
+def run_limited(command: list[str], environment: dict[str, str], seconds: float, log: Path) -> Ending:
+    """Run a program; what it writes goes to ``log``. When the time is out it ends with all that it has started.
+
+    Raises:
+        StoppedError: :func:`end_all` was called.
+    """
+    if _stopped.is_set():
+        raise StoppedError
+    with open(log, "wb") as file:
+        process = subprocess.Popen(command, env=environment, stdout=file, stderr=file, start_new_session=True)
+    with _lock:
+        _running.add(process)
+    try:
+        code: int | None = process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        code = None
+    finally:
+        _end(process)
+        with _lock:
+            _running.discard(process)
+    if _stopped.is_set():
+        raise StoppedError
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return Ending(code, lines[-1] if lines else "")
+
+
+def end_all() -> None:
+    """End every program that :func:`run_limited` waits for, and start no more until :func:`begin`."""
+    _stopped.set()
+    with _lock:
+        for process in _running:
+            _end(process)
+
+
+def begin() -> None:
+    """Programs may run (again)."""
+    _stopped.clear()
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to end this process when its parent dies (Linux; nothing elsewhere)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process with its session; a child that it left behind may outlive it, so also when it is done."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except (ProcessLookupError, PermissionError):
+        process.poll()
+    else:
+        process.wait()

@@ -152,7 +152,7 @@ def plot_axis(title: str, unit: str, values: Mapping[str, Sequence[float]], null
     plot.set_ylim(len(names) - 0.4, -0.6)
     plot.set_yticks(range(len(names)), names, fontsize=9)
     plot.xaxis.set_major_formatter(_number)
-    plot.xaxis.set_minor_formatter(_number if high / low < 20 else (lambda value, place: ""))
+    plot.xaxis.set_minor_formatter(_one_two_five if high / low < 30 else (lambda value, place: ""))
     plot.tick_params(axis="x", which="both", labelsize=8)
     _title(plot, f"{title} ({unit})")
     _tidy(plot)
@@ -232,6 +232,10 @@ def _tidy(*plots: Any) -> None:
 
 def _title(plot: Any, text: str) -> None:
     plot.set_title(text, loc="left", fontsize=10.5, color=INK)
+
+
+def _one_two_five(value: float, place: int) -> str:
+    return _number(value, place) if f"{value:e}"[0] in "125" else ""
 
 
 def _number(value: float, _place: int) -> str:

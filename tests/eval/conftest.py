@@ -1,8 +1,9 @@
-"""A small scene with exact motion: a textured wall and a textured board in front of it."""
+"""A small scene with exact motion (a textured wall, a textured board in front of it), and a small evaluation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,14 @@ from scipy.spatial.transform import Rotation
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
+from dvo.odometry.protocol import Odometry
+from eval import predict as predict_module
+from eval.plan import Plan, read_manifest
+from eval.predict import Job, Prediction, predict, predict_here
+from eval.runner import predict_all
+from eval.score import Row, score_all
+from eval.sequences import Sequence, Suite
+from eval.systems import System, find_system
 
 CAMERA = Camera(250.0, 250.0, 159.5, 119.5, 320, 240)
 TEXELS = 120  # a metre of wall
@@ -68,3 +77,119 @@ def film() -> Callable[[Trajectory], list[Frame]]:
 def path() -> Callable[..., Trajectory]:
     """``path(count, translate)``, see :func:`walk`."""
     return walk
+
+
+# --- an evaluation on the twenty images of ``image_folder`` ------------------------------------------------------------
+
+
+@pytest.fixture
+def sequence() -> Sequence:
+    """The twenty images."""
+    return Sequence("clip", "clip/images", calib="../calib.txt", times="../times.txt", groundtruth="../truth.txt")
+
+
+@pytest.fixture
+def suite(sequence: Sequence) -> Suite:
+    """A suite of them."""
+    return Suite("tiny", "made for a test", (sequence,))
+
+
+@pytest.fixture
+def suite_file(tmp_path: Path) -> Path:
+    """The suite as a file."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(
+        "name: tiny\nlabel: made for a test\nsequences:\n"
+        "  - {name: clip, path: clip/images, calib: ../calib.txt, times: ../times.txt, groundtruth: ../truth.txt}\n"
+    )
+    return path
+
+
+@pytest.fixture
+def job(tmp_path: Path, image_folder: Path, sequence: Sequence) -> Job:
+    """The null system on them."""
+    (tmp_path / "run").mkdir()
+    return Job("null", sequence, str(tmp_path), str(tmp_path / "run"), threads=1)
+
+
+@pytest.fixture
+def systems(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """``systems(name=odometry, ...)`` puts odometries into the registry; a string is a reason to be missing."""
+
+    def register(**entries: Odometry | str) -> None:
+        table = {
+            name: System(
+                name,
+                "MIT",
+                "for a test",
+                lambda seed, device, thing=thing: thing,  # type: ignore[misc]
+                lambda: "9.9",
+                lambda thing=thing: thing if isinstance(thing, str) else None,  # type: ignore[misc]
+            )
+            for name, thing in entries.items()
+        }
+
+        def find(name: str, weights: str | None = None) -> System:
+            return table[name] if name in table else find_system(name, weights)
+
+        for module in ("predict", "cache"):
+            monkeypatch.setattr(f"eval.{module}.find_system", find)
+
+    return register
+
+
+@pytest.fixture
+def boom() -> Callable[[], None]:
+    """Raises."""
+
+    def stop() -> None:
+        raise RuntimeError("boom | with a bar\nand two lines")
+
+    return stop
+
+
+def here(job: Job) -> Prediction:
+    """Run a job in this process, which is quicker and knows the systems of the test."""
+    if predict_module.find_system(job.system).missing():
+        return predict(job)
+    return predict_here(job)
+
+
+@pytest.fixture
+def plan(tmp_path: Path, suite: Suite) -> Plan:
+    """Five systems, two seeds."""
+    names = ("good", "lossy", "bad", "absent", "null")
+    (tmp_path / "out").mkdir()
+    return Plan((suite,), names, (0, 1), tmp_path, tmp_path / "out", threads=1)
+
+
+@pytest.fixture
+def rows(plan: Plan, image_folder: Path, fake_odometry, systems, boom) -> list[Row]:
+    """The plan, carried out."""
+
+    class Fresh:
+        """A fake that can be used for one run after the other."""
+
+        name = "fresh"
+
+        def __init__(self, **options) -> None:
+            self.options = options
+            self.inner = fake_odometry(**options)
+
+        def track(self, frame):
+            return self.inner.track(frame)
+
+        def finish(self):
+            done, self.inner = self.inner.finish(), fake_odometry(**self.options)
+            return done
+
+    systems(
+        good=Fresh(lost=(3, 4)),
+        lossy=Fresh(lost=tuple(range(12))),
+        bad=fake_odometry(at_frame={5: boom}),
+        absent="needs a thing",
+    )
+    said: list[str] = []
+    predict_all(plan, said.append, here)
+    assert len(said) == 10
+    return score_all(plan.out, read_manifest(plan.out))

@@ -1,12 +1,8 @@
-"""Predict, score, report and the command line, on twenty small images with ground truth."""
+"""The registry, the suites, one run, and the rows and tables made of it, on twenty small images with ground truth."""
 
 from __future__ import annotations
 
-import csv
-import json
-import subprocess
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,14 +10,13 @@ import pytest
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Odometry
-from eval import predict as predict_module
-from eval.__main__ import main
-from eval.predict import Job, predict, predict_here, read_prediction, read_trajectory
-from eval.report import markdown
-from eval.runner import Plan, predict_all, report, score_all
-from eval.score import COLUMNS, Row, evo_metrics
-from eval.sequences import Sequence, Suite, data_folder, read_suite, reference_for
-from eval.systems import System, find_system, list_systems
+from eval.metrics import evo_metrics
+from eval.plan import read_manifest
+from eval.predict import predict, predict_here, read_prediction, read_trajectory
+from eval.score import COLUMNS, Row
+from eval.sequences import data_folder, read_suite, reference_for
+from eval.systems import find_system, list_systems
+from eval.tables import axis_table, markdown
 
 REQUIRED_COLUMNS = [
     *("system", "version", "suite", "sequence", "seed", "status", "frames", "tracked", "alignment"),
@@ -29,62 +24,6 @@ REQUIRED_COLUMNS = [
 ]
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
-
-
-@pytest.fixture
-def sequence() -> Sequence:
-    return Sequence("clip", "clip/images", calib="../calib.txt", times="../times.txt", groundtruth="../truth.txt")
-
-
-@pytest.fixture
-def suite(sequence) -> Suite:
-    return Suite("tiny", "made for a test", (sequence,))
-
-
-@pytest.fixture
-def suite_file(tmp_path) -> Path:
-    path = tmp_path / "tiny.yaml"
-    path.write_text(
-        "name: tiny\nlabel: made for a test\nsequences:\n"
-        "  - {name: clip, path: clip/images, calib: ../calib.txt, times: ../times.txt, groundtruth: ../truth.txt}\n"
-    )
-    return path
-
-
-@pytest.fixture
-def job(tmp_path, image_folder, sequence) -> Job:
-    (tmp_path / "run").mkdir()
-    return Job("null", sequence, str(tmp_path), str(tmp_path / "run"), threads=1)
-
-
-@pytest.fixture
-def systems(monkeypatch):
-    """``systems(name=odometry, ...)`` puts odometries into the registry; a string is a reason to be missing."""
-
-    def register(**entries: Odometry | str) -> None:
-        table = {
-            name: System(
-                name,
-                "MIT",
-                "for a test",
-                lambda seed, device, thing=thing: thing,  # type: ignore[misc]
-                lambda: "9.9",
-                lambda thing=thing: thing if isinstance(thing, str) else None,  # type: ignore[misc]
-            )
-            for name, thing in entries.items()
-        }
-
-        def find(name: str, weights: str | None = None) -> System:
-            return table[name] if name in table else find_system(name, weights)
-
-        monkeypatch.setattr(predict_module, "find_system", find)
-        monkeypatch.setattr("eval.runner.find_system", find)
-
-    return register
-
-
-def stop() -> None:
-    raise RuntimeError("boom | with a bar\nand two lines")
 
 
 # --- registry and suites ----------------------------------------------------------------------------------------------
@@ -173,17 +112,21 @@ def test_time_limit(job):
     assert prediction.status == "timeout" and "0.01 s" in prediction.reason
 
 
-def test_death_of_the_process(job, monkeypatch):
-    def die(*_args, **_options):
-        return subprocess.CompletedProcess([], -11, "", "noise\nlast words")
-
-    monkeypatch.setattr(predict_module.subprocess, "run", die)
-    prediction = predict(job)
+def test_death_of_the_process(job, tmp_path):
+    prediction = predict(replace(job, system=f"{tmp_path / 'dying.py'}:Dies"))
+    assert prediction.status == "unavailable"
+    (tmp_path / "dying.py").write_text(
+        "import os, signal, sys\n"
+        "def Dies():\n"
+        "    print('last words', file=sys.stderr, flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGSEGV)\n"
+    )
+    prediction = predict(replace(job, system=f"{tmp_path / 'dying.py'}:Dies"))
     assert prediction.status == "crashed" and prediction.reason == "killed by SIGSEGV last words"
 
 
-def test_exception_of_a_system(job, fake_odometry, systems):
-    systems(bad=fake_odometry(at_frame={7: stop}))
+def test_exception_of_a_system(job, fake_odometry, systems, boom):
+    systems(bad=fake_odometry(at_frame={7: boom}))
     prediction = predict_here(replace(job, system="bad"))
     assert prediction.status == "crashed" and prediction.reason.startswith("RuntimeError: boom")
     assert len(read_trajectory(job.folder)) == 0
@@ -201,52 +144,7 @@ def test_missing_data_is_a_status(job):
     assert prediction.status == "no data" and "elsewhere" in prediction.reason
 
 
-# --- score and report -------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def plan(tmp_path, suite) -> Plan:
-    names = ("good", "lossy", "bad", "absent", "null")
-    (tmp_path / "out").mkdir()
-    return Plan(suite, names, (0, 1), tmp_path, tmp_path / "out", threads=1)
-
-
-def here(job: Job):
-    Path(job.folder).mkdir(parents=True, exist_ok=True)
-    system = predict_module.find_system(job.system)
-    if system.missing():
-        return predict(job)
-    return predict_here(job)
-
-
-@pytest.fixture
-def rows(plan, image_folder, fake_odometry, systems) -> list[Row]:
-    class Fresh:
-        """A fake that can be used for one run after the other."""
-
-        name = "fresh"
-
-        def __init__(self, **options) -> None:
-            self.options = options
-            self.inner = fake_odometry(**options)
-
-        def track(self, frame):
-            return self.inner.track(frame)
-
-        def finish(self):
-            done, self.inner = self.inner.finish(), fake_odometry(**self.options)
-            return done
-
-    systems(
-        good=Fresh(lost=(3, 4)),
-        lossy=Fresh(lost=tuple(range(12))),
-        bad=fake_odometry(at_frame={5: stop}),
-        absent="needs a thing",
-    )
-    said: list[str] = []
-    predict_all(plan, said.append, here)
-    assert len(said) == 10
-    return score_all(plan)
+# --- rows and tables --------------------------------------------------------------------------------------------------
 
 
 def test_every_run_is_a_row(rows):
@@ -263,13 +161,23 @@ def test_every_run_is_a_row(rows):
     assert good.ate_rmse < 1e-6 and good.rpe_rot_deg < 1e-3 and good.rotation_error_ratio < 1e-3
     assert (good.frames, good.tracked, good.completeness) == (20, 18, 0.9)
     assert good.version == "9.9" and good.resolution == "64x48" and good.stride == 1 and good.alignment == "sim3"
-    assert by_name["lossy"].reason == "8 of 20 frames have a pose"
+    # Two lost frames break four pairs of frames two apart, of eighteen.
+    assert good.auc == pytest.approx(1) and good.pose_auc_10 == pytest.approx(14 / 18, abs=1e-4)
+    assert by_name["lossy"].reason == "8 of 20 frames have a pose" and by_name["lossy"].auc == 0
     assert by_name["null"].rotation_error_ratio == pytest.approx(1) and by_name["null"].ate_percent > 1
     assert np.isnan(by_name["bad"].ate_rmse) and by_name["absent"].reason == "needs a thing"
+    assert by_name["bad"].auc == 0 and np.isnan(by_name["absent"].auc)
 
 
-def test_report(plan, rows):
-    table = report(plan, rows)
+def test_columns():
+    assert list(COLUMNS)[:16] == REQUIRED_COLUMNS
+    assert list(COLUMNS)[16:18] == ["stride", "resolution"]
+    assert {"scale_drift", "t_rel", "r_rel", "auc", "pose_auc_5", "ate_per_frame_scale", "recovery_s"} <= set(COLUMNS)
+
+
+def test_tables(plan, rows):
+    manifest = read_manifest(plan.out)
+    table = markdown(manifest, plan.suites[0], rows)
     assert "**made for a test**" in table and "Alignment sim3; stride 1; seeds 0, 1" in table
     lines = [line for line in table.splitlines() if line.startswith("|")]
     assert len(lines) == 2 + 5 and len({line.count("|") for line in lines}) == 1
@@ -277,30 +185,30 @@ def test_report(plan, rows):
     good, lossy = lines[2], lines[3]
     assert "**0.00**" in good and "| – |" in lossy and table.count("**") == 4
     assert table.count("- bad, clip, seed") == 2
-    with open(plan.out / "results.csv", newline="") as file:
-        written = list(csv.DictReader(file))
-    assert list(written[0])[:16] == REQUIRED_COLUMNS and tuple(written[0]) == COLUMNS
-    assert len(written) == 10 and float(written[0]["completeness"]) == 0.9
-    crashed = next(row for row in written if row["system"] == "bad")
-    assert crashed["ate_rmse"] == "" and crashed["reason"] == "RuntimeError: boom | with a bar and two lines"
-    assert (plan.out / "clip.png").read_bytes()[:4] == b"\x89PNG"
+    axes = axis_table(manifest, rows).splitlines()
+    assert axes[0] == "| axis | median | good | lossy | bad | absent | null |"
+    assert axes[2].startswith("| tiny | ATE % | **0.00** | – (2/2 failed) | – (2/2 failed) | unavailable | ")
 
 
-def test_median_and_range_over_seeds(suite, rows):
+def test_median_and_range_over_seeds(plan, rows):
+    manifest, suite = read_manifest(plan.out), plan.suites[0]
     row = next(row for row in rows if row.system == "null")
     three = [replace(row, seed=seed, ate_percent=value) for seed, value in enumerate((3.0, 1.0, 8.0))]
-    assert "**3.00 [1.00–8.00]**" in markdown(suite, three, 1, "cpu")
+    assert "**3.00 [1.00–8.00]**" in markdown(manifest, suite, three)
     one_lost = [*three[:2], replace(three[2], status="crashed")]
-    assert "3.00 [1.00–∞]" in markdown(suite, one_lost, 1, "cpu")
+    assert "3.00 [1.00–∞]" in markdown(manifest, suite, one_lost)
     two_lost = [replace(r, status="crashed") if r.seed else r for r in three]
-    assert "3.00" not in markdown(suite, two_lost, 1, "cpu")
+    assert "3.00" not in markdown(manifest, suite, two_lost)
 
 
-def test_judged_by_rotation(suite, rows):
+def test_judged_by_rotation(plan, rows):
     null, good = (next(row for row in rows if row.system == name) for name in ("null", "good"))
-    turned = replace(suite, sequences=(replace(suite.sequences[0], judged_by="rpe_rot_deg"),))
-    table = markdown(turned, [replace(null, rpe_rot_deg=0.25), replace(good, rpe_rot_deg=0.75)], 1, "cpu")
-    assert "**0.250**" in table and "clip by RPE in degrees" in table
+    sequence = replace(plan.suites[0].sequences[0], judged_by="rpe_rot_deg")
+    turned = replace(plan.suites[0], sequences=(sequence,))
+    manifest = replace(read_manifest(plan.out), suites=(turned,))
+    two: list[Row] = [replace(null, rpe_rot_deg=0.25), replace(good, rpe_rot_deg=0.75)]
+    assert "**0.250**" in markdown(manifest, turned, two) and "by RPE in degrees" in markdown(manifest, turned, two)
+    assert "| tiny | RPE ° | 0.750 |" in axis_table(manifest, two)
 
 
 def test_line_is_scored_although_evo_refuses_to_align_it():
@@ -310,42 +218,3 @@ def test_line_is_scored_although_evo_refuses_to_align_it():
     stamps = np.arange(30.0)
     metrics = evo_metrics(Trajectory(stamps, line), Trajectory(stamps, path), "sim3")
     assert 0 < metrics.ate_rmse < 1 and metrics.reason is None
-
-
-# --- the command line -------------------------------------------------------------------------------------------------
-
-
-def test_command(tmp_path, image_folder, suite_file, capsys):
-    out = tmp_path / "results"
-    options = ["--suite", str(suite_file), "--data", str(tmp_path), "--out", str(out), "--systems", "null"]
-    assert main([*options, "--threads", "1"]) == 0
-    table = capsys.readouterr().out
-    assert table.startswith("**made for a test**") and "| clip | null | 0/1 |" in table
-    assert (out / "table.md").read_text() == table.rstrip("\n") + "\n"
-    assert json.loads((out / "predictions/null/clip/seed0/prediction.json").read_text())["status"] == "ok"
-    before = (out / "results.csv").read_bytes()
-    assert main([*options, "--threads", "1", "--score-only"]) == 0
-    assert (out / "results.csv").read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--systems", "monoslam9"], "no system 'monoslam9'"),
-        (["--sequences", "nowhere"], "no sequence 'nowhere'"),
-        (["--seeds", "0"], "--seeds"),
-        (["--suite", "none"], "no such suite"),
-        (["--data", "nowhere"], "no such data folder"),
-        (["--score-only", "--systems", "null"], "no such prediction"),
-    ],
-)
-def test_bad_commands_exit_2_with_one_line(tmp_path, image_folder, suite_file, capsys, options, words):
-    base = ["--suite", str(suite_file), "--data", str(tmp_path), "--out", str(tmp_path / "o")]
-    assert main([*base, *options]) == 2
-    error = capsys.readouterr().err.strip()
-    assert error.startswith("eval: error:") and words in error and "\n" not in error
-
-
-def test_list(capsys):
-    assert main(["--list"]) == 0
-    assert "klt-pnp" in capsys.readouterr().out

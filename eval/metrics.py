@@ -14,7 +14,7 @@ import numpy as np
 
 from dvo.data.poses import pose_matrices, poses_from_matrices
 from dvo.data.trajectory import Trajectory
-from dvo.metrics import MINIMUM_MATCHES, Alignment, Metrics, associate, evaluate, fit_alignment, transform
+from dvo.metrics import Alignment, Metrics, associate, evaluate, fit_alignment, transform
 
 KITTI_LENGTHS = tuple(range(100, 801, 100))  # metres
 KITTI_STEP = 10  # frames between the starts of two segments
@@ -52,6 +52,48 @@ class SegmentErrors:
     longest_m: float = math.nan
 
 
+@dataclass(frozen=True)
+class Aligned:
+    """The matched frames of a reference and of an estimate after alignment, as evo's trajectories.
+
+    Attributes:
+        truth, track: of the same length.
+        scale: that was fitted, 1 where none was.
+        ours: the errors that dvo itself finds.
+    """
+
+    truth: Any
+    track: Any
+    scale: float
+    ours: Metrics
+
+
+def align_pair(
+    estimate: Trajectory, reference: Trajectory, align: Alignment = "sim3", *, rpe_gap: int = 1, max_dt: float = 0.01
+) -> Aligned | Metrics:
+    """Match and align. Where that has no meaning, dvo's :class:`Metrics` that say why.
+
+    evo refuses to align points on a line, as the turn about the line is open; then dvo's fit is taken.
+    """
+    ours = evaluate(estimate, reference, align, rpe_gap=rpe_gap, max_dt=max_dt)
+    if not math.isfinite(ours.ate_rmse):
+        return ours
+    from evo.core import sync
+    from evo.core.geometry import GeometryException
+
+    truth, track = sync.associate_trajectories(_evo(reference), _evo(estimate), max_diff=max_dt)
+    scale = 1.0
+    try:
+        if align != "none":
+            _, _, scale = track.align(truth, correct_scale=align == "sim3", correct_only_scale=align == "scale")
+    except GeometryException:
+        i, j = associate(estimate, reference, max_dt)
+        scale, rotation, shift = fit_alignment(estimate.positions[i], reference.positions[j], align)
+        matched = Trajectory(estimate.timestamps[i], estimate.poses_wc[i])
+        track = _evo(transform(matched, scale, rotation, shift))
+    return Aligned(truth, track, float(scale), ours)
+
+
 def evo_metrics(
     estimate: Trajectory,
     reference: Trajectory,
@@ -60,75 +102,59 @@ def evo_metrics(
     rpe_gap: int = 1,
     max_dt: float = 0.01,
 ) -> Metrics:
-    """:func:`dvo.metrics.evaluate` with ATE, RPE, scale and path length computed by evo.
+    """:func:`dvo.metrics.evaluate` with ATE, RPE, scale and path length computed by evo."""
+    pair = align_pair(estimate, reference, align, rpe_gap=rpe_gap, max_dt=max_dt)
+    return metrics_of(pair) if isinstance(pair, Aligned) else pair
 
-    evo has no rotation ratio, no scale drift, and no alignment of points on a line (it refuses, as the turn about the
-    line is open); those are dvo's.
-    """
-    ours = evaluate(estimate, reference, align, rpe_gap=rpe_gap, max_dt=max_dt)
-    if not math.isfinite(ours.ate_rmse):
-        return ours
+
+def metrics_of(pair: Aligned) -> Metrics:
+    """See :func:`evo_metrics`; the rotation ratio and the scale drift, which evo has not, are dvo's."""
     from evo.core import metrics
     from evo.core.metrics import PoseRelation, Unit
 
-    truth, track, scale = _aligned(estimate, reference, align, max_dt)
-    ape = metrics.APE(PoseRelation.translation_part)
-    ape.process_data((truth, track))
-    ate = float(ape.get_statistic(metrics.StatisticsType.rmse))
-    values = {"ate_rmse": ate, "scale": scale, "path_length": float(truth.path_length)}
+    ate, gap = absolute_rmse(pair), pair.ours.rpe_gap
+    values = {"ate_rmse": ate, "scale": pair.scale, "path_length": float(pair.truth.path_length)}
     if values["path_length"] > 0:
         values["ate_percent"] = 100 * ate / values["path_length"]
-    if ours.matched > rpe_gap:
+    if pair.ours.matched > gap:
         for name, relation in (
             ("rpe_trans", PoseRelation.translation_part),
             ("rpe_rot_deg", PoseRelation.rotation_angle_deg),
         ):
-            rpe = metrics.RPE(relation, delta=rpe_gap, delta_unit=Unit.frames, all_pairs=True)
-            rpe.process_data((truth, track))
+            rpe = metrics.RPE(relation, delta=gap, delta_unit=Unit.frames, all_pairs=True)
+            rpe.process_data((pair.truth, pair.track))
             values[name] = float(rpe.get_statistic(metrics.StatisticsType.median))
             values[f"{name}_rmse"] = float(rpe.get_statistic(metrics.StatisticsType.rmse))
-    return replace(ours, **values)  # type: ignore[arg-type]
+    return replace(pair.ours, **values)  # type: ignore[arg-type]
 
 
-def rotation_rmse(estimate: Trajectory, reference: Trajectory, align: Alignment, max_dt: float = 0.01) -> float:
-    """Root mean square angle between the aligned orientations and the reference's (evo's APE of the angle), degrees."""
-    if not _can_align(estimate, reference, align, max_dt):
-        return math.nan
+def absolute_rmse(pair: Aligned, angle: bool = False) -> float:
+    """Root mean square distance to the reference, metres; or the angle between orientations, degrees (evo's APE)."""
     from evo.core import metrics
 
-    truth, track, _ = _aligned(estimate, reference, align, max_dt)
-    ape = metrics.APE(metrics.PoseRelation.rotation_angle_deg)
-    ape.process_data((truth, track))
+    relation = metrics.PoseRelation.rotation_angle_deg if angle else metrics.PoseRelation.translation_part
+    ape = metrics.APE(relation)
+    ape.process_data((pair.truth, pair.track))
     return float(ape.get_statistic(metrics.StatisticsType.rmse))
 
 
-def path_errors(
-    estimate: Trajectory,
-    reference: Trajectory,
-    align: Alignment,
-    *,
-    distance_m: float | None = None,
-    max_dt: float = 0.01,
-) -> PathErrors:
+def path_errors(pair: Aligned, distance_m: float | None = None) -> PathErrors:
     """evo's RPE with a distance in place of a number of frames, pairs chosen on the reference (tolerance 10 %).
 
     Args:
         distance_m: a tenth of the matched reference's path by default.
     """
-    if not _can_align(estimate, reference, align, max_dt):
-        return PathErrors()
     from evo.core import filters, metrics
     from evo.core.metrics import PoseRelation, Unit
 
-    truth, track, _ = _aligned(estimate, reference, align, max_dt)
-    distance = float(truth.path_length) / 10 if distance_m is None else distance_m
+    distance = float(pair.truth.path_length) / 10 if distance_m is None else distance_m
     if not distance > 0:
         return PathErrors()
     values = []
     for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg):
         rpe = metrics.RPE(relation, delta=distance, delta_unit=Unit.meters, all_pairs=True, pairs_from_reference=True)
         try:
-            rpe.process_data((truth, track))
+            rpe.process_data((pair.truth, pair.track))
         except filters.FilterException:  # no pair of frames is that far apart
             return PathErrors(distance)
         values.append(float(rpe.get_statistic(metrics.StatisticsType.median)))
@@ -211,31 +237,6 @@ def per_frame_scale(estimate: Trajectory, reference: Trajectory, max_dt: float =
     steps = np.where(have > 1e-12, steps * want / np.maximum(have, 1e-12), 0.0)
     track[1:, :3, 3] = track[0, :3, 3] + np.cumsum(steps, axis=0)
     return Trajectory(reference.timestamps[j], poses_from_matrices(track))
-
-
-def _can_align(estimate: Trajectory, reference: Trajectory, align: Alignment, max_dt: float) -> bool:
-    i, _ = associate(estimate, reference, max_dt)
-    if len(i) < MINIMUM_MATCHES:
-        return False
-    return math.isfinite(evaluate(estimate, reference, align, max_dt=max_dt).ate_rmse)
-
-
-def _aligned(estimate: Trajectory, reference: Trajectory, align: Alignment, max_dt: float) -> tuple[Any, Any, float]:
-    """Matched reference, matched and aligned estimate (evo's trajectories), and the scale that was fitted."""
-    from evo.core import sync
-    from evo.core.geometry import GeometryException
-
-    truth, track = sync.associate_trajectories(_evo(reference), _evo(estimate), max_diff=max_dt)
-    if align == "none":
-        return truth, track, 1.0
-    try:
-        _, _, scale = track.align(truth, correct_scale=align == "sim3", correct_only_scale=align == "scale")
-    except GeometryException:
-        i, j = associate(estimate, reference, max_dt)
-        scale, rotation, shift = fit_alignment(estimate.positions[i], reference.positions[j], align)
-        matched = Trajectory(estimate.timestamps[i], estimate.poses_wc[i])
-        track = _evo(transform(matched, scale, rotation, shift))
-    return truth, track, float(scale)
 
 
 def _evo(trajectory: Trajectory) -> Any:

@@ -12,14 +12,16 @@ from dvo.data.trajectory import Trajectory, read_tum
 from dvo.metrics import Metrics
 from eval.blackout import BlackoutErrors, blackout_errors
 from eval.metrics import (
+    Aligned,
     PathErrors,
     SegmentErrors,
-    evo_metrics,
+    absolute_rmse,
+    align_pair,
     kitti_errors,
+    metrics_of,
     path_errors,
     per_frame_scale,
     relative_pose_auc,
-    rotation_rmse,
 )
 from eval.plan import Manifest, Run, groundtruth_file
 from eval.predict import RECORD, Prediction, read_prediction, read_trajectory
@@ -227,17 +229,16 @@ def all_errors(estimate: Trajectory, reference: Trajectory, suite: Suite, dark: 
         dark: stretches without light, see :func:`eval.blackout.dark_spans`.
     """
     align = suite.alignment
-    metrics = evo_metrics(estimate, reference, align, rpe_gap=suite.rpe_gap)
-    scale = metrics.scale if math.isfinite(metrics.scale) else 1.0
-    rescaled = evo_metrics(per_frame_scale(estimate, reference), reference, align, rpe_gap=suite.rpe_gap)
+    pair = align_pair(estimate, reference, align, rpe_gap=suite.rpe_gap)
+    rescaled = align_pair(per_frame_scale(estimate, reference), reference, align)
     return Errors(
-        metrics=metrics,
-        path=path_errors(estimate, reference, align),
-        kitti=kitti_errors(estimate, reference, scale) if len(estimate) else SegmentErrors(),
+        metrics=metrics_of(pair) if isinstance(pair, Aligned) else pair,
+        path=path_errors(pair) if isinstance(pair, Aligned) else PathErrors(),
+        kitti=kitti_errors(estimate, reference, pair.scale) if isinstance(pair, Aligned) else SegmentErrors(),
         blackout=blackout_errors(estimate, reference, [(begin, end) for begin, end in dark], align),
         pose_auc=relative_pose_auc(estimate, reference, suite.rpe_gap),
-        rotation=rotation_rmse(estimate, reference, align),
-        per_frame_scale=rescaled.ate_rmse,
+        rotation=absolute_rmse(pair, angle=True) if isinstance(pair, Aligned) else math.nan,
+        per_frame_scale=absolute_rmse(rescaled) if isinstance(rescaled, Aligned) else math.nan,
     )
 
 

@@ -79,7 +79,7 @@ def path() -> Callable[..., Trajectory]:
     return walk
 
 
-# --- an evaluation on the twenty images of ``image_folder`` ------------------------------------------------------------
+# --- an evaluation on the twenty images of ``image_folder`` -----------------------------------------------------------
 
 
 @pytest.fixture

@@ -37,12 +37,14 @@ class SystemFacts:
     """What the key and the report need of a system, asked once for a whole evaluation.
 
     Attributes:
+        label: the name as in the tables: without the folders of a file in it.
         version: as in the tables, ``""`` if the system cannot say.
         missing: why it cannot run, or None.
         code, libraries, threads: see :mod:`eval.versions`; ``threads`` is whether their number may change results.
     """
 
     name: str
+    label: str
     licence: str
     about: str
     version: str
@@ -64,6 +66,7 @@ def system_facts(name: str, weights: str | None = None) -> SystemFacts:
     libraries = library_versions()
     return SystemFacts(
         name=name,
+        label=name.replace(name.partition(":")[2], Path(name).name) if name.startswith("dvo:") else Path(name).name,
         licence=system.licence,
         about=system.about,
         version="" if missing is not None else _version(system),

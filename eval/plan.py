@@ -65,7 +65,7 @@ class Manifest:
     """What ``run.json`` holds.
 
     Attributes:
-        suites, systems, seeds: of the plan.
+        suites, systems, seeds: of the plan; systems by the names in the tables.
         runs: every run with its folder, in the order of the tables.
         facts: of the systems, by name.
         threads, device, workers, machine: how and where it ran.
@@ -91,7 +91,7 @@ def write_manifest(plan: Plan, runs: list[Run], facts: dict[str, SystemFacts]) -
     """Write ``run.json`` into the plan's folder, whole or not at all."""
     manifest = Manifest(
         plan.suites,
-        plan.systems,
+        tuple(facts),
         plan.seeds,
         tuple(runs),
         facts,

@@ -211,7 +211,7 @@ def speed_figures(axes: list[Axis], manifest: Manifest, rows: list[Row], figures
                 if mine:
                     pair = (_median([row.fps for row in mine]), _median(errors_of(mine, judge)))
                     points.setdefault(system, []).append(pair)
-        if points:
+        if any(math.isfinite(error) and error > 0 for pairs in points.values() for _, error in pairs):
             unit = UNITS.get(judge, judge)
             svg = plot_speed(points, unit)
             found.append((f"{unit} against frames a second, by system", figures(f"speed_{judge}", svg)))

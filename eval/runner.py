@@ -70,6 +70,10 @@ def predict_all(plan: Plan, say: Callable[[str], None], run: Callable[[Job], Pre
             a Ray cluster that cannot be reached.
     """
     facts = {name: system_facts(name, plan.weights) for name in plan.systems}
+    labels = [known.label for known in facts.values()]
+    for label in labels:
+        if labels.count(label) > 1:
+            raise DvoError(f"two systems of the name '{label}'", field="--systems", remedy="rename one of the files")
     with _hold(plan.out):
         sweep(plan.out / PREDICTIONS)
         opened = {(suite.name, seq.name): open_once(plan, suite, seq, say) for suite, seq in plan.sequences()}
@@ -80,13 +84,13 @@ def predict_all(plan: Plan, say: Callable[[str], None], run: Callable[[Job], Pre
                     task = make_task(plan, suite, opened[suite.name, sequence.name], facts[system], seed)
                     folder = str(Path(task.job.folder).relative_to(plan.out.resolve()))
                     tasks.append(task)
-                    runs.append(Run(system, suite.name, sequence.name, seed, folder))
-        write_manifest(plan, runs, facts)
+                    runs.append(Run(facts[system].label, suite.name, sequence.name, seed, folder))
+        write_manifest(plan, runs, {known.label: known for known in facts.values()})
         for number, (task, prediction, old) in enumerate(_done(plan, tasks, run), 1):
             said = f"{prediction.tracked}/{len(prediction.stamps)} frames"
             if prediction.status != "ok":
                 said = f"{prediction.status}: {prediction.reason}"
-            where = f"{task.job.sequence.name}, {task.job.system}, seed {task.job.seed}"
+            where = f"{task.job.sequence.name}, {facts[task.job.system].label}, seed {task.job.seed}"
             say(f"[{number}/{len(tasks)}] {where}: {said}{' (was there)' if old else ''}")
 
 
@@ -124,7 +128,7 @@ def make_task(plan: Plan, suite: Suite, opened: Opened, facts: SystemFacts, seed
     facts_of_suite = {name: value for name, value in jsonable(asdict(suite)).items() if name not in _JUDGING}
     key = job_key(job, facts, opened.fingerprint, facts_of_suite)
     digest = digest_of(key) if opened.problem is None else "nodata"
-    folder = prediction_folder(plan, facts.name, suite, opened.sequence, seed, digest)
+    folder = prediction_folder(plan, facts.label, suite, opened.sequence, seed, digest)
     return Task(replace(job, folder=str(folder.resolve())), key, opened.problem)
 
 

@@ -1,0 +1,178 @@
+"""The page, the figures and the verdicts, on an evaluation in which most systems fail in some way."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from dvo.data.trajectory import Trajectory
+from eval.__main__ import main
+from eval.plan import read_manifest
+from eval.plots import OURS, plot_axis, plot_sequence, plot_speed, styles
+from eval.report import overall, shade, write_report, write_tables
+from eval.tables import Cell, axes_of, best_of, cell, cell_text
+from eval.verdict import verdicts
+
+pytest.importorskip("evo", reason="evo is in the extra 'eval'")
+VOID_TAGS = {"meta", "img", "br", "link"}
+
+
+class Outline(HTMLParser):
+    """Checks that tags nest, and keeps what the tests look at."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        if tag not in VOID_TAGS:
+            self.open.append(tag)
+        if given.get("id"):
+            self.ids.append(given["id"])
+        if tag == "a":
+            self.links.append(given["href"])
+        if tag == "img":
+            self.images.append(given)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+@pytest.fixture
+def page(plan, rows) -> str:
+    manifest = read_manifest(plan.out)
+    write_tables(plan.out, manifest, rows)
+    return write_report(plan.out, manifest, rows).read_text(encoding="utf-8")
+
+
+def test_page_is_whole_and_needs_nothing_else(page):
+    outline = Outline()
+    outline.feed(page)
+    assert not outline.open
+    assert {"axes", "spread", "speed", "systems", "failures", "sequences", "meaning", "tiny-clip"} <= set(outline.ids)
+    assert all(link.lstrip("#") in outline.ids for link in outline.links)
+    assert len(outline.images) == 3
+    for image in outline.images:
+        kind, _, content = image["src"].partition(";base64,")
+        assert kind == "data:image/svg+xml" and image["alt"]
+        ElementTree.fromstring(base64.b64decode(content))
+    assert "<script" not in page and not re.search(r'(src|href)="(?!data:|#)', page) and "url(" not in page
+
+
+def test_page_shows_every_system_the_failed_ones_too(page):
+    outline = Outline()
+    outline.feed(page)
+    text = " ".join(" ".join(outline.text).split())
+    for name in ("good", "lossy", "bad", "absent", "null"):
+        assert text.count(name) >= 3, name
+    assert "10 runs, 6 of them failed" in text and "2 of 2 failed" in text
+    assert text.count("RuntimeError: boom | with a bar and two lines") == 2
+    assert "8 of 20 frames have a pose" in text and "needs a thing" in text
+    assert "null is the zero line" in text and "alignment" in text and "made for a test" in text
+
+
+def test_report_from_the_folder_alone(plan, rows, page, tmp_path, capsys):
+    """Neither images nor ground truth are looked for: everything lies in the folder, and may be moved."""
+    (tmp_path / "clip").rename(tmp_path / "gone")
+    moved = plan.out.rename(tmp_path / "moved")
+    assert main(["report", str(moved)]) == 0
+    assert (moved / "report.html").read_text(encoding="utf-8") == page
+    with open(moved / "results.csv", newline="") as file:
+        written = list(csv.DictReader(file))
+    assert len(written) == 10 and float(written[0]["completeness"]) == 0.9
+    crashed = next(row for row in written if row["system"] == "bad")
+    assert crashed["ate_rmse"] == "" and crashed["reason"] == "RuntimeError: boom | with a bar and two lines"
+    assert capsys.readouterr().out.startswith("**made for a test**")
+
+
+def test_cells(plan, rows):
+    manifest = read_manifest(plan.out)
+    (axis,) = axes_of(manifest)
+    assert cell(axis, "absent", rows).note == "unavailable" and cell(axis, "nobody", rows).note == "not run"
+    lossy = cell(axis, "lossy", rows)
+    assert (lossy.median, lossy.failed, lossy.runs) == (math.inf, 2, 2)
+    null = next(row for row in rows if row.system == "null")
+    values = [replace(null, ate_percent=value) for value in (1.0, 2.0, 30.0)]
+    mixed = cell(axis, "null", [*values, replace(null, status="timeout")])
+    assert mixed == Cell(16.0, 1.0, math.inf, 1, 4)  # between the second and the third of four
+    assert cell_text(mixed, 1, bold=True) == "**16.0** (1/4 failed)"
+    missing = cell(axis, "null", [*values, replace(null, status="no data")])
+    assert (missing.median, missing.runs, missing.failed) == (2.0, 3, 0)  # says nothing about the system
+    pair = {"a": Cell(1.001, 1, 1, 0, 1), "b": Cell(1.004, 1, 1, 0, 1), "c": Cell(math.inf, 1, 1, 1, 1)}
+    assert best_of(pair, 2) == {"a", "b"} and best_of(pair, 3) == {"a"}
+
+
+def test_shades_against_null():
+    shades = [shade(Cell(value, 0, 0, 0, 1), 10.0) for value in (0.5, 2.0, 4.0, 8.0, 10.0, math.inf)]
+    assert shades == ["good3", "good2", "good1", "plain", "bad", "lost"]
+    assert shade(Cell(1.0, 0, 0, 0, 1), math.nan) == "plain"
+
+
+def test_verdict_tells_losses_and_wins(plan, rows):
+    manifest = read_manifest(plan.out)
+    null = next(row for row in rows if row.system == "null")
+
+    def told(ours: float, theirs: float, status: str = "ok"):
+        systems = {"dvo-x": (ours, status), "keyframe": (theirs, "ok"), "null": (5.0, "ok")}
+        made = [replace(null, system=name, ate_percent=v, status=s) for name, (v, s) in systems.items()]
+        (found,) = verdicts(replace(manifest, systems=tuple(systems)), made)
+        return found
+
+    assert told(1.0, 2.0).wins == ("tiny: 1.00 ATE % against 2.00 of keyframe",) and not told(1.0, 2.0).losses
+    assert told(3.0, 2.0).losses == ("tiny: 3.00 ATE % against 2.00 of keyframe",) and not told(3.0, 2.0).below_null
+    assert told(2.1, 2.0).level and not told(2.1, 2.0).wins
+    assert told(6.0, 2.0).below_null == ("tiny: 6.00 against 5.00",)
+    crashed = told(1.0, 2.0, "crashed")
+    assert crashed.losses == ("tiny: fails ATE % against 2.00 of keyframe",) and crashed.failed == 1
+    assert verdicts(manifest, rows) == []  # none of ours was asked
+
+
+def test_areas_count_failures_as_nothing(rows):
+    null = next(row for row in rows if row.system == "null")
+    made = [replace(null, auc=0.8), replace(null, auc=0.0, status="crashed")]
+    assert overall("null", made)[3] == "0.40"
+
+
+def test_styles_are_told_apart_without_colour():
+    names = ["dvo-small", "dvo-full", "keyframe", "direct", "monoslam", "klt-pnp", "orbslam3", "svo", "colmap", "null"]
+    found = styles([*names, "own"])
+    assert found["dvo-small"].color == OURS == found["dvo-full"].color
+    assert found["dvo-small"].line != found["dvo-full"].line
+    assert len({(style.color, str(style.line)) for style in found.values()}) == len(names) + 1
+    assert len({style.color for name, style in found.items() if not name.startswith("dvo")}) == len(names) - 1
+
+
+def test_figures_survive_what_runs_leave_behind():
+    """No poses, one pose, all failed, far off, dark stretches."""
+    s = np.linspace(0, 5, 900)
+    truth = Trajectory(s, np.column_stack([np.cos(s), 0 * s, s, 0 * s, 0 * s, 0 * s, 1 + 0 * s]))
+    far = Trajectory(s, truth.poses_wc * [1e6, 1, 1e6, 1, 1, 1, 1])
+    none = Trajectory(np.zeros(0), np.zeros((0, 7)))
+    one = Trajectory(s[:1], truth.poses_wc[:1])
+    from eval.sequences import Suite
+
+    for judge in ("ate_percent", "rpe_rot_deg"):
+        tracks = {"dvo-x": truth, "far": far, "none": none, "one": one}
+        svg = plot_sequence(Suite("s", "l", ()), judge, truth, tracks, [[1.0, 2.0]])
+        ElementTree.fromstring(svg)
+        assert "none: no trajectory" in svg and len(svg) < 120_000
+        assert svg == plot_sequence(Suite("s", "l", ()), judge, truth, tracks, [[1.0, 2.0]])  # the same bytes
+    assert "2 failed" in plot_axis("t", "u", {"a": [1.0, 2.0, math.inf, math.inf], "b": [math.inf], "c": []}, 3.0)
+    ElementTree.fromstring(plot_axis("t", "u", {"a": [math.inf]}, math.nan))
+    assert "1 of 2 without a figure" in plot_speed({"a": [(3.0, 1.0), (3.0, math.inf)]}, "ATE %")

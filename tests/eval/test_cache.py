@@ -192,7 +192,7 @@ def test_halves_are_swept(tmp_path):
 
 
 def command(tmp_path: Path, suite_file: Path, system: str, out: str, *more: str) -> list[str]:
-    base = ["run", "--suite", str(suite_file), "--systems", f"{system},null", "--seeds", "3", "--threads", "1"]
+    base = ["run", "--suite", str(suite_file), "--systems", system, "--seeds", "3", "--threads", "1"]
     return [*base, "--data", str(tmp_path), "--out", str(tmp_path / out), "--no-report", *more]
 
 
@@ -211,7 +211,7 @@ def test_kill_and_resume(tmp_path, image_folder, suite_file, walk, capsys):
     assert finished(tmp_path) == ["0", "1", "2"]
     assert main(arguments) == 0  # nothing to do: the same bytes, timings and all
     assert finished(tmp_path) == ["0", "1", "2"] and (tmp_path / "whole/results.csv").read_bytes() == whole
-    assert capsys.readouterr().err.count("(was there)") == 6
+    assert capsys.readouterr().err.count("(was there)") == 3
     (tmp_path / "walk.log").unlink()
 
     slow = SLOW_SYSTEM.replace("PAUSE", "0.0 if self.seed == 0 or HURRY.exists() else 0.5")
@@ -310,14 +310,52 @@ def test_ray_missing_and_packed_runs(job, tmp_path, image_folder, monkeypatch, p
     assert done.status == "ok" and done.tracked == 20 and reusable(job) == done
     assert np.isfinite(np.loadtxt(tmp_path / "p/seed0-abc/trajectory.txt")).all()
 
+    asked: list[str] = []
+    monkeypatch.setattr(cluster.importlib, "import_module", lambda name: PretendedRay(asked))
+    said: list[str] = []
+    predict_all(replace(plan, systems=("null",), ray="ray://head:1"), said.append)
+    assert asked == ["init ray://head:1", "cpus 1", "run 0", "run 1", "shutdown"]
+    assert [text.split(": ")[1] for text in said] == ["20/20 frames"] * 2
+
     def absent(name: str):
         raise ImportError(name)
 
     monkeypatch.setattr(cluster.importlib, "import_module", absent)
     with pytest.raises(DvoError, match="Ray is not installed"):
-        predict_all(replace(plan, systems=("null",), ray="auto"), lambda text: None)
+        predict_all(replace(plan, systems=("null",), seeds=(7,), ray="auto"), lambda text: None)
 
 
 def predict_into_new_folder(job: Job) -> Prediction:
     Path(job.folder).mkdir(parents=True)
     return predict_here(job)
+
+
+class PretendedRay:
+    """The part of Ray that is used, in this process; the last run asked for is done first."""
+
+    def __init__(self, asked: list[str]) -> None:
+        self.asked = asked
+
+    def init(self, address: str, **options) -> None:
+        self.asked.append(f"init {address}")
+
+    def remote(self, **options):
+        self.asked.append(f"cpus {options['num_cpus']}")
+
+        def wrap(function):
+            def start(job: Job) -> tuple:
+                self.asked.append(f"run {job.seed}")
+                return (function, job)
+
+            return type("Remote", (), {"remote": staticmethod(start)})
+
+        return wrap
+
+    def wait(self, waiting: list, num_returns: int) -> tuple[list, list]:
+        return waiting[-num_returns:], waiting[:-num_returns]
+
+    def get(self, reference: tuple) -> bytes:
+        return reference[0](reference[1])
+
+    def shutdown(self) -> None:
+        self.asked.append("shutdown")

@@ -37,8 +37,8 @@ class TrackerConfig:
     lifetime: int = 7
     removal: int = 9
     optimisation: int = 8
-    initial_frames: int = 8
-    initial_updates: int = 12
+    initial_frames: int = 5
+    initial_updates: int = 16
     final_updates: int = 8
     updates: int = 1
     initial_motion: float = 0.5
@@ -62,6 +62,7 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
     "tiny": TrackerConfig(pixels=160 * 120, patches=16),
     # DPVO's "fast" setting.
     "full": TrackerConfig(
-        pixels=0, patches=48, lifetime=11, removal=16, optimisation=7, initial_motion=2.0, keyframe_motion=15.0
-    ),
+        pixels=0, patches=48, lifetime=11, removal=16, optimisation=7, initial_frames=8, initial_updates=12,
+        initial_motion=2.0, keyframe_motion=15.0,
+    ),  # fmt: skip
 }

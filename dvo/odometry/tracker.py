@@ -72,7 +72,7 @@ class PatchOdometry:
         self.window = Window.empty(config.patches, c.patch_size, c.hidden_channels, self.device)
         # Sides leave room for several pixels of motion before a window must be fetched again.
         self._correlations = [
-            EdgeCorrelation(scale, c.patch_size**2, c.radius, 16 if scale == 1 else 14, self.device)
+            EdgeCorrelation(scale, c.patch_size**2, c.radius, 14 if scale == 1 else 12, self.device)
             for scale in c.pyramid
         ]
         self._bounds = (0, 0)  # width and height of the feature map

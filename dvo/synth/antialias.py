@@ -8,7 +8,9 @@ from torch import Tensor
 OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))  # rotated grid, pixels
 
 
-def smooth_outlines(images: Tensor, surface: Tensor, functions: Tensor, slack: float) -> None:
+def smooth_outlines(
+    images: Tensor, surface: Tensor, functions: Tensor, slack: float, *, by_row: bool = False
+) -> None:
     """Blend the pixels at outlines, in place.
 
     At four places of each such pixel the nearest surface is looked for among those of the pixel and of its neighbours;
@@ -20,12 +22,13 @@ def smooth_outlines(images: Tensor, surface: Tensor, functions: Tensor, slack: f
         surface: ``(N, H, W)`` int32 row of the functions of what each pixel shows, -1 for nothing.
         functions: ``(N, Q, 5, 3)`` inverse depth and four edge functions, linear in (x, y, 1).
         slack: edge functions above ``-slack`` are inside.
+        by_row: functions are ``(N, H, Q, 5, 3)``, others for every row, in which they take the row as y = 0.
     """
     for frame in range(len(images)):  # one at a time: small enough for the processor's cache
-        _smooth_frame(images[frame], surface[frame], functions[frame], slack)
+        _smooth_frame(images[frame], surface[frame], functions[frame], slack, by_row)
 
 
-def _smooth_frame(image: Tensor, surface: Tensor, functions: Tensor, slack: float) -> None:
+def _smooth_frame(image: Tensor, surface: Tensor, functions: Tensor, slack: float, by_row: bool) -> None:
     height, width = surface.shape
     across, down = surface[:, 1:] != surface[:, :-1], surface[1:] != surface[:-1]
     outline = torch.zeros_like(surface, dtype=torch.bool)
@@ -41,7 +44,10 @@ def _smooth_frame(image: Tensor, surface: Tensor, functions: Tensor, slack: floa
     up, below = at - width * (y > 0).long(), at + width * (y < height - 1).long()
     places = torch.stack([at, left, right, up, below])  # (5, M) where each candidate's colour comes from
     names = surface.view(-1)[places].long()
-    rows = functions.view(-1, 15).index_select(0, names.clamp_min(0).view(-1))
+    index = names.clamp_min(0)
+    if by_row:
+        index, y = index + y * functions.shape[1], torch.zeros_like(y)
+    rows = functions.view(-1, 15).index_select(0, index.view(-1))
     rows = rows.t().contiguous().view(5, 3, *places.shape)  # function, coefficient, candidate, pixel
     centre = rows[:, 0] * x.float() + rows[:, 1] * y.float() + rows[:, 2]
     colours = image.view(3, -1)

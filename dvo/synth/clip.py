@@ -18,7 +18,7 @@ from dvo.synth.paths import Path, find_start, random_path
 from dvo.synth.poses import compose, inverse, split
 from dvo.synth.renderer import render, render_depth
 from dvo.synth.scene import Scene
-from dvo.synth.sensor import Sensor, expose, random_intrinsics, random_sensor
+from dvo.synth.sensor import Sensor, expose, random_intrinsics, random_sensor, random_wear
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.synth.textures import texture_pool
 
@@ -215,7 +215,10 @@ def make_clip(
             field, _ = flow_field(rendering.depth.cpu().numpy(), poses_wc, intrinsics)
             field = np.clip(np.concatenate([field, field[-1:]]), -width / 3, width / 3)
             flow = torch.from_numpy(field.astype(np.float32))
-        images = expose(images, camera, rng, flow)
+        times = plan.times - plan.times[0]
+        # From a stream of its own: what is drawn above stays what it was before there was wear.
+        camera = random_wear(np.random.default_rng([seed, 7302, index]), camera, float(times[-1]))
+        images = expose(images, camera, rng, flow, times)
     scale = float(rendering.depth.median())
     relative = compose(inverse(poses_wc), poses_wc[:1])  # world := first camera
     relative[:, :3] /= scale

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dvo.errors import DvoError
 from dvo.synth.antialias import smooth_outlines
+from dvo.synth.bodies import Stage
 from dvo.synth.scene import CELL, Scene
 from dvo.synth.textures import sample
 from dvo.synth.view import SLACK, View, look
@@ -41,7 +42,7 @@ class Rendering:
     uv: Tensor
 
 
-def _cast(view: View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
+def cast(view: View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
     """Largest inverse depth ``(N, H, W)``, the position in ``view.index`` of its surface (int32, -1 for none), and the
     functions ``(N, Q, 5, 3)`` that decided it: inverse depth and edges.
     """
@@ -82,7 +83,7 @@ def _linear(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return torch.addcmul(torch.addcmul(rows[2], rows[0], x), rows[1], y)
 
 
-def _functions(scene: Scene, view: View, device: torch.device | str) -> Tensor:
+def functions_of(scene: Scene, view: View, device: torch.device | str) -> Tensor:
     """Coefficients ``(N Q, 15)`` of 1/Z, s/Z, t/Z and of the light-map coordinates over Z."""
     texture = scene.texture_map[view.index] @ view.basis
     light = scene.light_map[view.index] @ view.basis
@@ -90,7 +91,7 @@ def _functions(scene: Scene, view: View, device: torch.device | str) -> Tensor:
     return torch.from_numpy(packed.reshape(-1, 15)).to(device)
 
 
-def _shade(scene: Scene, functions: Tensor, row: Tensor, surface: Tensor, x: Tensor, y: Tensor, taps: int) -> Tensor:
+def shade(scene: Scene, functions: Tensor, row: Tensor, surface: Tensor, x: Tensor, y: Tensor, taps: int) -> Tensor:
     """Colour ``(3, M)`` in [0, 1] of M pixels (x, y) that show ``surface (M,)``, with functions in ``row (M,)``."""
     tables = scene.tensors(surface.device)
     f = functions.index_select(0, row).t().contiguous().view(5, 3, -1)
@@ -134,17 +135,34 @@ def _cameras(poses_wc: object, intrinsics: object) -> tuple[Array, Array]:
     return poses, np.broadcast_to(k, (len(poses), 4))
 
 
+def sight(
+    scene: Scene | Stage, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None, times: object = None
+) -> tuple[Scene, View]:
+    """What cameras ``(N, 7)`` see at ``times (N,)``, and the scene whose paint and light goes with it.
+
+    Raises:
+        DvoError: moving bodies and no time for every camera.
+    """
+    if not isinstance(scene, Stage):
+        return scene, look(scene, poses_wc, intrinsics, size)
+    when = np.asarray(times, np.float64) if times is not None else np.zeros(0)
+    if when.shape != (len(poses_wc),):
+        raise DvoError("a scene with moving bodies needs a time for every pose", field="times")
+    return scene.surfaces, scene.look(poses_wc, intrinsics, size, when)
+
+
 def render_depth(
-    scene: Scene, poses_wc: object, intrinsics: object, height: int, width: int, *, device: torch.device | str = "cpu"
-) -> tuple[Tensor, Tensor]:
+    scene: Scene | Stage, poses_wc: object, intrinsics: object, height: int, width: int, *,
+    device: torch.device | str = "cpu", times: object = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
     poses, k = _cameras(poses_wc, intrinsics)
-    view = look(scene, poses, k, (height, width))
-    nearest, local, _ = _cast(view, height, width, device)
-    return torch.where(local >= 0, 1 / nearest, 0.0), _named(view, local)
+    _, view = sight(scene, poses, k, (height, width), times)
+    nearest, local, _ = cast(view, height, width, device)
+    return torch.where(local >= 0, 1 / nearest, 0.0), named(view, local)
 
 
-def _named(view: View, local: Tensor) -> Tensor:
+def named(view: View, local: Tensor) -> Tensor:
     """Positions in ``view.index`` -> surfaces of the scene, int64; -1 stays."""
     names = torch.from_numpy(np.append(view.index, -1).astype(np.int64)).to(local.device)
     return names[local.long()]
@@ -155,7 +173,7 @@ def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:
     n, height, width = local.shape
     device = local.device
     images = torch.empty(n, 3, height * width, device=device)
-    functions = _functions(scene, view, device)
+    functions = functions_of(scene, view, device)
     x = torch.arange(width, dtype=torch.float32, device=device).expand(height, width).reshape(-1)
     y = torch.arange(height, dtype=torch.float32, device=device)[:, None].expand(height, width).reshape(-1)
     names = torch.from_numpy(view.index).to(device)
@@ -167,14 +185,14 @@ def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:
         for a in range(0, flat.numel(), piece):
             part = slice(a, a + piece)
             row = flat[part] + frame * len(view.index)
-            images[frame, :, part] = _shade(scene, functions, row, names[flat[part]], x[part], y[part], taps)
+            images[frame, :, part] = shade(scene, functions, row, names[flat[part]], x[part], y[part], taps)
         if not hit.all():
             images[frame].masked_fill_(~hit, 0.0)
     return images.view(n, 3, height, width)
 
 
 def render(
-    scene: Scene,
+    scene: Scene | Stage,
     poses_wc: object,
     intrinsics: object,
     height: int,
@@ -185,11 +203,12 @@ def render(
     taps: int = 2,
     antialias: bool = True,
     coordinates: bool = True,
+    times: object = None,
 ) -> Rendering:
     """Render N frames.
 
     Args:
-        scene: what to render.
+        scene: what to render; a :class:`Stage` has bodies that move.
         poses_wc: ``(N, 7)`` camera to world, tensor or array.
         intrinsics: ``(N, 4)`` or ``(4,)`` fx fy cx cy in pixels of the ``height`` x ``width`` image.
         height, width: image size in pixels.
@@ -198,29 +217,30 @@ def render(
         taps: texture samples along the longer axis of a pixel's footprint (anisotropic filter).
         antialias: smooth outlines by coverage (with one ray a pixel; more rays smooth by themselves).
         coordinates: fill ``uv`` too; without, it is empty ``(N, 0, 0, 2)``.
+        times: ``(N,)`` seconds, for the places of moving bodies.
 
     Raises:
-        DvoError: poses or intrinsics of the wrong shape or not finite.
+        DvoError: poses or intrinsics of the wrong shape or not finite, or bodies without times.
     """
     poses, k = _cameras(poses_wc, intrinsics)
-    view = look(scene, poses, k, (height, width))
-    nearest, local, functions = _cast(view, height, width, device)
+    painted, view = sight(scene, poses, k, (height, width), times)
+    nearest, local, functions = cast(view, height, width, device)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
     if supersample == 1:
-        images = _colours(scene, view, local, taps)
+        images = _colours(painted, view, local, taps)
         if antialias:
             smooth_outlines(images, local, functions, SLACK)
     else:
         m = supersample
         fine = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
-        fine_view = look(scene, poses, fine, (height * m, width * m))
-        _, fine_local, _ = _cast(fine_view, height * m, width * m, device)
-        images = torch.nn.functional.avg_pool2d(_colours(scene, fine_view, fine_local, taps), m)
-    uv = _coordinates(view, local, depth) if coordinates else torch.zeros(len(poses), 0, 0, 2, device=device)
-    return Rendering(images, depth, _named(view, local), uv)
+        _, fine_view = sight(scene, poses, fine, (height * m, width * m), times)
+        _, fine_local, _ = cast(fine_view, height * m, width * m, device)
+        images = torch.nn.functional.avg_pool2d(_colours(painted, fine_view, fine_local, taps), m)
+    uv = coordinates_of(view, local, depth) if coordinates else torch.zeros(len(poses), 0, 0, 2, device=device)
+    return Rendering(images, depth, named(view, local), uv)
 
 
-def _coordinates(view: View, local: Tensor, depth: Tensor) -> Tensor:
+def coordinates_of(view: View, local: Tensor, depth: Tensor) -> Tensor:
     """Surface coordinates ``(N, H, W, 2)`` of a cast grid."""
     n, height, width = local.shape
     device = local.device
@@ -232,20 +252,28 @@ def _coordinates(view: View, local: Tensor, depth: Tensor) -> Tensor:
     return (chosen[..., 0] * xs + chosen[..., 1] * ys + chosen[..., 2]) * depth[..., None]
 
 
-def trace(scene: Scene, poses_wc: object, intrinsics: object, pixels: Array) -> tuple[Array, Array, Array]:
+def trace(
+    scene: Scene | Stage, poses_wc: object, intrinsics: object, pixels: Array, times: object = None,
+    size: tuple[int, int] | None = None,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """What single rays hit, in float64: the reference for tests and for tracks.
 
     Args:
         scene: what to look at.
         poses_wc: ``(N, 7)``; intrinsics: ``(N, 4)`` or ``(4,)``.
         pixels: ``(N, M, 2)`` x, y (need not be integers nor inside an image).
+        times: ``(N,)`` seconds, for the places of moving bodies.
+        size: height and width of pictures in which all pixels lie: spares work on what cannot show there.
 
     Returns:
         depth ``(N, M)``, surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
     """
     poses, k = _cameras(poses_wc, intrinsics)
-    view = look(scene, poses, k, None)
+    _, view = sight(scene, poses, k, size, times)
     homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1).swapaxes(1, 2)  # (N, 3, M)
+    if not len(view.index):
+        nothing = np.zeros(pixels.shape[:2])
+        return nothing, np.full(nothing.shape, -1), np.zeros(pixels.shape)
     inverse = view.basis[:, :, 2] @ homogeneous  # (N, Q, M)
     inside = (view.edges @ homogeneous[:, None]).min(2) >= -SLACK
     inverse = np.where(inside & view.seen[..., None] & (inverse > 0), inverse, 0)

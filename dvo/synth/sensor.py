@@ -1,4 +1,4 @@
-"""What a camera does to a clean rendering: exposure, colour, vignetting, blur, noise. Light version.
+"""What a camera does to a clean rendering: exposure, colour, vignetting, blur, noise, compression, failures.
 
 Everything is drawn from a seed; the drawing and the noise are made on the CPU, so that a clip does not depend on the
 device.
@@ -6,8 +6,9 @@ device.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -25,9 +26,16 @@ class Sensor:
         flicker: standard deviation of the frame-to-frame drift of log gain.
         vignette: darkening in the corners, 0 to 1.
         blur: Gaussian radius in pixels, 0 for none.
-        shutter: share of the time between frames during which light is gathered, 0 for no motion blur; the blur follows
-            the flow between frames (an approximation; poses and depth are those of mid-exposure).
+        shutter: share of the time between frames during which light is gathered, 0 for no motion blur. In films the
+            blur is integrated along the path; in training clips it follows the flow between frames (an approximation).
+            Poses and depth are those of mid-exposure.
         shot, read: noise deviation at full brightness (grows with the root of brightness) and in the dark.
+        readout: share of the time between frames during which a rolling shutter reads its rows, 0 for a global one.
+        stops: knots ``(second, exposure value)`` of the exposure over time, linear between them and constant outside;
+            one more stop is twice as bright. Empty: constant.
+        blackout: spans ``(from, to)`` in seconds without light: what is left is noise.
+        jpeg: quality of compression, 1 to 100; 0 for none.
+        drop: chance that a frame is lost (films only).
     """
 
     exposure: float | None = 0.45
@@ -41,6 +49,16 @@ class Sensor:
     shutter: float = 0.0
     shot: float = 0.0
     read: float = 0.0
+    readout: float = 0.0
+    stops: tuple[tuple[float, float], ...] = ()
+    blackout: tuple[tuple[float, float], ...] = ()
+    jpeg: int = 0
+    drop: float = 0.0
+
+    def dark(self, times: np.ndarray) -> np.ndarray:
+        """``(T,)`` bool: does a blackout hold at ``times (T,)``?"""
+        times = np.asarray(times, float)
+        return np.any([(times >= a) & (times < b) for a, b in self.blackout], 0) & np.ones(len(times), bool)
 
 
 def random_intrinsics(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
@@ -71,6 +89,64 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
     )
 
 
+def random_wear(rng: np.random.Generator, sensor: Sensor, duration: float) -> Sensor:
+    """Now and then (one clip in ten) compression or a change of exposure, on top of what :func:`random_sensor` draws."""
+    draw = rng.random()
+    if draw < 0.05:
+        return replace(sensor, jpeg=int(rng.integers(30, 95)))
+    if draw < 0.1:
+        return replace(sensor, stops=exposure_changes(rng, duration, float(rng.uniform(0.3, 1.2))))
+    return sensor
+
+
+def exposure_changes(rng: np.random.Generator, duration: float, strength: float) -> tuple[tuple[float, float], ...]:
+    """Knots for :attr:`Sensor.stops`: slow drifts of up to half of ``strength`` stops, and one or two sudden changes of
+    ``strength`` stops, from which an automatic exposure recovers most of the way within a second or two.
+    """
+    count = max(3, int(duration / 1.3))
+    times = np.linspace(0, duration, count)
+    drift = 0.5 * strength * np.clip(rng.normal(0, 0.6, count), -1, 1)
+    drift[0] = 0
+    sudden = int(rng.integers(1, 3))
+    when = (np.arange(sudden) + rng.uniform(0.3, 0.8, sudden)) / sudden * duration
+    knots = list(times)
+    for t in when:
+        knots += [t, t + 1e-3, *(t + s for s in (0.15, 0.3, 0.5, 0.8, 1.2, 1.8))]
+    grid = np.unique(np.array(knots))
+    level = np.interp(grid, times, drift)
+    for t in when:
+        jump = strength * float(rng.choice([-1.0, 0.7]))  # into the dark, or into the light
+        recovered = 1 - np.exp(-np.maximum(grid - t - 0.15, 0) / 0.5)
+        level = level + np.where(grid > t, jump * (1 - 0.8 * recovered), 0)
+    return tuple((float(t), float(v)) for t, v in zip(grid, level, strict=True))
+
+
+def in_the_dark(sensor: Sensor, light: float) -> Sensor:
+    """The sensor where only the share ``light`` of the usual light arrives: it amplifies up to 14 times, and with the
+    signal the noise. Noise is that of photons (variance grows with the amplified signal) and of reading out.
+    """
+    amplified = float(np.clip(0.8 / light, 1.0, 14.0))
+    red, green, blue = (value * light * amplified for value in sensor.balance)
+    return replace(
+        sensor,
+        balance=(red, green, blue),
+        saturation=0.7 * sensor.saturation,
+        shot=float(np.clip(sensor.shot, 0.008, 0.02)) * amplified**0.5,
+        read=float(np.clip(sensor.read, 0.002, 0.005)) * amplified,
+    )
+
+
+def compressed(images: Tensor, quality: int) -> Tensor:
+    """``(N, 3, H, W)`` float RGB in [0, 1] through JPEG and back."""
+    frames = (images * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+    out = []
+    for frame in frames:
+        _, code = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+        out.append(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
+    again = torch.from_numpy(np.ascontiguousarray(np.stack(out).transpose(0, 3, 1, 2)))
+    return again.to(images.device, images.dtype) / 255
+
+
 def _blurred(images: Tensor, radius: float) -> Tensor:
     half = max(1, int(np.ceil(2.5 * radius)))
     taps = np.exp(-0.5 * (np.arange(half + 1) / radius) ** 2)
@@ -99,7 +175,10 @@ def _smeared(images: Tensor, motion: Tensor, taps: int = 5) -> Tensor:
     return total / taps
 
 
-def expose(images: Tensor, sensor: Sensor, rng: np.random.Generator, flow: Tensor | None = None) -> Tensor:
+def expose(
+    images: Tensor, sensor: Sensor, rng: np.random.Generator, flow: Tensor | None = None,
+    times: np.ndarray | None = None,
+) -> Tensor:  # fmt: skip
     """Apply a sensor to clean frames of one clip.
 
     Args:
@@ -107,6 +186,7 @@ def expose(images: Tensor, sensor: Sensor, rng: np.random.Generator, flow: Tenso
         sensor: the camera.
         rng: draws flicker and noise.
         flow: ``(N, H, W, 2)`` pixels from each frame to the next, wanted by motion blur.
+        times: ``(N,)`` seconds, wanted by changes of exposure and blackouts.
 
     Returns:
         ``(N, 3, H, W)`` float RGB in [0, 1].
@@ -120,6 +200,9 @@ def expose(images: Tensor, sensor: Sensor, rng: np.random.Generator, flow: Tenso
     gain = np.exp(np.cumsum(rng.normal(0, 1, n)) * sensor.flicker)[:, None] * np.array(sensor.balance)[None]
     if sensor.exposure is not None:
         gain = gain * (sensor.exposure / max(float(images.mean()), 0.02)) ** 0.8
+    if times is not None and sensor.stops:
+        knots = np.array(sensor.stops)
+        gain = gain * 2.0 ** np.interp(times, knots[:, 0], knots[:, 1])[:, None]
     grey = images.mean(1, keepdim=True)
     images = grey + sensor.saturation * (images - grey)
     images = images * torch.from_numpy(gain.astype(np.float32)).to(device)[:, :, None, None]
@@ -129,6 +212,8 @@ def expose(images: Tensor, sensor: Sensor, rng: np.random.Generator, flow: Tenso
         images = images * (1 - sensor.vignette * (x * x + y * y) / 2)
     if sensor.contrast != 1:
         images = 0.45 + sensor.contrast * (images - 0.45)
+    if times is not None and sensor.blackout:
+        images = images * torch.from_numpy(~sensor.dark(times)).to(device)[:, None, None, None]
     images = images.clamp_(0, 4)
     # A soft shoulder instead of hard white.
     images = torch.where(images > 0.75, 0.75 + 0.25 * torch.tanh((images - 0.75) / 0.25), images)
@@ -138,4 +223,5 @@ def expose(images: Tensor, sensor: Sensor, rng: np.random.Generator, flow: Tenso
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         noise = torch.randn(images.shape, generator=generator).to(device)
         images = images + noise * (sensor.shot**2 * images + sensor.read**2).sqrt_()
-    return images.clamp_(0, 1)
+    images = images.clamp_(0, 1)
+    return compressed(images, sensor.jpeg) if sensor.jpeg else images

@@ -14,31 +14,37 @@ from dvo.data.source import Source, open_source
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.metrics import Alignment, associate
+from eval.axes import choose, expand
+from eval.rendered import rendered_folder
 
 ROOT = Path(__file__).resolve().parent.parent
 SUITES = ROOT / "configs" / "eval"
+AXES = "axes"  # the file of the rendered suites, and the name of them all
 Judge = Literal["ate_percent", "rpe_rot_deg"]
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """One recording with ground truth.
+    """One recording, or rendering, with ground truth.
 
     Attributes:
         name: in the tables.
-        path: folder or file, relative to the data folder.
+        path: folder or file, relative to the data folder; empty if rendered.
         judged_by: the column that decides between systems: ``ate_percent`` or, where scale is weak, ``rpe_rot_deg``.
         about: a few words.
         calib, times, groundtruth: files relative to the folder, where the layout itself does not say.
+        rendered: options of :func:`dvo.synth.make_sequence` and ``version``, as pairs, for a sequence that is rendered
+            into a cache (:mod:`eval.rendered`) when it is first wanted; None for a recording.
     """
 
     name: str
-    path: str
+    path: str = ""
     judged_by: Judge = "ate_percent"
     about: str = ""
     calib: str | None = None
     times: str | None = None
     groundtruth: str | None = None
+    rendered: tuple[tuple[str, Any], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,28 @@ class Suite:
         return replace(self, sequences=tuple(known[name] for name in names))
 
 
+def read_suites(text: str) -> list[Suite]:
+    """Suites by what stands on a command line.
+
+    ``fast`` is the mini tier of the validation split of a rendered axis, ``fast/test``, ``fast/large`` and
+    ``fast/test/large`` the others; ``axes`` (or ``axes/test``, ...) stands for all twelve. Anything else is the name of
+    a config or a file, as for :func:`read_suite`.
+
+    Raises:
+        DvoError: no such suite.
+    """
+    name, file = text.split("/")[0], SUITES / f"{AXES}.yaml"
+    table = _table(file)
+    if name != AXES and name not in table["axes"]:
+        return [read_suite(text)]
+    built = []
+    for axis, split, tier in choose(text, table, AXES):
+        entry = expand(table, file, axis, split, tier)
+        entry["sequences"] = tuple(_build(Sequence, one, file) for one in entry["sequences"])
+        built.append(_checked(_build(Suite, entry, file), file))
+    return built
+
+
 def read_suite(name_or_file: str | Path) -> Suite:
     """A suite by name (configs/eval/NAME.yaml) or from a file.
 
@@ -94,18 +122,25 @@ def read_suite(name_or_file: str | Path) -> Suite:
     if path.suffix not in (".yaml", ".yml"):
         path = SUITES / f"{name_or_file}.yaml"
     if not path.is_file():
-        names = ", ".join(sorted(file.stem for file in SUITES.glob("*.yaml")))
+        names = ", ".join([*sorted(file.stem for file in SUITES.glob("*.yaml")), *_table(SUITES / f"{AXES}.yaml")["axes"]])
         raise DvoError("no such suite", file=path, field="--suite", remedy=f"give a file, or one of: {names}")
-    try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="mend the file") from error
+    table = _table(path)
     if not isinstance(table, dict) or not isinstance(table.get("sequences"), list):
         raise DvoError("no list of sequences", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
     sequences = tuple(_build(Sequence, entry, path) for entry in table.pop("sequences"))
-    suite: Suite = _build(Suite, {**table, "sequences": sequences}, path)
+    return _checked(_build(Suite, {**table, "sequences": sequences}, path), path)
+
+
+def _table(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="mend the file") from error
+
+
+def _checked(suite: Suite, path: Path) -> Suite:
     _check(suite.alignment, get_args(Alignment), "alignment", path)
-    for sequence in sequences:
+    for sequence in suite.sequences:
         _check(sequence.judged_by, get_args(Judge), f"{sequence.name}: judged_by", path)
     return suite
 
@@ -123,20 +158,24 @@ def data_folder(given: str | Path | None = None) -> Path:
 
 
 def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, Trajectory]:
-    """The frames of a sequence and its ground truth.
+    """The frames of a sequence and its ground truth; rendered ones are rendered if they are not in the cache.
 
     Raises:
         DvoError: the data are not there, or hold no ground truth.
     """
+    if sequence.rendered is not None:
+        place = rendered_folder(sequence.name, dict(sequence.rendered))
+    else:
+        place = data / sequence.path
     source = open_source(
-        data / sequence.path,
+        place,
         calib=sequence.calib,
         times=sequence.times,
         groundtruth=sequence.groundtruth,
         stride=stride,
     )
     if source.groundtruth is None:
-        raise DvoError("no ground truth", file=data / sequence.path, remedy="name its file under 'groundtruth'")
+        raise DvoError("no ground truth", file=place, remedy="name its file under 'groundtruth'")
     return source, source.groundtruth
 
 

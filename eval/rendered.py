@@ -1,0 +1,111 @@
+"""Rendered sequences, kept on disk: made once, read back by the same readers as recordings, the same for every system.
+
+A folder of the cache has the layout of TUM RGB-D (``rgb.txt``, ``rgb/``, ``groundtruth.txt``) with ``calib.txt``, so that
+other people's tools read it too. It appears under its name only when it is whole.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from dvo.data.trajectory import write_tum
+from dvo.errors import DvoError
+
+RECORD = "sequence.json"
+STALE = 24 * 3600.0  # seconds after which an unfinished folder is nobody's work in progress
+
+
+def cache_folder() -> Path:
+    """``$DVO_CACHE/suites``, else ``~/.cache/dvo/suites``; made if need be.
+
+    Raises:
+        DvoError: it cannot be made.
+    """
+    folder = Path(os.environ.get("DVO_CACHE") or Path.home() / ".cache" / "dvo") / "suites"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DvoError(str(error.strerror), file=folder, field="DVO_CACHE", remedy="set it to another folder") from error
+    return folder
+
+
+def place_of(name: str, options: dict[str, Any]) -> Path:
+    """The folder of a sequence; another one whenever name, version or an option is another."""
+    text = json.dumps(options, sort_keys=True)
+    return cache_folder() / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+
+
+def rendered_folder(name: str, options: dict[str, Any]) -> Path:
+    """The folder of a rendered sequence, rendered now unless it is there.
+
+    Args:
+        name: of the sequence.
+        options: of :func:`dvo.synth.make_sequence`, and ``version``.
+
+    Raises:
+        DvoError: options that cannot be rendered, or a folder that cannot be written.
+    """
+    folder = place_of(name, options)
+    if (folder / RECORD).is_file():
+        return folder
+    _sweep(folder.parent)
+    part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        _write(part, name, options)
+        try:
+            part.rename(folder)
+        except OSError:
+            if not (folder / RECORD).is_file():  # else another process was faster, with the same bytes
+                raise
+    except OSError as error:
+        raise DvoError(str(error), file=folder, field="DVO_CACHE", remedy="make room or set another folder") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return folder
+
+
+def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
+    import cv2  # here, as rendering is: the evaluation of recordings needs neither
+
+    from dvo.synth.sequence import make_sequence
+
+    begin, clock = time.perf_counter(), time.process_time()
+    chosen = {key: value for key, value in options.items() if key != "version"}
+    try:
+        sequence = make_sequence(**chosen)
+    except TypeError as error:
+        raise DvoError(f"options that cannot be rendered ({error})", field=name, remedy="mend the suite") from error
+    (folder / "rgb").mkdir()
+    rows = ["# timestamp filename"]
+    for frame in sequence:
+        file = f"rgb/{frame.timestamp:.6f}.png"
+        if not cv2.imwrite(str(folder / file), frame.image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+            raise OSError(f"cannot write {file}")
+        rows.append(f"{frame.timestamp:.9f} {file}")
+    (folder / "rgb.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    write_tum(folder / "groundtruth.txt", sequence.groundtruth)
+    camera = " ".join(f"{value:.9f}" for value in sequence.camera.intrinsics)
+    (folder / "calib.txt").write_text(f"{camera}\n", encoding="utf-8")
+    facts = {
+        "name": name, "options": options, "scene": sequence.name, "frames": len(sequence),
+        "path_m": round(sequence.groundtruth.path_length, 4), "seconds": round(time.perf_counter() - begin, 2),
+        "processor_seconds": round(time.process_time() - clock, 2),
+    }  # fmt: skip
+    (folder / RECORD).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what interrupted renderings left long ago."""
+    for part in folder.glob(".*"):
+        try:
+            if time.time() - part.stat().st_mtime > STALE:
+                shutil.rmtree(part, ignore_errors=True)
+        except OSError:  # gone meanwhile
+            continue

@@ -1,0 +1,177 @@
+"""The rendered suites and their cache."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dvo.errors import DvoError
+from dvo.synth import FAMILIES, LONG_KINDS, make_sequence
+from eval import prepare, rendered
+from eval.rendered import RECORD, place_of, rendered_folder
+from eval.sequences import Sequence, open_sequence, read_suites
+
+AXES = {
+    "plain", "scale", "textureless", "fast", "blur", "rotation", "lighting", "dynamic", "rolling_shutter", "blackout",
+    "loop", "low_light",
+}  # fmt: skip
+OPTIONS: dict[str, Any] = {
+    "seed": 3_000_000_000, "family": "room", "frames": 4, "fps": 15.0, "width": 80, "height": 60, "version": 1,
+}  # fmt: skip
+NOWHERE = Path("there/are/no/recordings")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DVO_CACHE", str(tmp_path))
+    return tmp_path / "suites"
+
+
+def test_twelve_axes_two_tiers_two_splits() -> None:
+    seeds: dict[str, set[int]] = {}
+    names = []
+    for split in ("validation", "test"):
+        for tier, count in (("mini", 2), ("large", 4)):
+            suites = read_suites(f"axes/{split}/{tier}")
+            assert {suite.name.split("/")[0] for suite in suites} == AXES and len(suites) == 12
+            for suite in suites:
+                assert len(suite.sequences) == count and suite.label.startswith(f"rendered, {split}")
+                for sequence in suite.sequences:
+                    options = dict(sequence.rendered or ())
+                    seconds = options["frames"] / options["fps"]
+                    assert options["apart"] is True and options["seed"] >= 2**31
+                    assert options["family"] in FAMILIES and options["kind"] in LONG_KINDS
+                    assert seconds == 8 and options["fps"] == 15 if tier == "mini" else 10 <= seconds <= 20
+                    assert tier == "mini" or options["fps"] >= 20
+                    seeds.setdefault(split, set()).add(options["seed"])
+                    names.append(sequence.name)
+            sizes = {dict(s.rendered or ())["width"] for suite in suites for s in suite.sequences}
+            assert sizes == ({320} if tier == "mini" else {320, 640})
+    assert len(seeds["validation"]) == len(seeds["test"]) == 72, "a seed is used twice"
+    assert not seeds["validation"] & seeds["test"]
+    assert len(set(names)) == len(names)
+
+
+def test_names_on_the_command_line() -> None:
+    assert [suite.name for suite in read_suites("fast")] == ["fast"]
+    assert [suite.name for suite in read_suites("fast/test/large")] == ["fast/test/large"]
+    assert read_suites("fast") == read_suites("fast/validation/mini")
+    assert [suite.name for suite in read_suites("validation")] == ["validation"]
+    assert len(read_suites("axes")) == 12
+    assert {s.name for s in read_suites("axes") for q in s.sequences if q.judged_by == "rpe_rot_deg"} == {
+        "rotation", "blackout",
+    }  # fmt: skip
+    with pytest.raises(DvoError, match="huge"):
+        read_suites("fast/huge")
+    with pytest.raises(DvoError, match="low_light"):
+        read_suites("no such suite")
+
+
+def test_each_axis_differs_from_plain_by_its_effect() -> None:
+    plain = dict(read_suites("plain")[0].sequences[0].rendered or ())
+    drawn = {"seed", "family"}
+    for suite in read_suites("axes")[1:]:
+        options = dict(suite.sequences[0].rendered or ())
+        assert {k: v for k, v in options.items() if k not in drawn} != {
+            k: v for k, v in plain.items() if k not in drawn
+        }, suite.name
+    blackout = dict(read_suites("blackout")[0].sequences[0].rendered or ())
+    assert blackout["blackout"] == 2.0
+
+
+def test_readers_give_back_what_was_rendered(cache: Path) -> None:
+    sequence = Sequence("one", rendered=tuple(OPTIONS.items()))
+    source, truth = open_sequence(sequence, NOWHERE, 1)
+    original = make_sequence(**{key: value for key, value in OPTIONS.items() if key != "version"})
+    frames, expected = list(source), list(original)
+    assert len(frames) == len(expected) == 4
+    for read, drawn in zip(frames, expected, strict=True):
+        assert np.array_equal(read.image, drawn.image) and read.timestamp == pytest.approx(drawn.timestamp, abs=1e-8)
+        assert np.allclose(read.camera.intrinsics, drawn.camera.intrinsics, atol=1e-8)
+    assert np.allclose(truth.poses_wc, original.groundtruth.poses_wc, atol=1e-7)
+    assert np.allclose(truth.timestamps, original.groundtruth.timestamps, atol=1e-8)
+    # As the worker of a run gets it: through JSON.
+    again = Sequence(**json.loads(json.dumps({"name": "one", "rendered": sequence.rendered})))
+    assert open_sequence(again, NOWHERE, 1)[0].path == source.path
+
+
+def test_cache_is_used_and_keyed_by_everything(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = rendered_folder("one", OPTIONS)
+    stamp = (folder / RECORD).stat().st_mtime_ns
+    monkeypatch.setattr(rendered, "_write", lambda *_: pytest.fail("rendered again"))
+    assert rendered_folder("one", dict(reversed(OPTIONS.items()))) == folder
+    assert (folder / RECORD).stat().st_mtime_ns == stamp
+    others = [place_of("one", {**OPTIONS, key: 2}) for key in ("version", "seed", "frames")]
+    assert len({folder, place_of("two", OPTIONS), *others}) == 5
+
+
+def test_interrupted_rendering_leaves_nothing_that_counts(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import cv2
+
+    write, calls = cv2.imwrite, []
+
+    def stop(*given: Any) -> bool:
+        calls.append(given)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return bool(write(*given))
+
+    monkeypatch.setattr(cv2, "imwrite", stop)
+    with pytest.raises(KeyboardInterrupt):
+        rendered_folder("one", OPTIONS)
+    assert list(cache.iterdir()) == []
+    monkeypatch.setattr(cv2, "imwrite", write)
+    # A killed process cannot clean up: its folder does no harm and goes after a day.
+    left = cache / f".{place_of('one', OPTIONS).name}.killed"
+    (left / "rgb").mkdir(parents=True)
+    folder = rendered_folder("one", OPTIONS)
+    assert len(list((folder / "rgb").iterdir())) == 4 and left.exists()
+    os.utime(left, (time.time() - 2 * rendered.STALE,) * 2)
+    shutil.rmtree(folder)
+    rendered_folder("one", OPTIONS)
+    assert not left.exists()
+
+
+def test_two_at_once_agree(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another process finishes the same sequence first: its folder stands, ours goes."""
+    write = rendered._write
+
+    def slow(folder: Path, name: str, options: dict[str, Any]) -> None:
+        write(folder, name, options)
+        shutil.copytree(folder, place_of(name, options))
+        (place_of(name, options) / "first").touch()
+
+    monkeypatch.setattr(rendered, "_write", slow)
+    folder = rendered_folder("one", OPTIONS)
+    assert (folder / "first").is_file() and [path.name for path in cache.iterdir()] == [folder.name]
+
+
+def test_prepare_renders_and_says_so(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    suites = read_suites("plain")
+    short = tuple(Sequence(q.name, rendered=tuple({**dict(q.rendered or ()), **OPTIONS}.items()))
+                  for q in suites[0].sequences[:1])  # fmt: skip
+    from dataclasses import replace
+
+    monkeypatch.setattr(prepare, "read_suites", lambda _: [replace(suites[0], sequences=short)])
+    assert prepare.main(["plain", "--sheet", str(tmp_path / "sheet.png")]) == 0
+    assert "1 rendered now" in capsys.readouterr().out and (tmp_path / "sheet.png").is_file()
+    assert prepare.main(["plain"]) == 0
+    assert "in the cache" in capsys.readouterr().out
+    monkeypatch.undo()
+    assert prepare.main(["nonsense"]) == 2
+    assert "nonsense" in capsys.readouterr().err
+
+
+def test_bad_options_name_the_sequence(cache: Path) -> None:
+    with pytest.raises(DvoError, match="one"):
+        rendered_folder("one", {**OPTIONS, "colour": "red"})
+    assert list(cache.iterdir()) == []

@@ -28,7 +28,9 @@ def prepare(suites: list[Suite]) -> list[Path]:
             folder = rendered_folder(sequence.name, options)
             facts = json.loads((folder / RECORD).read_text(encoding="utf-8"))
             made += not there
-            took = "in the cache" if there else f"{facts['seconds']:.1f} s, {facts['processor_seconds']:.1f} s of a core"
+            took = (
+                "in the cache" if there else f"{facts['seconds']:.1f} s, {facts['processor_seconds']:.1f} s of a core"
+            )
             print(f"{sequence.name:32} {facts['frames']} frames, {facts['path_m']:.2f} m, {facts['scene']}: {took}")
             sys.stdout.flush()
             folders.append(folder)

@@ -1,7 +1,7 @@
 """Rendered sequences, kept on disk: made once, read back by the same readers as recordings, the same for every system.
 
-A folder of the cache has the layout of TUM RGB-D (``rgb.txt``, ``rgb/``, ``groundtruth.txt``) with ``calib.txt``, so that
-other people's tools read it too. It appears under its name only when it is whole.
+A folder of the cache has the layout of TUM RGB-D (``rgb.txt``, ``rgb/``, ``groundtruth.txt``) with ``calib.txt``, so
+that other people's tools read it too. It appears under its name only when it is whole.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def cache_folder() -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DvoError(str(error.strerror), file=folder, field="DVO_CACHE", remedy="set it to another folder") from error
+        raise DvoError(
+            str(error.strerror), file=folder, field="DVO_CACHE", remedy="set it to another folder"
+        ) from error
     return folder
 
 

@@ -122,7 +122,9 @@ def read_suite(name_or_file: str | Path) -> Suite:
     if path.suffix not in (".yaml", ".yml"):
         path = SUITES / f"{name_or_file}.yaml"
     if not path.is_file():
-        names = ", ".join([*sorted(file.stem for file in SUITES.glob("*.yaml")), *_table(SUITES / f"{AXES}.yaml")["axes"]])
+        names = ", ".join(
+            [*sorted(file.stem for file in SUITES.glob("*.yaml")), *_table(SUITES / f"{AXES}.yaml")["axes"]]
+        )
         raise DvoError("no such suite", file=path, field="--suite", remedy=f"give a file, or one of: {names}")
     table = _table(path)
     if not isinstance(table, dict) or not isinstance(table.get("sequences"), list):

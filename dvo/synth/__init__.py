@@ -13,7 +13,7 @@ from dvo.synth.truth import Flow, Tracks, dynamic_mask, optical_flow, tracks
 from dvo.synth.walks import LONG_KINDS, SplinePath, long_path
 
 __all__ = [
-    "FAMILIES", "KINDS", "LONG_KINDS", "Body", "Flow", "Imu", "ImuNoise", "Path", "Rendering", "Scene", "Sensor", "Shot",
-    "SplinePath", "Stage", "SyntheticSequence", "Tracks", "dynamic_mask", "film", "long_path", "make_sequence",
+    "FAMILIES", "KINDS", "LONG_KINDS", "Body", "Flow", "Imu", "ImuNoise", "Path", "Rendering", "Scene", "Sensor",
+    "Shot", "SplinePath", "Stage", "SyntheticSequence", "Tracks", "dynamic_mask", "film", "long_path", "make_sequence",
     "measure_imu", "optical_flow", "random_path", "random_scene", "render", "trace", "tracks",
 ]  # fmt: skip

@@ -84,5 +84,7 @@ class Stage:
             views.append(replace(view, index=view.index + start))
         if len(views) == 1:
             return views[0]
-        joined = {f.name: np.concatenate([getattr(v, f.name) for v in views], int(f.name != "index")) for f in fields(View)}
+        joined = {
+            f.name: np.concatenate([getattr(v, f.name) for v in views], int(f.name != "index")) for f in fields(View)
+        }
         return View(**joined)

@@ -90,7 +90,7 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
 
 
 def random_wear(rng: np.random.Generator, sensor: Sensor, duration: float) -> Sensor:
-    """Now and then (one clip in ten) compression or a change of exposure, on top of what :func:`random_sensor` draws."""
+    """Now and then (one clip in ten) compression or a change of exposure, on top of :func:`random_sensor`."""
     draw = rng.random()
     if draw < 0.05:
         return replace(sensor, jpeg=int(rng.integers(30, 95)))

@@ -121,7 +121,7 @@ class SyntheticSequence:
         return measure_imu(self.path, times, noise=noise, seed=self.seed if seed is None else seed)
 
     def stereo(self, baseline: float) -> SyntheticSequence:
-        """The second camera of a rectified pair, ``baseline`` metres to the right of this one, with noise of its own."""
+        """The second camera of a rectified pair, ``baseline`` metres to the right, with noise of its own."""
         second = self.shot.beside(baseline).path
         truth = Trajectory(self.groundtruth.timestamps, second.poses_wc(self.groundtruth.timestamps))
         return replace(
@@ -160,9 +160,7 @@ def film(
             kept[0] = True
             times = times[kept]
     truth = Trajectory(times, path.poses_wc(times))
-    return SyntheticSequence(
-        name, camera, truth, scene, path, sensor, seed, supersample, device, interval=interval
-    )
+    return SyntheticSequence(name, camera, truth, scene, path, sensor, seed, supersample, device, interval=interval)
 
 
 def make_sequence(

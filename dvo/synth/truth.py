@@ -1,7 +1,8 @@
 """Ground truth beyond pose and depth: optical flow with occlusions, moving pixels, tracks of points.
 
 Everything follows from depth, poses and surface identity of the frames in the middle of their exposure (see
-:mod:`dvo.synth.shot`): exact for sharp frames, for blurred ones that of mid-exposure, row by row with a rolling shutter.
+:mod:`dvo.synth.shot`): exact for sharp frames, for blurred ones that of mid-exposure, row by row with a
+rolling shutter.
 """
 
 from __future__ import annotations
@@ -77,7 +78,9 @@ def hits(rendering: Rendering) -> tuple[Array, Array, Array]:
     return np.stack([x, y], -1).astype(np.float64), depth[y, x], rendering.surface[0].cpu().numpy()[y, x]
 
 
-def shows(shot: Shot, time: float, pixels: Array, depth: Array, surface: Array, frame: Rendering | None = None) -> Array:
+def shows(
+    shot: Shot, time: float, pixels: Array, depth: Array, surface: Array, frame: Rendering | None = None
+) -> Array:
     """``(M,)`` bool: does the frame at ``time`` show these surfaces at these places ``(M, 2)``, or something nearer?
 
     A place whose four neighbouring pixels all show the surface does (surfaces are convex and a thing in front of them
@@ -87,7 +90,9 @@ def shows(shot: Shot, time: float, pixels: Array, depth: Array, surface: Array, 
     names = frame.surface[0].cpu().numpy()
     height, width = names.shape
     inside = shot.inside(pixels, depth)
-    x, y = (np.clip(np.floor(np.where(inside, pixels[:, i], 0)).astype(int), 0, n) for i, n in ((0, width), (1, height)))
+    x, y = (
+        np.clip(np.floor(np.where(inside, pixels[:, i], 0)).astype(int), 0, n) for i, n in ((0, width), (1, height))
+    )
     right, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
     around = np.stack([names[y, x], names[y, right], names[below, x], names[below, right]])
     seen = inside & (around == surface).all(0)

@@ -213,7 +213,8 @@ def _longest_way(scene: Scene, rng: np.random.Generator, position: Array) -> tup
 def _draw_loop(scene: Scene, rng: np.random.Generator, duration: float, speed: float, shake: float) -> SplinePath:
     """A rounded circuit that is walked ``TURNS`` times: the second round repeats the first but for the shake.
 
-    Where there is time for it the camera turns all the way round, else it looks about and comes back to where it looked.
+    Where there is time for it the camera turns all the way round, else it looks about and comes back to where it
+    looked.
     """
     once = duration / TURNS
     steps = max(8, int(np.ceil(once / 0.8)))

@@ -13,9 +13,18 @@ from torch.utils.data import DataLoader, Dataset
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth import (
-    LONG_KINDS, ImuNoise, Scene, Sensor, Stage, SyntheticSequence, film, long_path, make_sequence, random_scene,
+    LONG_KINDS,
+    ImuNoise,
+    Scene,
+    Sensor,
+    Stage,
+    SyntheticSequence,
+    film,
+    long_path,
+    make_sequence,
+    random_scene,
     render,
-)  # fmt: skip
+)
 from dvo.synth.bodies import Body
 from dvo.synth.clip import make_clip
 from dvo.synth.movers import random_bodies

@@ -13,8 +13,18 @@ from hypothesis import strategies as st
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth import (
-    ImuNoise, Scene, Shot, Stage, dynamic_mask, long_path, measure_imu, optical_flow, random_path, random_scene, tracks,
-)  # fmt: skip
+    ImuNoise,
+    Scene,
+    Shot,
+    Stage,
+    dynamic_mask,
+    long_path,
+    measure_imu,
+    optical_flow,
+    random_path,
+    random_scene,
+    tracks,
+)
 from dvo.synth.imu import GRAVITY, rotation_vector
 from dvo.synth.movers import random_bodies
 from dvo.synth.poses import compose, inverse, quaternion_to_matrix, so3_exp, split

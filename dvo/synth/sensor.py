@@ -142,7 +142,7 @@ def compressed(images: Tensor, quality: int) -> Tensor:
     out = []
     for frame in frames:
         _, code = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-        out.append(cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1])
+        out.append(np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))[..., ::-1])
     again = torch.from_numpy(np.ascontiguousarray(np.stack(out).transpose(0, 3, 1, 2)))
     return again.to(images.device, images.dtype) / 255
 

@@ -80,14 +80,19 @@ class Shot:
 
     def sharp(self, time: float, pose_wc: Array | None = None) -> Rendering:
         """Frozen in the middle of the exposure: batch of one. ``pose_wc (1, 7)`` spares evaluating the path."""
-        common = {"supersample": self.supersample, "device": self.device}
         if self.readout > 0:
             when = self._row_times(time)
             poses = self.path.poses_wc(when)
-            return render_rows(self.scene, poses, self.camera.intrinsics, self.camera.width, times=when, **common)
+            return render_rows(
+                self.scene, poses, self.camera.intrinsics, self.camera.width, times=when,
+                supersample=self.supersample, device=self.device,
+            )  # fmt: skip
         when = np.array([time])
         pose = self.path.poses_wc(when) if pose_wc is None else pose_wc
-        return render(self.scene, pose, self.camera.intrinsics, *self._size, times=when, **common)
+        return render(
+            self.scene, pose, self.camera.intrinsics, *self._size, times=when, supersample=self.supersample,
+            device=self.device,
+        )  # fmt: skip
 
     def rendering(self, time: float, pose_wc: Array | None = None) -> Rendering:
         """The clean frame at a time, blurred if the exposure lasts."""

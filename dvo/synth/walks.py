@@ -222,7 +222,7 @@ def _draw_loop(scene: Scene, rng: np.random.Generator, duration: float, speed: f
     count = int(np.ceil(duration / interval)) + 4
     radius = 0.1 * scene.scale * speed * once / (2 * np.pi)
     start = find_start(scene, rng, 2)
-    spots = np.concatenate([start.position[None], rng.uniform(*scene.bounds, (40, 3))])
+    spots = np.concatenate([start.position[None], rng.uniform(scene.bounds[0], scene.bounds[1], (40, 3))])
     spots[:, 2] = start.position[2]
     centre = spots[int(scene.clearance(spots).argmax())]
     room = np.minimum(centre - scene.bounds[0], scene.bounds[1] - centre)

@@ -144,7 +144,9 @@ def _checked(suite: Suite, path: Path) -> Suite:
     _check(suite.alignment, get_args(Alignment), "alignment", path)
     for sequence in suite.sequences:
         if not sequence.path and sequence.rendered is None:
-            raise DvoError(f"incomplete sequence ({sequence.name} has no path)", file=path, field="path", remedy="add it")
+            raise DvoError(
+                f"incomplete sequence ({sequence.name} has no path)", file=path, field="path", remedy="add it"
+            )
         _check(sequence.judged_by, get_args(Judge), f"{sequence.name}: judged_by", path)
     return suite
 

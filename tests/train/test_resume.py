@@ -48,7 +48,7 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted(tmp_path):
         return hidden, delta * torch.nan, weights
 
     program.net.update.forward = poisoned
-    batch = torch.utils.data.default_collate([Renderings(**CLIP).clips[0]])
+    batch = torch.utils.data.default_collate([Renderings(**CLIP).clips()[0]])
     program.log_dict = lambda *a, **k: None
     assert program.training_step(batch, 0) is None
     assert int(program.skipped) == 1
@@ -81,7 +81,7 @@ def test_export_takes_the_moving_average(tmp_path):
 def test_every_mode_trains_every_part_it_uses(mode):
     program = PatchVOTraining(model="tiny", updates=3, warmup_mode=mode, warmup_until=1.0)
     program.log_dict = lambda *a, **k: None
-    batch = torch.utils.data.default_collate([Renderings(**CLIP).clips[0]])
+    batch = torch.utils.data.default_collate([Renderings(**CLIP).clips()[0]])
     program.training_step(batch, 0).backward()
     idle = [name for name, p in program.net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     expected = [n for n, _ in program.net.named_parameters() if n.startswith("update.w.")] if mode == "flow" else []

@@ -1,0 +1,45 @@
+"""Two processes over gloo see the gradients of one process with twice the batch."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import torch
+
+WORKER = Path(__file__).with_name("distributed_step.py")
+ROOT = WORKER.parents[2]
+
+
+def start(path, batch, processes, rank, port):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    if processes > 1:
+        environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(processes),
+                        "RANK": str(rank), "LOCAL_RANK": str(rank), "NODE_RANK": "0"}  # fmt: skip
+    command = [sys.executable, str(WORKER), str(path), str(batch), str(processes)]
+    return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def test_two_processes_equal_one_with_twice_the_batch(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    started = [start(tmp_path / "two.pt", 1, 2, rank, port) for rank in (0, 1)]
+    started.append(start(tmp_path / "one.pt", 2, 1, 0, port))
+    try:
+        for process in started:
+            output, _ = process.communicate(timeout=240)
+            assert process.returncode == 0, output
+    finally:
+        for process in started:
+            process.kill()
+    two, one = (torch.load(tmp_path / name, weights_only=False) for name in ("two.pt", "one.pt"))
+    assert two["seen"] == one["seen"] == 4
+    assert max(g.abs().max() for g in one["grads"].values()) > 1e-3
+    for name, gradient in one["grads"].items():
+        torch.testing.assert_close(two["grads"][name], gradient, rtol=2e-3, atol=1e-5 * float(gradient.abs().max() + 1), msg=name)
+    assert one["balance"] != (1.0, 1.0)
+    for a, b in zip(one["balance"], two["balance"], strict=True):
+        assert abs(a - b) < 1e-3 * a
+    torch.testing.assert_close(one["within"], two["within"], rtol=1e-4, atol=1e-6)

@@ -1,13 +1,28 @@
 """Tiny training runs."""
 
+import functools
+
 import lightning as L
 import pytest
 import torch
 
+import dvo.synth.dataset
+from dvo.synth.clip import make_clip
 from train.data import Renderings
 from train.module import PatchVOTraining
 
 CLIP = {"frames": 4, "sizes": [(48, 64), (64, 48)], "workers": 0, "seed": 5}
+
+
+@functools.lru_cache(maxsize=64)
+def _clip(seed, index, options):
+    return make_clip(seed, index, **dict(options))
+
+
+@pytest.fixture(autouse=True)
+def rendered_once(monkeypatch):
+    """Tests share their clips: rendering them is what takes the time."""
+    monkeypatch.setattr(dvo.synth.dataset, "make_clip", lambda seed, index, **o: _clip(seed, index, tuple(o.items())))
 
 
 class Record(L.Callback):

@@ -8,6 +8,7 @@ import lightning as L
 import torch
 from lightning.pytorch.strategies import DDPStrategy
 
+import dvo.synth.dataset
 from train.data import Renderings
 from train.module import PatchVOTraining
 from train.objective import LossConfig
@@ -26,8 +27,10 @@ class KeepGradients(L.Callback):
                         "seen": trainer.datamodule.clips_seen, "within": pl_module.within_quarter}, self.path)  # fmt: skip
 
 
-def main(path, batch, processes):
+def main(path, batch, processes, clips):
     torch.set_num_threads(1)
+    rendered = torch.load(clips, weights_only=False)
+    dvo.synth.dataset.make_clip = lambda seed, index, **options: rendered[index]
     torch.manual_seed(0)
     loss = LossConfig(weighted=True, balance="v2v", balance_every=1, pose_from=1)
     # A rate of zero: the second step, where gradients are compared for the balance, sees the same weights.
@@ -43,4 +46,4 @@ def main(path, batch, processes):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])

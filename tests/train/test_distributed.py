@@ -8,25 +8,32 @@ from pathlib import Path
 
 import torch
 
+from dvo.synth.clip import make_clip
+
 WORKER = Path(__file__).with_name("distributed_step.py")
 ROOT = WORKER.parents[2]
 
 
-def start(path, batch, processes, rank, port):
+def start(path, batch, processes, rank, port, clips):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     if processes > 1:
         environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(processes),
                         "RANK": str(rank), "LOCAL_RANK": str(rank), "NODE_RANK": "0"}  # fmt: skip
-    command = [sys.executable, str(WORKER), str(path), str(batch), str(processes)]
+    command = [sys.executable, str(WORKER), str(path), str(batch), str(processes), str(clips)]
     return subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
-def test_two_processes_equal_one_with_twice_the_batch(tmp_path):
+def test_two_processes_equal_one_with_twice_the_batch(tmp_path, runs):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    started = [start(tmp_path / "two.pt", 1, 2, rank, port) for rank in (0, 1)]
-    started.append(start(tmp_path / "one.pt", 2, 1, 0, port))
+    clips = tmp_path / "clips.pt"
+    sizes = runs.clip["sizes"]
+    options = {"frames": 4, "flow_range": (2.0, 19.0)}
+    rendered = [make_clip(5, i, height=sizes[i // 2][0], width=sizes[i // 2][1], **options) for i in range(4)]
+    torch.save(rendered, clips)
+    started = [start(tmp_path / "two.pt", 1, 2, rank, port, clips) for rank in (0, 1)]
+    started.append(start(tmp_path / "one.pt", 2, 1, 0, port, clips))
     try:
         for process in started:
             output, _ = process.communicate(timeout=240)

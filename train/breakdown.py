@@ -146,9 +146,10 @@ def main(arguments: list[str]) -> None:
     reuse_freed_memory()
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
+    loss = LossConfig(10.0, 0.3, 0.5, weighted=options.weighted)
     program = PatchVOTraining(
         options.model, updates=options.updates, initial=options.initial or None, warmup_mode=options.mode,
-        warmup_until=0.0 if options.mode == "joint" else 2.0, loss=LossConfig(10.0, 0.3, 0.5, weighted=options.weighted),
+        warmup_until=0.0 if options.mode == "joint" else 2.0, loss=loss,
     ).to(options.device)  # fmt: skip
     course = Course(0, 1.0, 14.0, [tuple(options.size)])
     clips = MixedClips(0, [course], options.batch, frames=options.frames)

@@ -69,7 +69,8 @@ class MixedClips(Dataset[dict[str, torch.Tensor]]):
     ) -> None:
         self.seed, self.batch_size, self.real = seed, batch_size, real
         self.courses = list(courses)
-        self.rendered, self.recorded = [], []
+        self.rendered: list[Sequence[Dataset[dict[str, torch.Tensor]]]] = []
+        self.recorded: list[Sequence[Dataset[dict[str, torch.Tensor]]]] = []
         for course in self.courses:
             flow = (course.flow_low, course.flow_high)
             self.rendered.append(
@@ -85,8 +86,9 @@ class MixedClips(Dataset[dict[str, torch.Tensor]]):
         batch = index // self.batch_size
         first = batch * self.batch_size
         course = max(i for i, c in enumerate(self.courses) if c.from_clip <= first)
-        drawn_real = self.real is not None and np.random.default_rng([self.seed, 9109, batch]).random() < self.real.share
-        clips = (self.recorded if drawn_real else self.rendered)[course]
+        clips = self.rendered[course]
+        if self.real is not None and np.random.default_rng([self.seed, 9109, batch]).random() < self.real.share:
+            clips = self.recorded[course]
         return clips[batch % len(clips)][index]
 
 

@@ -100,8 +100,8 @@ def true_reprojection(
 @torch.no_grad()
 def _measures(prefix: str, error: Tensor, edges: Tensor) -> dict[str, Tensor]:
     used = torch.isfinite(error) & edges
-    total = used.sum().clamp(min=1)
-    return {f"{prefix}{px}": ((error < float(px)) & used).sum() / total for px in ("0.25", "1", "4")}
+    total = used.sum(1).clamp(min=1)
+    return {f"{prefix}{px}": (((error < float(px)) & used).sum(1) / total).mean() for px in ("0.25", "1", "4")}
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Pictures of a tracked clip for the training log: trajectory, patch flow with confidences, distribution of confidence."""
+"""Pictures of a tracked clip for the training log: trajectory, patch flow, confidences."""
 
 from __future__ import annotations
 

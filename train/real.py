@@ -75,9 +75,11 @@ class RealClips(Dataset[dict[str, Tensor]]):
                 self.starts += [(number, s, hop) for s in ok]
         if not self.starts:
             raise DvoError(
-                f"no {frames} frames with ground truth in a row", field="data.real.folders",
-                file=data.folders[0] if data.folders else None, remedy="name sequences with ground truth, or ask for fewer frames",
-            )  # fmt: skip
+                f"no {frames} frames with ground truth in a row",
+                file=data.folders[0] if data.folders else None,
+                field="data.real.folders",
+                remedy="name sequences with ground truth, or ask for fewer frames",
+            )
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         rng = np.random.default_rng([self.seed, 9107, index])
@@ -172,8 +174,8 @@ def _fit_depth(depth: np.ndarray | None, camera: Camera, fitted: Camera) -> np.n
         return np.full((fitted.height, fitted.width), np.nan, np.float32)
     columns = (np.arange(fitted.width) - fitted.cx) / fitted.fx * camera.fx + camera.cx
     rows = (np.arange(fitted.height) - fitted.cy) / fitted.fy * camera.fy + camera.cy
-    rows, columns = (np.clip(np.rint(x), 0, n - 1).astype(int) for x, n in ((rows, len(depth)), (columns, depth.shape[1])))
-    return depth[np.ix_(rows, columns)]
+    nearest = (np.clip(np.rint(x), 0, n - 1).astype(int) for x, n in zip((rows, columns), depth.shape, strict=True))
+    return depth[np.ix_(*nearest)]
 
 
 def _scale_of_motion(poses_wc: np.ndarray) -> float:

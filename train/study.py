@@ -1,7 +1,7 @@
-"""The study of V2V: DPVO's loss, V2V's weighting, and weighting with balance, on the same clips from the same start.
+"""The study of V2V: DPVO's loss, V2V's weighting, and weighting with balance, on the same clips.
 
 ``python -m train study --config configs/train/study.yaml`` trains every arm with every learning rate and seed, and
-writes curves of the validation error and a table. For a seed, the clips, the patches drawn and the weights to start from
+writes curves of the validation error and a table. For a seed, the clips, the patches drawn and the weights at the start
 are the same for all arms: the differences are paired. A run that is done is not run again; one that was interrupted
 goes on from its last checkpoint.
 """

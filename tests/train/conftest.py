@@ -43,7 +43,8 @@ class Runs:
     @staticmethod
     def module(**changes):
         torch.manual_seed(0)
-        return PatchVOTraining(**({"model": "tiny", "updates": 3, "initial": 3, "settle": 1, "warmup_until": 0.0} | changes))
+        options = {"model": "tiny", "updates": 3, "initial": 3, "settle": 1, "warmup_until": 0.0}
+        return PatchVOTraining(**(options | changes))
 
     @staticmethod
     def data(**changes):
@@ -60,7 +61,8 @@ class Runs:
         record = Record()
         trainer = L.Trainer(**({
             "accelerator": "cpu", "max_steps": steps, "max_epochs": -1, "logger": False, "enable_progress_bar": False,
-            "enable_model_summary": False, "enable_checkpointing": any("Checkpoint" in type(c).__name__ for c in callbacks),
+            "enable_model_summary": False,
+            "enable_checkpointing": any(isinstance(c, L.pytorch.callbacks.Checkpoint) for c in callbacks),
             "default_root_dir": folder, "use_distributed_sampler": False, "callbacks": [record, *callbacks],
         } | options))  # fmt: skip
         program = program or cls.module()

@@ -73,7 +73,15 @@ def test_recordings_without_depth_have_poses_of_the_unit_of_training():
 
 
 @real
-@pytest.mark.parametrize("name", ["tartanair_v2_10", "tum_fr1_rpy_60", "kitti00_120", "euroc_V1_01"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "tartanair_v2_10",
+        "tum_fr1_rpy_60",
+        pytest.param("kitti00_120", marks=pytest.mark.slow),
+        pytest.param("euroc_V1_01", marks=pytest.mark.slow),
+    ],
+)
 def test_a_step_runs_on_recordings(name, tmp_path, runs):
     """With depth the whole loss applies, elsewhere only that of the poses; nothing trained here is kept."""
     data = runs.data(real=RealData([str(DATA / name)], hops=[1], flow_low=0.1))

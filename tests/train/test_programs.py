@@ -22,7 +22,7 @@ TINY = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["small", "full"])
+@pytest.mark.parametrize("name", ["small", pytest.param("full", marks=pytest.mark.slow)])
 def test_a_step_of_every_configuration(name, tmp_path, monkeypatch):
     if name == "full":
         pytest.importorskip("kornia")
@@ -36,6 +36,7 @@ def test_a_step_of_every_configuration(name, tmp_path, monkeypatch):
     assert found["model"]["cycle"] == (240000 if name == "full" else None)
 
 
+@pytest.mark.slow
 def test_the_full_network_takes_a_step_of_dpvos_recipe(tmp_path, runs):
     """The real layer sizes, on few patches of small frames: grows from 3 frames, structure only at first."""
     program = PatchVOTraining(
@@ -47,7 +48,13 @@ def test_the_full_network_takes_a_step_of_dpvos_recipe(tmp_path, runs):
     assert int(program.skipped) == 0 and not bool(program.warming)
 
 
-@pytest.mark.parametrize("loss", [LossConfig(), LossConfig(weighted=True, balance="v2v", balance_every=1)])
+@pytest.mark.parametrize(
+    "loss",
+    [
+        pytest.param(LossConfig(), id="plain", marks=pytest.mark.slow),
+        pytest.param(LossConfig(weighted=True, balance="v2v", balance_every=1), id="v2v"),
+    ],
+)
 def test_mixed_precision_stays_near_full_precision(tmp_path, runs, loss):
     """Encoder and update operator in bfloat16; poses, bundle adjustment and loss in float32."""
     _, exact = runs.fit(tmp_path, 2, runs.module(loss=loss))

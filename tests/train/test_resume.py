@@ -19,7 +19,9 @@ def same(a, b):
         assert torch.equal(x, y), name
 
 
-@pytest.mark.parametrize("loss", [None, V2V], ids=["plain", "v2v"])
+@pytest.mark.parametrize(
+    "loss", [pytest.param(None, id="plain", marks=pytest.mark.slow), pytest.param(V2V, id="v2v")]
+)
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs, loss):
     for name in "abc":
         (tmp_path / name).mkdir()
@@ -37,7 +39,8 @@ def test_resumed_training_equals_uninterrupted_training(tmp_path, runs, loss):
     assert resumed.beta == whole.beta and resumed.rotation == whole.rotation
     if loss is not None:
         assert len(whole.beta.recent) == 3 and whole.beta.value != 1 != whole.rotation.value
-    assert any(not torch.equal(a, b) for a, b in zip(runs.module().net.parameters(), whole.net.parameters(), strict=True))
+    pairs = zip(runs.module().net.parameters(), whole.net.parameters(), strict=True)
+    assert any(not torch.equal(a, b) for a, b in pairs)
 
 
 def test_a_state_without_balance_goes_on_with_the_defaults(tmp_path, runs):

@@ -58,6 +58,7 @@ def small_study(folder, **changes):
     return study.StudyConfig(**(options | changes))
 
 
+@pytest.mark.slow
 def test_a_study_runs_resumes_and_reports(tmp_path, monkeypatch):
     config = small_study(tmp_path)
     names = list(config.arms)

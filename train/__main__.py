@@ -27,16 +27,17 @@ def main() -> None:
     from dvo.errors import DvoError
 
     try:
-        run(sys.argv[1:])
+        run()
     except DvoError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
 
 
-def run(arguments: list[str]) -> None:
+def run() -> None:
     """What may be typed after ``python -m train``."""
-    if arguments and arguments[0] in COMMANDS:
-        importlib.import_module(COMMANDS[arguments[0]]).main(arguments[1:])
+    command, rest = (sys.argv[1:2] or [""])[0], sys.argv[2:]
+    if command in COMMANDS:
+        importlib.import_module(COMMANDS[command]).main(rest)
         return
     from lightning.pytorch.cli import LightningCLI
 
@@ -45,9 +46,7 @@ def run(arguments: list[str]) -> None:
     from train.module import PatchVOTraining
 
     reuse_freed_memory()
-    LightningCLI(
-        PatchVOTraining, Renderings, seed_everything_default=0, save_config_kwargs={"overwrite": True}, args=arguments
-    )
+    LightningCLI(PatchVOTraining, Renderings, seed_everything_default=0, save_config_kwargs={"overwrite": True})
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ class Renderings(L.LightningDataModule):
         real: RealData | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["courses", "real"])
+        self.save_hyperparameters(ignore=["courses", "real"], logger=False)  # its seed need not be that of the module
         self.seed, self.batch_size, self.frames, self.workers = seed, batch_size, frames, workers
         self.courses = [Course(0, flow_low, flow_high, sizes or [(120, 160)]), *(courses or [])]
         self.real = real

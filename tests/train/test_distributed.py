@@ -49,9 +49,10 @@ def test_two_processes_equal_one_with_twice_the_batch(tmp_path, runs):
     two, one = (torch.load(tmp_path / name, weights_only=False) for name in ("two.pt", "one.pt"))
     assert two["seen"] == one["seen"] == 4
     assert max(g.abs().max() for g in one["grads"].values()) > 1e-3
-    for name, gradient in one["grads"].items():
-        off = (two["grads"][name] - gradient).norm() / gradient.norm().clamp(min=1e-6)
-        assert off < 1e-3, (name, off)
+    total = torch.stack([g.norm() for g in one["grads"].values()]).norm()
+    for name, gradient in one["grads"].items():  # a bias before a normalisation has a gradient of rounding alone
+        off = (two["grads"][name] - gradient).norm()
+        assert off < 1e-4 * gradient.norm() + 1e-6 * total, (name, off)
     assert one["balance"] != (1.0, 1.0)
     for a, b in zip(one["balance"], two["balance"], strict=True):
         assert abs(a - b) < 1e-3 * a

@@ -31,7 +31,7 @@ def test_training_is_the_same_with_and_without_it(tmp_path, runs):
     }  # fmt: skip
     assert wanted <= set(table[0].split(","))
     assert sum(bool(row.split(",")[table[0].split(",").index("loss")]) for row in table[1:]) == 3
-    assert any(p.stat().st_size > 50_000 for p in (tmp_path / "board").glob("events*"))  # the picture is in there
+    assert any(p.stat().st_size > 20_000 for p in (tmp_path / "board").glob("events*"))  # the picture is in there
 
 
 def test_random_states_are_put_back():

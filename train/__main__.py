@@ -1,34 +1,52 @@
-"""``python -m train fit --config configs/train/small.yaml``: training by LightningCLI; ``export`` ships the weights,
-``validate`` tracks real sequences with them.
+"""Training programs, run from a checkout:
 
-Ctrl-C stops after the running step and saves; the same command with ``--ckpt_path last`` goes on. See train/LOG.md.
+- ``python -m train fit --config configs/train/small.yaml`` trains (LightningCLI). Ctrl-C stops after the running step
+  and saves; the same command goes on.
+- ``export CHECKPOINT FILE`` ships the weights; ``validate CHECKPOINT`` tracks real sequences with them.
+- ``snr CHECKPOINT`` measures the signal-to-noise ratio of the flow loss's gradient, plain and weighted (V2V).
+- ``study --config configs/train/study.yaml`` compares DPVO's loss with V2V's.
+- ``profile`` prints where the seconds of a training step go.
 """
 
 from __future__ import annotations
 
+import importlib
 import sys
+
+COMMANDS = {
+    "export": "train.export",
+    "validate": "train.validate",
+    "snr": "train.snr",
+    "study": "train.study",
+    "profile": "train.breakdown",
+}
 
 
 def main() -> None:
-    """Entry point."""
+    """Entry point; bad input ends with code 2 and one line."""
+    from dvo.errors import DvoError
+
+    try:
+        run()
+    except DvoError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def run() -> None:
+    """What may be typed after ``python -m train``."""
     command, rest = (sys.argv[1:2] or [""])[0], sys.argv[2:]
-    if command == "export":
-        from train.export import main as export
+    if command in COMMANDS:
+        importlib.import_module(COMMANDS[command]).main(rest)
+        return
+    from lightning.pytorch.cli import LightningCLI
 
-        export(rest)
-    elif command == "validate":
-        from train.validate import main as validate
+    from dvo.allocator import reuse_freed_memory
+    from train.data import Renderings
+    from train.module import PatchVOTraining
 
-        validate(rest)
-    else:
-        from lightning.pytorch.cli import LightningCLI
-
-        from dvo.allocator import reuse_freed_memory
-        from train.data import Renderings
-        from train.module import PatchVOTraining
-
-        reuse_freed_memory()
-        LightningCLI(PatchVOTraining, Renderings, seed_everything_default=0, save_config_kwargs={"overwrite": True})
+    reuse_freed_memory()
+    LightningCLI(PatchVOTraining, Renderings, seed_everything_default=0, save_config_kwargs={"overwrite": True})
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -11,7 +11,8 @@ import numpy as np
 from dvo.data import euroc, folder, kitti, sequence, tartanair, tum, video
 from dvo.data.calibration import Calibration, read_calibration
 from dvo.data.frame import Frame
-from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.images import read_image
+from dvo.data.recording import ImageRecording, Log, RawFrame, Reader, Recording, Request
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
@@ -82,6 +83,31 @@ class Source:
     def skipped(self) -> int:
         """How many images could not be decoded on the last pass so far."""
         return len(self._log.unreadable)
+
+    @property
+    def timestamps(self) -> np.ndarray | None:
+        """Seconds, one for every image of the recording whatever the stride; None for a video."""
+        recording = self._recording
+        return recording.timestamps if isinstance(recording, ImageRecording) else None
+
+    def frames_at(self, indices: Sequence[int]) -> list[tuple[Frame, Path]]:
+        """Single frames of a recording that is made of image files, with their files, in any order.
+
+        Raises:
+            DvoError: a video, or an image that cannot be read.
+        """
+        recording = self._recording
+        if not isinstance(recording, ImageRecording):
+            raise DvoError("a video is read in order only", file=self.path, remedy="extract its frames into a folder")
+        frames = []
+        for index in indices:
+            image = read_image(recording.images[index])
+            if image is None:
+                raise DvoError("cannot be decoded", file=recording.images[index], remedy="remove or replace the image")
+            image = self._undistorter(image) if self._undistorter else image
+            frame = Frame(index, float(recording.timestamps[index]), image, self.camera)
+            frames.append((frame, recording.images[index]))
+        return frames
 
     def __iter__(self) -> Iterator[Frame]:
         """Frames with strictly increasing timestamps.

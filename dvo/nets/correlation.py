@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.geometry.precision import full_precision
 from dvo.nets.patchifier import pool_levels
 
 
@@ -166,12 +167,15 @@ class CorrelationVolume:
         b, k, c, p, _ = patches.shape
         self.radius, self.pyramid, self.frames = radius, pyramid, maps.shape[1]
         self.pixels, self.patches = p * p, k
+        if patches.dtype in (torch.float16, torch.bfloat16):  # too coarse to place a peak between two pixels
+            patches, maps = patches.float(), maps.float()
         rows = patches.permute(0, 1, 3, 4, 2).reshape(b, k * p * p, c)
         self.levels = []
         for level in pool_levels(maps, pyramid):
             columns = level.permute(0, 2, 1, 3, 4).reshape(b, c, -1)
             store: dict[str, Tensor] = {}
-            volume, token = _Volume.apply(rows, columns, store)
+            with full_precision(rows.device):
+                volume, token = _Volume.apply(rows, columns, store)
             self.levels.append((volume, token, store, (level.shape[-2], level.shape[-1])))
 
     def lookup(

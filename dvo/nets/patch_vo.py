@@ -69,7 +69,7 @@ class PatchVO(nn.Module):
         poses_cw: Float[Tensor, "B N 7"],
         inverse_depth: Float[Tensor, "B K"] | None = None,
         mode: Mode = "joint",
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | list[torch.Generator] | None = None,
         correlation_gradient: float = 1.0,
         ba_iterations: int = 2,
     ) -> Iterator[UpdateState]:
@@ -86,7 +86,8 @@ class PatchVO(nn.Module):
             mode: ``joint`` refines poses and depths; ``structure`` holds the poses; ``flow`` leaves bundle adjustment
                 out and moves each edge by its own revision alone, the cheapest way to learn to see motion (for a
                 schedule in which no frame joins later).
-            generator: draws patch centres and the edges that train the features; on the CPU.
+            generator: draws patch centres and the edges that train the features; on the CPU. With one for each clip a
+                clip draws the same in any batch.
             correlation_gradient: share of the edges whose correlation sends a gradient to the features.
             ba_iterations: Gauss-Newton steps an update.
 
@@ -99,7 +100,11 @@ class PatchVO(nn.Module):
         m = config.training_patches
         features = self.patchify.encode(normalise_images(images))
         height, width = features.matching.shape[-2:]
-        centres = random_centres(n, m, height, width, generator, b).to(images.device)
+        if isinstance(generator, list):
+            drawn = [random_centres(n, m, height, width, one) for one in generator]
+            centres = torch.cat(drawn).to(images.device)
+        else:
+            centres = random_centres(n, m, height, width, generator, b).to(images.device)
         matching, context = self.patchify.cut(features, centres)
         volume = CorrelationVolume(matching, features.matching, config.pyramid, config.radius)
         scaled = intrinsics / config.STRIDE
@@ -128,9 +133,7 @@ class PatchVO(nn.Module):
             coords = coords.detach()
             learn = None
             if correlation_gradient < 1 and torch.is_grad_enabled():
-                count = b * len(graph)
-                order = torch.randperm(count, generator=generator)
-                learn = order[: max(1, round(correlation_gradient * count))].to(images.device)
+                learn = _draw_edges(b, len(graph), correlation_gradient, generator).to(images.device)
             correlation = volume.lookup(coords, graph.kk, graph.jj, learn)
             hidden, delta, weights = self.update(hidden, context.index_select(1, graph.kk), correlation, graph)
             targets = coords[:, :, config.patch_size // 2, config.patch_size // 2] + delta
@@ -154,3 +157,13 @@ class PatchVO(nn.Module):
                 )
                 coords = reproject(poses, patches, now, graph.ii, graph.jj, graph.kk).coords
             yield UpdateState(graph, frames, poses, patches, coords, targets, weights)
+
+
+def _draw_edges(
+    clips: int, edges: int, share: float, generator: torch.Generator | list[torch.Generator] | None
+) -> Tensor:
+    """A share of the ``clips * edges`` edges of a batch, drawn over all of them or, with a generator each, by clip."""
+    if not isinstance(generator, list):
+        return torch.randperm(clips * edges, generator=generator)[: max(1, round(share * clips * edges))]
+    count = max(1, round(share * edges))
+    return torch.cat([torch.randperm(edges, generator=one)[:count] + i * edges for i, one in enumerate(generator)])

@@ -1,5 +1,7 @@
 """The training objective: exact estimates cost nothing, and bundle adjustment of exact targets finds the motion."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -12,7 +14,7 @@ from dvo.nets.patch_vo import UpdateState
 from dvo.nets.patchifier import patch_coordinates, random_centres
 from dvo.nets.schedule import full_graph
 from dvo.synth.clip import make_clip
-from train.objective import LossConfig, clip_losses, true_reprojection, truth_of
+from train.objective import LossConfig, clip_losses, clip_terms, true_reprojection, truth_of
 
 PATCHES = 24
 
@@ -51,6 +53,62 @@ def test_flow_mode_counts_the_target_alone():
     loss, measures = clip_losses([state], truth, LossConfig(target=0.1), "flow")
     torch.testing.assert_close(loss, torch.tensor(0.5), atol=1e-4, rtol=1e-4)  # 0.1 x 5 px
     assert "rotation_deg" not in measures
+
+
+def off_by(truth, offset, weight):
+    """A state whose patches all land ``offset`` pixels from the truth, with poses at identity."""
+    graph = full_graph(4, PATCHES, self_edges=True)
+    _, patches = patches_of(truth, torch.Generator().manual_seed(0))
+    coords, _ = true_reprojection(truth, patches, graph, 4, 4.0)
+    seen = coords + torch.tensor(offset)
+    weights = torch.full((1, len(graph), 2), weight)
+    return UpdateState(graph, 4, se3.identity(1, 4), patches, seen, seen[:, :, 1, 1], weights)
+
+
+def test_the_terms_add_up_with_their_weights():
+    """Hand-computed: every flow is off by 5 px, every confidence is one half, three updates, poses count from 2 on."""
+    truth = truth_of(rendered(0, frames=4, height=64, width=80), 4)
+    state = off_by(truth, [3.0, 4.0], 0.5)
+    errors = pose_errors(state.poses_cw, truth.poses_cw)
+    tau, phi = errors.translation.item(), errors.rotation.item()
+    plain = LossConfig(pose=10.0, flow=0.1, target=0.2, pose_from=2)
+    loss, measures = clip_losses([state] * 3, truth, plain)
+    assert loss.item() == pytest.approx(3 * (0.1 * 5 + 0.2 * 5) + 10 * (tau + phi), rel=1e-4)
+    assert measures["px<4"] == 0 and measures["confidence"] == 0.5
+    weighted = replace(plain, weighted=True)
+    terms, _ = clip_terms([state] * 3, truth, weighted)
+    total = 3 * (0.1 * 7 * 2.5 + 0.2 * 5) + 10 * (tau + 3 * phi)
+    assert terms.total(weighted, beta=7.0, rotation=3.0).item() == pytest.approx(total, rel=1e-4)
+    sums = {name: value.item() for name, value in terms.sums(weighted).items()}
+    assert sums == pytest.approx(
+        {"target": 3.0, "flow": 3 * 0.1 * 2.5, "translation": 10 * tau, "rotation": 10 * phi}, rel=1e-4
+    )
+
+
+def test_the_weighted_loss_takes_all_edges_and_the_plain_one_those_nearby():
+    truth = truth_of(rendered(0, frames=4, height=64, width=80), 4)
+    state = off_by(truth, [0.0, 0.0], 1.0)
+    far = (state.graph.ii - state.graph.jj).abs() > 2
+    state = replace(state, coords=state.coords + 3.0 * far[:, None, None, None])
+    plain, weighted = LossConfig(), LossConfig(weighted=True)
+    assert clip_terms([state], truth, plain)[0].sums(plain)["flow"] < 1e-5
+    assert clip_terms([state], truth, weighted)[0].sums(weighted)["flow"] > 0.01
+
+
+def test_depth_that_is_not_known_leaves_the_poses_to_learn_from():
+    batch = rendered(0, frames=4, height=64, width=80)
+    batch["depth"] = torch.full_like(batch["depth"], torch.nan)
+    truth = truth_of(batch, 4)
+    whole = truth_of(rendered(0, frames=4, height=64, width=80), 4)
+    state = off_by(whole, [3.0, 4.0], 0.5)
+    state = replace(state, poses_cw=state.poses_cw.requires_grad_())
+    for config in (LossConfig(), LossConfig(weighted=True)):
+        terms, _ = clip_terms([state] * 3, truth, config)
+        sums = terms.sums(config)
+        assert sums["flow"] == 0 and sums["target"] == 0
+        assert sums["rotation"] > 0
+        terms.total(config).backward()
+        assert torch.isfinite(state.poses_cw.grad).all() and state.poses_cw.grad.abs().sum() > 0
 
 
 @pytest.mark.parametrize("clips", [pytest.param(20, id="20"), pytest.param(50, id="50", marks=pytest.mark.slow)])

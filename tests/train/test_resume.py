@@ -1,59 +1,67 @@
-"""Resuming gives the same weights as not having stopped; a bad step is skipped; the warm-up ends by its criterion."""
+"""Resuming gives the same losses and weights as not having stopped; the warm-up ends by its criterion."""
 
-import lightning as L
+from pathlib import Path
+
 import pytest
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 
-from train.data import Renderings
 from train.export import averaged_model
 from train.module import PatchVOTraining
+from train.objective import LossConfig
 
-CLIP = {"frames": 4, "sizes": [(48, 64), (64, 48)], "workers": 0, "seed": 5}
-
-
-def module(**changes):
-    torch.manual_seed(0)
-    return PatchVOTraining(model="tiny", updates=3, initial=3, settle=1, warmup_until=0.0, **changes)
+STATE = Path(__file__).resolve().parents[2] / "train" / "state" / "small.ckpt"
+V2V = LossConfig(weighted=True, balance="v2v", balance_every=1, balance_window=3, pose_from=1)
 
 
-def fit(folder, steps, checkpoint=None, program=None):
-    trainer = L.Trainer(
-        accelerator="cpu", max_steps=steps, max_epochs=-1, logger=False, enable_progress_bar=False,
-        enable_model_summary=False, enable_checkpointing=False, default_root_dir=folder, use_distributed_sampler=False,
-    )  # fmt: skip
-    program = program or module()
-    trainer.fit(program, Renderings(**CLIP), ckpt_path=checkpoint, weights_only=False)
-    trainer.save_checkpoint(folder / "last.ckpt")
-    return program
+def same(a, b):
+    for (name, x), y in zip(a.state_dict().items(), b.state_dict().values(), strict=True):
+        assert torch.equal(x, y), name
 
 
-def test_resumed_training_equals_uninterrupted_training(tmp_path):
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    whole = fit(tmp_path / "a", 4)
-    fit(tmp_path / "b", 2)
-    resumed = fit(tmp_path / "b", 4, tmp_path / "b" / "last.ckpt")
-    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
-        assert torch.equal(a, b), name
-    assert any(not torch.equal(a, b) for a, b in zip(module().net.parameters(), whole.net.parameters(), strict=True))
+@pytest.mark.parametrize(
+    "loss", [pytest.param(None, id="plain", marks=pytest.mark.slow), pytest.param(V2V, id="v2v")]
+)
+def test_resumed_training_equals_uninterrupted_training(tmp_path, runs, loss):
+    for name in "abc":
+        (tmp_path / name).mkdir()
+    whole, losses = runs.fit(tmp_path / "a", 4, runs.module(loss=loss))
+    again, same_losses = runs.fit(tmp_path / "c", 4, runs.module(loss=loss))
+    assert losses == same_losses  # the same seed, the same bytes
+    same(whole, again)
+    # The checkpoint that is written while training goes on, not only the one at its end, holds everything.
+    saver = ModelCheckpoint(tmp_path / "b", filename="step", every_n_train_steps=2, save_top_k=1)
+    _, first = runs.fit(tmp_path / "b", 3, runs.module(loss=loss), callbacks=[saver])
+    resumed, then = runs.fit(tmp_path / "b", 4, runs.module(loss=loss), tmp_path / "b" / "step.ckpt")
+    assert first == losses[:3]
+    assert then == losses[2:]
+    same(whole, resumed)
+    assert resumed.beta == whole.beta and resumed.rotation == whole.rotation
+    if loss is not None:
+        assert len(whole.beta.recent) == 3 and whole.beta.value != 1 != whole.rotation.value
+    pairs = zip(runs.module().net.parameters(), whole.net.parameters(), strict=True)
+    assert any(not torch.equal(a, b) for a, b in pairs)
 
 
-def test_a_step_that_is_not_finite_is_skipped_and_counted(tmp_path):
-    program = module()
-    before = [p.clone() for p in program.net.parameters()]
-    real = program.net.update.forward
+def test_a_state_without_balance_goes_on_with_the_defaults(tmp_path, runs):
+    runs.fit(tmp_path, 1)
+    state = torch.load(tmp_path / "last.ckpt", weights_only=False)
+    del state["training"]
+    torch.save(state, tmp_path / "old.ckpt")
+    resumed, _ = runs.fit(tmp_path, 2, runs.module(loss=V2V), tmp_path / "old.ckpt")
+    assert len(resumed.beta.recent) == 1
+    plain, _ = runs.fit(tmp_path, 2, runs.module(), tmp_path / "old.ckpt")
+    assert plain.beta.value == plain.rotation.value == 1
 
-    def poisoned(*args):
-        hidden, delta, weights = real(*args)
-        return hidden, delta * torch.nan, weights
 
-    program.net.update.forward = poisoned
-    batch = torch.utils.data.default_collate([Renderings(**CLIP).clips[0]])
-    program.log_dict = lambda *a, **k: None
-    assert program.training_step(batch, 0) is None
-    assert int(program.skipped) == 1
-    for a, b in zip(before, program.net.parameters(), strict=True):
-        assert torch.equal(a, b)
+@pytest.mark.skipif(not STATE.is_file(), reason="no training state in this checkout")
+def test_the_state_of_the_shipped_weights_fits_the_program():
+    state = torch.load(STATE, map_location="cpu", weights_only=False)
+    program = PatchVOTraining(model="small")
+    program.load_state_dict(state["state_dict"], strict=True)
+    program.on_load_checkpoint(state)
+    optimizer = program.configure_optimizers()["optimizer"]
+    optimizer.load_state_dict(state["optimizer_states"][0])
 
 
 def test_warm_up_ends_when_the_flow_has_clicked():
@@ -68,8 +76,15 @@ def test_warm_up_ends_when_the_flow_has_clicked():
     assert not bool(program.warming)
 
 
-def test_export_takes_the_moving_average(tmp_path):
-    program = fit(tmp_path, 2)
+def test_warm_up_ends_after_its_steps(tmp_path, runs):
+    program, _ = runs.fit(tmp_path, 2, runs.module(warmup_until=2.0, warmup_steps=2, warmup_mode="structure"))
+    assert bool(program.warming)
+    program, _ = runs.fit(tmp_path, 3, program, tmp_path / "last.ckpt")
+    assert not bool(program.warming)
+
+
+def test_export_takes_the_moving_average(tmp_path, runs):
+    program, _ = runs.fit(tmp_path, 2)
     model, facts = averaged_model(tmp_path / "last.ckpt")
     assert facts["steps"] == 2
     assert facts["clips"] == 2
@@ -78,11 +93,10 @@ def test_export_takes_the_moving_average(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["joint", "structure", "flow"])
-def test_every_mode_trains_every_part_it_uses(mode):
+def test_every_mode_trains_every_part_it_uses(mode, runs):
     program = PatchVOTraining(model="tiny", updates=3, warmup_mode=mode, warmup_until=1.0)
     program.log_dict = lambda *a, **k: None
-    batch = torch.utils.data.default_collate([Renderings(**CLIP).clips[0]])
-    program.training_step(batch, 0).backward()
+    program.training_step(runs.batch(), 0).backward()
     idle = [name for name, p in program.net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     expected = [n for n, _ in program.net.named_parameters() if n.startswith("update.w.")] if mode == "flow" else []
     assert idle == expected or (mode == "flow" and set(expected) <= set(idle) and len(idle) <= len(expected) + 1)

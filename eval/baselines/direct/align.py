@@ -164,7 +164,7 @@ def _align_level(
             T, gain, offset = moved, gain + step[6], offset + step[7]
             loss, H, g = after
             damping = max(damping * 0.3, 1e-6)
-            if gained < 1e-4:
+            if gained < 3e-4:
                 break
         else:
             damping *= 8

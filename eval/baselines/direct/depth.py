@@ -10,6 +10,11 @@ from eval.baselines.direct.align import Reference
 from eval.baselines.direct.image import Level, inside, sample
 from eval.baselines.direct.stereo import Matches
 
+NEIGHBOURS = np.array([(u, v) for v in range(-2, 3) for u in range(-2, 3) if u or v])
+"""``(24, 2)`` steps to the pixels around one."""
+CLOSENESS = np.exp(-(NEIGHBOURS**2).sum(axis=1) / 4).astype(np.float32)
+"""``(24,)`` their weights."""
+
 
 @dataclass(frozen=True)
 class DepthConfig:
@@ -18,6 +23,7 @@ class DepthConfig:
     Attributes:
         strength: smallest gradient of a pixel that is used, intensities per pixel.
         pixels: how many pixels are used at most, the strongest.
+        aligned: how many of them images are aligned to at most, evenly over the image.
         prior: standard deviation of a new pixel's inverse depth, as part of the value that it begins with.
         agree: neighbours, and measurements, agree within so many standard deviations.
         growth: factor on every variance per new frame, and (squared) per failure.
@@ -28,6 +34,7 @@ class DepthConfig:
 
     strength: float = 5.0
     pixels: int = 10000
+    aligned: int = 5000
     prior: float = 0.5
     agree: float = 2.0
     growth: float = 1.01
@@ -111,32 +118,27 @@ class DepthMap:
             inverse depth, variance (the averaged one of the neighbours; infinite where there is none) and how many
             neighbours agreed, ``(H, W)`` each.
         """
-        c, valid = self.config, self.valid
-        weight = np.where(valid, 1 / np.where(valid, self.variance, 1), 0)
-        spread = np.where(valid, self.variance, 0)
-        total, summed = weight.copy(), weight * self.mean
-        count = np.zeros(valid.shape, np.int16)
-        near, strong = valid.astype(np.float32), valid.astype(np.float32) * spread
-        for dv in range(-2, 3):
-            for du in range(-2, 3):
-                if du == dv == 0:
-                    continue
-                here, there = _shifted(valid.shape, dv, du)
-                gap = (self.mean[there] - self.mean[here]) ** 2
-                agrees = valid[there] & (gap < c.agree**2 * (spread[there] + spread[here]))
-                if fill:
-                    agrees |= valid[there] & ~valid[here]
-                w = np.float32(np.exp(-0.5 * (du * du + dv * dv) / 2))
-                ww = w * weight[there] * agrees
-                total[here] += ww
-                summed[here] += ww * self.mean[there]
-                count[here] += agrees
-                near[here] += w * agrees
-                strong[here] += w * agrees * spread[there]
-        known = total > 0
-        mean = np.where(known, summed / np.where(known, total, 1), 1).astype(np.float32)
-        variance = np.where(known, strong / np.where(known, near, 1), np.inf).astype(np.float32)
-        return mean, variance, count
+        c, shape = self.config, self.mean.shape
+        v, u = np.nonzero(self.candidates)
+        at = v * shape[1] + u
+        beside = at[:, None] + (NEIGHBOURS[:, 1] * shape[1] + NEIGHBOURS[:, 0])  # candidates keep off the border
+        mean, variance = self.mean.ravel(), self.variance.ravel()
+        d, var, d_n, var_n = mean[at], variance[at], mean[beside], variance[beside]
+        known, known_n = np.isfinite(var), np.isfinite(var_n)
+        agrees = known_n & ((d_n - d[:, None]) ** 2 < c.agree**2 * (var_n + var[:, None]))
+        agrees &= known[:, None] | fill
+        w_n = np.where(agrees, CLOSENESS, 0)
+        ww_n = w_n / var_n
+        own = known / var
+        total, near = own + ww_n.sum(axis=1), known + w_n.sum(axis=1)
+        some = near > 0
+        summed = own * d + (ww_n * d_n).sum(axis=1)
+        strong = np.where(known, var, 0) + (w_n * np.where(known_n, var_n, 0)).sum(axis=1)
+        out = np.ones(shape, np.float32), np.full(shape, np.inf, np.float32), np.zeros(shape, np.int16)
+        out[0][v, u] = np.where(some, summed / np.where(some, total, 1), 1)
+        out[1][v, u] = np.where(some, strong / np.where(some, near, 1), np.inf)
+        out[2][v, u] = agrees.sum(axis=1)
+        return out
 
     def references(self, levels: list[Level]) -> list[Reference]:
         """Pixels to align with, on every level of the keyframe's pyramid."""
@@ -145,6 +147,9 @@ class DepthMap:
         out = []
         for level in levels:
             v, u = np.nonzero(np.isfinite(variance))
+            if len(v) > self.config.aligned:
+                rows = np.linspace(0, len(v) - 1, self.config.aligned).astype(int)
+                v, u = v[rows], u[rows]
             fx, fy, cx, cy = level.intrinsics
             rays = np.column_stack([(u - cx) / fx, (v - cy) / fy, np.ones(len(u))]).astype(np.float32)
             out.append(Reference(rays, mean[v, u], variance[v, u], level.grey[v, u]))
@@ -186,14 +191,6 @@ class DepthMap:
             new.begin(filled, np.where(support >= 2, np.minimum(4 * spread + (0.1 * filled) ** 2, wide), np.inf))
             new.begin(np.full_like(filled, middle), np.full_like(filled, (c.prior * middle) ** 2))
         return new
-
-
-def _shifted(shape: tuple[int, ...], dv: int, du: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Slices of the pixels that have a neighbour at ``(dv, du)``, and of those neighbours."""
-    height, width = shape
-    here = slice(max(-dv, 0), height - max(dv, 0)), slice(max(-du, 0), width - max(du, 0))
-    there = slice(max(dv, 0), height - max(-dv, 0)), slice(max(du, 0), width - max(-du, 0))
-    return here, there
 
 
 def _pooled(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

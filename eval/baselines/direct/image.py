@@ -58,7 +58,7 @@ def inside(u: np.ndarray, v: np.ndarray, shape: tuple[int, ...], margin: float =
 
 
 def sample(values: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Bilinear values ``(..., C)`` or ``(...)`` of ``(H, W, C)`` or ``(H, W)`` at pixels ``(...)``; clamped to the edge.
+    """Bilinear values ``(...)`` or ``(..., C)`` of ``(H, W)`` or ``(H, W, C)`` at pixels ``(...)``; edges are repeated.
 
     (``cv2.remap`` rounds positions to a 32nd of a pixel, which is coarser than an alignment.)
     """

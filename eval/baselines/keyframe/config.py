@@ -33,7 +33,7 @@ class KeyframeConfig:
     window: int = 15
     levels: int = 4
     closed: float = 0.7
-    start_parallax: float = 0.04
+    start_parallax: float = 0.025
     start_points: int = 40
     planar: float = 0.45
     angle: float = 1.0

@@ -14,13 +14,11 @@ import cv2
 import numpy as np
 
 from dvo.data.frame import Frame
-from dvo.data.poses import poses_from_matrices
-from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from eval.baselines import two_view
-from eval.baselines.back_fill import back_fill
 from eval.baselines.keyframe.adjust import adjust, neighbourhood
 from eval.baselines.keyframe.config import KeyframeConfig
+from eval.baselines.keyframe.history import History
 from eval.baselines.keyframe.initialise import start_from_two_views
 from eval.baselines.keyframe.map import Keyframe, Map
 from eval.baselines.keyframe.pose import centre, refine_pose
@@ -36,10 +34,7 @@ class KeyframeOdometry:
     def __init__(self, config: KeyframeConfig | None = None, seed: int = 0) -> None:
         self.config = config or KeyframeConfig()
         self._seed = seed
-        self._times: list[float] = []
-        self._hung: list[tuple[Keyframe, np.ndarray] | None] = []  # frame's pose: keyframe, and keyframe to frame
-        self._turns: list[np.ndarray | None] = []  # rotation from the frame before; None where it is not known
-        self._lost: set[int] = set()
+        self._history = History()
         self._intrinsics, self._size = np.ones(4), (0, 0)
         self._map, self._old = Map(), Map()  # the map in use or being started; the one before it
         self._retired: list[tuple[np.ndarray, np.ndarray]] = []  # points of maps that were given up
@@ -55,48 +50,36 @@ class KeyframeOdometry:
         self._counts = {"maps_started": 0, "planar_starts": 0, "keyframes": 0, "culled": 0, "relocalised": 0}
 
     def track(self, frame: Frame) -> Estimate:
-        index = len(self._times)
-        self._times.append(frame.timestamp)
-        self._hung.append(None)
-        self._turns.append(None)
+        index = self._history.begin(frame.timestamp)
         self._intrinsics, self._size = frame.camera.intrinsics, (frame.camera.width, frame.camera.height)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         if self._grey is None:
             self._begin(frame, grey, index)
-            return self._estimate(Status.INITIALISING)
+            return self._history.estimate(Status.INITIALISING)
         followed = self._follow(grey, index)
         if not self._started:
             return self._initialise(frame, grey, index, followed)
         confidence = self._pose(index) if followed else None
         if confidence is None and not self._recover(self._map, grey, index):
-            self._lost.add(index)
+            self._history.lost.add(index)
             self._blind += 1
             if self._blind >= self.config.patience:
                 self._give_up(frame, grey, index)
-            return self._estimate(Status.LOST)
+            return self._history.estimate(Status.LOST)
         self._grey, self._blind = grey, 0
         if self._wants_keyframe(index):
             self._insert(frame, grey, index)
-        return self._estimate(Status.TRACKING, confidence or 0.3)
+        return self._history.estimate(Status.TRACKING, confidence or 0.3)
 
     def finish(self) -> Result:
-        poses = [None if hung is None else hung[1] @ hung[0].T_cw for hung in self._hung]
-        poses = back_fill(poses, self._turns, self._lost)
-        rows = [index for index, pose in enumerate(poses) if pose is not None]
-        matrices = np.array([np.linalg.inv(poses[index]) for index in rows]).reshape(-1, 4, 4)  # type: ignore[arg-type]
         points, colors = zip(*self._retired, self._old.points(), self._map.points(), strict=True)
-        return Result(
-            trajectory=Trajectory(np.array([self._times[index] for index in rows]), poses_from_matrices(matrices)),
-            map=SparseMap(np.concatenate(points), np.concatenate(colors)),
-            frames_read=len(self._times),
-            frames_lost=len(self._times) - len(rows),
-            info={
-                "working_size": list(self._size),
-                "working_intrinsics": self._intrinsics.tolist(),
-                **self._counts,
-                "config": asdict(self.config),
-            },
-        )
+        info = {
+            "working_size": list(self._size),
+            "working_intrinsics": self._intrinsics.tolist(),
+            **self._counts,
+            "config": asdict(self.config),
+        }
+        return self._history.result(SparseMap(np.concatenate(points), np.concatenate(colors)), info)
 
     # --- every frame --------------------------------------------------------------------------------------------------
 
@@ -114,7 +97,7 @@ class KeyframeOdometry:
         if held.sum() < max(c.pose_points, 8):
             return False
         if not self._blind:
-            self._turns[index] = two_view.rotation_between(self._uv[held], uv[held], self._intrinsics)
+            self._history.turns[index] = two_view.rotation_between(self._uv[held], uv[held], self._intrinsics)
         self._followed = self._ids[held], uv[held]
         if not self._started:
             self._ids, self._uv = self._followed
@@ -157,8 +140,7 @@ class KeyframeOdometry:
         else:
             self._motion = np.eye(4)
         self._T = T
-        keyframe = self._map.keyframes[-1]
-        self._hung[index] = keyframe, T @ np.linalg.inv(keyframe.T_cw)
+        self._history.hang(index, self._map.keyframes[-1], T)
 
     def _recover(self, world: Map, grey: np.ndarray, index: int) -> bool:
         """Find the lost camera in a map and the map's points in the image."""
@@ -180,7 +162,7 @@ class KeyframeOdometry:
         self._ids, self._uv = ids[inliers], uv[inliers]
         self._blind = max(self._blind, 1)
         self._moved(index, T)
-        self._lost.discard(index)
+        self._history.lost.discard(index)
         self._counts["relocalised"] += 1
         return True
 
@@ -229,18 +211,14 @@ class KeyframeOdometry:
         self._ids, self._uv = self._ids[order], self._uv[order]
         keyframe = Keyframe(index, T, self._ids, self._uv, grey)
         self._map.keyframes.append(keyframe)
-        self._hung[index] = keyframe, np.eye(4)
+        self._history.hang(index, keyframe, T)
         self._counts["keyframes"] += 1
         return keyframe
 
     def _drop(self, gone: Keyframe) -> None:
         """Remove a keyframe; its frames hang on the one before."""
         at = next(i for i, keyframe in enumerate(self._map.keyframes) if keyframe is gone)
-        other = self._map.keyframes[at - 1]
-        step = gone.T_cw @ np.linalg.inv(other.T_cw)
-        for index, hung in enumerate(self._hung):
-            if hung is not None and hung[0] is gone:
-                self._hung[index] = other, hung[1] @ step
+        self._history.rehang(gone, self._map.keyframes[at - 1])
         del self._map.keyframes[at]
         self._counts["culled"] += 1
 
@@ -271,19 +249,19 @@ class KeyframeOdometry:
     def _initialise(self, frame: Frame, grey: np.ndarray, index: int, followed: bool) -> Estimate:
         if self._old.keyframes and self._recover(self._old, grey, index):
             self._grey, self._blind = grey, 0
-            return self._estimate(Status.TRACKING, 0.3)
+            return self._history.estimate(Status.TRACKING, 0.3)
         if not followed:
-            self._lost.add(index)
+            self._history.lost.add(index)
             self._begin(frame, grey, index)
-            return self._estimate(Status.LOST)
+            return self._history.estimate(Status.LOST)
         self._grey = grey
         if self._try_start(index, grey):
-            return self._estimate(Status.TRACKING, 0.5)
+            return self._history.estimate(Status.TRACKING, 0.5)
         if len(self._ids) < max(0.4 * len(self._first.ids), self.config.start_points):
             self._begin(frame, grey, index)
         else:
             self._pending.append((index, self._ids, self._uv))
-        return self._estimate(Status.INITIALISING)
+        return self._history.estimate(Status.INITIALISING)
 
     def _try_start(self, index: int, grey: np.ndarray) -> bool:
         """Start the map from the first view and this one if they are far enough apart; fill in the frames between."""
@@ -316,7 +294,7 @@ class KeyframeOdometry:
         world, first_T = self._map, first.T_cw
         world.xyz[first.ids[rows[good]]] = (scale * start.points[good] - first_T[:3, 3]) @ first_T[:3, :3]
         world.keyframes.append(first)
-        self._hung[first.frame] = first, np.eye(4)
+        self._history.hang(first.frame, first, first_T)
         self._counts["keyframes"] += 1
         second = self._keyframe(index, step @ first_T, grey)
         adjust(world, [second], [first], self._intrinsics, 20, c.reprojection)
@@ -326,7 +304,7 @@ class KeyframeOdometry:
                 world.xyz[ids[known]], uv[known], self._intrinsics, first_T, c.reprojection, iterations=20
             )
             if inliers.sum() >= c.pose_points:
-                self._hung[frame] = first, T @ np.linalg.inv(first.T_cw)
+                self._history.hang(frame, first, T)
         if self._old.keyframes:
             self._retired.append(self._old.points())
         self._old, self._pending, self._started = Map(), [], True
@@ -334,10 +312,3 @@ class KeyframeOdometry:
         self._counts["maps_started"] += 1
         self._counts["planar_starts"] += int(start.planar)
         return True
-
-    # --- results ------------------------------------------------------------------------------------------------------
-
-    def _estimate(self, status: Status, confidence: float = 0.0) -> Estimate:
-        hung = self._hung[-1]
-        pose = None if hung is None else poses_from_matrices(np.linalg.inv(hung[1] @ hung[0].T_cw))
-        return Estimate(self._times[-1], pose, status, confidence)

@@ -118,7 +118,8 @@ class DepthMap:
             inverse depth, variance (the averaged one of the neighbours; infinite where there is none) and how many
             neighbours agreed, ``(H, W)`` each.
         """
-        c, shape = self.config, self.mean.shape
+        c = self.config
+        shape: tuple[int, ...] = self.mean.shape
         v, u = np.nonzero(self.candidates)
         at = v * shape[1] + u
         beside = at[:, None] + (NEIGHBOURS[:, 1] * shape[1] + NEIGHBOURS[:, 0])  # candidates keep off the border
@@ -134,11 +135,12 @@ class DepthMap:
         some = near > 0
         summed = own * d + (ww_n * d_n).sum(axis=1)
         strong = np.where(known, var, 0) + (w_n * np.where(known_n, var_n, 0)).sum(axis=1)
-        out = np.ones(shape, np.float32), np.full(shape, np.inf, np.float32), np.zeros(shape, np.int16)
-        out[0][v, u] = np.where(some, summed / np.where(some, total, 1), 1)
-        out[1][v, u] = np.where(some, strong / np.where(some, near, 1), np.inf)
-        out[2][v, u] = agrees.sum(axis=1)
-        return out
+        smooth, spread = np.ones(shape, np.float32), np.full(shape, np.inf, np.float32)
+        count = np.zeros(shape, np.int16)
+        smooth[v, u] = np.where(some, summed / np.where(some, total, 1), 1)
+        spread[v, u] = np.where(some, strong / np.where(some, near, 1), np.inf)
+        count[v, u] = agrees.sum(axis=1)
+        return smooth, spread, count
 
     def references(self, levels: list[Level]) -> list[Reference]:
         """Pixels to align with, on every level of the keyframe's pyramid."""

@@ -118,7 +118,7 @@ def search_lines(
     length = np.linalg.norm(stop - start, axis=1)
     middle = np.where((length < config.longest - 4)[:, None], (start + stop) / 2, place(inverse_depth))
     reach = np.minimum(np.ceil(length / 2) + 1, config.longest // 2).astype(int)
-    try_it &= inside(*middle.T, other.grey.shape, 3)
+    try_it &= inside(middle[:, 0], middle[:, 1], other.grey.shape, 3)
     for least, most in ((0, 4), (4, 9), (9, config.longest)):
         group = np.flatnonzero(try_it & (reach > least) & (reach <= most))
         if not len(group):

@@ -15,7 +15,9 @@ OCTAVES = (2, 0, 4)
 """Levels of ORB's pyramid (1.2 each) at which a lost image is described; keyframes are described at the first."""
 
 
-def relocalise(world: Map, grey: np.ndarray, intrinsics: np.ndarray, config: KeyframeConfig, seed: int):  # type: ignore[no-untyped-def]
+def relocalise(
+    world: Map, grey: np.ndarray, intrinsics: np.ndarray, config: KeyframeConfig, seed: int
+) -> tuple[np.ndarray, Keyframe] | None:
     """Pose of an image against the map, without a prediction.
 
     The keyframes that look most alike (PTAM's small blurred images) and the last one are tried: ORB descriptors of
@@ -58,7 +60,7 @@ def thumbnail(grey: np.ndarray) -> np.ndarray | None:
 def describe(grey: np.ndarray, uv: np.ndarray, octave: int) -> tuple[np.ndarray, np.ndarray]:
     """Upright ORB descriptors: rows of ``uv`` that are far enough from the border, and ``(M, 32)`` uint8."""
     scale = 1.2**octave
-    orb = cv2.ORB_create(scaleFactor=1.2, nlevels=8)
+    orb = cv2.ORB.create(scaleFactor=1.2, nlevels=8)
     points = [cv2.KeyPoint(float(x), float(y), 31 * scale, 0, 0, octave, i) for i, (x, y) in enumerate(uv)]
     kept, descriptors = orb.compute(grey, points)
     if descriptors is None:

@@ -42,6 +42,8 @@ class KeyframeOdometry:
         self._grey: np.ndarray | None = None  # the last image in which the tracks were seen
         self._ids = np.zeros(0, int)  # tracks: landmarks and where they are in that image
         self._uv = np.zeros((0, 2), np.float32)
+        self._followed = self._ids, self._uv  # the same in the newest image, before a pose confirms them
+        self._first: Keyframe | None = None  # first view of a map that is being started
         self._T = np.eye(4)  # last pose and last motion, world to camera
         self._motion = np.eye(4)
         self._blind = 0  # frames since the tracks were seen
@@ -255,7 +257,8 @@ class KeyframeOdometry:
             self._begin(frame, grey, index)
             return self._history.estimate(Status.LOST)
         self._grey = grey
-        if self._try_start(index, grey):
+        assert self._first is not None
+        if self._try_start(self._first, index, grey):
             return self._history.estimate(Status.TRACKING, 0.5)
         if len(self._ids) < max(0.4 * len(self._first.ids), self.config.start_points):
             self._begin(frame, grey, index)
@@ -263,9 +266,9 @@ class KeyframeOdometry:
             self._pending.append((index, self._ids, self._uv))
         return self._history.estimate(Status.INITIALISING)
 
-    def _try_start(self, index: int, grey: np.ndarray) -> bool:
+    def _try_start(self, first: Keyframe, index: int, grey: np.ndarray) -> bool:
         """Start the map from the first view and this one if they are far enough apart; fill in the frames between."""
-        c, first = self.config, self._first
+        c = self.config
         _, rows, now = np.intersect1d(first.ids, self._ids, return_indices=True)
         one, two = first.uv[rows], self._uv[now]
         focal = float(self._intrinsics[:2].mean())

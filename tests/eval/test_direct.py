@@ -249,25 +249,25 @@ def test_tracks_a_clean_scene(film, path):
 
 
 def test_same_seed_same_bytes(film, path):
-    frames = film(path(20))
+    frames = film(path(40))[:14]
     first, second = (run(frames)[1].trajectory.poses_wc.tobytes() for _ in range(2))
     assert first == second
 
 
 def test_short_blackout_is_lost_and_found(film, path):
-    estimates, result = run(dark(film(path(50)), 30, 32))
-    assert [e.status for e in estimates[30:32]] == [Status.LOST] * 2
-    assert all(e.status is Status.TRACKING for e in estimates[32:])
+    estimates, result = run(dark(film(path(40))[:28], 18, 20))
+    assert [e.status for e in estimates[18:20]] == [Status.LOST] * 2
+    assert all(e.status is Status.TRACKING for e in estimates[20:])
     assert result.info["maps_started"] == 1 and result.frames_lost == 2
-    assert evaluate(result.trajectory, path(50)).ate_percent < 2
+    assert evaluate(result.trajectory, path(40)).ate_percent < 3
 
 
 def test_long_blackout_starts_anew(film, path):
-    moving = path(60)
-    estimates, result = run(dark(film(moving), 20, 32))
+    moving = path(40)
+    estimates, result = run(dark(film(moving), 14, 25))
     assert result.info["maps_started"] == 2 and estimates[-1].status is Status.TRACKING
-    assert not set(moving.timestamps[20:30]) & set(result.trajectory.timestamps)
-    assert result.frames_lost == 60 - len(result.trajectory) >= 10
+    assert not set(moving.timestamps[14:23]) & set(result.trajectory.timestamps)
+    assert result.frames_lost == 40 - len(result.trajectory) >= 9
 
 
 @pytest.mark.parametrize("value", [0, 120])
@@ -291,10 +291,7 @@ def test_hardly_any_frames(film, path, count):
     assert len(result.trajectory) == count and result.frames_lost == 0
 
 
-def test_rendered_sequence():
-    from dvo.synth.sequence import make_sequence
-
-    sequence = make_sequence(5000, frames=40, fps=10, family="room", height=120, width=160)
-    _, result = run(list(sequence))
-    metrics = evaluate(result.trajectory, sequence.groundtruth)
+def test_rendered_sequence(rendered):
+    frames, truth = rendered
+    metrics = evaluate(run(frames)[1].trajectory, truth)
     assert metrics.completeness == 1 and metrics.ate_percent < 3

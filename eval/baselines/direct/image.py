@@ -29,14 +29,14 @@ class Level:
 
 
 def pyramid(grey: np.ndarray, intrinsics: np.ndarray, levels: int) -> list[Level]:
-    """Finest first; every further level has half the width and height (area average), down to 16 pixels.
+    """Finest first; every further level has half the width and height (area average), down to 12 pixels.
 
     Args:
-        grey: ``(H, W)`` float32, at least 16x16.
+        grey: ``(H, W)`` float32, at least 12x12.
         intrinsics: fx fy cx cy of it.
     """
     out = [_level(np.ascontiguousarray(grey, np.float32), np.asarray(intrinsics, np.float64))]
-    while len(out) < levels and min(out[-1].grey.shape) >= 32:
+    while len(out) < levels and min(out[-1].grey.shape) >= 24:
         height, width = out[-1].grey.shape
         size = (width // 2, height // 2)
         scale = np.array([size[0] / width, size[1] / height])

@@ -39,6 +39,7 @@ class DirectConfig:
         keyframe_distance: way from the keyframe, in units of its mean depth, that asks for another.
         keyframe_overlap: part of the keyframe's pixels still seen below which another is made.
         lost_overlap, lost_agreement: parts of pixels seen and of those that fit below which the camera is lost.
+        sure_agreement: above it no second prediction is tried.
         gains: brightness relative to the keyframe outside which it is lost.
         views: images since the last keyframe in which the depths of a new one are measured at once.
         patience: lost frames after which a new start is made.
@@ -46,7 +47,7 @@ class DirectConfig:
     """
 
     pixels: int = 76800
-    iterations: tuple[int, ...] = (8, 12, 16, 20)
+    iterations: tuple[int, ...] = (8, 12, 16, 20, 20)
     noise: float = 6.0
     huber: float = 1.345
     start_parallax: float = 0.05
@@ -54,6 +55,7 @@ class DirectConfig:
     keyframe_overlap: float = 0.75
     lost_overlap: float = 0.3
     lost_agreement: float = 0.6
+    sure_agreement: float = 0.9
     gains: tuple[float, float] = (0.4, 2.5)
     views: int = 4
     patience: int = 10
@@ -157,8 +159,10 @@ class DirectOdometry:
     # --- every frame --------------------------------------------------------------------------------------------------
 
     def _align(self, key: Keyframe, levels: list[Level]) -> Alignment | None:
-        """Pose of an image against the keyframe, from the motion model, else from the last pose. None if lost."""
+        """Pose of an image against the keyframe: from the motion model, and where that is not convincing from the last
+        pose, whichever fits better. None if lost."""
         c, last = self.config, self._last
+        best: Alignment | None = None
         for T in (self._motion @ last.T, last.T):
             found = align(
                 key.references,
@@ -171,9 +175,12 @@ class DirectOdometry:
                 iterations=c.iterations,
             )
             fits = found.overlap > c.lost_overlap and found.agreement > c.lost_agreement
-            if fits and c.gains[0] < found.gain < c.gains[1]:
-                return found
-        return None
+            fits = fits and c.gains[0] < found.gain < c.gains[1]
+            if fits and (best is None or found.residual < best.residual):
+                best = found
+            if fits and found.agreement > c.sure_agreement:
+                break
+        return best
 
     def _moved(self, index: int, key: Keyframe, found: Alignment) -> None:
         """Take a pose and learn the motion."""

@@ -50,7 +50,7 @@ class DirectConfig:
     iterations: tuple[int, ...] = (8, 12, 16, 20, 20)
     noise: float = 6.0
     huber: float = 1.345
-    start_parallax: float = 0.05
+    start_parallax: float = 0.03
     keyframe_distance: float = 0.12
     keyframe_overlap: float = 0.75
     lost_overlap: float = 0.3

@@ -1,8 +1,8 @@
 """The systems that can be chosen by name, each behind :class:`dvo.odometry.protocol.Odometry`.
 
-``klt-pnp`` and ``null`` are here; ``dvo-NAME`` is the learned tracker with weights NAME of the package, ``dvo:FILE``
-the same with a weights file, ``FILE.py:NAME`` a system of one's own (:mod:`eval.plugin`). A system that cannot run says
-why instead of raising.
+The classical ones and the peers are here; ``dvo-NAME`` is the learned tracker with weights NAME of the package,
+``dvo:FILE`` the same with a weights file, ``FILE.py:NAME`` a system of one's own (:mod:`eval.plugin`). A system that
+cannot run says why instead of raising.
 """
 
 from __future__ import annotations
@@ -79,6 +79,18 @@ def _klt_pnp(seed: int, device: str) -> Odometry:
     return KltPnp(seed=seed)
 
 
+def _keyframe(seed: int, device: str) -> Odometry:
+    from eval.baselines.keyframe.system import KeyframeOdometry
+
+    return KeyframeOdometry(seed=seed)
+
+
+def _direct(seed: int, device: str) -> Odometry:
+    from eval.baselines.direct.system import DirectOdometry
+
+    return DirectOdometry(seed=seed)
+
+
 def _null(seed: int, device: str) -> Odometry:
     from eval.baselines.null import NullMotion
 
@@ -125,6 +137,22 @@ _CLASSICAL = {
             "MIT",
             "KLT tracks, five-point essential matrix, triangulation, PnP (OpenCV)",
             _klt_pnp,
+            lambda: dvo.__version__,
+            lambda: None,
+        ),
+        System(
+            "keyframe",
+            "MIT",
+            "two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)",
+            _keyframe,
+            lambda: dvo.__version__,
+            lambda: None,
+        ),
+        System(
+            "direct",
+            "MIT",
+            "semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)",
+            _direct,
             lambda: dvo.__version__,
             lambda: None,
         ),

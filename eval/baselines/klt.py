@@ -66,7 +66,14 @@ class Tracks:
 
 
 def follow(
-    before: np.ndarray, after: np.ndarray, uv: np.ndarray, *, window: int, levels: int, tolerance: float
+    before: np.ndarray,
+    after: np.ndarray,
+    uv: np.ndarray,
+    *,
+    window: int,
+    levels: int,
+    tolerance: float,
+    guess: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Follow pixels from one grey image to the next.
 
@@ -76,6 +83,7 @@ def follow(
         window: side of the patch, pixels.
         levels: pyramid levels above the image.
         tolerance: largest distance between a pixel and where it comes back to, pixels.
+        guess: ``(N, 2)`` where the search in ``after`` begins, if not at ``uv``.
 
     Returns:
         ``(N, 2)`` pixels in ``after`` and ``(N,)`` bool, True where the track holds.
@@ -83,15 +91,17 @@ def follow(
     if len(uv) == 0:
         return uv, np.zeros(0, bool)
 
-    def flow(first: np.ndarray, second: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def flow(first: np.ndarray, second: np.ndarray, at: np.ndarray, begin: np.ndarray | None) -> tuple[np.ndarray, ...]:
         end = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+        flags = 0 if begin is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+        start = np.empty_like(at) if begin is None else np.array(begin, np.float32)
         there, found, _ = cv2.calcOpticalFlowPyrLK(
-            first, second, at, np.empty_like(at), winSize=(window, window), maxLevel=levels, criteria=end
+            first, second, at, start, winSize=(window, window), maxLevel=levels, criteria=end, flags=flags
         )
         return np.asarray(there).reshape(-1, 2), np.asarray(found).ravel() == 1
 
-    there, found = flow(before, after, uv)
-    back, returned = flow(after, before, there)
+    there, found = flow(before, after, uv, guess)
+    back, returned = flow(after, before, there, None if guess is None else uv)
     height, width = after.shape
     inside = ((there >= 0) & (there <= np.array([width - 1, height - 1]))).all(axis=1)
     closed = np.linalg.norm(back - uv, axis=1) < tolerance

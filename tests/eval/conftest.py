@@ -74,6 +74,15 @@ def film() -> Callable[[Trajectory], list[Frame]]:
 
 
 @pytest.fixture(scope="session")
+def rendered() -> tuple[list[Frame], Trajectory]:
+    """A walk through a rendered room: 30 frames of 160x120 pixels with a sensor's noise, and the truth."""
+    from dvo.synth.sequence import make_sequence
+
+    sequence = make_sequence(5000, frames=30, fps=8, family="room", height=120, width=160)
+    return list(sequence), sequence.groundtruth
+
+
+@pytest.fixture(scope="session")
 def path() -> Callable[..., Trajectory]:
     """``path(count, translate)``, see :func:`walk`."""
     return walk

@@ -1,7 +1,7 @@
 """The systems that can be chosen by name, each behind :class:`dvo.odometry.protocol.Odometry`.
 
-``klt-pnp`` and ``null`` are here; ``dvo-NAME`` is the learned tracker with weights NAME of the package, ``dvo:FILE``
-the same with a weights file. A system that cannot run says why instead of raising.
+The classical ones and the peers that pip installs have plain names; ``dvo-NAME`` is the learned tracker with weights
+NAME of the package, ``dvo:FILE`` the same with a weights file. A system that cannot run says why instead of raising.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import dvo
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Odometry
+from eval.peers import colmap, orbslam3, svo
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,24 @@ def _klt_pnp(seed: int, device: str) -> Odometry:
     return KltPnp(seed=seed)
 
 
+def _monoslam(seed: int, device: str) -> Odometry:
+    from eval.baselines.monoslam import MonoSlam
+
+    return MonoSlam(seed=seed)
+
+
+def _orbslam3(seed: int, device: str) -> Odometry:
+    return orbslam3.OrbSlam3()
+
+
+def _svo(seed: int, device: str) -> Odometry:
+    return svo.Svo()
+
+
+def _colmap(seed: int, device: str) -> Odometry:
+    return colmap.Colmap(seed=seed)
+
+
 def _null(seed: int, device: str) -> Odometry:
     from eval.baselines.null import NullMotion
 
@@ -110,6 +129,26 @@ _CLASSICAL = {
             _klt_pnp,
             lambda: dvo.__version__,
             lambda: None,
+        ),
+        System(
+            "monoslam",
+            "MIT",
+            "filter: EKF over camera and inverse-depth points, active search, one-point RANSAC",
+            _monoslam,
+            lambda: dvo.__version__,
+            lambda: None,
+        ),
+        System(
+            "orbslam3",
+            "GPL-3",
+            "ORB-SLAM3 monocular (pyorbslam3), without the official vocabulary",
+            _orbslam3,
+            orbslam3.version,
+            orbslam3.missing,
+        ),
+        System("svo", "GPL-3", "SVO (svo-cpp)", _svo, svo.version, svo.missing),
+        System(
+            "colmap", "BSD-3", "COLMAP (pycolmap), every 5th frame, offline", _colmap, colmap.version, colmap.missing
         ),
         System(
             "null",

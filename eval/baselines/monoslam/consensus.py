@@ -82,7 +82,9 @@ def _likelihood(innovations: np.ndarray, S: np.ndarray, given: np.ndarray, anywh
     """Logarithm of the density of all innovations if the given measurements are right and others may be wrong."""
     a = (2 * given[:, None] + [0, 1]).ravel()
     own = innovations.ravel()[a]
-    total = -0.5 * float(own @ np.linalg.solve(S[np.ix_(a, a)], own) + np.linalg.slogdet(2 * np.pi * S[np.ix_(a, a)])[1])
+    total = -0.5 * float(
+        own @ np.linalg.solve(S[np.ix_(a, a)], own) + np.linalg.slogdet(2 * np.pi * S[np.ix_(a, a)])[1]
+    )
     others = np.ones(len(innovations), bool)
     others[given] = False
     left, spread = condition(innovations, S, given)

@@ -1,4 +1,4 @@
-"""The extended Kalman filter over a camera and inverse-depth points. No images here: pixels go in, a state comes out."""
+"""The extended Kalman filter over a camera and inverse-depth points. No images: pixels go in, a state comes out."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Filter:
         return np.sqrt(np.maximum(np.diag(self.P)[CAMERA + POINT - 1 :: POINT], 0))
 
     def predict(self, dt: float, acceleration: float, angular: float) -> None:
-        """Move on by ``dt`` seconds with unknown accelerations (standard deviations; units of the map and rad / s^2)."""
+        """Move on by ``dt`` seconds with unknown accelerations (standard deviations; map units / s^2, rad / s^2)."""
         self.r, self.q, F, G = move(self.r, self.q, self.v, self.w, dt)
         impulses = np.repeat([(acceleration * dt) ** 2, (angular * dt) ** 2], 3)
         c = slice(0, CAMERA)
@@ -89,7 +89,11 @@ class Filter:
         HP[:] = (slopes[:, :, :6].reshape(-1, 6) @ self.P[:6]).reshape(HP.shape)
         HP += slopes[:, :, 6:] @ self.P[index[:, 6:]]
         HP = HP.reshape(-1, len(self.P))
-        S = (HP[:, index].transpose(1, 0, 2) @ slopes.transpose(0, 2, 1)).transpose(1, 0, 2).reshape(len(HP), 2 * len(rows))
+        S = (
+            (HP[:, index].transpose(1, 0, 2) @ slopes.transpose(0, 2, 1))
+            .transpose(1, 0, 2)
+            .reshape(len(HP), 2 * len(rows))
+        )
         return HP, 0.5 * (S + S.T) + self.noise**2 * np.eye(len(S))
 
     def update(self, rows: np.ndarray, seen: np.ndarray, expected: Prediction) -> None:

@@ -113,7 +113,13 @@ def templates(appearance: Appearance, warps: np.ndarray, rows: np.ndarray) -> tu
 
 
 def find_point(
-    pyramid: list[np.ndarray], patches: np.ndarray, centre: np.ndarray, spread: np.ndarray, *, sigmas: float, reach: float
+    pyramid: list[np.ndarray],
+    patches: np.ndarray,
+    centre: np.ndarray,
+    spread: np.ndarray,
+    *,
+    sigmas: float,
+    reach: float,
 ) -> tuple[np.ndarray, float] | None:
     """Best place of a point inside its search ellipse; wide ellipses from coarse to fine.
 

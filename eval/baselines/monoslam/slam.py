@@ -50,12 +50,12 @@ class MonoSlamConfig:
     """
 
     pixels: int = 120_000
-    noise: float = 0.7
+    noise: float = 0.5
     speed: float = 0.6
     rate: float = 1.0
     acceleration: float = 1.5
     angular: float = 6.0
-    rho_sigma: float = 0.5
+    rho_sigma: float = 1.0
     sigmas: float = 3.0
     reach: float = 100.0
     score: float = 0.75

@@ -33,9 +33,7 @@ def condition(innovations: np.ndarray, S: np.ndarray, given: np.ndarray) -> tupl
     return left, S[rows[:, :, None], rows[:, None, :]] - explained
 
 
-def find_consensus(
-    innovations: np.ndarray, S: np.ndarray, noise: float, samples: int, rng: np.random.Generator
-) -> np.ndarray:
+def find_consensus(innovations: np.ndarray, S: np.ndarray, samples: int, rng: np.random.Generator) -> np.ndarray:
     """A set of measurements that let expect each other.
 
     Every single measurement makes a hypothesis; while the prior is loose (the first frames, or after a gap) one leaves
@@ -45,7 +43,6 @@ def find_consensus(
     Args:
         innovations: ``(M, 2)``.
         S: ``(2 M, 2 M)`` their covariance, measurement noise included.
-        noise: standard deviation of a measured pixel.
         samples: number of triples.
         rng: draws them.
 

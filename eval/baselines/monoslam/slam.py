@@ -167,7 +167,7 @@ class MonoSlam:
         rows, seen = self._look(state, pyramid, expected, scouts)
         looked[scouts] = True
         innovations, S = seen - expected.pixels[rows], state.innovation(rows, expected)[1]
-        good = find_consensus(innovations, S, c.noise, c.samples if loose else 0, self._rng)
+        good = find_consensus(innovations, S, c.samples if loose else 0, self._rng)
         if good.sum() < max(4, (0.25 if loose else 0.4) * len(rows)):
             return
         state.update(rows[good], seen[good], expected)

@@ -14,6 +14,7 @@ import dvo
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Odometry
 from eval import plugin
+from eval.peers import colmap, orbslam3, svo
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,24 @@ def _direct(seed: int, device: str) -> Odometry:
     return DirectOdometry(seed=seed)
 
 
+def _monoslam(seed: int, device: str) -> Odometry:
+    from eval.baselines.monoslam import MonoSlam
+
+    return MonoSlam(seed=seed)
+
+
+def _orbslam3(seed: int, device: str) -> Odometry:
+    return orbslam3.OrbSlam3()
+
+
+def _svo(seed: int, device: str) -> Odometry:
+    return svo.Svo()
+
+
+def _colmap(seed: int, device: str) -> Odometry:
+    return colmap.Colmap(seed=seed)
+
+
 def _null(seed: int, device: str) -> Odometry:
     from eval.baselines.null import NullMotion
 
@@ -141,6 +160,14 @@ _CLASSICAL = {
             lambda: None,
         ),
         System(
+            "monoslam",
+            "MIT",
+            "filter: EKF over camera and inverse-depth points, active search, one-point RANSAC",
+            _monoslam,
+            lambda: dvo.__version__,
+            lambda: None,
+        ),
+        System(
             "keyframe",
             "MIT",
             "two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)",
@@ -155,6 +182,18 @@ _CLASSICAL = {
             _direct,
             lambda: dvo.__version__,
             lambda: None,
+        ),
+        System(
+            "orbslam3",
+            "GPL-3",
+            "ORB-SLAM3 monocular (pyorbslam3), without the official vocabulary",
+            _orbslam3,
+            orbslam3.version,
+            orbslam3.missing,
+        ),
+        System("svo", "GPL-3", "SVO (svo-cpp)", _svo, svo.version, svo.missing),
+        System(
+            "colmap", "BSD-3", "COLMAP (pycolmap), every 5th frame, offline", _colmap, colmap.version, colmap.missing
         ),
         System(
             "null",

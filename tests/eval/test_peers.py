@@ -1,0 +1,142 @@
+"""The peers' wrappers; each runs in a process of its own, and is skipped where its package is not installed."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dvo.data.frame import Frame
+from dvo.geometry.camera import Camera
+from eval.peers import colmap, orbslam3, svo
+from eval.peers.common import Pictures, Row, longest_part
+from eval.systems import find_system
+
+ROOT = Path(__file__).resolve().parents[2]
+GPL = {"svo_cpp", "pyorbslam3"}
+DRIVE = """
+import sys, cv2, numpy as np
+cv2.setNumThreads(1)
+from dvo.metrics import evaluate
+from dvo.synth.sequence import make_sequence
+from eval.systems import find_system
+name, frames, fps = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+film = make_sequence(5005, frames=frames, fps=fps, family="clutter", kind="handheld")
+odometry = find_system(name).build(0, "cpu")
+for frame in film:
+    odometry.track(frame)
+result = odometry.finish()
+metrics = evaluate(result.trajectory, film.groundtruth)
+print("MEASURED", metrics.completeness, metrics.ate_percent, metrics.rotation_error_ratio)
+"""
+
+
+def measure(name: str, frames: int, fps: float) -> list[float]:
+    """Completeness, ATE % and rotation error ratio of a system on a rendered sequence."""
+    done = subprocess.run(
+        [sys.executable, "-c", DRIVE, name, str(frames), str(fps)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    lines = [line for line in done.stdout.splitlines() if line.startswith("MEASURED")]
+    assert lines, done.stderr[-2000:]
+    return [float(value) for value in lines[0].split()[1:]]
+
+
+def test_gpl_packages_are_imported_only_when_a_system_is_built():
+    for file in sorted((ROOT / "eval").rglob("*.py")) + sorted((ROOT / "dvo").rglob("*.py")):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        inside = {
+            id(n)
+            for f in ast.walk(tree)
+            if isinstance(f, ast.FunctionDef) and f.name == "__init__"
+            for n in ast.walk(f)
+        }
+        for node in ast.walk(tree):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            if GPL & {name.split(".")[0] for name in names}:
+                assert file.parent.name == "peers" and id(node) in inside, file
+    check = "import sys, eval.systems as s; [x.missing() for x in s.list_systems()]; print(sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", check], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert not any(f"'{name}'" in done.stdout for name in GPL | {"pycolmap"})
+
+
+def test_every_peer_says_how_to_install_it(monkeypatch):
+    monkeypatch.setattr("eval.peers.common.find_spec", lambda name: None)
+    for peer, package in ((colmap, "pycolmap"), (orbslam3, "pyorbslam3"), (svo, "svo-cpp")):
+        assert f"{package} (" in (peer.missing() or "") and "pip install" in (peer.missing() or "")
+
+
+def test_orbslam3_says_that_it_needs_a_vocabulary(monkeypatch, tmp_path):
+    monkeypatch.setattr("eval.peers.common.find_spec", lambda name: True)
+    monkeypatch.setenv(orbslam3.VOCABULARY, str(tmp_path / "none.txt"))
+    assert "eval.vocabulary" in (orbslam3.missing() or "")
+
+
+def test_settings_hold_the_camera(tmp_path):
+    file = tmp_path / "settings.yaml"
+    file.write_text(orbslam3.settings(Camera(500.5, 501.5, 319.5, 239.5, 640, 480)))
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    assert storage.getNode("Camera1.fx").real() == 500.5 and storage.getNode("Camera.width").real() == 640
+    assert storage.getNode("Camera1.cy").real() == 239.5 and storage.getNode("Camera.type").string() == "PinHole"
+
+
+def test_small_pictures_are_doubled_with_their_camera():
+    frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), Camera(250.0, 250.0, 159.5, 119.5, 320, 240))
+    pictures = Pictures()
+    assert pictures(frame).shape == (480, 640)
+    assert pictures.camera is not None and pictures.camera.intrinsics.tolist() == [500, 500, 319.5, 239.5]
+    assert Pictures(smallest=0)(frame).shape == (240, 320)
+
+
+def test_distorted_pictures_are_straightened():
+    bent = Camera(250.0, 250.0, 159.5, 119.5, 320, 240, "radtan", (-0.3, 0.1, 0.0, 0.0))
+    pictures = Pictures(smallest=0)
+    pictures(Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), bent))
+    assert pictures.camera is not None and not pictures.camera.is_distorted
+
+
+def test_longest_part():
+    rows = [Row(float(k), np.eye(4), part) for k, part in enumerate([0, 0, 1, 1, 1, 2])]
+    assert [row.timestamp for row in longest_part(rows)] == [2, 3, 4] and longest_part([]) == []
+
+
+def test_frames_follow_their_keyframes():
+    def at(x: float) -> np.ndarray:
+        T = np.eye(4)
+        T[0, 3] = x
+        return T
+
+    rows = [Row(float(k), at(k), 0) for k in range(6)]
+    moved, count = orbslam3.follow_keyframes(rows, np.array([1.0, 4.0, 9.0]), np.array([at(1.5), at(3.0), at(0)]))
+    assert count == 2
+    assert [row.T_wc[0, 3] for row in moved] == pytest.approx([0.5, 1.5, 2.5, 3.5, 3.0, 4.0])
+
+
+def test_colmap_of_none_and_one_frame():
+    frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
+    nothing, one = colmap.Colmap(), colmap.Colmap()
+    one.track(frame)
+    assert nothing.finish().frames_read == 0 and one.finish().frames_lost == 1
+
+
+# The conventions (which way poses go, where pixel centres lie) show in rotation as well as in position.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "frames", "fps"), [("svo", 130, 30.0), ("orbslam3", 130, 30.0), ("colmap", 100, 30.0)]
+)
+def test_poses_agree_with_the_ground_truth(name, frames, fps):
+    reason = find_system(name).missing()
+    if reason is not None:
+        pytest.skip(reason)
+    completeness, ate, rotation = measure(name, frames, fps)
+    assert completeness > 0.5 and ate < 2 and rotation < 0.3

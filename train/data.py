@@ -64,6 +64,7 @@ class Renderings(L.LightningDataModule):
         sizes: height and width of a clip in pixels, taken in turn by the batches.
         flow_low, flow_high: range of the mean induced flow between consecutive frames, pixels.
         workers: rendering processes; 0 renders in the training process.
+        textures: folder of photographs to paint the scenes with; None: those that scikit-image ships.
     """
 
     def __init__(
@@ -75,12 +76,13 @@ class Renderings(L.LightningDataModule):
         flow_low: float = 2.0,
         flow_high: float = 19.0,
         workers: int = 1,
+        textures: str | None = None,
     ) -> None:
         super().__init__()
         self.save_hyperparameters()
         self.batch_size, self.workers = batch_size, workers
         self.clips_seen = 0
-        options = {"frames": frames, "flow_range": (flow_low, flow_high)}
+        options = {"frames": frames, "flow_range": (flow_low, flow_high), "textures": textures}
         self.clips = MixedClips(seed, sizes or [(120, 160)], batch_size, **options)
 
     def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:

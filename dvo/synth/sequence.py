@@ -82,6 +82,7 @@ def make_sequence(
     sensor: bool = True,
     supersample: int = 1,
     device: torch.device | str = "cpu",
+    textures: str | None = None,
 ) -> SyntheticSequence:
     """A smooth, realistic sequence through one scene.
 
@@ -94,6 +95,7 @@ def make_sequence(
         sensor: False for clean frames.
         supersample: rays per pixel edge.
         device: where to render.
+        textures: folder of photographs to paint with; None: those that scikit-image ships.
 
     Raises:
         DvoError: no such family or kind, or sizes out of order.
@@ -101,7 +103,7 @@ def make_sequence(
     if frames < 1 or height < 16 or width < 16 or fps <= 0:
         raise DvoError("a sequence needs a frame or more of 16x16 pixels or more and fps > 0", field="frames, fps")
     rng = np.random.default_rng([seed, 7401])
-    scene = random_scene(int(rng.integers(2**31)), family, pool=texture_pool(seed))
+    scene = random_scene(int(rng.integers(2**31)), family, pool=texture_pool(seed, folder=textures))
     name = kind or ("forward" if scene.hints.get("heading") is not None else "handheld")
     times = np.arange(frames) / fps
     path = long_path(scene, int(rng.integers(2**31)), name, frames / fps, speed=speed)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dvo.errors import DvoError
 from dvo.synth.antialias import smooth_outlines
+from dvo.synth.mesh import MeshScene, mesh_depth, render_mesh, trace_mesh
 from dvo.synth.scene import CELL, Scene
 from dvo.synth.textures import sample
 from dvo.synth.view import SLACK, View, look
@@ -135,10 +136,18 @@ def _cameras(poses_wc: object, intrinsics: object) -> tuple[Array, Array]:
 
 
 def render_depth(
-    scene: Scene, poses_wc: object, intrinsics: object, height: int, width: int, *, device: torch.device | str = "cpu"
+    scene: Scene | MeshScene,
+    poses_wc: object,
+    intrinsics: object,
+    height: int,
+    width: int,
+    *,
+    device: torch.device | str = "cpu",
 ) -> tuple[Tensor, Tensor]:
     """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
     poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        return mesh_depth(scene, poses, k, height, width, device)
     view = look(scene, poses, k, (height, width))
     nearest, local, _ = _cast(view, height, width, device)
     return torch.where(local >= 0, 1 / nearest, 0.0), _named(view, local)
@@ -174,7 +183,7 @@ def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:
 
 
 def render(
-    scene: Scene,
+    scene: Scene | MeshScene,
     poses_wc: object,
     intrinsics: object,
     height: int,
@@ -189,7 +198,8 @@ def render(
     """Render N frames.
 
     Args:
-        scene: what to render.
+        scene: what to render; of a mesh, ``surface`` is the triangle and ``uv`` the barycentric weights of its second
+            and third corner.
         poses_wc: ``(N, 7)`` camera to world, tensor or array.
         intrinsics: ``(N, 4)`` or ``(4,)`` fx fy cx cy in pixels of the ``height`` x ``width`` image.
         height, width: image size in pixels.
@@ -203,6 +213,13 @@ def render(
         DvoError: poses or intrinsics of the wrong shape or not finite.
     """
     poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        rays = max(supersample, 2 if antialias else 1)
+        return Rendering(
+            *render_mesh(
+                scene, poses, k, height, width, supersample=rays, device=device, taps=taps, coordinates=coordinates
+            )
+        )
     view = look(scene, poses, k, (height, width))
     nearest, local, functions = _cast(view, height, width, device)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
@@ -232,7 +249,7 @@ def _coordinates(view: View, local: Tensor, depth: Tensor) -> Tensor:
     return (chosen[..., 0] * xs + chosen[..., 1] * ys + chosen[..., 2]) * depth[..., None]
 
 
-def trace(scene: Scene, poses_wc: object, intrinsics: object, pixels: Array) -> tuple[Array, Array, Array]:
+def trace(scene: Scene | MeshScene, poses_wc: object, intrinsics: object, pixels: Array) -> tuple[Array, Array, Array]:
     """What single rays hit, in float64: the reference for tests and for tracks.
 
     Args:
@@ -244,6 +261,8 @@ def trace(scene: Scene, poses_wc: object, intrinsics: object, pixels: Array) -> 
         depth ``(N, M)``, surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
     """
     poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        return trace_mesh(scene, poses, k, pixels)
     view = look(scene, poses, k, None)
     homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1).swapaxes(1, 2)  # (N, 3, M)
     inverse = view.basis[:, :, 2] @ homogeneous  # (N, Q, M)

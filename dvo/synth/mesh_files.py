@@ -109,7 +109,7 @@ def mesh_scene(
     if bare.any():
         share = "no texture" if bare.all() else f"no texture on {bare.mean():.0%} of the triangles"
         warnings.append(f"{share}: painted with a procedural one")
-        uv[bare] = _projected(corners[bare], 0.5 * scale)
+        uv[bare] = _projected(corners[bare], 0.9 * scale)
     if not space.inside and ground:
         reach = 12 * float(np.linalg.norm(extent[:2]) + extent[2])
         middle = (low + high) / 2
@@ -137,8 +137,7 @@ def _fallback(seed: int, kind: int) -> Array:
     """A procedural picture without a seam: stains for meshes, a rough one for the ground."""
     rng = np.random.default_rng([seed, 7501, kind])
     picture = PATTERNS["stains" if kind == 0 else "fractal"][0](rng, 512)
-    if kind == 1:  # a ground of loud colours would hide what stands on it
-        picture = 0.3 * picture + 0.7 * picture.mean(2, keepdims=True)
+    picture = 0.4 * picture + 0.6 * picture.mean(2, keepdims=True)  # muted: a stand-in, and a ground to stand on
     return np.clip(picture * (0.55 / max(float(picture.mean()), 0.1)), 0, 1).astype(np.float32)
 
 
@@ -208,7 +207,7 @@ def _factor(material: Any) -> Array:
 
 
 def _picture(image: Any, warnings: list[str]) -> Array:
-    picture = np.asarray(image.convert("RGB"), np.float32) / 255
+    picture: Array = np.asarray(image.convert("RGB"), np.float32) / 255
     shrink = MAX_EDGE / max(picture.shape[:2])
     if shrink < 1:
         warnings.append(f"a texture of {picture.shape[1]}x{picture.shape[0]} was reduced to {MAX_EDGE} pixels")

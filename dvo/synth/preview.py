@@ -69,7 +69,7 @@ def clip_row(clip: Clip, columns: int = 4) -> Array:
     """One row ``(H, (columns + 3) W, 3)``: evenly chosen frames, depth and flow of the first, plan view."""
     images = clip.images.cpu().numpy().transpose(0, 2, 3, 1)
     chosen = np.linspace(0, len(images) - 1, columns).round().astype(int)
-    flow = flow_between(clip, 0, 1)
+    flow = flow_between(clip, 0, 1) * (clip.depth[0] > 0).cpu().numpy()[..., None]
     cells = [
         *images[chosen],
         depth_colours(clip.depth[0].cpu().numpy()),

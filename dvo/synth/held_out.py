@@ -81,7 +81,7 @@ def hall(rng: np.random.Generator, pool: TexturePool) -> Scene:
     bounds = np.stack([centre - half, centre + half])
     focus = (centre - half * [0.9, 0.9, 0.8], centre + half * [0.9, 0.9, 0.3])
     scene = b.build("hall", bounds, 0.55 * float(half[0]), heading=None, focus=focus, height=(0.8, 2.2))
-    bake(scene, rng, lamps=int(rng.integers(3, 6)), texel=0.8)
+    bake(scene, rng, lamps=int(rng.integers(3, 6)), texel=0.8, exposure=0.85)
     return scene
 
 
@@ -159,7 +159,7 @@ def courtyard(rng: np.random.Generator, pool: TexturePool) -> Scene:
     bounds = np.concatenate([inner, [[0.4], [3.2]]], 1)
     focus = (np.append(-0.9 * half, 0.5), np.append(0.9 * half, 3.0))
     scene = b.build("courtyard", bounds, 0.5 * float(half.mean()), heading=None, focus=focus, height=(0.9, 2.2))
-    bake(scene, rng, sun=True, glowing=np.array(above), texel=0.8)
+    bake(scene, rng, sun=True, glowing=np.array(above), texel=0.8, exposure=0.68)
     return scene
 
 
@@ -233,5 +233,5 @@ def gallery(rng: np.random.Generator, pool: TexturePool) -> Scene:
     bounds = np.stack([centre - half, centre + half])
     focus = (centre - half * [0.95, 0.9, 0.5], centre + half * [0.95, 0.9, 0.4])
     scene = b.build("gallery", bounds, 0.9 * wide, heading=None, focus=focus, height=(0.8, 2.1))
-    bake(scene, rng, lamps=rooms + 1, texel=0.7)
+    bake(scene, rng, lamps=rooms + 1, texel=0.7, exposure=0.85)
     return scene

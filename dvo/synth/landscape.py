@@ -129,7 +129,7 @@ def terrain(rng: np.random.Generator, pool: TexturePool) -> Scene:
         normal[smooth] = hills.normal(points[smooth, :2])
         return normal
 
-    bake(scene, rng, sun=True, glowing=np.array(above), texel=0.8, bend=bend)
+    bake(scene, rng, sun=True, glowing=np.array(above), texel=0.8, exposure=0.85, bend=bend)
     return scene
 
 
@@ -188,5 +188,5 @@ def forest(rng: np.random.Generator, pool: TexturePool) -> Scene:
     bounds = np.array([[-size, -size, 0.3], [size, size, 2.6]])
     focus = (np.array([-0.8 * size, -0.8 * size, 0.4]), np.array([0.8 * size, 0.8 * size, 2.2]))
     scene = b.build("forest", bounds, 0.45 * size, heading=None, focus=focus, height=(0.6, 2.2))
-    bake(scene, rng, sun=True, glowing=np.array(above), texel=0.8)
+    bake(scene, rng, sun=True, glowing=np.array(above), texel=0.8, exposure=0.65)
     return scene

@@ -56,7 +56,7 @@ def load_mesh(
     except ImportError:
         raise DvoError("meshes need trimesh", field="mesh", remedy="pip install 'dvo[synth]'") from None
     try:
-        loaded = trimesh.load_scene(path)
+        loaded = trimesh.load_scene(path, process=False)  # processing would hide defects
     except Exception as error:  # whatever trimesh's readers stumble over
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DvoError(
@@ -158,6 +158,10 @@ def _gather(
         raise DvoError("broken: a face names a vertex that is not there", file=file, remedy="export it again")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise DvoError("broken: a vertex is not finite", file=file, remedy="export it again")
+    if mesh.visual.kind is None:  # smooth shading needs to know which triangles share a corner
+        mesh = mesh.copy()
+        mesh.merge_vertices()
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     tint: Array = np.ones((len(faces), 3, 3), np.float32)
     texture = np.zeros(len(faces), np.int64)
     uv = np.full((len(faces), 3, 2), np.nan)

@@ -109,8 +109,8 @@ def _reach(seed: Array, blocked: Array) -> Array:
                 source = [slice(None)] * 3
                 target = [slice(None)] * 3
                 source[axis], target[axis] = cut, paste
-                found[tuple(target)] |= found[tuple(source)]
-        found &= ~blocked
+                # Masked at once: a blocked cell must not hand on what it is reached from.
+                found[tuple(target)] |= found[tuple(source)] & ~blocked[tuple(target)]
     return found
 
 

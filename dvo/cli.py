@@ -56,7 +56,45 @@ def build_parser() -> argparse.ArgumentParser:
     info = verbs.add_parser("info", help="architecture, size and origin of weights")
     info.add_argument("weights", metavar="NAME|FILE")
     info.set_defaults(run="dvo.commands.weights:info")
+
+    synth = commands.add_parser("synth", help="render scenes and meshes: look at them, or write sequences")
+    verbs = synth.add_subparsers(dest="verb", required=True, metavar="VERB")
+    preview = verbs.add_parser("preview", help="contact sheet: frames, depth, flow, path")
+    preview.add_argument(
+        "source",
+        metavar="SOURCE",
+        nargs="?",
+        help="family, mesh file (glTF, OBJ, PLY), or 'clips'; default: all families",
+    )
+    preview.add_argument("--out", metavar="FILE", required=True, help="PNG to write")
+    preview.add_argument("--rows", type=_positive_int, metavar="N", help="rows of a family, mesh or 'clips'")
+    _rendering_options(preview, "160x120")
+    preview.set_defaults(run="dvo.commands.synth:preview")
+    export = verbs.add_parser("export", help="write a sequence with ground truth in a dataset's layout")
+    export.add_argument("--layout", choices=("tum", "tartanair"), default="tum", help="default: %(default)s")
+    export.add_argument("--out", metavar="DIR", required=True, help="new folder")
+    what = export.add_mutually_exclusive_group()
+    what.add_argument("--family", metavar="F", help="family of scenes (default: drawn)")
+    what.add_argument("--mesh", metavar="FILE", help="glTF, OBJ or PLY to move around or within")
+    export.add_argument("--frames", type=_positive_int, default=150, metavar="N", help="default: %(default)s")
+    export.add_argument("--fps", type=_positive_float, default=30.0, metavar="F", help="default: %(default)g")
+    export.add_argument("--path", metavar="KIND", help="kind of path: handheld, forward, orbit, rotation, drone, ...")
+    export.add_argument("--sensor", action="store_true", help="noise, vignetting and so on; without: clean and exact")
+    export.add_argument("--device", metavar="D", default="cpu", help="torch device (default: %(default)s)")
+    _rendering_options(export, "320x240")
+    export.set_defaults(run="dvo.commands.synth:export")
     return parser
+
+
+def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
+    parser.add_argument("--size", type=_size, default=_size(size), metavar="WxH", help=f"pixels (default: {size})")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
+    parser.add_argument("--textures", metavar="DIR", help="photographs to paint scenes with")
+    parser.add_argument("--up", choices=("y", "z"), help="axis of the mesh that points up (default: y; z for PLY)")
+    parser.add_argument(
+        "--view", choices=("auto", "inside", "outside"), default="auto", help="where the camera is as to the mesh"
+    )
+    parser.add_argument("--unlit", action="store_true", help="do not shade the mesh: its textures hold the light")
 
 
 def _tracking_options(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +109,13 @@ def _positive_int(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be 1 or more, got {text}")
     return value
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, separator, height = text.lower().partition("x")
+    if not (separator and width.isdigit() and height.isdigit() and min(int(width), int(height)) >= 16):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT of 16 pixels or more, got {text!r}")
+    return int(width), int(height)
 
 
 def _positive_float(text: str) -> float:

@@ -104,6 +104,7 @@ class Renderings(L.LightningDataModule):
         workers: rendering processes; 0 renders in the training process.
         courses: later changes of sizes and flow, by the index of the first clip; None for none.
         real: recordings to train on as well or instead.
+        textures: folder of photographs to paint the scenes with; None: those that scikit-image ships.
     """
 
     def __init__(
@@ -117,17 +118,19 @@ class Renderings(L.LightningDataModule):
         workers: int = 1,
         courses: list[Course] | None = None,
         real: RealData | None = None,
+        textures: str | None = None,
     ) -> None:
         super().__init__()
         self.save_hyperparameters(ignore=["courses", "real"], logger=False)  # its seed need not be that of the module
         self.seed, self.batch_size, self.frames, self.workers = seed, batch_size, frames, workers
         self.courses = [Course(0, flow_low, flow_high, sizes or [(120, 160)]), *(courses or [])]
-        self.real = real
+        self.real, self.textures = real, textures
         self.clips_seen = 0
 
     def clips(self, processes: int = 1) -> MixedClips:
         """The clips, in batches that span the processes."""
-        return MixedClips(self.seed, self.courses, self.batch_size * processes, self.real, frames=self.frames)
+        options = {"frames": self.frames, "textures": self.textures}
+        return MixedClips(self.seed, self.courses, self.batch_size * processes, self.real, **options)
 
     def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
         processes, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)

@@ -181,9 +181,7 @@ class PatchOdometry:
         x, y = (centres[0, 0] * net.config.STRIDE).unbind(-1)
         colors = rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu()
         intrinsics = torch.tensor(camera.intrinsics / net.config.STRIDE, dtype=torch.float32, device=self.device)
-        keyframe = Keyframe(
-            self._count, frame.timestamp, slot, matching[0], context[0], colors, intrinsics
-        )
+        keyframe = Keyframe(self._count, frame.timestamp, slot, matching[0], context[0], colors, intrinsics)
         self._count += 1
         depth = torch.ones(1, config.patches, device=self.device)
         if self._initialised:

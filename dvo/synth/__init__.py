@@ -1,8 +1,10 @@
 """Synthetic renderings: scenes, camera paths and frames with exact ground truth, endless, from a seed."""
 
 from dvo.synth.bodies import Body, Stage
-from dvo.synth.families import FAMILIES, random_scene
+from dvo.synth.families import FAMILIES, HELD_OUT, random_scene
 from dvo.synth.imu import Imu, ImuNoise, measure_imu
+from dvo.synth.mesh import MeshScene
+from dvo.synth.mesh_files import load_mesh, mesh_scene
 from dvo.synth.paths import KINDS, Path, random_path
 from dvo.synth.renderer import Rendering, render, trace
 from dvo.synth.scene import Scene
@@ -13,7 +15,8 @@ from dvo.synth.truth import Flow, Tracks, dynamic_mask, optical_flow, tracks
 from dvo.synth.walks import LONG_KINDS, SplinePath, long_path
 
 __all__ = [
-    "FAMILIES", "KINDS", "LONG_KINDS", "Body", "Flow", "Imu", "ImuNoise", "Path", "Rendering", "Scene", "Sensor",
-    "Shot", "SplinePath", "Stage", "SyntheticSequence", "Tracks", "dynamic_mask", "film", "long_path", "make_sequence",
-    "measure_imu", "optical_flow", "random_path", "random_scene", "render", "trace", "tracks",
+    "FAMILIES", "HELD_OUT", "KINDS", "LONG_KINDS", "Body", "Flow", "Imu", "ImuNoise", "MeshScene", "Path", "Rendering",
+    "Scene", "Sensor", "Shot", "SplinePath", "Stage", "SyntheticSequence", "Tracks", "dynamic_mask", "film", "load_mesh",
+    "long_path", "make_sequence", "measure_imu", "mesh_scene", "optical_flow", "random_path", "random_scene", "render",
+    "trace", "tracks",
 ]  # fmt: skip

@@ -146,8 +146,9 @@ def _plan(
 
 
 @lru_cache(maxsize=4)
-def _scene(seed: int, number: int) -> Scene:
-    return random_scene(int(np.random.default_rng([seed, number]).integers(2**31)), pool=texture_pool(seed))
+def _scene(seed: int, number: int, textures: str | None) -> Scene:
+    pool = texture_pool(seed, folder=textures)
+    return random_scene(int(np.random.default_rng([seed, number]).integers(2**31)), pool=pool)
 
 
 def make_clip(
@@ -162,6 +163,7 @@ def make_clip(
     sensor: bool = True,
     clips_per_scene: int = 2,
     supersample: int = 1,
+    textures: str | None = None,
 ) -> Clip:
     """Draw clip ``index`` of the endless stream ``seed``: same arguments, same bytes (on one machine).
 
@@ -175,6 +177,7 @@ def make_clip(
         sensor: False returns clean renderings.
         clips_per_scene: neighbouring indices that share a scene; more is faster and less varied.
         supersample: rays per pixel edge for the colours.
+        textures: folder of photographs to paint with; None: those that scikit-image ships.
 
     Raises:
         DvoError: sizes or flow range out of order.
@@ -183,7 +186,7 @@ def make_clip(
         raise DvoError("a clip needs 2 frames or more of 16x16 pixels or more", field="frames, height, width")
     if not 0 < flow_range[0] <= flow_range[1]:
         raise DvoError(f"not a range: {flow_range}", field="flow_range", remedy="give low <= high, in pixels")
-    scene = _scene(seed, index // clips_per_scene)
+    scene = _scene(seed, index // clips_per_scene, textures)
     rng = np.random.default_rng([seed, 7301, index])
     target = float(np.exp(rng.uniform(*np.log(flow_range))))
     rhythm = _rhythm(rng, frames)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from dvo.synth.scene import CELL, Scene
@@ -33,9 +35,10 @@ def _blocked(start: Array, end: Array, scene: Scene, occluders: Array) -> Array:
 
 def bake(
     scene: Scene, rng: np.random.Generator, *, lamps: int = 0, sun: bool = False, glowing: Array | None = None,
-    shadows: bool = True, texel: float = 0.5,
+    shadows: bool = True, texel: float = 0.5, exposure: float = 1.0,
+    bend: Callable[[Array, Array, Array], Array] | None = None,
 ) -> None:  # fmt: skip
-    """Fill the scene's light maps in place; the median brightness of the result is about 1.
+    """Fill the scene's light maps in place; the median brightness of the result is about ``exposure``.
 
     Args:
         scene: surfaces to light.
@@ -45,6 +48,8 @@ def bake(
         glowing: indices of surfaces that shine by themselves (sky): constant light 1, cast no shadow.
         shadows: trace shadow rays.
         texel: aim for this edge of a light texel, in units of a quarter of the scene's scale.
+        exposure: below 1 where what faces the light is bright and wide (a floor in the sun).
+        bend: from points ``(M, 3)``, their normals and surfaces to the normals to shade with (smooth hills).
     """
     count = len(scene)
     glow = np.zeros(count, bool)
@@ -69,6 +74,8 @@ def bake(
     uv = low[owner] + (0.02 + 0.96 * grid) * extent[owner]  # a little inside, or walls would shade their own corners
     points = scene.origin[owner] + uv[:, :1] * scene.u_axis[owner] + uv[:, 1:] * scene.v_axis[owner]
     normal = scene.normal[owner]
+    if bend is not None:
+        normal = bend(points, normal, owner)
     double = scene.two_sided[owner]
     area = np.where(glow, -1.0, extent.prod(1))
     occluders = np.argsort(-area)[:MAX_OCCLUDERS]
@@ -107,7 +114,7 @@ def bake(
         light = light + strength[:, None] * tint
     visible = ~glow[owner]
     level = np.median(light[visible].mean(1)) if visible.any() else 1.0
-    light = light / max(level, 1e-6)
+    light = light / max(level, 1e-6) * exposure
     light[~visible] = 1.0
     scene.light[owner, local // cells[owner, 0], local % cells[owner, 0]] = np.clip(light, 0.12, 1.9)
     scene.light_map = mapping

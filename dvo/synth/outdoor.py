@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvo.synth.furnishing import UP, WALLS, any_rotation, paint_object, scatter, yaw
+from dvo.synth.furnishing import UP, WALLS, paint_object, scatter, yaw
 from dvo.synth.lighting import bake
 from dvo.synth.scene import Scene, SceneBuilder
 from dvo.synth.textures import TexturePool
+from dvo.synth.vegetation import sky as sky_box
+from dvo.synth.vegetation import tree
 
 Array = np.ndarray
-
-
-def _sky(b: SceneBuilder, radius: float) -> list[int]:
-    """A far box of sky; returns its surfaces (they glow)."""
-    first = len(b.rows)
-    paint = b.material("sky", metres=(radius * 1.5, radius * 3), contrast=(0.3, 1.1), bright=1.3)
-    b.box([0, 0, 0], [radius, radius, radius], np.eye(3), [paint], inside=True, faces="xXyYZ")
-    return list(range(first, len(b.rows)))
 
 
 def _building(b: SceneBuilder, x: float, y: float, half: Array, sign: float) -> None:
@@ -56,31 +50,12 @@ def _car(b: SceneBuilder, spot: Array, turned: Array) -> None:
             )
 
 
-def _tree(b: SceneBuilder, spot: Array) -> None:
-    rng = b.rng
-    trunk, crown = rng.uniform(1.2, 3), rng.uniform(0.8, 2.2)
-    b.prism(spot, rng.uniform(0.08, 0.25), trunk + crown, 6, b.material("floor", "stone", metres=(0.4, 1), bright=0.6))
-    paint = b.material("plant", metres=(1, 3))
-    for _ in range(int(rng.integers(3, 7))):  # crown of tilted boards
-        rotation = any_rotation(rng)
-        centre = spot + [0, 0, trunk + crown * 0.7] + rng.normal(0, 0.35, 3) * crown
-        angle = np.sort(rng.uniform(0, 2 * np.pi, 4))
-        if np.diff(angle, append=angle[0] + 2 * np.pi).max() > 2.8:
-            angle = np.arange(4) * np.pi / 2
-        ring = (
-            crown
-            * rng.uniform(0.5, 1)
-            * (np.cos(angle)[:, None] * rotation[:, 0] + np.sin(angle)[:, None] * rotation[:, 1])
-        )
-        b.polygon(centre + ring, paint, two_sided=True)
-
-
 def street(rng: np.random.Generator, pool: TexturePool) -> Scene:
     """Road between houses, with pavements, markings, cars, poles, trees and sky; y is along the street."""
     b = SceneBuilder(rng, pool)
     length, road = rng.uniform(35, 60), rng.uniform(3, 7)
     kerb = rng.uniform(1.5, 5)
-    sky = _sky(b, 600.0)
+    sky = sky_box(b, 600.0)
     b.rectangle([0, 0, 0], UP, [0, 1, 0], 400, 400, b.material("ground", "stone", metres=(2, 6)))
     b.rectangle([0, 0, 0.01], UP, [0, 1, 0], 2 * road, 2 * length, b.material("road", metres=(3, 8)))
     pave = b.material("floor", "stone", "road", "ground", metres=(1.5, 5))
@@ -99,13 +74,13 @@ def street(rng: np.random.Generator, pool: TexturePool) -> Scene:
                 _building(b, sign * (road + kerb + rng.uniform(0, 2.5)), y + half[1], half, sign)
             else:
                 for _ in range(2):
-                    _tree(b, np.array([sign * (road + kerb + rng.uniform(0, 4)), y + rng.uniform(0, 2) * half[1], 0]))
+                    tree(b, np.array([sign * (road + kerb + rng.uniform(0, 4)), y + rng.uniform(0, 2) * half[1], 0]))
             y += 2 * half[1] + (rng.uniform(0, 6) if rng.random() < 0.4 else 0.0)
         for y in np.arange(-length, length, rng.uniform(7, 16)):
             spot = np.array([sign * (road + rng.uniform(0.3, 1)), y + rng.uniform(-2, 2), 0.0])
             kind = rng.random()
             if kind < 0.35:
-                _tree(b, spot)
+                tree(b, spot)
             elif kind < 0.6:
                 b.prism(spot, rng.uniform(0.05, 0.15), rng.uniform(3, 7), 5, b.material("plain", "stone", bright=0.7))
                 sign_paint = b.material("poster", "cloth", "photo", metres=(0.5, 1.5))
@@ -131,7 +106,7 @@ def clutter(rng: np.random.Generator, pool: TexturePool) -> Scene:
     """Ground, a far wall or two, and boxes, poles and boards at all depths under a sky."""
     b = SceneBuilder(rng, pool)
     size = float(np.exp(rng.uniform(np.log(3), np.log(14))))
-    sky = _sky(b, 40 * size)
+    sky = sky_box(b, 40 * size)
     b.rectangle(
         [0, 0, 0],
         UP,
@@ -168,7 +143,7 @@ def clutter(rng: np.random.Generator, pool: TexturePool) -> Scene:
                 paint_object(b, (0.2, 1), 0.3),
             )
         elif size > 6:
-            _tree(b, spot * [1, 1, 0])
+            tree(b, spot * [1, 1, 0])
     low, high = np.array([-1, -1, 0.1]) * size, np.array([1, 1, 0.9]) * size
     scatter(b, low, high, int(rng.integers(2, 14)), 0.08 * size)
     bounds = np.array([[-1.1, -1.1, 0.06], [1.1, 1.1, 0.8]]) * size

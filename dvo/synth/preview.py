@@ -1,16 +1,16 @@
-"""Contact sheets of clips: frames, depth, flow, plan of the path. ``python -m dvo.synth.preview --out sheet.png``."""
+"""Contact sheets of clips: frames, depth, flow, plan of the path (``dvo synth preview``)."""
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
+import torch
 
-from dvo.errors import DvoError
 from dvo.synth.clip import Clip, make_clip
-from dvo.synth.poses import inverse, split
+from dvo.synth.poses import compose, inverse, split
+from dvo.synth.sequence import SyntheticSequence, make_sequence
 
 Array = np.ndarray
 
@@ -19,6 +19,7 @@ def depth_colours(depth: Array) -> Array:
     """``(H, W)`` depth (unit: median 1) -> ``(H, W, 3)`` uint8 RGB; near is bright, by inverse depth."""
     level = np.clip(1 / np.maximum(depth, 1e-3) / 2.5, 0, 1)
     table = cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+    table[depth <= 0] = 0  # nothing there
     return np.ascontiguousarray(table[..., ::-1])
 
 
@@ -68,7 +69,7 @@ def clip_row(clip: Clip, columns: int = 4) -> Array:
     """One row ``(H, (columns + 3) W, 3)``: evenly chosen frames, depth and flow of the first, plan view."""
     images = clip.images.cpu().numpy().transpose(0, 2, 3, 1)
     chosen = np.linspace(0, len(images) - 1, columns).round().astype(int)
-    flow = flow_between(clip, 0, 1)
+    flow = flow_between(clip, 0, 1) * (clip.depth[0] > 0).cpu().numpy()[..., None]
     cells = [
         *images[chosen],
         depth_colours(clip.depth[0].cpu().numpy()),
@@ -84,25 +85,38 @@ def contact_sheet(seed: int = 0, count: int = 12, *, start: int = 0, **options: 
     return np.concatenate(rows, 0)
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="PNG to write")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--start", type=int, default=0, help="index of the first clip")
-    parser.add_argument("--count", type=int, default=12)
-    parser.add_argument("--height", type=int, default=120)
-    parser.add_argument("--width", type=int, default=160)
-    parser.add_argument("--clean", action="store_true", help="no sensor effects")
-    given = parser.parse_args(arguments)
-    sheet = contact_sheet(
-        given.seed, given.count, start=given.start, height=given.height, width=given.width, sensor=not given.clean,
-        clips_per_scene=1,
+def sequence_rows(sequence: SyntheticSequence, columns: int = 4) -> Array:
+    """One row of a sequence, as :func:`clip_row` has it; the flow is that over a tenth of a second."""
+    poses_wc, times = sequence.groundtruth.poses_wc, sequence.groundtruth.timestamps
+    chosen = np.linspace(0, len(sequence) - 1, columns).round().astype(int)
+    pictures = [sequence.rendering(int(index)) for index in chosen]
+    depth = torch.cat([picture.depth for picture in pictures])
+    seen = depth[depth > 0]
+    scale = float(seen.median()) if len(seen) else 1.0
+    near = int(np.searchsorted(times, times[0] + 0.1).clip(1, len(sequence) - 1)) if len(sequence) > 1 else 0
+    shown = np.unique(np.concatenate([[0, near], np.linspace(0, len(sequence) - 1, 24).round().astype(int)]))
+    relative = compose(inverse(poses_wc[shown]), poses_wc[:1])
+    relative[:, :3] /= scale
+    # The frames for the pictures, two poses for the flow, some more for the plan.
+    images = torch.cat([(picture.images * 255).round().to(torch.uint8) for picture in pictures]).cpu()
+    picture_clip = Clip(
+        images, depth.cpu() / scale, torch.from_numpy(relative),
+        torch.from_numpy(np.tile(np.asarray(sequence.camera.intrinsics, float), (len(shown), 1))),
     )  # fmt: skip
-    if not cv2.imwrite(str(given.out), sheet[..., ::-1]):
-        raise DvoError("cannot write the picture", file=given.out, remedy="give a path that ends in .png")
-    print(f"{given.out}: {given.count} clips of stream {given.seed}")
+    return clip_row(picture_clip, columns)
 
 
-if __name__ == "__main__":
-    main()
+def family_sheet(
+    names: Sequence[str], seeds: Sequence[int], height: int, width: int, *, textures: str | None = None
+) -> Array:
+    """Sheet of clean sequences of six seconds, a row for each family and seed, with its name on it."""
+    rows = []
+    for name, seed in zip(names, seeds, strict=True):
+        sequence = make_sequence(
+            seed, frames=60, height=height, width=width, fps=10, family=name, sensor=False, textures=textures
+        )
+        row = np.ascontiguousarray(sequence_rows(sequence))
+        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(row, name, (4, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+        rows.append(row)
+    return np.concatenate(rows)

@@ -17,6 +17,7 @@ from torch import Tensor
 from dvo.errors import DvoError
 from dvo.synth.antialias import smooth_outlines
 from dvo.synth.bodies import Stage
+from dvo.synth.mesh import MeshScene, mesh_depth, render_mesh, trace_mesh
 from dvo.synth.scene import CELL, Scene
 from dvo.synth.textures import sample
 from dvo.synth.view import SLACK, View, look
@@ -152,11 +153,13 @@ def sight(
 
 
 def render_depth(
-    scene: Scene | Stage, poses_wc: object, intrinsics: object, height: int, width: int, *,
+    scene: Scene | Stage | MeshScene, poses_wc: object, intrinsics: object, height: int, width: int, *,
     device: torch.device | str = "cpu", times: object = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
     poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        return mesh_depth(scene, poses, k, height, width, device)
     _, view = sight(scene, poses, k, (height, width), times)
     nearest, local, _ = cast(view, height, width, device)
     return torch.where(local >= 0, 1 / nearest, 0.0), named(view, local)
@@ -192,7 +195,7 @@ def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:
 
 
 def render(
-    scene: Scene | Stage,
+    scene: Scene | Stage | MeshScene,
     poses_wc: object,
     intrinsics: object,
     height: int,
@@ -208,7 +211,8 @@ def render(
     """Render N frames.
 
     Args:
-        scene: what to render; a :class:`Stage` has bodies that move.
+        scene: what to render; a :class:`Stage` has bodies that move; of a mesh, ``surface`` is the triangle and ``uv``
+            the barycentric weights of its second and third corner.
         poses_wc: ``(N, 7)`` camera to world, tensor or array.
         intrinsics: ``(N, 4)`` or ``(4,)`` fx fy cx cy in pixels of the ``height`` x ``width`` image.
         height, width: image size in pixels.
@@ -223,6 +227,13 @@ def render(
         DvoError: poses or intrinsics of the wrong shape or not finite, or bodies without times.
     """
     poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        rays = max(supersample, 2 if antialias else 1)
+        return Rendering(
+            *render_mesh(
+                scene, poses, k, height, width, supersample=rays, device=device, taps=taps, coordinates=coordinates
+            )
+        )
     painted, view = sight(scene, poses, k, (height, width), times)
     nearest, local, functions = cast(view, height, width, device)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
@@ -253,7 +264,7 @@ def coordinates_of(view: View, local: Tensor, depth: Tensor) -> Tensor:
 
 
 def trace(
-    scene: Scene | Stage, poses_wc: object, intrinsics: object, pixels: Array, times: object = None,
+    scene: Scene | Stage | MeshScene, poses_wc: object, intrinsics: object, pixels: Array, times: object = None,
     size: tuple[int, int] | None = None,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """What single rays hit, in float64: the reference for tests and for tracks.
@@ -269,6 +280,8 @@ def trace(
         depth ``(N, M)``, surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
     """
     poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        return trace_mesh(scene, poses, k, pixels)
     _, view = sight(scene, poses, k, size, times)
     homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1).swapaxes(1, 2)  # (N, 3, M)
     if not len(view.index):

@@ -175,9 +175,14 @@ class SceneBuilder:
         return Material(texture, repeat, tint * strength, tint * (1 - strength) * mean, turn, whole)
 
     def polygon(
-        self, corners: ArrayLike, material: Material, *, up: Array | None = None, two_sided: bool = False
-    ) -> None:
-        """Add a convex planar polygon ``(3 or 4, 3)``, corners counter-clockwise seen from the front."""
+        self, corners: ArrayLike, material: Material, *, up: Array | None = None, two_sided: bool = False,
+        drape: Array | None = None,
+    ) -> None:  # fmt: skip
+        """Add a convex planar polygon ``(3 or 4, 3)``, corners counter-clockwise seen from the front.
+
+        ``drape (2,)`` lays the texture on from above, shifted by that many texels, so that it goes on from one polygon
+        to the next.
+        """
         corners = np.asarray(corners, float)
         if len(corners) == 3:
             corners = np.concatenate([corners, corners[2:]])
@@ -186,12 +191,13 @@ class SceneBuilder:
             metres = max(metres, 0.8 * float(np.ptp(corners, axis=0).max()))
         density = self.pool.size / metres
         c, s = np.cos(material.turn) * density, np.sin(material.turn) * density
-        shift = self.rng.uniform(0, 2 * self.pool.size, 2)
+        shift = self.rng.uniform(0, 2 * self.pool.size, 2) if drape is None else drape
         self.rows.append(
             {
                 "corners": corners, "down": np.array([0.0, 0.0, -1.0]) if up is None else -np.asarray(up, float),
                 "two_sided": two_sided, "texture": material.texture,
                 "texture_map": [[c, -s, shift[0]], [s, c, shift[1]]], "gain": material.gain, "offset": material.offset,
+                "drape": drape is not None,
             }
         )  # fmt: skip
 
@@ -244,7 +250,7 @@ class SceneBuilder:
     def build(self, family: str, bounds: Array, scale: float, **hints: Any) -> Scene:
         """Stack everything and derive axes and edges (light is baked separately)."""
         rows: dict[str, Any] = {key: np.array([row[key] for row in self.rows]) for key in self.rows[0]}
-        corners, down = rows["corners"], rows.pop("down")
+        corners, down, drape = rows["corners"], rows.pop("down"), rows.pop("drape")
         first = corners[:, 1] - corners[:, 0]
         normal = _cross(first, corners[:, 2] - corners[:, 0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -261,6 +267,10 @@ class SceneBuilder:
         inward = np.stack([step[..., 1], -step[..., 0]], -1) / np.maximum(length, 1e-12)[..., None]
         edges = np.concatenate([inward, -(inward * flat).sum(-1, keepdims=True)], -1)
         edges[length < 1e-9] = [0, 0, 1]  # the edge that a triangle lacks
+        if drape.any():  # from (u, v, 1) to (x, y, 1) first
+            place = np.stack([u, v, origin], 2)[drape]
+            place[:, 2] = [0, 0, 1]
+            rows["texture_map"][drape] = rows["texture_map"][drape] @ place
         count = len(corners)
         return Scene(
             **rows, origin=origin, u_axis=u, v_axis=v, edges=edges, pool=self.pool, family=family,

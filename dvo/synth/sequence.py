@@ -187,6 +187,7 @@ def make_sequence(
     drop: float = 0.0,
     jpeg: int = 0,
     apart: bool = False,
+    textures: str | None = None,
 ) -> SyntheticSequence:
     """A smooth, realistic sequence through one scene.
 
@@ -210,8 +211,9 @@ def make_sequence(
         drop: chance that a frame is lost.
         jpeg: quality of compression, 0 for none.
         apart: take a scene that no training clip can show (a seed of ``APART`` or above).
+        textures: folder of photographs to paint with; None: those that scikit-image ships.
 
-    Everything after ``device`` is an effect and needs the sensor, except ``shake``, ``movers``, ``texture``, ``apart``.
+    ``shutter`` to ``jpeg`` are effects and need the sensor, except ``movers`` and ``texture``.
 
     Raises:
         DvoError: no such family or kind, or numbers out of order.
@@ -225,7 +227,8 @@ def make_sequence(
     if not 0 <= jpeg <= 100 or movers < 0 or lighting < 0 or not 0 <= blackout < frames / fps:
         raise DvoError("out of range", field="jpeg, movers, lighting, blackout", remedy="see make_sequence")
     rng = np.random.default_rng([seed, 7401])
-    scene = random_scene(int(rng.integers(2**31)) + (APART if apart else 0), family, pool=texture_pool(seed))
+    pool = texture_pool(seed, folder=textures)
+    scene = random_scene(int(rng.integers(2**31)) + (APART if apart else 0), family, pool=pool)
     name = kind or ("forward" if scene.hints.get("heading") is not None else "handheld")
     duration, path_seed = frames / fps, int(rng.integers(2**31))
     path = long_path(scene, path_seed, name, duration, speed=speed, shake=shake)

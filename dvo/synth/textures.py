@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dvo.synth.patterns import PATTERNS, Rng
+from dvo.errors import DvoError
+from dvo.synth.patterns import PATTERNS, SPECIAL, Rng
 
 # Photographs inside the scikit-image wheel (read from its folder, so nothing is ever downloaded) and what they suit.
 PHOTOGRAPHS = {
@@ -40,6 +41,44 @@ def photographs() -> list[tuple[np.ndarray, str]]:
         image = cv2.imread(str(Path(spec.origin).parent / "data" / name), cv2.IMREAD_COLOR)
         if image is not None:
             found.append((cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255, tag))
+    return found
+
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
+MOST_PHOTOGRAPHS, EDGE = 96, 1024  # of a folder: how many a pool takes, and their longer edge in pixels
+TAGS = {tag for _, tag in (*PATTERNS.values(), *SPECIAL.values())} | {"photo"}
+
+
+def folder_photographs(folder: Path | str, seed: int) -> list[tuple[np.ndarray, str]]:
+    """RGB photographs in [0, 1] from a folder and its subfolders, with tags: up to ``MOST_PHOTOGRAPHS``, drawn by seed.
+
+    A subfolder named after a tag ("wall", "floor", "ground", ...) says what its pictures suit; others suit "photo".
+
+    Raises:
+        DvoError: no such folder, no pictures in it, or one that cannot be read.
+    """
+    folder = Path(folder)
+    remedy = f"give a folder with pictures ({', '.join(SUFFIXES[:3])}, ...)"
+    if not folder.is_dir():
+        raise DvoError("no such folder", file=folder, field="textures", remedy=remedy)
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES and file.is_file())
+    if not files:
+        raise DvoError("no pictures in it", file=folder, field="textures", remedy=remedy)
+    if len(files) > MOST_PHOTOGRAPHS:
+        chosen = np.random.default_rng([seed, 7003]).choice(len(files), MOST_PHOTOGRAPHS, replace=False)
+        files = [files[i] for i in sorted(chosen)]
+    found = []
+    for file in files:
+        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        if image is None:
+            raise DvoError("cannot be read as a picture", file=file, field="textures", remedy="mend or remove the file")
+        if min(image.shape[:2]) < 16:
+            raise DvoError("smaller than 16 pixels", file=file, field="textures", remedy="remove the file")
+        shrink = EDGE / max(image.shape[:2])
+        if shrink < 1:
+            image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        tag = file.parent.name if file.parent.name in TAGS else "photo"
+        found.append((cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255, tag))
     return found
 
 
@@ -76,8 +115,12 @@ class TexturePool:
 
     Args:
         seed: same seed, same textures (on one machine, with the same packages).
-        count: number of textures.
+        count: number of textures, not counting the special ones.
         size: edge length of level 0 in texels, a power of two.
+        folder: photographs to use in place of scikit-image's.
+
+    Raises:
+        DvoError: no pictures in the folder, or one that cannot be read.
 
     Attributes:
         atlas: ``(3, H, W)`` float32 in [0, 1]; cells of textures that were never used are black.
@@ -85,15 +128,19 @@ class TexturePool:
         tags: what each texture suits ("wall", "floor", "photo", ...).
     """
 
-    def __init__(self, seed: int, count: int, size: int) -> None:
+    def __init__(self, seed: int, count: int, size: int, folder: Path | str | None = None) -> None:
         self.seed, self.count, self.size, self.levels = seed, count, size, size.bit_length() - 1
         self.columns = int(np.ceil(np.sqrt(1.5 * count)))
-        rows = -(-count // self.columns)
+        # Special patterns follow the others, so that scenes which ask for none of them look as they do without.
+        special = [name for name in SPECIAL for _ in range(max(1, count // 56))]
+        total = count + len(special)
+        rows = -(-total // self.columns)
         self.atlas = torch.zeros(3, rows * size * 3 // 2, self.columns * size)
-        self._photos = photographs()
-        self._ready = np.zeros(count, bool)
-        self._mean = np.zeros((count, 3))
+        self._photos = photographs() if folder is None else folder_photographs(folder, seed)
+        self._ready = np.zeros(total, bool)
+        self._mean = np.zeros((total, 3))
         self._copies: dict[str, tuple[Tensor, np.ndarray]] = {}
+        self._patterns = PATTERNS | SPECIAL
         # Every pattern at least once, then by weight.
         names = list(PATTERNS)
         weights = np.array([WEIGHTS.get(name, 1.0) for name in names])
@@ -102,7 +149,8 @@ class TexturePool:
         self._sources: list[str | int] = [
             i // 3 % len(self._photos) if self._photos and i % 3 == 2 else str(next(plan)) for i in range(count)
         ]
-        self.tags = [self._photos[s][1] if isinstance(s, int) else PATTERNS[s][1] for s in self._sources]
+        self._sources += special
+        self.tags = [self._photos[s][1] if isinstance(s, int) else self._patterns[s][1] for s in self._sources]
 
     def cell(self, index: int) -> tuple[int, int]:
         """Top and left of a texture's cell in the atlas."""
@@ -116,7 +164,7 @@ class TexturePool:
             if isinstance(source, int):
                 image = _window(rng, self._photos[source][0], self.size)
             else:
-                image = PATTERNS[source][0](rng, self.size)
+                image = self._patterns[source][0](rng, self.size)
             top, left = self.cell(index)
             cell = self.atlas[:, top : top + self.size * 3 // 2, left : left + self.size].numpy()
             _fill_cell(cell, np.clip(image, 0, 1), self.levels)
@@ -130,7 +178,7 @@ class TexturePool:
             return self.atlas[None]
         key = str(device)
         if key not in self._copies:
-            self._copies[key] = (torch.zeros_like(self.atlas, device=device), np.zeros(self.count, bool))
+            self._copies[key] = (torch.zeros_like(self.atlas, device=device), np.zeros(len(self._ready), bool))
         copy, there = self._copies[key]
         for index in np.flatnonzero(self._ready & ~there).tolist():
             top, left = self.cell(index)
@@ -146,9 +194,9 @@ class TexturePool:
 
 
 @lru_cache(maxsize=4)
-def texture_pool(seed: int, count: int = 224, size: int = 256) -> TexturePool:
-    """The pool of a seed, one object per process."""
-    return TexturePool(seed, count, size)
+def texture_pool(seed: int, count: int = 224, size: int = 256, *, folder: Path | str | None = None) -> TexturePool:
+    """The pool of a seed (and of a folder of photographs), one object per process."""
+    return TexturePool(seed, count, size, folder)
 
 
 def sample(

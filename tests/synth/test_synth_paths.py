@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dvo.cli import main
 from dvo.errors import DvoError
-from dvo.synth import FAMILIES, KINDS, preview, random_path, random_scene
+from dvo.synth import FAMILIES, KINDS, random_path, random_scene
 from dvo.synth.clip import make_sequence
 from dvo.synth.poses import compose, inverse, matrix_to_quaternion, quaternion_to_matrix, se3_exp, so3_exp, split
 from dvo.synth.scene import Scene
@@ -94,7 +95,7 @@ def test_sequence_is_a_source_of_frames() -> None:
 
 def test_contact_sheet_is_written(tmp_path: Path) -> None:
     out = tmp_path / "sheet.png"
-    preview.main(["--out", str(out), "--seed", "5", "--count", "1", "--height", "48", "--width", "64"])
+    assert main(["synth", "preview", "clips", "--out", str(out), "--seed", "5", "--rows", "1", "--size", "64x48"]) == 0
     sheet = cv2.imread(str(out))
     assert sheet.shape == (48, 7 * 64, 3)
     assert all(sheet[:, i * 64 : (i + 1) * 64].std() > 1 for i in range(7)), "a cell is empty"

@@ -1,0 +1,95 @@
+"""``dvo synth preview | export``: look at scenes and meshes, and write sequences of them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from dvo.commands.console import device_of
+from dvo.errors import DvoError
+from dvo.synth import FAMILIES, HELD_OUT, MeshScene, load_mesh
+from dvo.synth.export import export_sequence, mesh_sequence
+from dvo.synth.preview import contact_sheet, family_sheet, sequence_rows
+from dvo.synth.sequence import SyntheticSequence, make_sequence
+
+
+def preview(arguments: argparse.Namespace) -> int:
+    """A contact sheet of a family, of a mesh, of training clips or of all families."""
+    out = Path(arguments.out)
+    if not out.parent.is_dir() or out.suffix.lower() not in (".png", ".jpg"):
+        raise DvoError("cannot be written", file=out, field="--out", remedy="name a .png in a folder that exists")
+    width, height = arguments.size
+    known = FAMILIES | HELD_OUT
+    if arguments.source == "clips":  # what training sees
+        sheet = contact_sheet(
+            arguments.seed, arguments.rows or 8, height=height, width=width, clips_per_scene=1,
+            textures=arguments.textures,
+        )  # fmt: skip
+    elif arguments.source is None or arguments.source in known:
+        names = list(known) if arguments.source is None else [arguments.source] * (arguments.rows or 4)
+        seeds = [arguments.seed + (i if arguments.source else 0) for i in range(len(names))]
+        sheet = family_sheet(names, seeds, height, width, textures=arguments.textures)
+    else:
+        if arguments.textures is not None:
+            raise DvoError("a mesh brings its own textures", field="--textures", remedy="leave it out")
+        rows = arguments.rows or 3
+        mesh = _mesh(arguments, arguments.source)
+        sheet = np.concatenate(
+            [
+                sequence_rows(mesh_sequence(mesh, arguments.seed + i, frames=60, height=height, width=width, fps=10))
+                for i in range(rows)
+            ]
+        )
+    if not cv2.imwrite(str(out), sheet[..., ::-1]):
+        raise DvoError("cannot be written", file=out, field="--out", remedy="name a file elsewhere")
+    print(f"{out}: frames, depth (near is red), flow (hue is direction), path from above")
+    return 0
+
+
+def export(arguments: argparse.Namespace) -> int:
+    """A sequence in the layout of TUM RGB-D or TartanAir."""
+    width, height = arguments.size
+    device = device_of(arguments.device)
+    sequence: SyntheticSequence
+    if arguments.mesh is not None:
+        for option, given in (("--textures", arguments.textures), ("--sensor", arguments.sensor or None)):
+            if given is not None:
+                raise DvoError("does not go with --mesh", field=option, remedy="leave it out")
+        sequence = mesh_sequence(
+            _mesh(arguments, arguments.mesh), arguments.seed, frames=arguments.frames, height=height, width=width,
+            fps=arguments.fps, kind=arguments.path, name=Path(arguments.mesh).stem, device=device,
+        )  # fmt: skip
+    else:
+        sequence = make_sequence(
+            arguments.seed, frames=arguments.frames, height=height, width=width, fps=arguments.fps,
+            family=arguments.family, kind=arguments.path, sensor=arguments.sensor, textures=arguments.textures,
+            device=device,
+        )  # fmt: skip
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("rendering", total=arguments.frames)
+        notes = export_sequence(
+            sequence, arguments.out, arguments.layout, on_frame=lambda done: progress.update(task, completed=done)
+        )
+    for note in notes:
+        print(f"dvo: note: {note}", file=sys.stderr)
+    print(f"{arguments.out}: {arguments.frames} frames of {sequence.name}, {width}x{height}, {arguments.layout} layout")
+    print(f"track it: dvo run {arguments.out}")
+    return 0
+
+
+def _mesh(arguments: argparse.Namespace, path: str) -> MeshScene:
+    if Path(path).suffix == "" and not Path(path).exists():
+        known = ", ".join(FAMILIES | HELD_OUT)
+        raise DvoError(f"neither a mesh file nor a family: {path}", field="SOURCE", remedy=f"families: {known}")
+    scene = load_mesh(path, up=arguments.up, view=arguments.view, light=not arguments.unlit, seed=arguments.seed)
+    where = "within" if scene.space.inside else "around"
+    print(f"{path}: {len(scene):,} triangles; the camera moves {where} it", file=sys.stderr)
+    for warning in scene.warnings:
+        print(f"dvo: warning: {warning}", file=sys.stderr)
+    return scene

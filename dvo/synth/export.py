@@ -1,0 +1,195 @@
+"""Sequences as files in the layouts of TUM RGB-D and TartanAir, and scenes as triangles for other renderers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import torch
+
+from dvo.data.poses import NED_FROM_CAMERA, pose_matrices, poses_from_matrices
+from dvo.data.trajectory import Trajectory, write_tum
+from dvo.errors import DvoError
+from dvo.geometry.camera import Camera
+from dvo.synth.mesh import MeshScene
+from dvo.synth.poses import inverse, split
+from dvo.synth.scene import Scene
+from dvo.synth.sensor import random_intrinsics
+from dvo.synth.sequence import SyntheticSequence
+from dvo.synth.walks import long_path
+
+Array = np.ndarray
+Layout = Literal["tum", "tartanair"]
+TUM_FACTOR = 5000  # units of a metre in TUM's 16-bit depth
+# TartanAir's codes of flow that has no counterpart.
+OCCLUDED, OUT_OF_VIEW = 1, 100
+
+
+def scene_triangles(scene: Scene) -> tuple[Array, Array, Array]:
+    """Vertices ``(V, 3)``, faces ``(F, 3)`` counter-clockwise from the front, the surface of each face ``(F,)``."""
+    count = len(scene)
+    faces = np.arange(count)[:, None] * 4 + np.array([[0, 1, 2, 0, 2, 3]])
+    is_triangle = (scene.corners[:, 2] == scene.corners[:, 3]).all(1)
+    keep = np.stack([np.ones(count, bool), ~is_triangle], 1).ravel()
+    owner = np.repeat(np.arange(count), 2)
+    return scene.corners.reshape(-1, 3), faces.reshape(-1, 3)[keep], owner[keep]
+
+
+def mesh_sequence(
+    scene: MeshScene, seed: int, *, frames: int = 100, height: int = 240, width: int = 320, fps: float = 30.0,
+    kind: str | None = None, speed: float = 1.0, name: str = "mesh", device: torch.device | str = "cpu",
+) -> SyntheticSequence:  # fmt: skip
+    """Clean frames along a path around a mesh (an orbit) or through it (a hand-held walk).
+
+    Args:
+        seed: draws path and intrinsics; same seed, same bytes.
+        frames, height, width, fps: length and format.
+        kind: kind of path (``dvo.synth.KINDS``), to suit the mesh if None.
+        speed: 1 is a relaxed pace.
+        name: of the sequence.
+        device: where to render.
+
+    Raises:
+        DvoError: no such kind, sizes out of order, or no room for a camera.
+    """
+    if frames < 1 or height < 16 or width < 16 or fps <= 0:
+        raise DvoError("a sequence needs a frame or more of 16x16 pixels or more and fps > 0", field="frames, fps")
+    rng = np.random.default_rng([seed, 7601])
+    drawn = kind or ("handheld" if scene.space.inside else "orbit")
+    world: Any = scene  # planning asks it for bounds, clearance and depth, as it asks a Scene
+    path = long_path(world, int(rng.integers(2**31)), drawn, frames / fps, speed=speed)
+    fx, fy, cx, cy = random_intrinsics(rng, height, width).tolist()
+    camera = Camera(fx, fy, cx, cy, width, height)
+    times = np.arange(frames) / fps
+    truth = Trajectory(times, path.poses_wc(times))
+    return SyntheticSequence(f"{name}-{drawn}-{seed}", camera, truth, world, path, None, seed, device=device)
+
+
+def export_sequence(
+    sequence: SyntheticSequence, out: Path | str, layout: Layout, *, on_frame: Callable[[int], None] | None = None
+) -> list[str]:
+    """Write a sequence; returns notes on what the layout cannot hold.
+
+    ``tum``: ``rgb/``, ``depth/`` (16 bit, 5000 to a metre, 0 for none or beyond 13.1 m), ``rgb.txt``, ``depth.txt``,
+    ``groundtruth.txt``. ``tartanair``: ``image_left/``, ``depth_left/*.npy`` (metres, float32, 0 for none), ``flow/``
+    with masks (0 valid, 1 occluded, 100 out of view), ``pose_left.txt`` (camera x forward, y right, z down; the world's
+    z axis points up, unlike TartanAir's), ``imu/cam_time.txt``. Both: ``calib.txt`` with fx fy cx cy.
+
+    Args:
+        out: folder, new or empty.
+        on_frame: called with the number of frames written so far.
+
+    Raises:
+        DvoError: no such layout, or the folder holds something or cannot be written.
+    """
+    if layout not in ("tum", "tartanair"):
+        raise DvoError(f"no layout {layout!r}", field="layout", remedy="choose tum or tartanair")
+    out = Path(out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise DvoError("holds something already", file=out, field="--out", remedy="name a new folder")
+        numbers = " ".join(f"{value:.9f}" for value in sequence.camera.intrinsics)
+        (out / "calib.txt").write_text(f"# fx fy cx cy, pixels\n{numbers}\n", encoding="utf-8")
+        write = _write_tum if layout == "tum" else _write_tartanair
+        notes = write(_frames(sequence, on_frame), sequence, out)
+    except OSError as error:
+        raise DvoError(f"cannot be written ({error.strerror})", file=out, remedy="name a folder elsewhere") from error
+    return [*sequence.warnings, *notes]
+
+
+def _frames(sequence: SyntheticSequence, on_frame: Callable[[int], None] | None) -> Iterator[tuple[int, Array, Array]]:
+    """Index, image ``(H, W, 3)`` uint8, depth ``(H, W)`` float32."""
+    for index in range(len(sequence)):
+        clean = sequence.rendering(index)
+        if sequence.sensor is None:
+            image = (clean.images[0] * 255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
+        else:
+            image = sequence.frame(index).image
+        yield index, image, clean.depth[0].cpu().numpy()
+        if on_frame is not None:
+            on_frame(index + 1)
+
+
+def _write_picture(path: Path, picture: Array) -> None:
+    picture = picture[..., ::-1] if picture.ndim == 3 else picture
+    if not cv2.imwrite(str(path), picture):
+        raise DvoError("cannot be written", file=path, remedy="name a folder elsewhere")
+
+
+def _write_tum(frames: Iterator[tuple[int, Array, Array]], sequence: SyntheticSequence, out: Path) -> list[str]:
+    (out / "rgb").mkdir()
+    (out / "depth").mkdir()
+    times = sequence.groundtruth.timestamps.round(6)  # as the names state them
+    lists: dict[str, list[str]] = {"rgb": ["# timestamp filename"], "depth": ["# timestamp filename"]}
+    beyond = total = 0
+    for index, image, depth in frames:
+        stamp = f"{times[index]:.6f}"
+        units = np.rint(depth.astype(float) * TUM_FACTOR)
+        beyond += int((units > 65535).sum())
+        total += depth.size
+        _write_picture(out / "rgb" / f"{stamp}.png", image)
+        _write_picture(out / "depth" / f"{stamp}.png", np.where(units > 65535, 0, units).astype(np.uint16))
+        for kind, rows in lists.items():
+            rows.append(f"{stamp} {kind}/{stamp}.png")
+    for kind, rows in lists.items():
+        (out / f"{kind}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    write_tum(out / "groundtruth.txt", Trajectory(times, sequence.groundtruth.poses_wc))
+    far = 65535 / TUM_FACTOR
+    return [f"{beyond / total:.1%} of the depths exceed {far:.1f} m and are written as 0 (none)"] if beyond else []
+
+
+def _write_tartanair(frames: Iterator[tuple[int, Array, Array]], sequence: SyntheticSequence, out: Path) -> list[str]:
+    for folder in ("image_left", "depth_left", "flow", "imu"):
+        (out / folder).mkdir()
+    poses = sequence.groundtruth.poses_wc
+    matrices = pose_matrices(poses)
+    matrices[..., :3, :3] = matrices[..., :3, :3] @ NED_FROM_CAMERA.T
+    np.savetxt(out / "pose_left.txt", poses_from_matrices(matrices), fmt="%.9f")
+    np.savetxt(out / "imu" / "cam_time.txt", sequence.groundtruth.timestamps, fmt="%.9f")
+    before: Array | None = None
+    for index, image, depth in frames:
+        _write_picture(out / "image_left" / f"{index:06d}_left.png", image)
+        np.save(out / "depth_left" / f"{index:06d}_left_depth.npy", depth)
+        if before is not None:
+            flow, mask = static_flow(before, depth, poses[index - 1 : index + 1], sequence.camera.intrinsics)
+            name = f"{index - 1:06d}_{index:06d}"
+            np.save(out / "flow" / f"{name}_flow.npy", flow)
+            np.save(out / "flow" / f"{name}_mask.npy", mask)
+        before = depth
+    return []
+
+
+def static_flow(first: Array, second: Array, poses_wc: Array, intrinsics: Any) -> tuple[Array, Array]:
+    """Flow of a static scene from one frame to another, by depth and pose.
+
+    Args:
+        first, second: ``(H, W)`` depth, 0 for none (a background at infinity).
+        poses_wc: ``(2, 7)``; intrinsics: fx fy cx cy.
+
+    Returns:
+        ``(H, W, 2)`` float32 pixels; ``(H, W)`` uint8 mask: 0 valid, 1 occluded, 100 out of view.
+    """
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    height, width = first.shape
+    y, x = np.mgrid[:height, :width]
+    (r0, t0), (r1, t1) = split(poses_wc[0]), split(inverse(poses_wc[1]))
+    ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones(first.shape)], -1)
+    near = first[..., None].astype(float) > 0
+    points = np.where(near, (ray * first[..., None]) @ r0.T + t0, ray @ r0.T)
+    local = np.where(near, points @ r1.T + t1, points @ r1.T)
+    z = local[..., 2]
+    safe = np.where(z > 1e-6, z, np.nan)
+    u, v = fx * local[..., 0] / safe + cx, fy * local[..., 1] / safe + cy
+    there = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
+    column, row = (np.where(there, at, 0).round().astype(int) for at in (u, v))
+    column, row = column.clip(0, width - 1), row.clip(0, height - 1)
+    # Hidden where all that is seen around the spot is nearer (around: the spot lies between pixels).
+    seen = np.where(second > 0, second, np.inf)
+    around = cv2.dilate(np.where(np.isfinite(seen), seen, 1e9).astype(np.float32), np.ones((3, 3)))[row, column]
+    hidden = there & (around < 0.99 * np.where(near[..., 0], z, 1e8))
+    mask = np.where(~there, OUT_OF_VIEW, np.where(hidden, OCCLUDED, 0)).astype(np.uint8)
+    return np.nan_to_num(np.stack([u - x, v - y], -1)).astype(np.float32), mask

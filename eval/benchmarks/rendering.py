@@ -1,0 +1,115 @@
+"""Speed of the renderer, and whether training waits for it.
+
+``python -m eval.benchmarks.rendering [--frames 8] [--clips 5] [--steps 3] [--threads 1]``
+
+Prints frames per second of clean frames at three sizes, on the CPU and on the accelerator where there is one, for a
+scene of each family; then the time to draw one training clip beside that of one training step of the small recipe
+(configs/train/small.yaml), both with the same threads, one after the other. In training a worker process renders on a
+core of its own, so that training waits only where the ratio exceeds 1 (times the processes that training uses).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from dvo.allocator import reuse_freed_memory
+from dvo.synth import FAMILIES, random_path, random_scene, render
+from dvo.synth.clip import make_clip
+from dvo.synth.textures import texture_pool
+
+SIZES = ((120, 160), (240, 320), (480, 640))
+RECIPE = Path(__file__).resolve().parents[2] / "configs" / "train" / "small.yaml"
+
+
+def frames_per_second(device: torch.device, frames: int) -> list[tuple[str, list[float]]]:
+    """For each family (and their mean time, last), frames a second at ``SIZES``."""
+    rows, seconds = [], np.zeros((len(FAMILIES), len(SIZES)))
+    for i, family in enumerate(FAMILIES):
+        scene = random_scene(0, family, pool=texture_pool(0))
+        poses = random_path(scene, 0, "handheld").scaled(0.3).poses_wc(np.arange(frames) / 20)
+        for j, (height, width) in enumerate(SIZES):
+            k = np.array([0.9 * width, 0.9 * width, (width - 1) / 2, (height - 1) / 2])
+            for timed in (False, True):  # the first run fills caches, and copies textures to the accelerator
+                start = time.perf_counter()
+                render(scene, poses, k, height, width, device=device, coordinates=False)
+                if device.type != "cpu":
+                    torch.accelerator.synchronize(device)
+                if timed:
+                    seconds[i, j] = (time.perf_counter() - start) / frames
+        rows.append((family, (1 / seconds[i]).tolist()))
+    rows.append(("mean", (1 / seconds.mean(0)).tolist()))
+    return rows
+
+
+def clip_seconds(count: int, recipe: dict[str, Any]) -> tuple[float, list[dict[str, torch.Tensor]]]:
+    """Mean seconds to draw a clip of the recipe (planning, scene, rendering, sensor), and the clips."""
+    data = recipe["data"]
+    options = {"frames": data.get("frames", 8), "flow_range": (data["flow_low"], data["flow_high"])}
+    make_clip(0, 2**20, **options)  # textures are drawn when first used: not the state of a running training
+    batches = []
+    start = time.perf_counter()
+    for index in range(count):
+        height, width = data["sizes"][index % len(data["sizes"])]
+        clip = make_clip(0, index, height=height, width=width, **options)
+        names = ("images", "depth", "poses_cw", "intrinsics")
+        batches.append({name: getattr(clip, name)[None] for name in names})
+    return (time.perf_counter() - start) / count, batches
+
+
+def step_seconds(count: int, recipe: dict[str, Any], batches: list[dict[str, torch.Tensor]]) -> float:
+    """Mean seconds of a training step: loss, backward, clipping, optimiser; the phase with bundle adjustment."""
+    from train.module import PatchVOTraining
+    from train.objective import LossConfig
+
+    given = dict(recipe["model"])
+    module = PatchVOTraining(**{**given, "loss": LossConfig(**given.get("loss", {})), "warmup_until": 0.0})
+    module.log_dict = module.log = lambda *_, **__: None  # type: ignore[assignment,method-assign]
+    optimizer = module.configure_optimizers()["optimizer"]
+    spent = []
+    for index in range(count + 1):
+        start = time.perf_counter()
+        loss = module.training_step(batches[index % len(batches)], index)
+        if loss is not None:
+            optimizer.zero_grad()
+            loss.backward()
+            module.on_before_optimizer_step(optimizer)
+            optimizer.step()
+        spent.append(time.perf_counter() - start)
+    return float(np.mean(spent[1:]))  # the first one builds schedules
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=8, help="frames rendered together")
+    parser.add_argument("--clips", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    warnings.filterwarnings("ignore", module="lightning")
+    reuse_freed_memory()
+    torch.set_num_threads(options.threads)
+    devices = [torch.device("cpu")]
+    if torch.accelerator.is_available():
+        devices.append(torch.device(torch.accelerator.current_accelerator().type))
+    for device in devices:
+        print(f"frames/s on {device}, {options.threads} threads" if device.type == "cpu" else f"frames/s on {device}")
+        print(f"{'family':<10}" + "".join(f"{f'{width}x{height}':>10}" for height, width in SIZES))
+        for name, rates in frames_per_second(device, options.frames):
+            print(f"{name:<10}" + "".join(f"{rate:>10.1f}" for rate in rates))
+    recipe = yaml.safe_load(RECIPE.read_text(encoding="utf-8"))
+    clip, batches = clip_seconds(options.clips, recipe)
+    step = step_seconds(options.steps, recipe, batches)
+    print(f"one training clip {clip:.2f} s, one training step {step:.2f} s: rendering / training = {clip / step:.2f}")
+
+
+if __name__ == "__main__":
+    main()

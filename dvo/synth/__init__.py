@@ -16,7 +16,7 @@ from dvo.synth.walks import LONG_KINDS, SplinePath, long_path
 
 __all__ = [
     "FAMILIES", "HELD_OUT", "KINDS", "LONG_KINDS", "Body", "Flow", "Imu", "ImuNoise", "MeshScene", "Path", "Rendering",
-    "Scene", "Sensor", "Shot", "SplinePath", "Stage", "SyntheticSequence", "Tracks", "dynamic_mask", "film", "load_mesh",
-    "long_path", "make_sequence", "measure_imu", "mesh_scene", "optical_flow", "random_path", "random_scene", "render",
-    "trace", "tracks",
+    "Scene", "Sensor", "Shot", "SplinePath", "Stage", "SyntheticSequence", "Tracks", "dynamic_mask", "film",
+    "load_mesh", "long_path", "make_sequence", "measure_imu", "mesh_scene", "optical_flow", "random_path",
+    "random_scene", "render", "trace", "tracks",
 ]  # fmt: skip

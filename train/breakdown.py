@@ -44,13 +44,15 @@ BACKWARD: tuple[tuple[str, Any, str], ...] = (
 
 
 class Stopwatch:
-    """Seconds by name. A part that runs inside another one counts in both."""
+    """Seconds by name, of the clock or of the processor. A part that runs inside another one counts in both."""
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: torch.device, processor: bool = False) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
-        self.device = device
+        self.device, self.processor = device, processor
 
     def _now(self) -> float:
+        if self.processor:
+            return time.process_time()
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return time.perf_counter()
@@ -76,10 +78,10 @@ class Stopwatch:
 
 
 def measure(
-    program: PatchVOTraining, clips: MixedClips, batch_size: int, steps: int, warm: int = 2
+    program: PatchVOTraining, clips: MixedClips, batch_size: int, steps: int, warm: int = 2, processor: bool = False
 ) -> dict[str, float]:
     """Mean seconds a step by part, after ``warm`` steps that do not count; ``step`` is everything but rendering."""
-    watch = Stopwatch(program.device)
+    watch = Stopwatch(program.device, processor)
     optimizer = program.configure_optimizers()["optimizer"]
     program.log_dict = program.log = lambda *a, **k: None  # type: ignore[method-assign, assignment]
     with ExitStack() as patches:
@@ -140,6 +142,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--weighted", action="store_true")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--cpu-time", action="store_true", help="processor seconds: for a machine that does other work")
     options = parser.parse_args(arguments)
     from dvo.allocator import reuse_freed_memory
 
@@ -153,10 +156,10 @@ def main(arguments: list[str]) -> None:
     ).to(options.device)  # fmt: skip
     course = Course(0, 1.0, 14.0, [tuple(options.size)])
     clips = MixedClips(0, [course], options.batch, frames=options.frames)
-    seconds = measure(program, clips, options.batch, options.steps)
+    seconds = measure(program, clips, options.batch, options.steps, processor=options.cpu_time)
     print(
         f"{options.model}, {options.batch} clip(s) of {options.frames} frames {options.size[1]}x{options.size[0]}, "
         f"{options.updates} updates, mode {options.mode}, {options.threads} thread(s) on {options.device}; "
-        f"mean of {options.steps} steps"
+        f"mean of {options.steps} steps{', processor time' if options.cpu_time else ''}"
     )
     print(table(seconds))

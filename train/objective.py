@@ -3,17 +3,19 @@ V2V if wanted."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.balance import PARAMETER
 from dvo.losses.flow import flow_error, flow_loss, weighted_flow_error
-from dvo.losses.pose import pose_errors
+from dvo.losses.pose import PoseErrors, pose_errors
 from dvo.nets.graph import PatchGraph
 from dvo.nets.patch_vo import Mode, UpdateState
 from dvo.nets.patchifier import crop_patches
@@ -97,7 +99,6 @@ def true_reprojection(
     return there.coords, there.valid & inside & seen
 
 
-@torch.no_grad()
 def _measures(prefix: str, error: Tensor, edges: Tensor) -> dict[str, Tensor]:
     used = torch.isfinite(error) & edges
     total = used.sum(1).clamp(min=1)
@@ -165,9 +166,10 @@ def clip_terms(
         ``px<0.25`` ...
     """
     terms = Terms()
-    measures: dict[str, Tensor] = {}
     there: tuple[Tensor, Tensor] | None = None
     graph: PatchGraph | None = None
+    measures: dict[str, Tensor] = {}
+    measured: Callable[[], dict[str, Tensor]] = dict
     for update, state in enumerate(states):
         if there is None or state.graph is not graph:
             graph = state.graph
@@ -187,25 +189,32 @@ def clip_terms(
             weighted = weighted_flow_error(state.coords, coords, valid, state.weights)
             counted = flow_loss(weighted, torch.ones_like(near))
         terms.flow.append(counted if mode != "flow" else None)
-        terms.translation.append(None)
-        terms.rotation.append(None)
-        measures = {"flow": flow, "target": target, **_measures("px<", error, near)}
-        measures |= _measures("target_px<", wanted, near)
-        measures["confidence"] = state.weights.mean()
+        errors = None
         if mode == "joint":
-            poses = truth.poses_cw[:, : state.frames]
-            errors = pose_errors(state.poses_cw, poses)
-            if update >= config.pose_from:
-                terms.translation[-1], terms.rotation[-1] = errors.translation, errors.rotation
-            still = torch.zeros_like(poses)
-            still[..., 6] = 1
-            motion = pose_errors(still, poses).rotation
-            measures |= {
-                "translation": errors.translation.mean(),
-                "rotation_deg": errors.rotation.mean().rad2deg(),
-                "rotation_ratio": (errors.rotation / motion.clamp(min=1e-4)).median(),
-            }
-    return terms, {name: value.detach() for name, value in measures.items()}
+            errors = pose_errors(state.poses_cw, truth.poses_cw[:, : state.frames])
+        counts = errors is not None and update >= config.pose_from
+        terms.translation.append(errors.translation if errors is not None and counts else None)
+        terms.rotation.append(errors.rotation if errors is not None and counts else None)
+        measures = {"flow": flow, "target": target, "confidence": state.weights.mean()}
+        # Only the last update is measured further.
+        measured = partial(_further_measures, truth, state, errors, error, wanted, near)
+    return terms, {name: value.detach() for name, value in (measures | measured()).items()}
+
+
+@torch.no_grad()
+def _further_measures(
+    truth: Truth, state: UpdateState, errors: PoseErrors | None, error: Tensor, wanted: Tensor, near: Tensor
+) -> dict[str, Tensor]:
+    measures = _measures("px<", error, near) | _measures("target_px<", wanted, near)
+    if errors is not None:
+        poses = truth.poses_cw[:, : state.frames]
+        motion = pose_errors(se3.identity(*poses.shape[:2], device=poses.device), poses).rotation
+        measures |= {
+            "translation": errors.translation.mean(),
+            "rotation_deg": errors.rotation.mean().rad2deg(),
+            "rotation_ratio": (errors.rotation / motion.clamp(min=1e-4)).median(),
+        }
+    return measures
 
 
 def clip_losses(

@@ -80,7 +80,7 @@ Reproduced by
 
 ![validation error against steps]({picture.name})
 
-Lines are medians over {len(config.seeds)} seeds, bands their range. A step took {seconds:.2f} s.
+Lines are medians over {len(config.seeds)} seeds, bands their range. A step took {seconds:.2f} s of the processor.
 """
     report = out.with_suffix(".md")
     report.write_text(text, encoding="utf-8")

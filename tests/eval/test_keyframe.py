@@ -177,6 +177,9 @@ def test_neighbourhood_is_the_newest_and_those_that_share():
     assert frames == [[0, 5, 10, 30], [20, 25]]
     free, held = neighbourhood(world_of(cloud(6), arc(3)), world.keyframes[-1], adjusted=4, anchors=2)
     assert len(held) == 1 and held[0].frame == 0
+    five = world_of(cloud(6), arc(5))
+    free, held = neighbourhood(five, five.keyframes[-1], adjusted=8, anchors=2)
+    assert [k.frame for k in held] == [0, 5] and [k.frame for k in free] == [10, 15, 20]
 
 
 def test_bad_observations_and_unsupported_points_go():

@@ -35,7 +35,9 @@ class DirectConfig:
         iterations: of the alignment, per level of the pyramid, finest first.
         noise: standard deviation of an intensity in the alignment (sensor, and what the model leaves out).
         huber: normalised residual from which the loss is linear.
-        start_parallax: rotation-compensated parallax of the first two views, as part of the focal length.
+        start_parallax: rotation-compensated parallax of the first two views, as part of the focal length; while the
+            camera waits, half of it comes to be enough.
+        start_wait: frames after which half is enough.
         keyframe_distance: way from the keyframe, in units of its mean depth, that asks for another.
         keyframe_overlap: part of the keyframe's pixels still seen below which another is made.
         lost_overlap, lost_agreement: parts of pixels seen and of those that fit below which the camera is lost.
@@ -50,7 +52,8 @@ class DirectConfig:
     iterations: tuple[int, ...] = (8, 12, 16, 20, 20)
     noise: float = 6.0
     huber: float = 1.345
-    start_parallax: float = 0.03
+    start_parallax: float = 0.05
+    start_wait: int = 15
     keyframe_distance: float = 0.12
     keyframe_overlap: float = 0.75
     lost_overlap: float = 0.3
@@ -253,7 +256,8 @@ class DirectOdometry:
             return self._estimate(Status.INITIALISING if index not in self._lost else Status.LOST)
         self._turns[index] = turn
         self._pending.append((index, levels, image))
-        parallax = self.config.start_parallax * float(self._intrinsics[:2].mean())
+        waited = min((index - self._start.frame) / self.config.start_wait, 1)
+        parallax = (1 - 0.5 * waited) * self.config.start_parallax * float(self._intrinsics[:2].mean())
         solved = self._start.solve(self._intrinsics, parallax, self._seed + index)
         if solved is not None and self._first_keyframe(*solved):
             return self._estimate(Status.TRACKING, 0.5)

@@ -16,7 +16,8 @@ def neighbourhood(world: Map, newest: Keyframe, adjusted: int, anchors: int) -> 
 
     Args:
         adjusted: how many to adjust at most, the newest and those that share most of its landmarks.
-        anchors: how many more to hold; without any the oldest of the adjusted is held.
+        anchors: how many more to hold. At least the oldest of the adjusted is held instead where there are no others,
+            and from four on two, or else the scale would be free.
 
     Returns:
         Both in order of time, so that ties and rounding never depend on chance.
@@ -24,10 +25,9 @@ def neighbourhood(world: Map, newest: Keyframe, adjusted: int, anchors: int) -> 
     shared = world.shared(newest)
     order = [i for i in np.argsort(-shared, kind="stable") if shared[i] > 0 and world.keyframes[i] is not newest]
     free, held = sorted(order[: adjusted - 1]), sorted(order[adjusted - 1 : adjusted - 1 + anchors])
-    keyframes = [world.keyframes[i] for i in free] + [newest]
-    if not held:
-        return keyframes[1:], keyframes[:1]
-    return keyframes, [world.keyframes[i] for i in held]
+    keyframes, fixed = [world.keyframes[i] for i in free] + [newest], [world.keyframes[i] for i in held]
+    missing = max((2 if len(keyframes) >= 4 else 1) - len(fixed), 0)
+    return keyframes[missing:], fixed + keyframes[:missing]
 
 
 def adjust(

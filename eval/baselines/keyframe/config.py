@@ -12,8 +12,11 @@ class KeyframeConfig:
     Attributes:
         corners: number of tracks that a keyframe is filled up to.
         quality, window, levels, closed: corner strength, patch side, pyramid levels and forward-backward tolerance.
-        start_parallax: rotation-compensated parallax that starts the map, as part of the focal length.
-        start_points: points that the first two views must give.
+        start_parallax: rotation-compensated parallax that starts the map, as part of the focal length; while the
+            camera waits, half of it comes to be enough.
+        start_wait: frames after which half is enough.
+        start_wait: int = 15
+    start_points: points that the first two views must give.
         planar: part of the homography's score from which it is preferred to the essential matrix (ORB-SLAM: 0.45).
         angle: smallest angle between two views from which a point is triangulated.
         epipolar, reprojection: inlier thresholds, pixels.
@@ -33,7 +36,8 @@ class KeyframeConfig:
     window: int = 15
     levels: int = 4
     closed: float = 0.7
-    start_parallax: float = 0.025
+    start_parallax: float = 0.045
+    start_wait: int = 15
     start_points: int = 40
     planar: float = 0.45
     angle: float = 1.0

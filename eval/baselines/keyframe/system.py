@@ -271,10 +271,11 @@ class KeyframeOdometry:
         c = self.config
         _, rows, now = np.intersect1d(first.ids, self._ids, return_indices=True)
         one, two = first.uv[rows], self._uv[now]
-        focal = float(self._intrinsics[:2].mean())
+        waited = min((index - first.frame) / c.start_wait, 1)
+        parallax = (1 - 0.5 * waited) * c.start_parallax * float(self._intrinsics[:2].mean())
         turned = two_view.rays(one, self._intrinsics) @ two_view.rotation_between(one, two, self._intrinsics).T
         turned = turned[:, :2] / turned[:, 2:] * self._intrinsics[:2] + self._intrinsics[2:]
-        if np.median(np.linalg.norm(turned - two, axis=1)) < 0.1 * c.start_parallax * focal:
+        if np.median(np.linalg.norm(turned - two, axis=1)) < 0.1 * parallax:
             return False  # clearly too little; spares the models
         start = start_from_two_views(
             one,
@@ -285,7 +286,7 @@ class KeyframeOdometry:
             planar=c.planar,
             seed=self._seed + index,
         )
-        if start is None or start.parallax < c.start_parallax * focal:
+        if start is None or start.parallax < parallax:
             return False
         good = ~np.isnan(start.points[:, 0])
         if good.sum() < max(c.start_points, 0.5 * len(rows)):

@@ -175,6 +175,34 @@ def find_patch(
     return low + np.array([x + _peak(scores[y], x), y + _peak(scores[:, x], y)]), best
 
 
+def contrast(grey: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """``(M,)`` standard deviation of the patch at each whole pixel, in standard deviations of the image's noise.
+
+    The noise is the median answer to a mask that no smooth surface answers to (Immerkaer 1996); two pictures of a patch
+    of contrast c correlate to ``1 - 1 / c^2``.
+    """
+    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1.0]])
+    noise = float(np.median(np.abs(cv2.filter2D(grey, cv2.CV_32F, mask)))) / (6 * 0.6745)
+    floating = grey.astype(np.float32)
+    size = (2 * HALF + 1, 2 * HALF + 1)
+    variance = cv2.blur(floating**2, size) - cv2.blur(floating, size) ** 2
+    return np.sqrt(np.maximum(variance[uv[:, 1], uv[:, 0]], 0)) / max(noise, 0.5)
+
+
+def self_likeness(grey: np.ndarray, uv: np.ndarray, radius: int = 12) -> np.ndarray:
+    """``(M,)`` best score of the patch at each whole pixel somewhere else within ``radius``: near 1 in a pattern that
+    repeats itself, whose points are confused with their neighbours."""
+    border = HALF + radius
+    wide = cv2.copyMakeBorder(grey, border, border, border, border, cv2.BORDER_REFLECT_101)
+    likeness = np.zeros(len(uv))
+    for k, (x, y) in enumerate(uv):
+        window = wide[y : y + 2 * border + 1, x : x + 2 * border + 1]
+        scores = cv2.matchTemplate(window, window[radius:-radius, radius:-radius], cv2.TM_CCOEFF_NORMED)
+        scores[radius - 3 : radius + 4, radius - 3 : radius + 4] = -1
+        likeness[k] = scores.max()
+    return likeness
+
+
 def _peak(scores: np.ndarray, at: int) -> float:
     """Offset in [-0.5, 0.5] of the top of the parabola through three scores."""
     if not 0 < at < len(scores) - 1:

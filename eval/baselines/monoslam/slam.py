@@ -24,7 +24,16 @@ from eval.baselines.klt import detect
 from eval.baselines.monoslam.consensus import drop_inconsistent, find_consensus
 from eval.baselines.monoslam.filter import Filter, Prediction
 from eval.baselines.monoslam.models import directions
-from eval.baselines.monoslam.search import HALF, Appearance, affine_warps, find_point, image_pyramid, templates
+from eval.baselines.monoslam.search import (
+    HALF,
+    Appearance,
+    affine_warps,
+    contrast,
+    find_point,
+    image_pyramid,
+    self_likeness,
+    templates,
+)
 
 
 @dataclass(frozen=True)
@@ -45,6 +54,8 @@ class MonoSlamConfig:
             the number of triples that are tried then.
         visible, capacity: points wanted in view; most points in the filter.
         quality: smallest corner strength of a new point relative to the strongest of the image.
+        contrast: smallest contrast of a new point over the noise of the image.
+        alike: likeness to its surroundings from which a corner is avoided.
         fewest: matches below which a frame is lost.
         patience: seconds after which a lost map is given up and a new one begun.
     """
@@ -66,6 +77,8 @@ class MonoSlamConfig:
     visible: int = 60
     capacity: int = 90
     quality: float = 0.005
+    contrast: float = 2.5
+    alike: float = 0.75
     fewest: int = 6
     patience: float = 0.7
 
@@ -182,7 +195,7 @@ class MonoSlam:
         rows, seen = self._look(state, pyramid, expected, rest)
         looked[rest] = True
         S = state.innovation(rows, expected)[1]
-        good = drop_inconsistent(seen - expected.pixels[rows], S, self.config.noise, self.config.agree)
+        good = drop_inconsistent(seen - expected.pixels[rows], S, expected.noise[rows], self.config.agree)
         state.update(rows[good], seen[good], expected)
         found[rows[good]] = True
 
@@ -269,10 +282,14 @@ class MonoSlam:
         spacing = 0.6 * float(np.sqrt(grey.size / c.visible))
         inner = np.ascontiguousarray(grey[edge:-edge, edge:-edge])
         near = there[((there > -1e4) & (there < 1e4)).all(1)] - edge
-        corners = detect(inner, near, wanted, quality=c.quality, spacing=spacing)
-        strength = cv2.cornerMinEigenVal(inner, 5)
-        at = np.rint(corners).astype(int)
-        corners = at[strength[at[:, 1], at[:, 0]] > 1e-5] + edge
+        corners = detect(inner, near, 2 * wanted, quality=c.quality, spacing=spacing)
+        corners = np.rint(corners).astype(int) + edge
+        corners = corners[contrast(grey, corners) > c.contrast]
+        # Points of repeating patterns only as far as there would be too few without them.
+        likeness = self_likeness(grey, corners)
+        enough = np.arange(len(corners)) + len(there) < c.visible // 3
+        order = np.argsort(likeness, kind="stable")
+        corners = corners[order][(likeness[order] < c.alike) | enough][:wanted]
         if len(corners):
             state.add(corners, self._rho, c.rho_sigma * self._rho)
             self._looks.add(corners, pyramid, image, state.q)

@@ -175,7 +175,8 @@ def test_neighbourhood_is_the_newest_and_those_that_share():
     free, held = neighbourhood(world, world.keyframes[-1], adjusted=4, anchors=2)
     frames = [[k.frame for k in part] for part in (free, held)]
     assert frames == [[0, 5, 10, 30], [20, 25]]
-    free, held = neighbourhood(world_of(cloud(6), arc(3)), world.keyframes[-1], adjusted=4, anchors=2)
+    three = world_of(cloud(6), arc(3))
+    free, held = neighbourhood(three, three.keyframes[-1], adjusted=4, anchors=2)
     assert len(held) == 1 and held[0].frame == 0
     five = world_of(cloud(6), arc(5))
     free, held = neighbourhood(five, five.keyframes[-1], adjusted=8, anchors=2)

@@ -140,10 +140,7 @@ def test_update_is_the_gaussian_condition():
     for k in range(3):
         H[2 * k : 2 * k + 2, :6] = expected.slopes[k, :, :6]
         H[2 * k : 2 * k + 2, CAMERA + 6 * k : CAMERA + 6 * k + 6] = expected.slopes[k, :, 6:]
-    R = np.zeros((6, 6))
-    for k in range(3):
-        R[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = expected.noise[k]
-    S = H @ state.P @ H.T + R
+    S = H @ state.P @ H.T + 0.49 * np.eye(6)
     assert np.allclose([S[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(3)], expected.spread)
     rows, seen = np.array([0, 2]), expected.pixels[[0, 2]] + np.array([[1.0, -2.0], [0.5, 1.5]])
     pick = [0, 1, 4, 5]
@@ -217,7 +214,7 @@ def test_consensus_finds_the_wrong_matches():
     innovations[wrong] += np.array([[25.0, -30.0], [-35.0, 20.0], [40.0, 15.0]])
     good = find_consensus(innovations, S, 60, np.random.default_rng(0))
     assert not good[wrong].any() and good.sum() >= 10
-    everything = drop_inconsistent(innovations, S, expected.noise, 2.0)
+    everything = drop_inconsistent(innovations, S, 0.5, 2.0)
     assert not everything[wrong].any() and everything.sum() >= 8
 
 

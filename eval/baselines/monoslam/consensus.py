@@ -91,15 +91,15 @@ def _likelihood(innovations: np.ndarray, S: np.ndarray, given: np.ndarray, anywh
 
 
 def drop_inconsistent(
-    innovations: np.ndarray, S: np.ndarray, noise: np.ndarray, threshold: float, rounds: int = 4
+    innovations: np.ndarray, S: np.ndarray, noise: float, threshold: float, rounds: int = 4
 ) -> np.ndarray:
     """Measurements that all of them together explain: those that a joint update would leave far off are dropped.
 
-    What an update leaves of the innovations ``n`` is ``R S^-1 n`` with the noise R (the model being linear).
+    What an update leaves of the innovations ``n`` is ``noise^2 S^-1 n`` (the model being linear).
 
     Args:
         innovations, S: as above.
-        noise: ``(M, 2, 2)`` noise of each measurement.
+        noise: standard deviation of a measured pixel.
         threshold: distance that may be left, pixels.
         rounds: the worse half of the offenders goes in each, in the last all.
 
@@ -111,8 +111,7 @@ def drop_inconsistent(
         if not kept.any():
             break
         a = np.flatnonzero(np.repeat(kept, 2))
-        left = np.linalg.solve(S[np.ix_(a, a)], innovations[kept].ravel()).reshape(-1, 2)
-        left = np.einsum("mij,mj->mi", noise[kept], left)
+        left = noise**2 * np.linalg.solve(S[np.ix_(a, a)], innovations[kept].ravel()).reshape(-1, 2)
         error = np.zeros(len(kept))
         error[kept] = np.linalg.norm(left, axis=1)
         bad = error > threshold

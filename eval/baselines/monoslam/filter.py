@@ -26,14 +26,12 @@ class Prediction:
         front: ``(N,)`` bool.
         slopes: ``(N, 2, 12)`` Jacobians, of the camera's ``[dr, da]`` and of the point itself.
         spread: ``(N, 2, 2)`` covariance of the pixel, noise included.
-        noise: ``(N, 2, 2)`` the part of it that is not explained by the state to first order.
     """
 
     pixels: np.ndarray
     front: np.ndarray
     slopes: np.ndarray
     spread: np.ndarray
-    noise: np.ndarray
 
 
 class Filter:
@@ -73,21 +71,13 @@ class Filter:
         self.P[c, c] = F @ self.P[c, c] @ F.T + G * impulses @ G.T
 
     def expect(self) -> Prediction:
-        """Where the points should be seen now, and how surely.
-
-        A pixel depends on the product of a point's inverse distance and the way that the camera has gone since the
-        point began. The linear model drops the product of their errors, which at the start is as large as anything, so
-        its variance counts as noise of the measurement (the second-order filter, for this one term).
-        """
+        """Where the points should be seen now, and how surely."""
         pixels, front, by_camera, by_point = observe(self.r, self.q, self.points, self.intrinsics)
         slopes = np.concatenate([by_camera, by_point], -1)
         index = self._index(np.arange(len(self)))
         P = self.P[index[:, :, None], index[:, None, :]]
-        way = [0, 1, 2, 6, 7, 8]  # camera and beginning of the point: their slopes are the inverse distance's times rho
-        relative = (self.rho_sigma / np.maximum(np.abs(self.points[:, 5]), 1e-6)) ** 2
-        noise = slopes[:, :, way] @ P[:, way][:, :, way] @ slopes[:, :, way].transpose(0, 2, 1)
-        noise = relative[:, None, None] * noise + self.noise**2 * np.eye(2)
-        return Prediction(pixels, front, slopes, slopes @ P @ slopes.transpose(0, 2, 1) + noise, noise)
+        spread = slopes @ P @ slopes.transpose(0, 2, 1) + self.noise**2 * np.eye(2)
+        return Prediction(pixels, front, slopes, spread)
 
     def innovation(self, rows: np.ndarray, expected: Prediction) -> tuple[np.ndarray, np.ndarray]:
         """``H P (2 M, n)`` and ``S = H P H^T + noise (2 M, 2 M)`` of measurements of some points.
@@ -99,11 +89,8 @@ class Filter:
         HP += slopes[:, :, 6:] @ self.P[index[:, 6:]]
         HP = HP.reshape(-1, len(self.P))
         S = (HP[:, index].transpose(1, 0, 2) @ slopes.transpose(0, 2, 1)).transpose(1, 0, 2)  # (2 M, M, 2)
-        S = S.reshape(len(rows), 2, len(rows), 2)
-        every = np.arange(len(rows))
-        S[every, :, every, :] += expected.noise[rows]
         S = S.reshape(len(HP), len(HP))
-        return HP, 0.5 * (S + S.T)
+        return HP, 0.5 * (S + S.T) + self.noise**2 * np.eye(len(HP))
 
     def update(self, rows: np.ndarray, seen: np.ndarray, expected: Prediction) -> None:
         """Take in measurements.

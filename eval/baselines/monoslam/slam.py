@@ -61,12 +61,12 @@ class MonoSlamConfig:
     """
 
     pixels: int = 120_000
-    noise: float = 0.5
+    noise: float = 0.7
     speed: float = 0.6
     rate: float = 1.0
     acceleration: float = 1.5
     angular: float = 6.0
-    rho_sigma: float = 1.0
+    rho_sigma: float = 0.5
     sigmas: float = 3.0
     reach: float = 100.0
     score: float = 0.75
@@ -195,7 +195,7 @@ class MonoSlam:
         rows, seen = self._look(state, pyramid, expected, rest)
         looked[rest] = True
         S = state.innovation(rows, expected)[1]
-        good = drop_inconsistent(seen - expected.pixels[rows], S, expected.noise[rows], self.config.agree)
+        good = drop_inconsistent(seen - expected.pixels[rows], S, self.config.noise, self.config.agree)
         state.update(rows[good], seen[good], expected)
         found[rows[good]] = True
 

@@ -53,8 +53,7 @@ class Stopwatch:
     def _now(self) -> float:
         if self.processor:
             return time.process_time()
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
+        getattr(torch, self.device.type).synchronize()  # a module for each kind of device
         return time.perf_counter()
 
     @contextmanager

@@ -12,9 +12,8 @@ from dvo.data.sequence import matches as is_sequence
 from dvo.data.tartanair import matches as is_tartanair
 from dvo.data.tum import matches as is_tum
 from dvo.errors import DvoError
-from eval import sequences
 from eval.layouts import adopt
-from eval.sequences import SUITES, Sequence, Suite, data_folder
+from eval.sequences import SUITES, Sequence, Suite, data_folder, read_suites
 
 LAYOUTS = (is_euroc, is_kitti, is_tartanair, is_tum, is_sequence)
 
@@ -87,7 +86,7 @@ def folder_of_data(suites: list[Suite], given: Path | None) -> Path:
 
 def is_rendered(sequence: Sequence) -> bool:
     """Whether a sequence is made on demand and not recorded."""
-    return not sequence.path or getattr(sequence, "rendered", None) is not None
+    return sequence.rendered is not None
 
 
 def settle(suite: Suite, sequence: Sequence, data: Path, scratch: Path) -> Sequence:
@@ -124,8 +123,7 @@ def config_names() -> list[str]:
 def _suites(name: str) -> list[Suite]:
     if name not in config_names() and Path(name).is_dir():
         return [suite_of_folder(Path(name))]
-    several = getattr(sequences, "read_suites", None)
-    return list(several(name)) if several is not None else [sequences.read_suite(name)]
+    return read_suites(name)
 
 
 def _from(kind: type, entry: dict[str, Any]) -> Any:

@@ -190,24 +190,24 @@ def clip_terms(
             counted = flow_loss(weighted, torch.ones_like(near))
         terms.flow.append(counted if mode != "flow" else None)
         errors = None
-        if mode == "joint":
+        if mode == "joint" and update >= config.pose_from:
             errors = pose_errors(state.poses_cw, truth.poses_cw[:, : state.frames])
-        counts = errors is not None and update >= config.pose_from
-        terms.translation.append(errors.translation if errors is not None and counts else None)
-        terms.rotation.append(errors.rotation if errors is not None and counts else None)
+        terms.translation.append(None if errors is None else errors.translation)
+        terms.rotation.append(None if errors is None else errors.rotation)
         measures = {"flow": flow, "target": target, "confidence": state.weights.mean()}
         # Only the last update is measured further.
-        measured = partial(_further_measures, truth, state, errors, error, wanted, near)
+        measured = partial(_further_measures, truth, state, mode, errors, error, wanted, near)
     return terms, {name: value.detach() for name, value in (measures | measured()).items()}
 
 
 @torch.no_grad()
 def _further_measures(
-    truth: Truth, state: UpdateState, errors: PoseErrors | None, error: Tensor, wanted: Tensor, near: Tensor
+    truth: Truth, state: UpdateState, mode: Mode, errors: PoseErrors | None, error: Tensor, wanted: Tensor, near: Tensor
 ) -> dict[str, Tensor]:
     measures = _measures("px<", error, near) | _measures("target_px<", wanted, near)
-    if errors is not None:
+    if mode == "joint":
         poses = truth.poses_cw[:, : state.frames]
+        errors = errors or pose_errors(state.poses_cw, poses)
         motion = pose_errors(se3.identity(*poses.shape[:2], device=poses.device), poses).rotation
         measures |= {
             "translation": errors.translation.mean(),

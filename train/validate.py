@@ -18,14 +18,12 @@ import torch
 from dvo.data.frame import Frame
 from dvo.data.source import open_source
 from dvo.data.trajectory import Trajectory
-from dvo.geometry import se3
-from dvo.geometry.camera import Camera
 from dvo.metrics import Metrics, evaluate
 from dvo.nets.weights import load_weights
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.tracker import PatchOdometry
-from dvo.synth.clip import make_clip
+from dvo.synth.sequence import SyntheticSequence, make_sequence
 from train.export import averaged_model
 
 VALIDATION_SEED = 900_001  # training seeds are small numbers
@@ -51,18 +49,10 @@ def track_sequence(
     return evaluate(result.trajectory, truth, rpe_gap=2), rate, result.frames_lost
 
 
-def rendered_frames(index: int, frames: int, height: int, width: int) -> tuple[list[Frame], Trajectory]:
-    """A rendered clip of the validation seed, as frames at 10 Hz, and its true trajectory."""
-    flow = (2.0 * width / 160, 8.0 * width / 160)
-    clip = make_clip(VALIDATION_SEED, index, frames=frames, height=height, width=width, flow_range=flow)
-    fx, fy, cx, cy = clip.intrinsics[0].tolist()
-    camera = Camera(fx, fy, cx, cy, width, height)
-    times = 0.1 * np.arange(frames)
-    images = clip.images.permute(0, 2, 3, 1).contiguous().numpy()
-    truth = se3.inverse(clip.poses_cw.double()).numpy()
-    return [Frame(i, t, image, camera) for i, (t, image) in enumerate(zip(times, images, strict=True))], Trajectory(
-        times, truth
-    )
+def rendered_clip(index: int, frames: int, size: tuple[int, int], fps: float) -> SyntheticSequence:
+    """A rendered validation clip: of a scene that training cannot draw. ``size`` is height, width."""
+    height, width = size
+    return make_sequence(VALIDATION_SEED + index, frames=frames, height=height, width=width, fps=fps, apart=True)
 
 
 def main(arguments: list[str]) -> None:
@@ -89,6 +79,7 @@ def main(arguments: list[str]) -> None:
         settings[name] = type(settings[name])(float(value))
     config = TrackerConfig.from_dict(settings)
     torch.set_grad_enabled(False)
+
     def ready(seed: int) -> Odometry:
         return PatchOdometry(model, config, seed=seed, device=options.device)
 
@@ -104,8 +95,8 @@ def main(arguments: list[str]) -> None:
             )
     found = []
     for index in range(options.rendered):
-        frames, truth = rendered_frames(index, 40, 240, 320)
-        m, _, _ = track_sequence(ready(0), frames, truth)
+        source = rendered_clip(index, 60, (240, 320), 15.0)
+        m, _, _ = track_sequence(ready(0), source, source.groundtruth)
         found.append((m.ate_percent, m.rotation_error_ratio))
         print(f"rendered clip {index}: ATE {m.ate_percent:.2f} %, rotation error/motion {m.rotation_error_ratio:.3f}")
     if found:

@@ -21,9 +21,8 @@ from dvo.data.trajectory import Trajectory
 from dvo.metrics import evaluate
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.tracker import PatchOdometry
-from dvo.synth.sequence import make_sequence
 from train.pictures import draw, image_at, patch_flow
-from train.validate import VALIDATION_SEED, data_root
+from train.validate import data_root, rendered_clip
 
 Clip = tuple[str, list[Frame], Trajectory]
 
@@ -131,9 +130,7 @@ class TrackWhileTraining(L.Callback):
     def _rendered_clips(self) -> list[Clip]:
         clips = []
         for index in range(self.rendered):
-            height, width = self.size
-            seed = VALIDATION_SEED + index
-            source = make_sequence(seed, frames=self.frames, height=height, width=width, fps=self.fps)
+            source = rendered_clip(index, self.frames, self.size, self.fps)
             clips.append((f"rendered{index}", list(source), source.groundtruth))
         return clips
 

@@ -1,10 +1,15 @@
-"""Poses for frames that were seen before the map could be started."""
+"""From what a classical baseline knows of its frames to the result, frames before the start of a map included."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
+
+from dvo.data.poses import poses_from_matrices
+from dvo.data.trajectory import Trajectory
+from dvo.odometry.protocol import Result, SparseMap
 
 
 def back_fill(
@@ -33,3 +38,25 @@ def back_fill(
                 step[:3, :3] = turn.T if towards > 0 else turn
                 poses[i] = step @ neighbour
     return poses
+
+
+def map_of(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> SparseMap:
+    """One map from pieces of points ``(n, 3)`` and colours ``(n, 3)``."""
+    points, colors = (np.concatenate(part) for part in zip(*parts, strict=True)) if parts else ((), ())
+    return SparseMap(np.array(points, np.float32).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3))
+
+
+def result_of(
+    times: list[float],
+    T_cw: list[np.ndarray | None],
+    turns: list[np.ndarray | None],
+    lost: Collection[int],
+    points: SparseMap,
+    info: dict[str, Any],
+) -> Result:
+    """Everything, with the frames before each start filled in (see :func:`back_fill`)."""
+    poses = back_fill(T_cw, turns, lost)
+    rows = [index for index, pose in enumerate(poses) if pose is not None]
+    matrices = np.array([np.linalg.inv(poses[index]) for index in rows]).reshape(-1, 4, 4)  # type: ignore[arg-type]
+    trajectory = Trajectory(np.array([times[index] for index in rows]), poses_from_matrices(matrices))
+    return Result(trajectory, points, len(times), len(times) - len(rows), info)

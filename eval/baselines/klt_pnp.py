@@ -14,10 +14,9 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.data.poses import poses_from_matrices
-from dvo.data.trajectory import Trajectory
-from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 from eval.baselines import two_view
-from eval.baselines.back_fill import back_fill
+from eval.baselines.back_fill import map_of, result_of
 from eval.baselines.klt import Tracks, detect, follow
 
 
@@ -108,22 +107,13 @@ class KltPnp:
 
     def finish(self) -> Result:
         self._retire(np.ones(len(self._tracks), bool))
-        poses = back_fill(self._T_cw, self._turns, self._lost)
-        rows = [index for index, pose in enumerate(poses) if pose is not None]
-        matrices = np.array([np.linalg.inv(poses[index]) for index in rows]).reshape(-1, 4, 4)  # type: ignore[arg-type]
-        points, colors = (np.concatenate(part) for part in zip(*self._map, strict=True)) if self._map else ((), ())
-        return Result(
-            trajectory=Trajectory(np.array([self._times[index] for index in rows]), poses_from_matrices(matrices)),
-            map=SparseMap(np.array(points, np.float32).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3)),
-            frames_read=len(self._times),
-            frames_lost=len(self._times) - len(rows),
-            info={
-                "working_size": list(self._size),
-                "working_intrinsics": self._intrinsics.tolist(),
-                "maps_started": self._starts,
-                "config": asdict(self.config),
-            },
-        )
+        info = {
+            "working_size": list(self._size),
+            "working_intrinsics": self._intrinsics.tolist(),
+            "maps_started": self._starts,
+            "config": asdict(self.config),
+        }
+        return result_of(self._times, self._T_cw, self._turns, self._lost, map_of(self._map), info)
 
     # --- tracks -------------------------------------------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """COLMAP (Schoenberger, Frahm 2016), from the package ``pycolmap`` (BSD-3): incremental structure from motion, offline.
 
-Every fifth frame is reconstructed, at the end; frames between two that were placed are interpolated. Frames that the
-largest model lacks have no row.
+All frames are reconstructed at the end, or of a long sequence every second, third ... one; frames between two that were
+placed are interpolated (which costs a hand-held camera its shake). Frames that the largest model lacks have no row.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dvo.data.trajectory import Trajectory, interpolate
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from eval.peers.common import Pictures, missing_module, version_of
 
-STRIDE = 5
+MOST_IMAGES = 300
 version = version_of("pycolmap")
 
 
@@ -32,27 +32,26 @@ class Colmap:
 
     name = "colmap"
 
-    def __init__(self, seed: int = 0, stride: int = STRIDE) -> None:
-        self._seed, self._stride = seed, stride
+    def __init__(self, seed: int = 0, most_images: int = MOST_IMAGES) -> None:
+        self._seed, self._most = seed, most_images
         self._folder = tempfile.TemporaryDirectory(prefix="colmap-")
         self._images = Path(self._folder.name) / "images"
         self._images.mkdir()
         self._pictures = Pictures(smallest=0)
         self._times: list[float] = []
-        self._last: tuple[int, Frame] | None = None
         self._kept: dict[str, float] = {}
 
     def track(self, frame: Frame) -> Estimate:
-        index = len(self._times)
+        cv2.imwrite(str(self._images / self._file(len(self._times))), self._pictures(frame))
         self._times.append(frame.timestamp)
-        self._last = index, frame
-        if index % self._stride == 0:
-            self._keep(index, frame)
         return Estimate(frame.timestamp, None, Status.INITIALISING)
 
     def finish(self) -> Result:
-        if self._last is not None:
-            self._keep(*self._last)  # so that the end is interpolated, not lost
+        count = len(self._times)
+        stride = max(1, -(-count // self._most))
+        # The last one too, so that the end is interpolated, not lost.
+        chosen = sorted({*range(0, count, stride), count - 1} - {-1})
+        self._kept = {self._file(index): self._times[index] for index in chosen}
         poses: dict[float, np.ndarray] = {}
         sparse_map, models = SparseMap(), 0
         if len(self._kept) > 1:
@@ -60,17 +59,15 @@ class Colmap:
         stamps = np.array(sorted(poses))
         placed = Trajectory(stamps, np.array([poses[t] for t in stamps]).reshape(-1, 7))
         steps = np.diff(self._times)
-        gap = 1.5 * self._stride * float(np.median(steps)) if len(steps) else 0.0
+        gap = 1.5 * stride * float(np.median(steps)) if len(steps) else 0.0
         trajectory = interpolate(placed, np.array(self._times), max_gap=gap)
         self._folder.cleanup()
-        info = {**self._pictures.facts(), "stride": self._stride, "placed": len(placed), "models": models}
+        info = {**self._pictures.facts(), "stride": stride, "placed": len(placed), "models": models}
         return Result(trajectory, sparse_map, len(self._times), len(self._times) - len(trajectory), info)
 
-    def _keep(self, index: int, frame: Frame) -> None:
-        name = f"{index:06d}.png"
-        if name not in self._kept:
-            cv2.imwrite(str(self._images / name), self._pictures(frame))
-            self._kept[name] = frame.timestamp
+    @staticmethod
+    def _file(index: int) -> str:
+        return f"{index:06d}.png"
 
     def _reconstruct(self) -> tuple[dict[float, np.ndarray], SparseMap, int]:
         """Poses ``(7,)`` by time and points of the largest model, and how many models there are."""
@@ -95,6 +92,7 @@ class Colmap:
         pycolmap.extract_features(
             database,
             self._images,
+            image_names=list(self._kept),
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             extraction_options=extraction,

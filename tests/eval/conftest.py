@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -71,6 +72,16 @@ def film() -> Callable[[Trajectory], list[Frame]]:
         return [Frame(i, float(t), scene(pose), CAMERA) for i, (t, pose) in enumerate(poses)]
 
     return shoot
+
+
+@pytest.fixture(scope="session")
+def dark() -> Callable[..., list[Frame]]:
+    """``dark(frames, start, stop, value=0)``: the frames from start to before stop without anything to see."""
+
+    def cover(frames: list[Frame], start: int, stop: int, value: int = 0) -> list[Frame]:
+        return [replace(f, image=np.full_like(f.image, value)) if start <= f.index < stop else f for f in frames]
+
+    return cover
 
 
 @pytest.fixture(scope="session")

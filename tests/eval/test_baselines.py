@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +18,6 @@ from eval.baselines.null import NullMotion
 def run(frames: list[Frame], odometry: Odometry | None = None) -> tuple[list[Estimate], Result]:
     odometry = odometry or KltPnp(KltPnpConfig(corners=300))
     return [odometry.track(frame) for frame in frames], odometry.finish()
-
-
-def dark(frames: list[Frame], start: int, stop: int) -> list[Frame]:
-    return [replace(f, image=np.zeros_like(f.image)) if start <= f.index < stop else f for f in frames]
 
 
 def test_both_are_odometries():
@@ -44,12 +39,6 @@ def test_tracks_a_clean_scene(film, path):
     assert (near | far).mean() > 0.8 and near.sum() > 10
 
 
-def test_same_seed_same_bytes(film, path):
-    frames = film(path(20))
-    first, second = (run(frames)[1].trajectory.poses_wc.tobytes() for _ in range(2))
-    assert first == second
-
-
 def test_start_is_back_filled(film, path):
     """Standing still gives no parallax; the frames of the start get poses all the same."""
     moving = path()
@@ -63,7 +52,7 @@ def test_start_is_back_filled(film, path):
     assert steps.max() * metrics.scale < 0.01
 
 
-def test_short_blackout_is_lost_and_found(film, path):
+def test_short_blackout_is_lost_and_found(film, path, dark):
     estimates, result = run(dark(film(path(60)), 25, 28))
     assert [e.status for e in estimates[25:28]] == [Status.LOST] * 3
     assert all(e.status is Status.TRACKING for e in estimates[28:])
@@ -72,7 +61,7 @@ def test_short_blackout_is_lost_and_found(film, path):
     assert metrics.matched == 57 and metrics.ate_percent < 2
 
 
-def test_long_blackout_starts_a_second_map(film, path):
+def test_long_blackout_starts_a_second_map(film, path, dark):
     estimates, result = run(dark(film(path(80)), 30, 45))
     assert result.info["maps_started"] == 2
     assert estimates[-1].status is Status.TRACKING
@@ -90,12 +79,6 @@ def test_pure_rotation_turns_and_does_not_move(film, path):
     assert metrics.completeness == 1 and metrics.rotation_error_ratio < 0.05
     assert result.info["maps_started"] == 0
     assert np.isnan(metrics.ate_rmse) and metrics.reason is not None
-
-
-def test_one_frame(film, path):
-    estimates, result = run(film(path(2))[:1])
-    assert estimates[0].status is Status.INITIALISING
-    assert result.trajectory.poses_wc.tolist() == [[0, 0, 0, 0, 0, 0, 1]]
 
 
 def test_null_moves_straight_and_never_turns(film, path):

@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from dvo.data.frame import Frame
 from dvo.metrics import evaluate
-from dvo.odometry.protocol import Estimate, Odometry, Result, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 from eval.baselines.direct.align import Reference, align, residuals
 from eval.baselines.direct.depth import DepthConfig, DepthMap, fuse
 from eval.baselines.direct.image import inside, pyramid, sample
 from eval.baselines.direct.start import TwoViewStart, spread
 from eval.baselines.direct.stereo import Matches, StereoConfig, search_lines
 from eval.baselines.direct.system import DirectConfig, DirectOdometry
-from eval.systems import find_system
 
 INTRINSICS = np.array([250.0, 250.0, 159.5, 119.5])
 
@@ -227,16 +226,6 @@ def run(frames: list[Frame], seed: int = 0) -> tuple[list[Estimate], Result]:
     return [odometry.track(frame) for frame in frames], odometry.finish()
 
 
-def dark(frames: list[Frame], start: int, stop: int, value: int = 0) -> list[Frame]:
-    return [replace(f, image=np.full_like(f.image, value)) if start <= f.index < stop else f for f in frames]
-
-
-def test_it_is_a_system():
-    system = find_system("direct")
-    odometry = system.build(0, "cpu")
-    assert isinstance(odometry, Odometry) and odometry.name == "direct" and system.licence == "MIT"
-
-
 def test_tracks_a_clean_scene(film, path):
     estimates, result = run(film(path()))
     metrics = evaluate(result.trajectory, path())
@@ -248,13 +237,7 @@ def test_tracks_a_clean_scene(film, path):
     assert len(depths) > 200 and (near | far).mean() > 0.8 and near.sum() > 10
 
 
-def test_same_seed_same_bytes(film, path):
-    frames = film(path(40))[:14]
-    first, second = (run(frames)[1].trajectory.poses_wc.tobytes() for _ in range(2))
-    assert first == second
-
-
-def test_short_blackout_is_lost_and_found(film, path):
+def test_short_blackout_is_lost_and_found(film, path, dark):
     estimates, result = run(dark(film(path(40))[:28], 18, 20))
     assert [e.status for e in estimates[18:20]] == [Status.LOST] * 2
     assert all(e.status is Status.TRACKING for e in estimates[20:])
@@ -262,19 +245,12 @@ def test_short_blackout_is_lost_and_found(film, path):
     assert evaluate(result.trajectory, path(40)).ate_percent < 3
 
 
-def test_long_blackout_starts_anew(film, path):
+def test_long_blackout_starts_anew(film, path, dark):
     moving = path(40)
     estimates, result = run(dark(film(moving), 14, 25))
     assert result.info["maps_started"] == 2 and estimates[-1].status is Status.TRACKING
     assert not set(moving.timestamps[14:23]) & set(result.trajectory.timestamps)
     assert result.frames_lost == 40 - len(result.trajectory) >= 9
-
-
-@pytest.mark.parametrize("value", [0, 120])
-def test_nothing_to_see(film, path, value):
-    _, result = run(dark(film(path(12)), 0, 12, value))
-    assert result.frames_read == 12 and len(result.map.points) == 0
-    assert result.frames_lost == 12 - len(result.trajectory)
 
 
 def test_pure_rotation_turns_and_does_not_move(film, path):
@@ -283,15 +259,3 @@ def test_pure_rotation_turns_and_does_not_move(film, path):
     metrics = evaluate(result.trajectory, turning)
     assert metrics.completeness == 1 and metrics.rotation_error_ratio < 0.1
     assert result.info["maps_started"] == 0
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_hardly_any_frames(film, path, count):
-    _, result = run(film(path(2))[:count])
-    assert len(result.trajectory) == count and result.frames_lost == 0
-
-
-def test_rendered_sequence(rendered):
-    frames, truth = rendered
-    metrics = evaluate(run(frames)[1].trajectory, truth)
-    assert metrics.completeness == 1 and metrics.ate_percent < 3

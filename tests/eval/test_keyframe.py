@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from dvo.data.frame import Frame
 from dvo.metrics import evaluate
-from dvo.odometry.protocol import Estimate, Odometry, Result, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 from eval.baselines import two_view
 from eval.baselines.keyframe.adjust import adjust, neighbourhood
 from eval.baselines.keyframe.config import KeyframeConfig
@@ -22,7 +20,6 @@ from eval.baselines.keyframe.map import Keyframe, Map
 from eval.baselines.keyframe.pose import _jacobian, centre, refine_pose
 from eval.baselines.keyframe.relocalise import describe, match, thumbnail
 from eval.baselines.keyframe.system import KeyframeOdometry
-from eval.systems import find_system
 
 INTRINSICS = np.array([300.0, 310.0, 160.0, 120.0])
 
@@ -219,16 +216,6 @@ def run(frames: list[Frame], seed: int = 0) -> tuple[list[Estimate], Result]:
     return [odometry.track(frame) for frame in frames], odometry.finish()
 
 
-def dark(frames: list[Frame], start: int, stop: int, value: int = 0) -> list[Frame]:
-    return [replace(f, image=np.full_like(f.image, value)) if start <= f.index < stop else f for f in frames]
-
-
-def test_it_is_a_system():
-    system = find_system("keyframe")
-    odometry = system.build(0, "cpu")
-    assert isinstance(odometry, Odometry) and odometry.name == "keyframe" and system.licence == "MIT"
-
-
 def test_tracks_a_clean_scene(film, path):
     estimates, result = run(film(path()))
     metrics = evaluate(result.trajectory, path())
@@ -238,12 +225,6 @@ def test_tracks_a_clean_scene(film, path):
     depths = result.map.points[:, 2] * metrics.scale
     near, far = np.abs(depths - 2.5) < 0.15, np.abs(depths - 5) < 0.3
     assert len(depths) > 100 and (near | far).mean() > 0.9 and near.sum() >= 5  # the near board is small
-
-
-def test_same_seed_same_bytes(film, path):
-    frames = film(path(40))[:16]
-    first, second = (run(frames)[1].trajectory.poses_wc.tobytes() for _ in range(2))
-    assert first == second
 
 
 def test_relocalises_without_a_prediction(film, path):
@@ -261,7 +242,7 @@ def test_relocalises_without_a_prediction(film, path):
     assert not odometry._recover(odometry._map, np.zeros((240, 320), np.uint8), 25)
 
 
-def test_short_blackout_is_lost_and_found(film, path):
+def test_short_blackout_is_lost_and_found(film, path, dark):
     estimates, result = run(dark(film(path(40))[:28], 18, 20))
     assert [e.status for e in estimates[18:20]] == [Status.LOST] * 2
     assert all(e.status is Status.TRACKING for e in estimates[20:])
@@ -270,19 +251,12 @@ def test_short_blackout_is_lost_and_found(film, path):
     assert metrics.matched == 26 and metrics.ate_percent < 1
 
 
-def test_starts_anew_when_it_cannot_be_found(film, path):
+def test_starts_anew_when_it_cannot_be_found(film, path, dark):
     moving = path(40)
     estimates, result = run(dark(film(moving), 14, 26))
     assert estimates[-1].status is Status.TRACKING and np.isfinite(result.trajectory.poses_wc).all()
     assert not set(moving.timestamps[14:23]) & set(result.trajectory.timestamps)
     assert result.frames_lost == 40 - len(result.trajectory) >= 9
-
-
-@pytest.mark.parametrize("value", [0, 120])
-def test_nothing_to_see(film, path, value):
-    _, result = run(dark(film(path(12)), 0, 12, value))
-    assert result.frames_read == 12 and len(result.map.points) == 0
-    assert result.frames_lost == 12 - len(result.trajectory)
 
 
 def test_pure_rotation_turns_and_does_not_move(film, path):
@@ -291,18 +265,6 @@ def test_pure_rotation_turns_and_does_not_move(film, path):
     metrics = evaluate(result.trajectory, turning)
     assert metrics.completeness == 1 and metrics.rotation_error_ratio < 0.05
     assert result.info["maps_started"] == 0
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_hardly_any_frames(film, path, count):
-    _, result = run(film(path(2))[:count])
-    assert len(result.trajectory) == count and result.frames_lost == 0
-
-
-def test_rendered_sequence(rendered):
-    frames, truth = rendered
-    metrics = evaluate(run(frames)[1].trajectory, truth)
-    assert metrics.completeness == 1 and metrics.ate_percent < 3
 
 
 def test_culled_keyframes_leave_their_frames_in_place(film, path):

@@ -6,6 +6,7 @@ import ast
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ import pytest
 
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
+from dvo.odometry.protocol import SparseMap
 from eval.peers import colmap, orbslam3, svo
 from eval.peers.common import Pictures, Row, longest_part
 from eval.systems import find_system
@@ -26,8 +28,8 @@ cv2.setNumThreads(1)
 from dvo.metrics import evaluate
 from dvo.synth.sequence import make_sequence
 from eval.systems import find_system
-name, frames, fps = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
-film = make_sequence(5005, frames=frames, fps=fps, family="clutter", kind="handheld")
+name, seed, frames, fps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
+film = make_sequence(seed, frames=frames, fps=fps, family="clutter", kind="handheld")
 odometry = find_system(name).build(0, "cpu")
 for frame in film:
     odometry.track(frame)
@@ -37,10 +39,10 @@ print("MEASURED", metrics.completeness, metrics.ate_percent, metrics.rotation_er
 """
 
 
-def measure(name: str, frames: int, fps: float) -> list[float]:
+def measure(name: str, seed: int, frames: int, fps: float) -> list[float]:
     """Completeness, ATE % and rotation error ratio of a system on a rendered sequence."""
     done = subprocess.run(
-        [sys.executable, "-c", DRIVE, name, str(frames), str(fps)],
+        [sys.executable, "-c", DRIVE, name, str(seed), str(frames), str(fps)],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,
@@ -122,6 +124,16 @@ def test_frames_follow_their_keyframes():
     assert [row.T_wc[0, 3] for row in moved] == pytest.approx([0.5, 1.5, 2.5, 3.5, 3.0, 4.0])
 
 
+def test_colmap_takes_a_part_of_a_long_sequence_and_its_end(monkeypatch):
+    frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
+    system = colmap.Colmap(most_images=4)
+    monkeypatch.setattr(system, "_reconstruct", lambda: ({}, SparseMap(), 0))
+    for k in range(12):
+        system.track(replace(frame, index=k, timestamp=0.1 * k))
+    assert system.finish().info["stride"] == 3
+    assert list(system._kept) == [f"{k:06d}.png" for k in (0, 3, 6, 9, 11)]
+
+
 def test_colmap_of_none_and_one_frame():
     frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
     nothing, one = colmap.Colmap(), colmap.Colmap()
@@ -132,11 +144,12 @@ def test_colmap_of_none_and_one_frame():
 # The conventions (which way poses go, where pixel centres lie) show in rotation as well as in position.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "frames", "fps"), [("svo", 130, 30.0), ("orbslam3", 130, 30.0), ("colmap", 100, 30.0)]
+    ("name", "seed", "frames", "fps"),
+    [("svo", 5004, 130, 30.0), ("orbslam3", 5005, 130, 30.0), ("colmap", 5005, 40, 15.0)],
 )
-def test_poses_agree_with_the_ground_truth(name, frames, fps):
+def test_poses_agree_with_the_ground_truth(name, seed, frames, fps):
     reason = find_system(name).missing()
     if reason is not None:
         pytest.skip(reason)
-    completeness, ate, rotation = measure(name, frames, fps)
+    completeness, ate, rotation = measure(name, seed, frames, fps)
     assert completeness > 0.5 and ate < 2 and rotation < 0.3

@@ -14,7 +14,6 @@ from dvo.data.poses import pose_matrices
 from dvo.data.trajectory import Trajectory, read_tum, write_tum
 from dvo.errors import DvoError
 from dvo.metrics import evaluate
-from eval import sequences
 from eval.sequences import SUITES, Sequence, Suite, open_sequence
 from eval.suites import config_names, folder_of_data, load_suites, settle, suite_from, suite_of_folder
 
@@ -49,8 +48,9 @@ def test_several_suites_and_chosen_sequences():
 
 
 def test_a_name_that_stands_for_several_suites(monkeypatch):
-    made = [Suite("plain", "l", (Sequence("a", ""),)), Suite("fast", "l", (Sequence("a", ""),))]
-    monkeypatch.setattr(sequences, "read_suites", lambda text: made, raising=False)
+    a = Sequence("a", "", rendered=(("seed", 1),))
+    made = [Suite("plain", "l", (a,)), Suite("fast", "l", (a,))]
+    monkeypatch.setattr("eval.suites.read_suites", lambda text: made)
     assert load_suites(["axes"]) == made
     assert folder_of_data(made, None) == Path()  # rendered sequences need no data folder
 

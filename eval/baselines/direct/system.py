@@ -15,10 +15,9 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.data.poses import poses_from_matrices
-from dvo.data.trajectory import Trajectory
-from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.working_image import working_image
-from eval.baselines.back_fill import back_fill
+from eval.baselines.back_fill import map_of, result_of
 from eval.baselines.direct.align import Alignment, Reference, align
 from eval.baselines.direct.depth import DepthConfig, DepthMap
 from eval.baselines.direct.image import Level, pyramid
@@ -142,22 +141,13 @@ class DirectOdometry:
         if self._key is not None:
             self._retire(self._key)
             self._key = None
-        poses = back_fill(self._T_cw, self._turns, self._lost)
-        rows = [index for index, pose in enumerate(poses) if pose is not None]
-        matrices = np.array([np.linalg.inv(poses[index]) for index in rows]).reshape(-1, 4, 4)  # type: ignore[arg-type]
-        points, colors = (np.concatenate(part) for part in zip(*self._map, strict=True)) if self._map else ((), ())
-        return Result(
-            trajectory=Trajectory(np.array([self._times[index] for index in rows]), poses_from_matrices(matrices)),
-            map=SparseMap(np.array(points, np.float32).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3)),
-            frames_read=len(self._times),
-            frames_lost=len(self._times) - len(rows),
-            info={
-                "working_size": list(self._size),
-                "working_intrinsics": self._intrinsics.tolist(),
-                **self._counts,
-                "config": asdict(self.config),
-            },
-        )
+        info = {
+            "working_size": list(self._size),
+            "working_intrinsics": self._intrinsics.tolist(),
+            **self._counts,
+            "config": asdict(self.config),
+        }
+        return result_of(self._times, self._T_cw, self._turns, self._lost, map_of(self._map), info)
 
     # --- every frame --------------------------------------------------------------------------------------------------
 

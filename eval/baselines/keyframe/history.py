@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from dvo.data.poses import poses_from_matrices
-from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
-from eval.baselines.back_fill import back_fill
+from eval.baselines.back_fill import result_of
 from eval.baselines.keyframe.map import Keyframe
 
 
@@ -57,13 +56,4 @@ class History:
 
     def result(self, points: SparseMap, info: dict[str, Any]) -> Result:
         """Everything, with the frames before each start filled in."""
-        poses = back_fill(self.poses(), self.turns, self.lost)
-        rows = [index for index, pose in enumerate(poses) if pose is not None]
-        matrices = np.array([np.linalg.inv(poses[index]) for index in rows]).reshape(-1, 4, 4)  # type: ignore[arg-type]
-        return Result(
-            trajectory=Trajectory(np.array([self.times[index] for index in rows]), poses_from_matrices(matrices)),
-            map=points,
-            frames_read=len(self.times),
-            frames_lost=len(self.times) - len(rows),
-            info=info,
-        )
+        return result_of(self.times, self.poses(), self.turns, self.lost, points, info)

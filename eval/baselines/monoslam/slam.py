@@ -18,8 +18,9 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.working_image import working_image
+from eval.baselines.back_fill import map_of
 from eval.baselines.klt import detect
 from eval.baselines.monoslam.consensus import drop_inconsistent, find_consensus
 from eval.baselines.monoslam.filter import Filter, Prediction
@@ -130,10 +131,9 @@ class MonoSlam:
         self._retire(None)
         rows = [index for index, pose in enumerate(self._poses) if pose is not None]
         poses = np.array([self._poses[index] for index in rows]).reshape(-1, 7)
-        points, colors = (np.concatenate(part) for part in zip(*self._map, strict=True)) if self._map else ((), ())
         return Result(
             trajectory=Trajectory(np.array([self._times[index] for index in rows]), poses),
-            map=SparseMap(np.array(points, np.float32).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3)),
+            map=map_of(self._map),
             frames_read=len(self._times),
             frames_lost=len(self._times) - len(rows),
             info={

@@ -80,6 +80,9 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--fps", type=_positive_float, default=30.0, metavar="F", help="default: %(default)g")
     export.add_argument("--path", metavar="KIND", help="kind of path: handheld, forward, orbit, rotation, drone, ...")
     export.add_argument("--sensor", action="store_true", help="noise, vignetting and so on; without: clean and exact")
+    export.add_argument(
+        "--lens", choices=("none", "radtan", "fisheye"), default="none", help="distortion (default: %(default)s)"
+    )
     export.add_argument("--device", metavar="D", default="cpu", help="torch device (default: %(default)s)")
     _rendering_options(export, "320x240")
     export.set_defaults(run="dvo.commands.synth:export")

@@ -58,8 +58,9 @@ def export(arguments: argparse.Namespace) -> int:
     device = device_of(arguments.device)
     sequence: SyntheticSequence
     if arguments.mesh is not None:
-        for option, given in (("--textures", arguments.textures), ("--sensor", arguments.sensor or None)):
-            if given is not None:
+        options = {"--textures": arguments.textures, "--sensor": arguments.sensor, "--lens": arguments.lens}
+        for option, given in options.items():
+            if given not in (None, False, "none"):
                 raise DvoError("does not go with --mesh", field=option, remedy="leave it out")
         sequence = mesh_sequence(
             _mesh(arguments, arguments.mesh), arguments.seed, frames=arguments.frames, height=height, width=width,
@@ -69,7 +70,7 @@ def export(arguments: argparse.Namespace) -> int:
         sequence = make_sequence(
             arguments.seed, frames=arguments.frames, height=height, width=width, fps=arguments.fps,
             family=arguments.family, kind=arguments.path, sensor=arguments.sensor, textures=arguments.textures,
-            device=device,
+            lens=arguments.lens, device=device,
         )  # fmt: skip
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=arguments.frames)

@@ -118,12 +118,15 @@ def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.nd
         )
         ideal = ideal - np.clip(step / safe[..., None], -0.3, 0.3)
     value, jacobian = _radtan(ideal, camera)
-    found = (np.abs(value - points).max(axis=-1) < 1e-9) & _rising(ideal, camera)
+    found = (np.abs(value - points).max(axis=-1) < 1e-9) & in_range(ideal, camera)
     return np.where(found[..., None], ideal, np.nan)
 
 
-def _rising(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Whether the lens model still grows outwards all the way from the centre to each ideal point ``(..., 2)``."""
+def in_range(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """``(...)`` bool: does the lens model grow outwards all the way from the centre to the ideal points ``(..., 2)``?
+
+    Farther out the polynomials fold back, and :func:`distort` gives places that the lens never fills.
+    """
     r = np.linalg.norm(points, axis=-1)[..., None] * np.linspace(0, 1, 17)
     if camera.model == "fisheye":
         return np.asarray((_kannala_brandt(np.arctan(r), camera)[1] > 0).all(axis=-1))
@@ -153,7 +156,7 @@ def _all_seen(camera: Camera, scale: float) -> bool:
     """Whether every pixel of the undistorted image with focal lengths times ``scale`` falls into the real image."""
     target = _scaled(camera, scale)
     ideal = (_border(target) - [target.cx, target.cy]) / [target.fx, target.fy]
-    if not _rising(ideal, camera).all():
+    if not in_range(ideal, camera).all():
         return False
     real = distort(ideal, camera) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     limit = np.array([camera.width - 1, camera.height - 1])

@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.geometry.undistort import bends
 
 _MULTIPLE = 8
 
@@ -21,7 +23,17 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
 
 
 def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
-    """Area-resampled ``(H, W, 3)`` uint8 image and its camera."""
+    """Area-resampled ``(H, W, 3)`` uint8 image and its camera.
+
+    Raises:
+        DvoError: the frame's camera has distortion, with which poses would be wrong without a word.
+    """
+    if bends(frame.camera):
+        raise DvoError(
+            f"frames with {frame.camera.model} distortion cannot be tracked",
+            field="camera",
+            remedy="undistort them first: dvo.geometry.undistort.Undistorter, or open_source, which does it",
+        )
     width, height = working_size(frame.camera.width, frame.camera.height, pixels)
     if (width, height) == (frame.camera.width, frame.camera.height):
         return np.ascontiguousarray(frame.image), frame.camera

@@ -14,6 +14,7 @@ from dvo.data.poses import NED_FROM_CAMERA, pose_matrices, poses_from_matrices
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.geometry.undistort import bends
 from dvo.synth.mesh import MeshScene
 from dvo.synth.poses import inverse, split
 from dvo.synth.scene import Scene
@@ -76,7 +77,8 @@ def export_sequence(
     ``tum``: ``rgb/``, ``depth/`` (16 bit, 5000 to a metre, 0 for none or beyond 13.1 m), ``rgb.txt``, ``depth.txt``,
     ``groundtruth.txt``. ``tartanair``: ``image_left/``, ``depth_left/*.npy`` (metres, float32, 0 for none), ``flow/``
     with masks (0 valid, 1 occluded, 100 out of view), ``pose_left.txt`` (camera x forward, y right, z down; the world's
-    z axis points up, unlike TartanAir's), ``imu/cam_time.txt``. Both: ``calib.txt`` with fx fy cx cy.
+    z axis points up, unlike TartanAir's), ``imu/cam_time.txt``. Both: ``calib.txt`` with fx fy cx cy; of a lens with
+    distortion (``tum`` only) also its coefficients, of a fisheye ``calib.yaml`` instead.
 
     Args:
         out: folder, new or empty.
@@ -87,18 +89,34 @@ def export_sequence(
     """
     if layout not in ("tum", "tartanair"):
         raise DvoError(f"no layout {layout!r}", field="layout", remedy="choose tum or tartanair")
+    if layout == "tartanair" and bends(sequence.camera):
+        raise DvoError("TartanAir's layout has no lens distortion", field="layout", remedy="choose tum")
     out = Path(out)
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
             raise DvoError("holds something already", file=out, field="--out", remedy="name a new folder")
-        numbers = " ".join(f"{value:.9f}" for value in sequence.camera.intrinsics)
-        (out / "calib.txt").write_text(f"# fx fy cx cy, pixels\n{numbers}\n", encoding="utf-8")
+        _write_calibration(sequence.camera, out)
         write = _write_tum if layout == "tum" else _write_tartanair
         notes = write(_frames(sequence, on_frame), sequence, out)
     except OSError as error:
         raise DvoError(f"cannot be written ({error.strerror})", file=out, remedy="name a folder elsewhere") from error
     return [*sequence.warnings, *notes]
+
+
+def _write_calibration(camera: Camera, out: Path) -> None:
+    """``calib.txt``, which has no place for a fisheye's model, or ``calib.yaml``."""
+    if camera.model == "fisheye":
+        rows = {name: f"{value:.9f}" for name, value in zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True)}
+        rows |= {"width": str(camera.width), "height": str(camera.height), "model": "fisheye"}
+        rows["coefficients"] = str(list(camera.coefficients))
+        text = "\n".join(f"{name}: {value}" for name, value in rows.items())
+        (out / "calib.yaml").write_text(text + "\n", encoding="utf-8")
+        return
+    numbers = [*camera.intrinsics, *camera.coefficients]
+    names = "fx fy cx cy, pixels" + (" (then k1 k2 p1 p2)" if camera.coefficients else "")
+    line = " ".join(f"{value:.9f}" for value in numbers)
+    (out / "calib.txt").write_text(f"# {names}\n{line}\n", encoding="utf-8")
 
 
 def _frames(sequence: SyntheticSequence, on_frame: Callable[[int], None] | None) -> Iterator[tuple[int, Array, Array]]:

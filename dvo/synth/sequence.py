@@ -11,10 +11,11 @@ import torch
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from dvo.geometry.camera import Camera
+from dvo.geometry.camera import Camera, DistortionModel
 from dvo.synth.bodies import Motion, Stage
 from dvo.synth.families import random_scene
 from dvo.synth.imu import Imu, ImuNoise, measure_imu
+from dvo.synth.lens import random_lens
 from dvo.synth.movers import random_bodies
 from dvo.synth.renderer import Rendering, render
 from dvo.synth.repaint import plainer
@@ -188,6 +189,7 @@ def make_sequence(
     jpeg: int = 0,
     apart: bool = False,
     textures: str | None = None,
+    lens: DistortionModel = "none",
 ) -> SyntheticSequence:
     """A smooth, realistic sequence through one scene.
 
@@ -212,6 +214,7 @@ def make_sequence(
         jpeg: quality of compression, 0 for none.
         apart: take a scene that no training clip can show (a seed of ``APART`` or above).
         textures: folder of photographs to paint with; None: those that scikit-image ships.
+        lens: ``radtan`` or ``fisheye`` draws a lens with distortion; frames come as it bends them, with its camera.
 
     ``shutter`` to ``jpeg`` are effects and need the sensor, except ``movers`` and ``texture``.
 
@@ -233,6 +236,7 @@ def make_sequence(
     duration, path_seed = frames / fps, int(rng.integers(2**31))
     path = long_path(scene, path_seed, name, duration, speed=speed, shake=shake)
     fx, fy, cx, cy = random_intrinsics(rng, height, width).tolist()
+    camera = random_lens(np.random.default_rng([seed, 7405]), Camera(fx, fy, cx, cy, width, height), lens)
     drawn = replace(random_sensor(rng), shutter=shutter, readout=rolling_shutter, drop=drop, jpeg=jpeg)
     if lighting > 0:
         drawn = replace(drawn, stops=exposure_changes(np.random.default_rng([seed, 7404]), duration, lighting))
@@ -244,7 +248,7 @@ def make_sequence(
         scene = plainer(scene, texture, seed)
     stage = Stage(scene, random_bodies(scene, path, duration, seed, movers)) if movers else scene
     return film(
-        stage, path, Camera(fx, fy, cx, cy, width, height), drawn if sensor else None, seed, device,
+        stage, path, camera, drawn if sensor else None, seed, device,
         times=np.arange(frames) / fps, supersample=supersample, name=f"{scene.family}-{name}-{seed}",
     )  # fmt: skip
 

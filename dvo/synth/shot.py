@@ -13,8 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.geometry.undistort import bends
 from dvo.synth.bodies import Motion, Stage
+from dvo.synth.lens import bent, plate_of, render_lens, straight
 from dvo.synth.poses import compose, pose_from, quaternion_to_matrix, split
 from dvo.synth.renderer import Rendering, render, trace
 from dvo.synth.rolling import render_rows, row_offsets
@@ -55,11 +58,14 @@ class Shot:
     Attributes:
         scene: static, or a :class:`Stage` with moving bodies.
         path: camera to world at any time.
-        camera: pinhole; its distortion is not rendered.
+        camera: pinhole, or with distortion (:mod:`dvo.synth.lens`); depth is along the optical axis in any case.
         exposure: seconds during which a row gathers light; 0 freezes the motion.
         readout: seconds from the first to the last row of a rolling shutter; 0 is a global shutter.
         supersample: rays per pixel edge for the colours.
         device: where to render.
+
+    Raises:
+        DvoError: a rolling shutter behind a lens with distortion, which is not rendered.
     """
 
     scene: Scene | Stage
@@ -69,6 +75,14 @@ class Shot:
     readout: float = 0.0
     supersample: int = 1
     device: torch.device | str = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.readout > 0 and bends(self.camera):
+            raise DvoError(
+                "a rolling shutter is not rendered through a lens with distortion",
+                field="readout, camera",
+                remedy="set readout to 0 or give a camera without model",
+            )
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -89,9 +103,18 @@ class Shot:
             )  # fmt: skip
         when = np.array([time])
         pose = self.path.poses_wc(when) if pose_wc is None else pose_wc
+        return self._render(pose, when, self.supersample)
+
+    def _render(self, poses_wc: Array, when: Array, supersample: int = 1, coordinates: bool = True) -> Rendering:
+        """Sharp frames ``(N, ...)`` with a global shutter."""
+        if bends(self.camera):
+            return render_lens(
+                self.scene, poses_wc, self.camera, times=when, supersample=supersample, device=self.device,
+                coordinates=coordinates,
+            )  # fmt: skip
         return render(
-            self.scene, pose, self.camera.intrinsics, *self._size, times=when, supersample=self.supersample,
-            device=self.device,
+            self.scene, poses_wc, self.camera.intrinsics, *self._size, times=when, supersample=supersample,
+            device=self.device, coordinates=coordinates,
         )  # fmt: skip
 
     def rendering(self, time: float, pose_wc: Array | None = None) -> Rendering:
@@ -112,8 +135,7 @@ class Shot:
                 )
                 total += rows.images
         elif count > 1:
-            poses, k = self.path.poses_wc(others), self.camera.intrinsics
-            many = render(self.scene, poses, k, *self._size, times=others, device=self.device, coordinates=False)
+            many = self._render(self.path.poses_wc(others), others, coordinates=False)
             total += many.images.sum(0, keepdim=True)
         return replace(middle, images=total / count)
 
@@ -140,7 +162,8 @@ class Shot:
         """Points ``(M, 3)`` that pixels ``(M, 2)`` with depth and surface ``(M,)`` show in the frame at ``time``, each
         in the frame of what it belongs to: the world, or a body."""
         fx, fy, cx, cy = self.camera.intrinsics
-        ray = np.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
+        ideal = straight(pixels, self.camera)
+        ray = np.stack([(ideal[:, 0] - cx) / fx, (ideal[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
         rotation, centre = self._read(self.path, time, pixels[:, 1])
         points = (rotation @ (ray * depth[:, None])[..., None])[..., 0] + centre
         for at, motion in self._moving(surface):
@@ -166,7 +189,7 @@ class Shot:
             local = (np.swapaxes(rotation, -1, -2) @ (world - centre)[..., None])[..., 0]
             z = local[:, 2]
             ahead = np.where(z > 1e-9, z, 1e-9)
-            pixels = np.stack([fx * local[:, 0] / ahead + cx, fy * local[:, 1] / ahead + cy], -1)
+            pixels = bent(np.stack([fx * local[:, 0] / ahead + cx, fy * local[:, 1] / ahead + cy], -1), self.camera)
             change = float(np.abs(pixels[:, 1] - rows).max(initial=0))
             rows = np.clip(pixels[:, 1], -1.0, self.camera.height)
             if change < 1e-7:
@@ -183,8 +206,12 @@ class Shot:
         ``(M,)``, surface ``(M,)``, uv ``(M, 2)``."""
         k = self.camera.intrinsics
         if self.readout <= 0:
-            when = np.array([time])
-            depth, surface, uv = trace(self.scene, self.path.poses_wc(when), k, pixels[None], when, self._size)
+            when, size = np.array([time]), self._size
+            if bends(self.camera):  # through the pinhole picture that covers what the lens sees
+                plate = plate_of(self.camera, 2)
+                pixels = straight(pixels, self.camera) + (plate.intrinsics - k)[2:]
+                k, size = plate.intrinsics, plate.size
+            depth, surface, uv = trace(self.scene, self.path.poses_wc(when), k, pixels[None], when, size)
             return depth[0], surface[0], uv[0]
         when = time + row_offsets(pixels[:, 1], self.camera.height, self.readout)
         poses = pose_from(*self._read(self.path, time, pixels[:, 1]))

@@ -41,14 +41,23 @@ def scene() -> Scene:
     return random_scene(4, "room", pool=texture_pool(5))
 
 
-def make_shot(scene: Scene, *, bodies: int = 0, readout: float = 0.0, exposure: float = 0.0) -> Shot:
+LENSES = {
+    "radtan": replace(CAMERA, model="radtan", coefficients=(-0.17, 0.02, 1e-3, -8e-4)),
+    "fisheye": replace(CAMERA, model="fisheye", coefficients=(0.02, -0.004, 0.0, 0.0)),
+}
+
+
+def make_shot(
+    scene: Scene, *, bodies: int = 0, readout: float = 0.0, exposure: float = 0.0, camera: Camera = CAMERA
+) -> Shot:
     path = long_path(scene, 3, "handheld", 3.0, speed=2.0, shake=2.0)
     stage = Stage(scene, random_bodies(scene, path, 1.0, 2, bodies)) if bodies else scene
-    return Shot(stage, path, CAMERA, exposure, readout)
+    return Shot(stage, path, camera, exposure, readout)
 
 
 CASES = {
     "still": {}, "bodies": {"bodies": 4}, "rolling": {"readout": 0.03}, "both": {"bodies": 4, "readout": 0.03},
+    "radtan": {"bodies": 4, "camera": LENSES["radtan"]}, "fisheye": {"camera": LENSES["fisheye"]},
 }  # fmt: skip
 
 

@@ -62,8 +62,8 @@ class Sensor:
 
 
 def random_intrinsics(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """``(4,)`` fx fy cx cy: horizontal field of view 40-100 degrees, slightly off centre, slightly anisotropic."""
-    view = np.deg2rad(rng.uniform(40, 100))
+    """``(4,)`` fx fy cx cy: horizontal field of view 40-110 degrees, slightly off centre, slightly anisotropic."""
+    view = np.deg2rad(rng.uniform(40, 110))
     fx = 0.5 * width / np.tan(view / 2)
     fy = fx * np.exp(rng.normal(0, 0.01))
     cx = (width - 1) / 2 + np.clip(rng.normal(0, 0.012), -0.04, 0.04) * width

@@ -193,7 +193,12 @@ _CLASSICAL = {
         ),
         System("svo", "GPL-3", "SVO (svo-cpp)", _svo, svo.version, svo.missing),
         System(
-            "colmap", "BSD-3", "COLMAP (pycolmap), offline, at most 120 frames of a sequence", _colmap, colmap.version, colmap.missing
+            "colmap",
+            "BSD-3",
+            "COLMAP (pycolmap), offline, at most 120 frames of a sequence",
+            _colmap,
+            colmap.version,
+            colmap.missing,
         ),
         System(
             "null",

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What to draw; one draw for all frames of a clip. The defaults are DPVO's.
+    """What to draw; one draw for all frames of a clip, but for the exposure. The defaults are DPVO's.
 
     Attributes:
         colour: probability of a change of colours.
@@ -22,6 +22,8 @@ class Augmentation:
         zoom: probability of crop-and-resize.
         zoom_range: the window is the image over ``2^u``, ``u`` from ``[0, zoom_range]``.
         off_centre: whether the window lies anywhere, or in the middle as DPVO's.
+        exposure: probability that the exposure drifts from frame to frame and jumps once, as an automatic one does.
+        exposure_range: lowest and highest size of the jump, stops; the drift is a third of it over the clip.
     """
 
     colour: float = 0.5
@@ -34,6 +36,8 @@ class Augmentation:
     zoom: float = 0.8
     zoom_range: float = 0.5
     off_centre: bool = True
+    exposure: float = 0.0
+    exposure_range: tuple[float, float] = (-1.5, 0.8)
 
 
 def augment(batch: dict[str, Tensor], settings: Augmentation, seed: int, step: int) -> dict[str, Tensor]:
@@ -49,6 +53,8 @@ def augment(batch: dict[str, Tensor], settings: Augmentation, seed: int, step: i
             clip |= _zoom(clip, settings, draw)
         if torch.rand((), generator=draw) < settings.colour:
             clip["images"] = _colour(clip["images"], settings, draw)
+        if settings.exposure > 0 and torch.rand((), generator=draw) < settings.exposure:
+            clip["images"] = _reexpose(clip["images"], settings, draw)
         clips.append(clip)
     return {name: torch.stack([clip[name] for clip in clips]) for name in batch}
 
@@ -91,6 +97,17 @@ def crop_and_resize(clip: dict[str, Tensor], scale: float, left: float, top: flo
         "depth": depth[:, rows][:, :, columns],
         "intrinsics": intrinsics,
     }
+
+
+def _reexpose(images: Tensor, settings: Augmentation, draw: torch.Generator) -> Tensor:
+    """``(N, 3, H, W)`` uint8, each frame brightened or darkened as a whole; what gets too bright is cut off."""
+    low, high = settings.exposure_range
+    n = len(images)
+    jump, drift, when = torch.rand(3, generator=draw)
+    frame = torch.arange(n)
+    stops = (low + (high - low) * jump) * (frame > when * (n - 1)) + (low + (high - low) * drift) / 3 * frame / n
+    gain = (2.0**stops).to(images.device)[:, None, None, None]
+    return (images.float() * gain).round().clamp(0, 255).to(images.dtype)
 
 
 def _colour(images: Tensor, settings: Augmentation, draw: torch.Generator) -> Tensor:

@@ -52,3 +52,19 @@ def test_one_draw_for_all_frames_and_the_same_for_the_same_step():
     assert a["images"].dtype == torch.uint8 and a["images"].shape == batch["images"].shape
     never = augment(batch, Augmentation(colour=0.0, zoom=0.0), 0, 5)
     assert all(torch.equal(never[name], batch[name]) for name in batch)
+
+
+def test_the_exposure_jumps_once_and_drifts():
+    clip = ramp()
+    images = torch.full((1, 8, 3, 24, 32), 100, dtype=torch.uint8)
+    batch = {"images": images, "depth": clip["depth"][None, :1].repeat(1, 8, 1, 1)}
+    only = Augmentation(colour=0.0, zoom=0.0, exposure=1.0, exposure_range=(-1.5, 0.8))
+    steps = []
+    for step in range(40):
+        new = augment(batch, only, 0, step)["images"][0].float()
+        assert (new == new[:, :1, :1, :1]).all()  # the whole frame alike
+        steps.append((new[:, 0, 0, 0] / 100).log2().diff())
+    jumps = torch.stack(steps)
+    assert (jumps.abs() > 0.15).sum(1).max() == 1 and (jumps.abs() > 0.15).any(1).float().mean() > 0.7
+    assert jumps.min() > -1.7 and jumps.max() < 1.0 and jumps.min() < -0.8 and jumps.max() > 0.4
+    assert augment(batch, only, 0, 3)["images"].equal(augment(batch, only, 0, 3)["images"])

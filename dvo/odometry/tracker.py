@@ -7,7 +7,7 @@ keeping. What leaves the window is written down once and never changes again.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from torch import Tensor
 from dvo.ba.cold_start import COLD_UPDATES, damping_at, robust_cost, solve_from_nothing
 from dvo.ba.layer import bundle_adjust
 from dvo.data.frame import Frame
-from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
@@ -24,21 +23,12 @@ from dvo.nets.edge_correlation import EdgeCorrelation
 from dvo.nets.patch_vo import PatchVO
 from dvo.nets.patchifier import normalise_images, patch_coordinates, pool_levels, random_centres
 from dvo.nets.weights import load_weights
+from dvo.odometry.chronicle import Chronicle
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.motion import flow_magnitude, parallax, predict_pose
-from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.window import Keyframe, Window
 from dvo.odometry.working_image import working_image
-
-
-@dataclass
-class _Record:
-    """A frame of the video: its pose is ``relative`` after that of keyframe ``anchor`` (world to camera)."""
-
-    timestamp: float
-    anchor: int
-    relative: np.ndarray
-    lost: bool = False
 
 
 class PatchOdometry:
@@ -76,10 +66,7 @@ class PatchOdometry:
             for scale in c.pyramid
         ]
         self._bounds = (0, 0)  # width and height of the feature map
-        self._records: list[_Record] = []
-        self._settled: dict[int, np.ndarray] = {}
-        self._points: list[np.ndarray] = []
-        self._colors: list[np.ndarray] = []
+        self._chronicle = Chronicle()
         self._count = 0
         self._initialised = False
         self._size: tuple[int, int] | None = None
@@ -103,15 +90,14 @@ class PatchOdometry:
         self._connect()
         if not self._initialised and len(window) > 1 and self._probe() < config.initial_motion:
             return self._skip(frame)
-        self._records.append(_Record(frame.timestamp, keyframe.identifier, _IDENTITY))
+        record = self._chronicle.add(frame.timestamp, keyframe.identifier)
         if self._initialised:
             for _ in range(config.updates):
                 self._update()
         elif len(window) >= config.initial_frames:
             self._initialise()
         confidence = self._confidence()
-        lost = self._initialised and confidence < config.lost_confidence
-        self._records[-1].lost = lost
+        record.lost = lost = self._initialised and confidence < config.lost_confidence
         pose_wc = self._pose_wc(len(window) - 1)
         self._reduce()
         status = Status.LOST if lost else Status.TRACKING if self._initialised else Status.INITIALISING
@@ -124,34 +110,22 @@ class PatchOdometry:
         if len(window) > 1:
             for age in range(config.final_updates if self._initialised else config.initial_updates):
                 self._update(COLD_UPDATES if self._initialised else age)
-        poses = dict(self._settled)
-        for index, keyframe in enumerate(window.frames):
-            poses[keyframe.identifier] = window.poses_cw[index].double().cpu().numpy()
-            self._to_map(index)
-        kept = [record for record in self._records if not record.lost and record.anchor in poses]
-        rows = np.zeros((0, 7))
-        if kept:
-            relative = torch.from_numpy(np.stack([record.relative for record in kept]))
-            anchors = torch.from_numpy(np.stack([poses[record.anchor] for record in kept]))
-            rows = se3.normalise(se3.inverse(se3.compose(relative, anchors))).numpy()
-        times = np.array([record.timestamp for record in kept], dtype=np.float64)
-        points = np.concatenate([np.zeros((0, 3), np.float32), *self._points])
-        colors = np.concatenate([np.zeros((0, 3), np.uint8), *self._colors])
-        info = {**self._info, "keyframes": len(poses), "seed": self.seed, "initialised": self._initialised}
-        return Result(
-            Trajectory(times, rows),
-            SparseMap(points, colors),
-            len(self._records),
-            len(self._records) - len(kept),
-            {**info, "config": asdict(config)},
-        )
+        while len(window):
+            self._settle()
+        trajectory, read = self._chronicle.trajectory(), len(self._chronicle.frames)
+        info = {
+            **self._info, "keyframes": self._chronicle.keyframes, "seed": self.seed, "initialised": self._initialised,
+            "config": asdict(config),
+        }  # fmt: skip
+        return Result(trajectory, self._chronicle.map(), read, read - len(trajectory), info)
 
     # -- steps of a frame ----------------------------------------------------------------------------------------
 
     def _check(self, frame: Frame) -> None:
-        if self._records and frame.timestamp <= self._records[-1].timestamp:
+        past = self._chronicle.frames
+        if past and frame.timestamp <= past[-1].timestamp:
             raise DvoError(
-                f"time {frame.timestamp} does not come after {self._records[-1].timestamp}",
+                f"time {frame.timestamp} does not come after {past[-1].timestamp}",
                 field=f"frame {frame.index}",
                 remedy="give frames in order of time",
             )
@@ -252,8 +226,7 @@ class PatchOdometry:
     def _skip(self, frame: Frame) -> Estimate:
         """Before initialisation: a frame that shows too little motion shares the pose of the keyframe before it."""
         self.window.remove(len(self.window) - 1)
-        anchor = self.window.frames[-1].identifier
-        self._records.append(_Record(frame.timestamp, anchor, _IDENTITY))
+        self._chronicle.add(frame.timestamp, self.window.frames[-1].identifier)
         return Estimate(frame.timestamp, self._pose_wc(len(self.window) - 1), Status.INITIALISING)
 
     def _initialise(self) -> None:
@@ -296,42 +269,22 @@ class PatchOdometry:
     def _drop(self, index: int) -> None:
         """Remove a keyframe; its frames hang on the one before it from now on."""
         window = self.window
-        relative = se3.relative(window.poses_cw[index - 1], window.poses_cw[index]).double().cpu()
-        anchor = window.frames[index - 1].identifier
-        gone = window.remove(index).identifier
-        for record in self._recent(gone):
-            record.relative = se3.compose(torch.from_numpy(record.relative), relative).numpy()
-            record.anchor = anchor
-
-    def _recent(self, anchor: int) -> list[_Record]:
-        """The records that hang on a keyframe of the window; they are among the last ones."""
-        found: list[_Record] = []
-        oldest = self.window.frames[0].identifier
-        for record in reversed(self._records):
-            if record.anchor == anchor:
-                found.append(record)
-            elif record.anchor < oldest:
-                break
-        return found
+        relative = se3.relative(window.poses_cw[index - 1], window.poses_cw[index]).double().cpu().numpy()
+        anchor, oldest = window.frames[index - 1].identifier, window.frames[0].identifier
+        self._chronicle.rehang(window.remove(index).identifier, anchor, relative, oldest)
 
     def _settle(self) -> None:
         """The oldest keyframe leaves the window: its pose and points are final."""
-        self._to_map(0)
-        pose = self.window.poses_cw[0].double().cpu().numpy()
-        self._settled[self.window.remove(0).identifier] = pose
-
-    def _to_map(self, index: int) -> None:
-        """Write down the points of a frame that were seen well."""
-        window, m = self.window, self.config.patches
-        frame = window.frames[index]
-        centre = self.model.config.patch_size // 2
-        x, y, d = window.patches[index * m : (index + 1) * m, :, centre, centre].unbind(-1)
+        window, centre = self.window, self.model.config.patch_size // 2
+        frame, pose = window.frames[0], window.poses_cw[0]
+        x, y, d = window.patches[: self.config.patches, :, centre, centre].unbind(-1)
         fx, fy, cx, cy = frame.intrinsics
         rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
-        world = se3.act(se3.inverse(window.poses_cw[index]), rays / d[:, None])
-        near = (d > 0.05 * d.median()).cpu().numpy()
-        self._points.append(world.float().cpu().numpy()[near])
-        self._colors.append(frame.colors.numpy()[near])
+        world = se3.act(se3.inverse(pose), rays / d[:, None])
+        near = (d > 0.05 * d.median()).cpu().numpy()  # a far point's depth is a guess
+        self._chronicle.add_points(world.float().cpu().numpy()[near], frame.colors.numpy()[near])
+        self._chronicle.settle(frame.identifier, pose.double().cpu().numpy())
+        window.remove(0)
 
     def _confidence(self) -> float:
         newest = self.window.weights[self.window.jj == len(self.window) - 1]
@@ -339,9 +292,6 @@ class PatchOdometry:
 
     def _pose_wc(self, index: int) -> np.ndarray:
         return se3.inverse(self.window.poses_cw[index]).double().cpu().numpy()
-
-
-_IDENTITY = np.array([0.0, 0, 0, 0, 0, 0, 1])
 
 
 def load(

@@ -29,6 +29,9 @@ class TrackerConfig:
             below this.
         keyframe_index: how many keyframes back that test looks.
         motion_damping: share of the last motion expected to go on.
+        patience: so many lost frames in a row stay out of the graph, so that the first good one after them joins those
+            before them; after more it is given up to find them again, and lost frames stay in the graph.
+        search_updates: recurrent updates of a frame after a lost one, to find the way again.
         lost_confidence: below this mean confidence of the newest frame's edges the tracker says ``lost``.
     """
 
@@ -47,6 +50,8 @@ class TrackerConfig:
     keyframe_index: int = 4
     motion_damping: float = 0.5
     lost_confidence: float = 0.01
+    patience: int = 15
+    search_updates: int = 8
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrackerConfig:

@@ -69,6 +69,7 @@ class PatchOdometry:
         self._chronicle = Chronicle()
         self._count = 0
         self._initialised = False
+        self._blind = 0
         self._size: tuple[int, int] | None = None
         self._info: dict[str, object] = {}
 
@@ -91,15 +92,22 @@ class PatchOdometry:
         if not self._initialised and len(window) > 1 and self._probe() < config.initial_motion:
             return self._skip(frame)
         record = self._chronicle.add(frame.timestamp, keyframe.identifier)
+        before = window.poses_cw, window.patches, window.hidden, window.weights
         if self._initialised:
-            for _ in range(config.updates):
+            searching = 0 < self._blind <= config.patience
+            for _ in range(config.search_updates if searching else config.updates):
                 self._update()
         elif len(window) >= config.initial_frames:
             self._initialise()
         confidence = self._confidence()
         record.lost = lost = self._initialised and confidence < config.lost_confidence
         pose_wc = self._pose_wc(len(window) - 1)
-        self._reduce()
+        self._blind = self._blind + 1 if lost else 0
+        if 0 < self._blind <= config.patience:
+            window.poses_cw, window.patches, window.hidden, window.weights = before
+            self._forget_newest()
+        else:
+            self._reduce()
         status = Status.LOST if lost else Status.TRACKING if self._initialised else Status.INITIALISING
         return Estimate(frame.timestamp, pose_wc, status, confidence)
 
@@ -222,6 +230,13 @@ class PatchOdometry:
         _, delta, _, _ = self._revise()
         edges = (window.ii == n - 2) & (window.jj == n - 1)
         return float(delta[edges].norm(dim=-1).median())
+
+    def _forget_newest(self) -> None:
+        """A frame that nothing is known of must not stand between those before it and those to come."""
+        window = self.window
+        anchor, oldest = window.frames[-2].identifier, window.frames[0].identifier
+        still = np.array([0.0, 0, 0, 0, 0, 0, 1])
+        self._chronicle.rehang(window.remove(len(window) - 1).identifier, anchor, still, oldest)
 
     def _skip(self, frame: Frame) -> Estimate:
         """Before initialisation: a frame that shows too little motion shares the pose of the keyframe before it."""

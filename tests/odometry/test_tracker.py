@@ -1,4 +1,5 @@
-"""The streaming tracker with an untrained network: bookkeeping, determinism, bounded memory."""
+"""The streaming tracker with an untrained network: bookkeeping, determinism, bounded memory; with the shipped weights:
+finding the way again."""
 
 from dataclasses import replace
 
@@ -6,14 +7,17 @@ import numpy as np
 import pytest
 import torch
 
+import dvo
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.metrics import evaluate
 from dvo.nets.config import preset
 from dvo.nets.patch_vo import PatchVO
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.protocol import Odometry, Status
 from dvo.odometry.tracker import PatchOdometry
+from dvo.synth.sequence import make_sequence
 
 SMALL = TrackerConfig(
     pixels=96 * 72, patches=6, lifetime=4, removal=5, optimisation=4, initial_frames=5, initial_updates=3,
@@ -107,3 +111,20 @@ def test_frames_out_of_order_or_of_another_size_are_refused():
 def test_unknown_setting_is_named():
     with pytest.raises(DvoError, match="colour"):
         TrackerConfig.from_dict({"colour": 1})
+
+
+def test_a_covered_lens_is_lost_and_the_way_found_again():
+    """Half a second without light: those frames are lost, nothing else is, and the path goes on as if it had not been
+    (the same sequence without the dark is the yardstick)."""
+    film = make_sequence(61, frames=48, height=120, width=160, fps=15, family="room", kind="handheld", sensor=False)
+    clear = list(film)
+    covered = [replace(f, image=np.zeros_like(f.image)) if 26 <= f.index < 33 else f for f in clear]
+    errors = []
+    for frames in (clear, covered):
+        odometry = dvo.load("small", device="cpu", seed=0)
+        estimates = [odometry.track(frame) for frame in frames]
+        result = odometry.finish()
+        errors.append(evaluate(result.trajectory, film.groundtruth).ate_percent)
+    assert [e.status is Status.LOST for e in estimates] == [26 <= k < 33 for k in range(48)]
+    assert result.frames_lost == 7 and len(result.trajectory) == 41
+    assert errors[1] < max(2 * errors[0], 2.0), errors

@@ -195,7 +195,7 @@ _CLASSICAL = {
         System(
             "colmap",
             "BSD-3",
-            "COLMAP (pycolmap), offline, at most 120 frames of a sequence",
+            "COLMAP (pycolmap), offline, at most 60 frames of a sequence",
             _colmap,
             colmap.version,
             colmap.missing,

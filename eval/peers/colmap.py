@@ -18,7 +18,7 @@ from dvo.data.trajectory import Trajectory, interpolate
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from eval.peers.common import Pictures, missing_module, version_of
 
-MOST_IMAGES = 120
+MOST_IMAGES = 60
 version = version_of("pycolmap")
 
 

@@ -104,8 +104,10 @@ class PatchOdometry:
         pose_wc = self._pose_wc(len(window) - 1)
         self._blind = self._blind + 1 if lost else 0
         if 0 < self._blind <= config.patience:
+            # Nothing is known of this frame: it must not stand between those before it and those to come.
             window.poses_cw, window.patches, window.hidden, window.weights = before
-            self._forget_newest()
+            window.remove(len(window) - 1)
+            record.anchor = window.frames[-1].identifier
         else:
             self._reduce()
         status = Status.LOST if lost else Status.TRACKING if self._initialised else Status.INITIALISING
@@ -230,13 +232,6 @@ class PatchOdometry:
         _, delta, _, _ = self._revise()
         edges = (window.ii == n - 2) & (window.jj == n - 1)
         return float(delta[edges].norm(dim=-1).median())
-
-    def _forget_newest(self) -> None:
-        """A frame that nothing is known of must not stand between those before it and those to come."""
-        window = self.window
-        anchor, oldest = window.frames[-2].identifier, window.frames[0].identifier
-        still = np.array([0.0, 0, 0, 0, 0, 0, 1])
-        self._chronicle.rehang(window.remove(len(window) - 1).identifier, anchor, still, oldest)
 
     def _skip(self, frame: Frame) -> Estimate:
         """Before initialisation: a frame that shows too little motion shares the pose of the keyframe before it."""

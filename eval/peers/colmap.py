@@ -18,7 +18,7 @@ from dvo.data.trajectory import Trajectory, interpolate
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from eval.peers.common import Pictures, missing_module, version_of
 
-MOST_IMAGES = 60
+MOST_IMAGES = 60  # of a sequence; one takes about half a second of a core at 320x240, and more the more there are
 version = version_of("pycolmap")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from dvo.data.frame import Frame
@@ -75,3 +76,12 @@ def test_a_dark_frame_is_lost_and_the_next_is_not(name, film, path, dark):
     odometry = SMALL[name]()
     estimates = [odometry.track(frame) for frame in frames]
     assert estimates[24].status is Status.LOST and estimates[-1].status is Status.TRACKING
+
+
+@pytest.mark.parametrize(("name", "most"), [("klt-pnp", 0.05), ("keyframe", 0.05), ("direct", 0.1)])
+def test_pure_rotation_turns_and_does_not_move(name, film, path, most):
+    turning = path(30, translate=0.0)
+    result = run(name, film(turning))
+    metrics = evaluate(result.trajectory, turning)
+    assert metrics.completeness == 1 and metrics.rotation_error_ratio < most
+    assert result.info["maps_started"] == 0 and np.isnan(metrics.ate_rmse) and metrics.reason is not None

@@ -251,11 +251,3 @@ def test_long_blackout_starts_anew(film, path, dark):
     assert result.info["maps_started"] == 2 and estimates[-1].status is Status.TRACKING
     assert not set(moving.timestamps[14:23]) & set(result.trajectory.timestamps)
     assert result.frames_lost == 40 - len(result.trajectory) >= 9
-
-
-def test_pure_rotation_turns_and_does_not_move(film, path):
-    turning = path(30, translate=0.0)
-    _, result = run(film(turning))
-    metrics = evaluate(result.trajectory, turning)
-    assert metrics.completeness == 1 and metrics.rotation_error_ratio < 0.1
-    assert result.info["maps_started"] == 0

@@ -18,7 +18,7 @@ from dvo.errors import DvoError
 if TYPE_CHECKING:
     from dvo.ba.layer import bundle_adjust
     from dvo.data.source import open_source as open
-    from dvo.nets.weights import load_model
+    from dvo.models.weights import load_model
     from dvo.odometry.tracker import load
 
 __version__ = "0.1.0"
@@ -28,7 +28,7 @@ __all__ = ["DvoError", "__version__", "bundle_adjust", "load", "load_model", "op
 _LAZY = {
     "bundle_adjust": ("dvo.ba.layer", "bundle_adjust"),
     "load": ("dvo.odometry.tracker", "load"),
-    "load_model": ("dvo.nets.weights", "load_model"),
+    "load_model": ("dvo.models.weights", "load_model"),
     "open": ("dvo.data.source", "open_source"),
 }
 

@@ -12,9 +12,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from dvo.data.poses import pose_matrices, poses_from_matrices
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
+from dvo.geometry.poses import pose_matrices, poses_from_matrices
 
 Alignment = Literal["none", "scale", "se3", "sim3"]
 MINIMUM_MATCHES = 3

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import NoReturn
 
 from dvo.errors import DvoError
-from eval.plan import Plan, read_manifest
-from eval.report import AXES, PAGE, RESULTS, TABLE, write_report, write_tables
-from eval.runner import predict_all
-from eval.score import score_all
-from eval.sequences import data_folder
-from eval.suites import config_names, folder_of_data, is_rendered, load_suites, settle
-from eval.systems import DEFAULT, list_systems
+from eval.execution.plan import Plan, read_manifest
+from eval.execution.runner import predict_all
+from eval.reporting.report import AXES, PAGE, RESULTS, TABLE, write_report, write_tables
+from eval.scoring.score import score_all
+from eval.suites.selection import config_names, folder_of_data, is_rendered, load_suites, settle
+from eval.suites.suite import data_folder
+from eval.systems.registry import DEFAULT, list_systems
 
 
 class _Parser(argparse.ArgumentParser):

@@ -20,10 +20,12 @@ ARROWS: dict[str, set[str]] = {
     "data": {"geometry"},
     "ba": {"geometry"},
     "metrics": {"data", "geometry"},
-    "nets": {"geometry", "ba", "data"},
+    "graph": {"data", "geometry"},
+    "nets": {"geometry", "ba", "data", "graph"},
+    "models": {"nets", "graph", "ba", "data", "geometry"},
     "synth": {"geometry", "ba", "data"},
     "losses": {"geometry"},
-    "odometry": {"nets", "ba", "data", "geometry"},
+    "odometry": {"models", "graph", "nets", "ba", "data", "geometry"},
     "viz": {"data", "geometry", "odometry"},
 }
 TOP = {"cli", "commands", "demo", "__main__", "__init__"}  # these know everything, nobody below knows them

@@ -209,7 +209,7 @@ def test_agrees_with_the_stored_values_of_evo(data_root: Path, index: int):
 @pytest.mark.parametrize("align", ["none", "scale", "se3", "sim3"])
 def test_agrees_with_evo_run_now(data_root: Path, name: str, align: Alignment):
     pytest.importorskip("evo", reason="evo is in the extra 'eval'")
-    from eval.metrics import evo_metrics
+    from eval.scoring.metrics import evo_metrics
 
     folder = data_root / "trajectories/evo"
     estimate = read_tum(folder / f"freiburg1_xyz-{name}.txt")

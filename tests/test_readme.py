@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dvo.cli import build_parser
-from dvo.nets.weights import list_weights
+from dvo.models.weights import list_weights
 
 README = Path(__file__).resolve().parent.parent / "README.md"
 

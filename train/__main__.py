@@ -14,11 +14,11 @@ import importlib
 import sys
 
 COMMANDS = {
-    "export": "train.export",
-    "validate": "train.validate",
-    "snr": "train.snr",
-    "study": "train.study",
-    "profile": "train.breakdown",
+    "export": "train.engine.export",
+    "validate": "train.validation.validate",
+    "snr": "train.studies.snr",
+    "study": "train.studies.study",
+    "profile": "train.studies.breakdown",
 }
 
 
@@ -42,8 +42,8 @@ def run() -> None:
     from lightning.pytorch.cli import LightningCLI
 
     from dvo.allocator import reuse_freed_memory
-    from train.data import Renderings
-    from train.module import PatchVOTraining
+    from train.data.clips import Renderings
+    from train.tasks.patch_vo.module import PatchVOTraining
 
     reuse_freed_memory()
     LightningCLI(PatchVOTraining, Renderings, seed_everything_default=0, save_config_kwargs={"overwrite": True})

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dvo.errors import DvoError
-from dvo.nets.weights import WeightsInfo, import_checkpoint, list_weights, weights_info
+from dvo.models.weights import WeightsInfo, import_checkpoint, list_weights, weights_info
 from dvo.odometry.results import jsonable
 
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from dvo.data.calibration import Calibration, load_yaml, read_calibration
 from dvo.data.folder import camera_images
-from dvo.data.poses import compose_poses, invert_poses, poses_from_matrices
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.stamps import choose_times, read_times
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.errors import DvoError
+from dvo.geometry.poses import compose_poses, invert_poses, poses_from_matrices
 
 
 def _mav(path: Path) -> Path | None:

@@ -9,11 +9,11 @@ import numpy as np
 
 from dvo.data.calibration import Calibration
 from dvo.data.images import has_images, list_images
-from dvo.data.poses import compose_poses
 from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
 from dvo.data.stamps import choose_times, read_times
 from dvo.data.trajectory import Trajectory, read_kitti_poses
 from dvo.errors import DvoError
+from dvo.geometry.poses import compose_poses
 
 CAMERAS = ("image_0", "image_2", "image_1", "image_3")
 KITTI_FPS = 1 / 0.1037  # the laser scanner that triggers the cameras

@@ -9,12 +9,12 @@ import numpy as np
 
 from dvo.data.calibration import Calibration
 from dvo.data.images import has_images, list_images
-from dvo.data.poses import ned_to_camera
 from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
 from dvo.data.sequence import find_calibration
 from dvo.data.stamps import read_times
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
+from dvo.geometry.poses import ned_to_camera
 
 NOMINAL_FPS = 10.0  # the simulator has no clock of its own; v2's inertial data take images at 10 Hz
 LAYOUTS = {

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dvo.data.poses import pose_matrices, poses_from_matrices, slerp
 from dvo.errors import DvoError
+from dvo.geometry.poses import pose_matrices, poses_from_matrices, slerp
 
 
 @dataclass(frozen=True)

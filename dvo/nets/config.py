@@ -10,7 +10,7 @@ from dvo.errors import DvoError
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Architecture of :class:`dvo.nets.patch_vo.PatchVO`.
+    """Architecture of :class:`dvo.models.patch_vo.PatchVO`.
 
     Attributes:
         stem_channels, trunk_channels: encoder channels at 1/2 and 1/4 of the image resolution.

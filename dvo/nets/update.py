@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dvo.graph.edges import Groups, PatchGraph
 from dvo.nets.config import ModelConfig
-from dvo.nets.graph import Groups, PatchGraph
 
 
 class _ClampGradient(torch.autograd.Function):

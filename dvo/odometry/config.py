@@ -67,7 +67,14 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
     "tiny": TrackerConfig(pixels=160 * 120, patches=16),
     # DPVO's "fast" setting.
     "full": TrackerConfig(
-        pixels=0, patches=48, lifetime=11, removal=16, optimisation=7, initial_frames=8, initial_updates=12,
-        initial_motion=2.0, keyframe_motion=15.0,
+        pixels=0,
+        patches=48,
+        lifetime=11,
+        removal=16,
+        optimisation=7,
+        initial_frames=8,
+        initial_updates=12,
+        initial_motion=2.0,
+        keyframe_motion=15.0,
     ),  # fmt: skip
 }

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from dvo.odometry.window import Window
+from dvo.graph.window import Window
 
 
 def predict_pose(poses_cw: Tensor, times: list[float], time: float, damping: float) -> Tensor:

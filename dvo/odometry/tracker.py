@@ -19,20 +19,20 @@ from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
+from dvo.graph.window import Keyframe, Window
+from dvo.models.patch_vo import PatchVO
+from dvo.models.weights import load_weights
 from dvo.nets.edge_correlation import EdgeCorrelation
-from dvo.nets.patch_vo import PatchVO
 from dvo.nets.patchifier import normalise_images, patch_coordinates, pool_levels, random_centres
-from dvo.nets.weights import load_weights
 from dvo.odometry.chronicle import Chronicle
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.motion import flow_magnitude, parallax, predict_pose
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.window import Keyframe, Window
 from dvo.odometry.working_image import working_image
 
 
 class PatchOdometry:
-    """Tracks one sequence with :class:`dvo.nets.patch_vo.PatchVO`.
+    """Tracks one sequence with :class:`dvo.models.patch_vo.PatchVO`.
 
     Args:
         model: the network; moved to ``device`` and used in evaluation mode.

@@ -1,18 +1,18 @@
 """Synthetic renderings: scenes, camera paths and frames with exact ground truth, endless, from a seed."""
 
-from dvo.synth.bodies import Body, Stage
-from dvo.synth.families import FAMILIES, HELD_OUT, random_scene
-from dvo.synth.imu import Imu, ImuNoise, measure_imu
-from dvo.synth.mesh import MeshScene
-from dvo.synth.mesh_files import load_mesh, mesh_scene
-from dvo.synth.paths import KINDS, Path, random_path
-from dvo.synth.renderer import Rendering, render, trace
-from dvo.synth.scene import Scene
-from dvo.synth.sensor import Sensor
+from dvo.synth.meshes.files import load_mesh, mesh_scene
+from dvo.synth.meshes.mesh import MeshScene
+from dvo.synth.motion.paths import KINDS, Path, random_path
+from dvo.synth.motion.walks import LONG_KINDS, SplinePath, long_path
+from dvo.synth.render.renderer import Rendering, render, trace
+from dvo.synth.render.shot import Shot
+from dvo.synth.scenes.bodies import Body, Stage
+from dvo.synth.scenes.families import FAMILIES, HELD_OUT, random_scene
+from dvo.synth.scenes.scene import Scene
+from dvo.synth.sensors.imu import Imu, ImuNoise, measure_imu
+from dvo.synth.sensors.sensor import Sensor
 from dvo.synth.sequence import SyntheticSequence, film, make_sequence
-from dvo.synth.shot import Shot
 from dvo.synth.truth import Flow, Tracks, dynamic_mask, optical_flow, tracks
-from dvo.synth.walks import LONG_KINDS, SplinePath, long_path
 
 __all__ = [
     "FAMILIES", "HELD_OUT", "KINDS", "LONG_KINDS", "Body", "Flow", "Imu", "ImuNoise", "MeshScene", "Path", "Rendering",

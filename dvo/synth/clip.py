@@ -13,14 +13,14 @@ import numpy as np
 import torch
 
 from dvo.errors import DvoError
-from dvo.synth.families import random_scene
-from dvo.synth.paths import Path, find_start, random_path
+from dvo.synth.motion.paths import Path, find_start, random_path
 from dvo.synth.poses import compose, inverse, split
-from dvo.synth.renderer import render, render_depth
-from dvo.synth.scene import Scene
-from dvo.synth.sensor import Sensor, expose, random_intrinsics, random_sensor, random_wear
+from dvo.synth.render.renderer import render, render_depth
+from dvo.synth.scenes.families import random_scene
+from dvo.synth.scenes.scene import Scene
+from dvo.synth.sensors.sensor import Sensor, expose, random_intrinsics, random_sensor, random_wear
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from dvo.synth.textures import texture_pool
+from dvo.synth.textures.pool import texture_pool
 
 Array = np.ndarray
 LOW = 5  # planning looks at images this many times smaller

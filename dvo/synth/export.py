@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 import torch
 
-from dvo.data.poses import NED_FROM_CAMERA, pose_matrices, poses_from_matrices
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.geometry.poses import NED_FROM_CAMERA, pose_matrices, poses_from_matrices
 from dvo.geometry.undistort import bends
-from dvo.synth.mesh import MeshScene
+from dvo.synth.meshes.mesh import MeshScene
+from dvo.synth.motion.walks import long_path
 from dvo.synth.poses import inverse, split
-from dvo.synth.scene import Scene
-from dvo.synth.sensor import random_intrinsics
+from dvo.synth.scenes.scene import Scene
+from dvo.synth.sensors.sensor import random_intrinsics
 from dvo.synth.sequence import SyntheticSequence
-from dvo.synth.walks import long_path
 
 Array = np.ndarray
 Layout = Literal["tum", "tartanair"]

@@ -12,15 +12,16 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
-from dvo.synth.bodies import Motion, Stage
-from dvo.synth.families import random_scene
-from dvo.synth.imu import Imu, ImuNoise, measure_imu
-from dvo.synth.lens import random_lens
-from dvo.synth.movers import random_bodies
-from dvo.synth.renderer import Rendering, render
-from dvo.synth.repaint import plainer
-from dvo.synth.scene import Scene
-from dvo.synth.sensor import (
+from dvo.synth.motion.walks import long_path
+from dvo.synth.render.lens import random_lens
+from dvo.synth.render.renderer import Rendering, render
+from dvo.synth.render.shot import Shot
+from dvo.synth.scenes.bodies import Motion, Stage
+from dvo.synth.scenes.families import random_scene
+from dvo.synth.scenes.movers import random_bodies
+from dvo.synth.scenes.scene import Scene
+from dvo.synth.sensors.imu import Imu, ImuNoise, measure_imu
+from dvo.synth.sensors.sensor import (
     Sensor,
     expose,
     exposure_changes,
@@ -28,10 +29,9 @@ from dvo.synth.sensor import (
     random_intrinsics,
     random_sensor,
 )
-from dvo.synth.shot import Shot
-from dvo.synth.textures import texture_pool
+from dvo.synth.textures.pool import texture_pool
+from dvo.synth.textures.repaint import plainer
 from dvo.synth.truth import Flow, Tracks, dynamic_mask, optical_flow, tracks
-from dvo.synth.walks import long_path
 
 APART = 2**31  # seeds of scenes from here on are never drawn by training clips
 
@@ -41,7 +41,7 @@ class SyntheticSequence:
     """A source of frames with ground truth: iterate it, as often as you like; every pass gives the same bytes.
 
     Timestamps and poses are those of the middle of the exposure, with a rolling shutter of the middle row; what that
-    means for depth and flow stands in :mod:`dvo.synth.shot`.
+    means for depth and flow stands in :mod:`dvo.synth.render.shot`.
 
     Attributes:
         name: says family, kind and seed.

@@ -1,7 +1,7 @@
 """Ground truth beyond pose and depth: optical flow with occlusions, moving pixels, tracks of points.
 
 Everything follows from depth, poses and surface identity of the frames in the middle of their exposure (see
-:mod:`dvo.synth.shot`): exact for sharp frames, for blurred ones that of mid-exposure, row by row with a
+:mod:`dvo.synth.render.shot`): exact for sharp frames, for blurred ones that of mid-exposure, row by row with a
 rolling shutter.
 """
 
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dvo.synth.bodies import Stage
-from dvo.synth.renderer import Rendering
-from dvo.synth.shot import Shot
+from dvo.synth.render.renderer import Rendering
+from dvo.synth.render.shot import Shot
+from dvo.synth.scenes.bodies import Stage
 
 Array = np.ndarray
 CLOSE = 1e-4  # relative difference of depth below which two hits are the same point (touching surfaces share edges)

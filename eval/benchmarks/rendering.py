@@ -24,7 +24,7 @@ import yaml
 from dvo.allocator import reuse_freed_memory
 from dvo.synth import FAMILIES, random_path, random_scene, render
 from dvo.synth.clip import make_clip
-from dvo.synth.textures import texture_pool
+from dvo.synth.textures.pool import texture_pool
 
 SIZES = ((120, 160), (240, 320), (480, 640))
 RECIPE = Path(__file__).resolve().parents[2] / "configs" / "train" / "small.yaml"
@@ -68,9 +68,9 @@ def clip_seconds(count: int, recipe: dict[str, Any]) -> tuple[float, list[dict[s
 
 def step_seconds(count: int, recipe: dict[str, Any], batches: list[dict[str, torch.Tensor]]) -> float:
     """Mean seconds of a training step: loss, backward, clipping, optimiser; the phase with bundle adjustment."""
-    from train.augment import Augmentation
-    from train.module import PatchVOTraining
-    from train.objective import LossConfig
+    from train.data.augment import Augmentation
+    from train.tasks.patch_vo.module import PatchVOTraining
+    from train.tasks.patch_vo.objective import LossConfig
 
     given = dict(recipe["model"])
     given["loss"] = LossConfig(**given.get("loss", {}))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from dvo.data import open_source
-from dvo.data.poses import pose_matrices
 from dvo.errors import DvoError
+from dvo.geometry.poses import pose_matrices
 
 S = np.sqrt(0.5)
 

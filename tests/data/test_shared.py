@@ -8,7 +8,7 @@ import pytest
 
 from dvo.data import open_source, read_tum
 from dvo.data.clips import read_clips
-from dvo.data.poses import pose_matrices
+from dvo.geometry.poses import pose_matrices
 
 CLIPS = [
     ("kitti00_120", "sequence", 120, (1241, 376), (718.856, 607.1928), 91.97),

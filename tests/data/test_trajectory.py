@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.data import Trajectory, interpolate, read_kitti_poses, read_tum, write_kitti_poses, write_tum
-from dvo.data.poses import (
+from dvo.errors import DvoError
+from dvo.geometry.poses import (
     compose_poses,
     invert_poses,
     ned_to_camera,
@@ -12,7 +13,6 @@ from dvo.data.poses import (
     poses_from_matrices,
     slerp,
 )
-from dvo.errors import DvoError
 
 number = st.floats(-1, 1)
 quaternion = st.tuples(number, number, number, number).filter(lambda q: np.linalg.norm(q) > 1e-2)

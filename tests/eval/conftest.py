@@ -15,13 +15,13 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.odometry.protocol import Odometry
-from eval import predict as predict_module
-from eval.plan import Plan, read_manifest
-from eval.predict import Job, Prediction, predict, predict_here
-from eval.runner import predict_all
-from eval.score import Row, score_all
-from eval.sequences import Sequence, Suite
-from eval.systems import System, find_system
+from eval.execution import predict as predict_module
+from eval.execution.plan import Plan, read_manifest
+from eval.execution.predict import Job, Prediction, predict, predict_here
+from eval.execution.runner import predict_all
+from eval.scoring.score import Row, score_all
+from eval.suites.suite import Sequence, Suite
+from eval.systems.registry import System, find_system
 
 CAMERA = Camera(250.0, 250.0, 159.5, 119.5, 320, 240)
 TEXELS = 120  # a metre of wall

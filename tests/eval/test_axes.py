@@ -14,9 +14,9 @@ import pytest
 
 from dvo.errors import DvoError
 from dvo.synth import HELD_OUT, LONG_KINDS, make_sequence
-from eval import prepare, rendered
-from eval.rendered import RECORD, place_of, rendered_folder
-from eval.sequences import Sequence, open_sequence, read_suites
+from eval.suites import prepare, rendered
+from eval.suites.rendered import RECORD, place_of, rendered_folder
+from eval.suites.suite import Sequence, open_sequence, read_suites
 
 AXES = {
     "plain", "scale", "textureless", "fast", "blur", "rotation", "lighting", "dynamic", "rolling_shutter", "blackout",

@@ -11,8 +11,8 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import evaluate
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
-from eval.baselines.klt_pnp import KltPnp, KltPnpConfig
-from eval.baselines.null import NullMotion
+from eval.systems.baselines.klt_pnp import KltPnp, KltPnpConfig
+from eval.systems.baselines.null import NullMotion
 
 
 def run(frames: list[Frame], odometry: Odometry | None = None) -> tuple[list[Estimate], Result]:

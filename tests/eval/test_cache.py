@@ -16,16 +16,16 @@ import numpy as np
 import pytest
 
 from dvo.errors import DvoError
-from eval import cache, versions
 from eval.__main__ import main
-from eval.cache import data_fingerprint, digest_of, job_key, obtain, reusable, sweep, system_facts
-from eval.plan import read_manifest
-from eval.predict import Job, Prediction, predict_here, write_prediction
-from eval.process import begin, run_limited
-from eval.runner import predict_all
-from eval.sequences import ROOT, open_sequence
-from eval.systems import find_system
-from eval.versions import code_digest, feels_threads, source_files
+from eval.execution import cache, versions
+from eval.execution.cache import data_fingerprint, digest_of, job_key, obtain, reusable, sweep, system_facts
+from eval.execution.plan import read_manifest
+from eval.execution.predict import Job, Prediction, predict_here, write_prediction
+from eval.execution.process import begin, run_limited
+from eval.execution.runner import predict_all
+from eval.execution.versions import code_digest, feels_threads, source_files
+from eval.suites.suite import ROOT, open_sequence
+from eval.systems.registry import find_system
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 
@@ -138,7 +138,7 @@ def test_code_of_a_system_is_what_it_imports(monkeypatch):
 
 def test_weights_are_part_of_the_version(tmp_path):
     torch = pytest.importorskip("torch")
-    from dvo.nets.weights import find_weights, weights_info
+    from dvo.models.weights import find_weights, weights_info
 
     first = tmp_path / "first.safetensors"
     first.write_bytes(find_weights("small").read_bytes())
@@ -302,7 +302,7 @@ def test_time_limit_ends_the_children_too(tmp_path):
 
 
 def test_ray_missing_and_packed_runs(job, tmp_path, image_folder, monkeypatch, plan):
-    from eval import cluster
+    from eval.execution import cluster
 
     job = replace(job, folder=str(tmp_path / "p/seed0-abc"))
     monkeypatch.setattr(cluster, "predict", predict_into_new_folder)

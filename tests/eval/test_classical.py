@@ -10,12 +10,12 @@ import pytest
 from dvo.data.frame import Frame
 from dvo.metrics import evaluate
 from dvo.odometry.protocol import Odometry, Result, Status
-from eval.baselines.direct.system import DirectConfig, DirectOdometry
-from eval.baselines.keyframe.config import KeyframeConfig
-from eval.baselines.keyframe.system import KeyframeOdometry
-from eval.baselines.klt_pnp import KltPnp, KltPnpConfig
-from eval.baselines.monoslam import MonoSlam, MonoSlamConfig
-from eval.systems import find_system
+from eval.systems.baselines.direct.system import DirectConfig, DirectOdometry
+from eval.systems.baselines.keyframe.config import KeyframeConfig
+from eval.systems.baselines.keyframe.system import KeyframeOdometry
+from eval.systems.baselines.klt_pnp import KltPnp, KltPnpConfig
+from eval.systems.baselines.monoslam import MonoSlam, MonoSlamConfig
+from eval.systems.registry import find_system
 
 SMALL: dict[str, Callable[[], Odometry]] = {
     "klt-pnp": lambda: KltPnp(KltPnpConfig(corners=300)),

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from dvo.data.frame import Frame
 from dvo.metrics import evaluate
 from dvo.odometry.protocol import Estimate, Result, Status
-from eval.baselines.direct.align import Reference, align, residuals
-from eval.baselines.direct.depth import DepthConfig, DepthMap, fuse
-from eval.baselines.direct.image import inside, pyramid, sample
-from eval.baselines.direct.start import TwoViewStart, spread
-from eval.baselines.direct.stereo import Matches, StereoConfig, search_lines
-from eval.baselines.direct.system import DirectConfig, DirectOdometry
+from eval.systems.baselines.direct.align import Reference, align, residuals
+from eval.systems.baselines.direct.depth import DepthConfig, DepthMap, fuse
+from eval.systems.baselines.direct.image import inside, pyramid, sample
+from eval.systems.baselines.direct.start import TwoViewStart, spread
+from eval.systems.baselines.direct.stereo import Matches, StereoConfig, search_lines
+from eval.systems.baselines.direct.system import DirectConfig, DirectOdometry
 
 INTRINSICS = np.array([250.0, 250.0, 159.5, 119.5])
 

@@ -10,13 +10,13 @@ import pytest
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Odometry
-from eval.metrics import evo_metrics
-from eval.plan import read_manifest
-from eval.predict import predict, predict_here, read_prediction, read_trajectory
-from eval.score import COLUMNS, Row
-from eval.sequences import data_folder, read_suite, reference_for
-from eval.systems import find_system, list_systems
-from eval.tables import axis_table, markdown
+from eval.execution.plan import read_manifest
+from eval.execution.predict import predict, predict_here, read_prediction, read_trajectory
+from eval.reporting.tables import axis_table, markdown
+from eval.scoring.metrics import evo_metrics
+from eval.scoring.score import COLUMNS, Row
+from eval.suites.suite import data_folder, read_suite, reference_for
+from eval.systems.registry import find_system, list_systems
 
 REQUIRED_COLUMNS = [
     *("system", "version", "suite", "sequence", "seed", "status", "frames", "tracked", "alignment"),

@@ -12,14 +12,19 @@ from scipy.spatial.transform import Rotation
 from dvo.data.frame import Frame
 from dvo.metrics import evaluate
 from dvo.odometry.protocol import Estimate, Result, Status
-from eval.baselines import two_view
-from eval.baselines.keyframe.adjust import adjust, neighbourhood
-from eval.baselines.keyframe.config import KeyframeConfig
-from eval.baselines.keyframe.initialise import fit_homography, fundamental, homography_share, start_from_two_views
-from eval.baselines.keyframe.map import Keyframe, Map
-from eval.baselines.keyframe.pose import _jacobian, centre, refine_pose
-from eval.baselines.keyframe.relocalise import describe, match, thumbnail
-from eval.baselines.keyframe.system import KeyframeOdometry
+from eval.systems.baselines import two_view
+from eval.systems.baselines.keyframe.adjust import adjust, neighbourhood
+from eval.systems.baselines.keyframe.config import KeyframeConfig
+from eval.systems.baselines.keyframe.initialise import (
+    fit_homography,
+    fundamental,
+    homography_share,
+    start_from_two_views,
+)
+from eval.systems.baselines.keyframe.map import Keyframe, Map
+from eval.systems.baselines.keyframe.pose import _jacobian, centre, refine_pose
+from eval.systems.baselines.keyframe.relocalise import describe, match, thumbnail
+from eval.systems.baselines.keyframe.system import KeyframeOdometry
 
 INTRINSICS = np.array([300.0, 310.0, 160.0, 120.0])
 

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.metrics import fit_alignment, transform
-from eval.blackout import blackout_errors, dark_spans, is_dark
-from eval.metrics import (
+from eval.scoring.blackout import blackout_errors, dark_spans, is_dark
+from eval.scoring.metrics import (
     AUC_DEGREES,
     Aligned,
     absolute_rmse,

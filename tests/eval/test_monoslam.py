@@ -10,8 +10,8 @@ from dvo.data.trajectory import Trajectory
 from dvo.metrics import evaluate
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.synth.sequence import make_sequence
-from eval.baselines.monoslam import MonoSlam, MonoSlamConfig
-from eval.baselines.monoslam.search import HALF, find_patch
+from eval.systems.baselines.monoslam import MonoSlam, MonoSlamConfig
+from eval.systems.baselines.monoslam.search import HALF, find_patch
 
 SMALL = MonoSlamConfig(visible=35, capacity=50)
 

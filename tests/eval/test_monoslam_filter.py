@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from eval.baselines.monoslam.consensus import condition, drop_inconsistent, find_consensus
-from eval.baselines.monoslam.filter import Filter
-from eval.baselines.monoslam.models import (
+from eval.systems.baselines.monoslam.consensus import condition, drop_inconsistent, find_consensus
+from eval.systems.baselines.monoslam.filter import Filter
+from eval.systems.baselines.monoslam.models import (
     CAMERA,
     directions,
     move,

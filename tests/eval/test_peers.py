@@ -16,9 +16,9 @@ import pytest
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
 from dvo.odometry.protocol import SparseMap
-from eval.peers import colmap, orbslam3, svo
-from eval.peers.common import Pictures, Row, longest_part
-from eval.systems import find_system
+from eval.systems.peers import colmap, orbslam3, svo
+from eval.systems.peers.common import Pictures, Row, longest_part
+from eval.systems.registry import find_system
 
 ROOT = Path(__file__).resolve().parents[2]
 GPL = {"svo_cpp", "pyorbslam3"}
@@ -27,7 +27,7 @@ import sys, cv2, numpy as np
 cv2.setNumThreads(1)
 from dvo.metrics import evaluate
 from dvo.synth.sequence import make_sequence
-from eval.systems import find_system
+from eval.systems.registry import find_system
 name, seed, frames, fps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
 film = make_sequence(seed, frames=frames, fps=fps, family="clutter", kind="handheld")
 odometry = find_system(name).build(0, "cpu")
@@ -67,21 +67,21 @@ def test_gpl_packages_are_imported_only_when_a_system_is_built():
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             if GPL & {name.split(".")[0] for name in names}:
                 assert file.parent.name == "peers" and id(node) in inside, file
-    check = "import sys, eval.systems as s; [x.missing() for x in s.list_systems()]; print(sorted(sys.modules))"
+    check = "import sys, eval.systems.registry as s; [x.missing() for x in s.list_systems()]; print(list(sys.modules))"
     done = subprocess.run([sys.executable, "-c", check], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not any(f"'{name}'" in done.stdout for name in GPL | {"pycolmap"})
 
 
 def test_every_peer_says_how_to_install_it(monkeypatch):
-    monkeypatch.setattr("eval.peers.common.find_spec", lambda name: None)
+    monkeypatch.setattr("eval.systems.peers.common.find_spec", lambda name: None)
     for peer, package in ((colmap, "pycolmap"), (orbslam3, "pyorbslam3"), (svo, "svo-cpp")):
         assert f"{package} (" in (peer.missing() or "") and "pip install" in (peer.missing() or "")
 
 
 def test_orbslam3_says_that_it_needs_a_vocabulary(monkeypatch, tmp_path):
-    monkeypatch.setattr("eval.peers.common.find_spec", lambda name: True)
+    monkeypatch.setattr("eval.systems.peers.common.find_spec", lambda name: True)
     monkeypatch.setenv(orbslam3.VOCABULARY, str(tmp_path / "none.txt"))
-    assert "eval.vocabulary" in (orbslam3.missing() or "")
+    assert "eval.systems.peers.vocabulary" in (orbslam3.missing() or "")
 
 
 def test_settings_hold_the_camera(tmp_path):

@@ -15,12 +15,12 @@ import pytest
 
 from dvo.data.trajectory import Trajectory
 from eval.__main__ import main
-from eval.plan import read_manifest
-from eval.plots import OURS, plot_axis, plot_sequence, plot_speed, styles
-from eval.report import overall, shade, write_report, write_tables
-from eval.sequences import Suite
-from eval.tables import Cell, axes_of, best_of, cell, cell_text
-from eval.verdict import verdicts
+from eval.execution.plan import read_manifest
+from eval.reporting.plots import OURS, plot_axis, plot_sequence, plot_speed, styles
+from eval.reporting.report import overall, shade, write_report, write_tables
+from eval.reporting.tables import Cell, axes_of, best_of, cell, cell_text
+from eval.reporting.verdict import verdicts
+from eval.suites.suite import Suite
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 VOID_TAGS = {"meta", "img", "br", "link"}

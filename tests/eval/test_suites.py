@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvo.data.poses import pose_matrices
 from dvo.data.trajectory import Trajectory, read_tum, write_tum
 from dvo.errors import DvoError
+from dvo.geometry.poses import pose_matrices
 from dvo.metrics import evaluate
-from eval.sequences import SUITES, Sequence, Suite, open_sequence
-from eval.suites import config_names, folder_of_data, load_suites, settle, suite_from, suite_of_folder
+from eval.suites.selection import config_names, folder_of_data, load_suites, settle, suite_from, suite_of_folder
+from eval.suites.suite import SUITES, Sequence, Suite, open_sequence
 
 PUBLIC = {"tum_fr1": 9, "euroc": 11, "tartanair_test": 16, "kitti": 11, "icl_nuim": 8}
 
@@ -50,7 +50,7 @@ def test_several_suites_and_chosen_sequences():
 def test_a_name_that_stands_for_several_suites(monkeypatch):
     a = Sequence("a", "", rendered=(("seed", 1),))
     made = [Suite("plain", "l", (a,)), Suite("fast", "l", (a,))]
-    monkeypatch.setattr("eval.suites.read_suites", lambda text: made)
+    monkeypatch.setattr("eval.suites.selection.read_suites", lambda text: made)
     assert load_suites(["axes"]) == made
     assert folder_of_data(made, None) == Path()  # rendered sequences need no data folder
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from eval.baselines import two_view
+from eval.systems.baselines import two_view
 
 INTRINSICS = np.array([300.0, 310.0, 160.0, 120.0])
 

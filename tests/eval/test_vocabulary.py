@@ -8,8 +8,16 @@ import numpy as np
 import pytest
 
 from dvo.errors import DvoError
-from eval.peers.orbslam3 import count_words
-from eval.vocabulary import STATED_DEPTH, Vocabulary, hamming, main, majority_clusters, train, write_vocabulary
+from eval.systems.peers.orbslam3 import count_words
+from eval.systems.peers.vocabulary import (
+    STATED_DEPTH,
+    Vocabulary,
+    hamming,
+    main,
+    majority_clusters,
+    train,
+    write_vocabulary,
+)
 
 
 def noisy(centres: np.ndarray, count: int, flips: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

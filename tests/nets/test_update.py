@@ -4,9 +4,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dvo.graph.edges import build_graph, group_edges
+from dvo.models.schedule import full_graph, training_schedule
 from dvo.nets.config import preset
-from dvo.nets.graph import build_graph, group_edges
-from dvo.nets.schedule import full_graph, training_schedule
 from dvo.nets.update import GradientClamp, SoftAggregation, Update
 
 

@@ -7,9 +7,9 @@ import torch
 from safetensors.torch import save_file
 
 from dvo.errors import DvoError
+from dvo.models.patch_vo import PatchVO
+from dvo.models.weights import import_checkpoint, load_weights, save_weights, weights_info
 from dvo.nets.config import PRESETS, ModelConfig, preset
-from dvo.nets.patch_vo import PatchVO
-from dvo.nets.weights import import_checkpoint, load_weights, save_weights, weights_info
 
 
 def dpvo_table() -> dict[str, tuple[int, ...]]:

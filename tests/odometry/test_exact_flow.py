@@ -9,8 +9,8 @@ from dvo.geometry import se3
 from dvo.geometry.camera import Camera
 from dvo.geometry.projection import reproject
 from dvo.metrics import evaluate
+from dvo.models.patch_vo import PatchVO
 from dvo.nets.config import preset
-from dvo.nets.patch_vo import PatchVO
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.protocol import Status
 from dvo.odometry.tracker import PatchOdometry

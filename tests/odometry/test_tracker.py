@@ -12,8 +12,8 @@ from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.metrics import evaluate
+from dvo.models.patch_vo import PatchVO
 from dvo.nets.config import preset
-from dvo.nets.patch_vo import PatchVO
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.protocol import Odometry, Status
 from dvo.odometry.tracker import PatchOdometry

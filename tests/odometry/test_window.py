@@ -3,9 +3,9 @@
 import torch
 
 from dvo.geometry import se3
+from dvo.graph.window import Keyframe, Window
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.motion import flow_magnitude, parallax, predict_pose
-from dvo.odometry.window import Keyframe, Window
 
 
 def window(count=4, m=2):

@@ -10,12 +10,12 @@ import pytest
 
 from dvo.errors import DvoError
 from dvo.synth import FAMILIES, HELD_OUT, random_scene, render
-from dvo.synth.families import SHARES
-from dvo.synth.paths import find_start
-from dvo.synth.patterns import PATTERNS, SPECIAL
+from dvo.synth.motion.paths import find_start
+from dvo.synth.motion.walks import long_path
 from dvo.synth.poses import pose_from
-from dvo.synth.textures import TexturePool, texture_pool
-from dvo.synth.walks import long_path
+from dvo.synth.scenes.families import SHARES
+from dvo.synth.textures.patterns import PATTERNS, SPECIAL
+from dvo.synth.textures.pool import TexturePool, texture_pool
 
 H, W = 48, 64
 K = np.array([50.0, 50.0, 31.5, 23.5])

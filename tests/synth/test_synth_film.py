@@ -25,14 +25,14 @@ from dvo.synth import (
     random_scene,
     render,
 )
-from dvo.synth.bodies import Body
 from dvo.synth.clip import make_clip
-from dvo.synth.movers import random_bodies
 from dvo.synth.poses import compose, inverse, split
-from dvo.synth.repaint import plainer
-from dvo.synth.sensor import compressed, expose, exposure_changes, in_the_dark, random_sensor, random_wear
+from dvo.synth.scenes.bodies import Body
+from dvo.synth.scenes.movers import random_bodies
+from dvo.synth.sensors.sensor import compressed, expose, exposure_changes, in_the_dark, random_sensor, random_wear
 from dvo.synth.sequence import APART
-from dvo.synth.textures import texture_pool
+from dvo.synth.textures.pool import texture_pool
+from dvo.synth.textures.repaint import plainer
 
 SMALL: dict[str, Any] = {"frames": 12, "height": 60, "width": 80, "fps": 10.0, "family": "room"}
 SEED = 4
@@ -190,8 +190,8 @@ def test_body_at_rest_is_part_of_the_scene(scene: Scene) -> None:
     """Half of a scene as a body that stands still gives the picture of the whole scene."""
     from dataclasses import replace
 
-    from dvo.synth.bodies import PER_SURFACE
-    from dvo.synth.shot import Rest
+    from dvo.synth.render.shot import Rest
+    from dvo.synth.scenes.bodies import PER_SURFACE
 
     def part(start: int, end: int) -> Scene:
         return replace(scene, **{name: getattr(scene, name)[start:end] for name in PER_SURFACE}, _cache={})

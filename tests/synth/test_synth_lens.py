@@ -16,9 +16,9 @@ from dvo.geometry.undistort import Undistorter
 from dvo.odometry.working_image import working_image
 from dvo.synth import Shot, make_sequence, mesh_scene, random_path, random_scene, render, trace
 from dvo.synth.export import export_sequence
-from dvo.synth.lens import bent, plate_of, random_lens, render_lens, straight
-from dvo.synth.sensor import random_intrinsics
-from dvo.synth.textures import texture_pool
+from dvo.synth.render.lens import bent, plate_of, random_lens, render_lens, straight
+from dvo.synth.sensors.sensor import random_intrinsics
+from dvo.synth.textures.pool import texture_pool
 
 CAMERA = Camera(130.0, 129.0, 81.0, 58.5, 160, 120)
 LENSES = {

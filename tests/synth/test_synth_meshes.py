@@ -12,16 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.errors import DvoError
-from dvo.synth import FAMILIES, HELD_OUT, MeshScene, load_mesh, mesh_files, mesh_scene, random_scene, render, trace
+from dvo.synth import FAMILIES, HELD_OUT, MeshScene, load_mesh, mesh_scene, random_scene, render, trace
 from dvo.synth.export import scene_triangles
-from dvo.synth.mesh import mesh_depth
-from dvo.synth.mesh_space import free_space, triangle_distance
-from dvo.synth.mesh_textures import TextureSet
-from dvo.synth.paths import find_start
+from dvo.synth.meshes import files as mesh_files
+from dvo.synth.meshes.mesh import mesh_depth
+from dvo.synth.meshes.space import free_space, triangle_distance
+from dvo.synth.meshes.textures import TextureSet
+from dvo.synth.motion.paths import find_start
+from dvo.synth.motion.walks import long_path
 from dvo.synth.poses import inverse, look_rotation, pose_from, so3_exp, split
-from dvo.synth.scene import Scene
-from dvo.synth.textures import texture_pool
-from dvo.synth.walks import long_path
+from dvo.synth.scenes.scene import Scene
+from dvo.synth.textures.pool import texture_pool
 
 trimesh = pytest.importorskip("trimesh")
 H, W = 60, 80

@@ -14,10 +14,10 @@ from dvo.cli import main
 from dvo.errors import DvoError
 from dvo.synth import FAMILIES, KINDS, random_path, random_scene
 from dvo.synth.clip import make_sequence
+from dvo.synth.motion.walks import long_path
 from dvo.synth.poses import compose, inverse, matrix_to_quaternion, quaternion_to_matrix, se3_exp, so3_exp, split
-from dvo.synth.scene import Scene
-from dvo.synth.textures import TexturePool, texture_pool
-from dvo.synth.walks import long_path
+from dvo.synth.scenes.scene import Scene
+from dvo.synth.textures.pool import TexturePool, texture_pool
 
 vectors = st.lists(st.floats(-3, 3), min_size=3, max_size=3).map(np.array)
 
@@ -102,7 +102,7 @@ def test_contact_sheet_is_written(tmp_path: Path) -> None:
 
 
 def test_without_photographs_the_pool_is_procedural(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dvo.synth.textures.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("dvo.synth.textures.pool.importlib.util.find_spec", lambda name: None)
     pool = TexturePool(0, 20, 32)
     assert "photo" not in pool.tags
     colours = np.stack([pool.use(i) for i in range(20)])

@@ -9,9 +9,9 @@ import torch
 from dvo.errors import DvoError
 from dvo.synth import FAMILIES, random_path, random_scene, render, trace
 from dvo.synth.poses import inverse, look_rotation, pose_from, split
-from dvo.synth.renderer import render_depth
-from dvo.synth.scene import Scene, SceneBuilder
-from dvo.synth.textures import TexturePool, texture_pool
+from dvo.synth.render.renderer import render_depth
+from dvo.synth.scenes.scene import Scene, SceneBuilder
+from dvo.synth.textures.pool import TexturePool, texture_pool
 
 H, W = 48, 64
 K = np.array([52.0, 51.5, 31.2, 23.9])

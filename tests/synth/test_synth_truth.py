@@ -25,11 +25,11 @@ from dvo.synth import (
     random_scene,
     tracks,
 )
-from dvo.synth.imu import GRAVITY, rotation_vector
-from dvo.synth.movers import random_bodies
 from dvo.synth.poses import compose, inverse, quaternion_to_matrix, so3_exp, split
-from dvo.synth.shot import Rest
-from dvo.synth.textures import texture_pool
+from dvo.synth.render.shot import Rest
+from dvo.synth.scenes.movers import random_bodies
+from dvo.synth.sensors.imu import GRAVITY, rotation_vector
+from dvo.synth.textures.pool import texture_pool
 from dvo.synth.truth import hits, shows
 
 CAMERA = Camera(82.0, 81.5, 47.7, 35.2, 96, 72)

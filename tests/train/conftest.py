@@ -8,8 +8,8 @@ import torch
 
 import dvo.synth.dataset
 from dvo.synth.clip import make_clip
-from train.data import Renderings
-from train.module import PatchVOTraining
+from train.data.clips import Renderings
+from train.tasks.patch_vo.module import PatchVOTraining
 
 CLIP = {"frames": 4, "sizes": [(48, 64), (64, 48)], "workers": 0, "seed": 5}
 

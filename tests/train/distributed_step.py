@@ -9,9 +9,9 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy
 
 import dvo.synth.dataset
-from train.data import Renderings
-from train.module import PatchVOTraining
-from train.objective import LossConfig
+from train.data.clips import Renderings
+from train.tasks.patch_vo.module import PatchVOTraining
+from train.tasks.patch_vo.objective import LossConfig
 
 
 class KeepGradients(L.Callback):

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train.augment import Augmentation, augment, crop_and_resize
+from train.data.augment import Augmentation, augment, crop_and_resize
 
 
 def ramp(h=24, w=32):

@@ -11,9 +11,9 @@ import torch
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from train.data import Course, MixedClips, _From
-from train.objective import LossConfig
-from train.real import RealClips, RealData, read_depth
+from train.data.clips import Course, MixedClips, _From
+from train.data.real import RealClips, RealData, read_depth
+from train.tasks.patch_vo.objective import LossConfig
 
 DATA = Path(os.environ.get("DVO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 real = pytest.mark.skipif(not DATA.is_dir(), reason="set DVO_DATA to the folder of real sequences")

@@ -10,11 +10,11 @@ from dvo.ba.layer import bundle_adjust
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.pose import pose_errors
-from dvo.nets.patch_vo import UpdateState
+from dvo.models.patch_vo import UpdateState
+from dvo.models.schedule import full_graph
 from dvo.nets.patchifier import patch_coordinates, random_centres
-from dvo.nets.schedule import full_graph
 from dvo.synth.clip import make_clip
-from train.objective import LossConfig, clip_losses, clip_terms, true_reprojection, truth_of
+from train.tasks.patch_vo.objective import LossConfig, clip_losses, clip_terms, true_reprojection, truth_of
 
 PATCHES = 24
 

@@ -8,9 +8,9 @@ import torch
 import yaml
 
 from train.__main__ import main
-from train.augment import Augmentation
-from train.module import PatchVOTraining
-from train.objective import LossConfig
+from train.data.augment import Augmentation
+from train.tasks.patch_vo.module import PatchVOTraining
+from train.tasks.patch_vo.objective import LossConfig
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "train"
 TINY = {

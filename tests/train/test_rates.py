@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from train.rates import constant_rate, one_cycle_rate
+from train.engine.rates import constant_rate, one_cycle_rate
 
 
 @pytest.mark.parametrize("steps, rise", [(200, 0.01), (1000, 0.01), (50, 0.3)])

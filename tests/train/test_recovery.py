@@ -3,7 +3,7 @@ state; the run goes on."""
 
 import torch
 
-from train.recovery import LastGood, weights_finite
+from train.engine.recovery import LastGood, weights_finite
 
 
 def poison(program, steps):
@@ -34,9 +34,7 @@ def test_a_bad_step_changes_nothing_and_is_counted(tmp_path, runs):
 
 def test_a_bad_gradient_alone_is_a_bad_step(tmp_path, runs):
     program = runs.module()
-    program.net.patchify.fnet.conv1.weight.register_hook(
-        lambda g: g * torch.nan if program.global_step == 1 else g
-    )
+    program.net.patchify.fnet.conv1.weight.register_hook(lambda g: g * torch.nan if program.global_step == 1 else g)
     before = runs.fit(tmp_path, 1, runs.module())[0]
     runs.fit(tmp_path, 2, program)
     assert int(program.skipped) == 1

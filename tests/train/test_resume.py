@@ -6,9 +6,9 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from train.export import averaged_model
-from train.module import PatchVOTraining
-from train.objective import LossConfig
+from train.engine.export import averaged_model
+from train.tasks.patch_vo.module import PatchVOTraining
+from train.tasks.patch_vo.objective import LossConfig
 
 STATE = Path(__file__).resolve().parents[2] / "train" / "state" / "small.ckpt"
 V2V = LossConfig(weighted=True, balance="v2v", balance_every=1, balance_window=3, pose_from=1)
@@ -19,9 +19,7 @@ def same(a, b):
         assert torch.equal(x, y), name
 
 
-@pytest.mark.parametrize(
-    "loss", [pytest.param(None, id="plain", marks=pytest.mark.slow), pytest.param(V2V, id="v2v")]
-)
+@pytest.mark.parametrize("loss", [pytest.param(None, id="plain", marks=pytest.mark.slow), pytest.param(V2V, id="v2v")])
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs, loss):
     for name in "abc":
         (tmp_path / name).mkdir()

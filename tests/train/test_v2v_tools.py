@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.errors import DvoError
+from dvo.models.patch_vo import PatchVO
+from dvo.models.schedule import training_schedule
 from dvo.nets.config import preset
-from dvo.nets.patch_vo import PatchVO
-from dvo.nets.schedule import training_schedule
-from train import breakdown, study
-from train.snr import DPVO, V2V, VARIANTS, clip_gradients, compare, signal_to_noise, table
+from train.studies import breakdown, study
+from train.studies.snr import DPVO, V2V, VARIANTS, clip_gradients, compare, signal_to_noise, table
 
 
 def test_signal_and_noise_of_a_hand_computed_case():
@@ -86,7 +86,7 @@ def test_a_study_runs_resumes_and_reports(tmp_path, monkeypatch):
     monkeypatch.undo()
     again = study.run_arm(names[1], 1e-3, 0, config)
     assert again["curve"] == results[1]["curve"]
-    from train.study_report import write_report
+    from train.studies.report import write_report
 
     report, picture = write_report(results, config)
     assert all(name in report.read_text() for name in names) and picture.stat().st_size > 10_000

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
-from train.watch import TrackWhileTraining, undisturbed
+from train.validation.watch import TrackWhileTraining, undisturbed
 
 QUICK = {"rendered": 1, "frames": 10, "size": (48, 64)}
 

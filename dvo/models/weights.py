@@ -1,0 +1,199 @@
+"""Weights files: safetensors with the architecture in the metadata; import of DPVO's pickled checkpoints."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from dvo.errors import DvoError
+from dvo.models.patch_vo import PatchVO
+from dvo.nets.config import PRESETS, ModelConfig
+
+FOLDER = Path(__file__).resolve().parent.parent / "weights"
+"""Where the weights of the package lie."""
+
+
+@dataclass(frozen=True)
+class WeightsInfo:
+    """What a weights file says of itself.
+
+    Attributes:
+        name: stem of the file.
+        path: where it lies.
+        preset: preset that it was made from, or ``custom``.
+        config: its architecture.
+        parameters, tensors: counts.
+        sha256: of the file.
+        card: free facts of the model card: training steps, hours, licence, validation figures.
+    """
+
+    name: str
+    path: Path
+    preset: str
+    config: ModelConfig
+    parameters: int
+    tensors: int
+    sha256: str
+    card: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class LoadedWeights:
+    """A network with its origin."""
+
+    model: PatchVO
+    name: str
+    preset: str
+    info: WeightsInfo
+
+
+def find_weights(name_or_file: str | Path) -> Path:
+    """The file of shipped weights by name, or a file by path.
+
+    Raises:
+        DvoError: neither.
+    """
+    path = Path(name_or_file)
+    if path.is_file():
+        return path
+    shipped = FOLDER / f"{name_or_file}.safetensors"
+    if path.name == str(name_or_file) and shipped.is_file():
+        return shipped
+    names = ", ".join(sorted(p.stem for p in FOLDER.glob("*.safetensors"))) or "none"
+    raise DvoError("no such weights", file=name_or_file, remedy=f"give a file, or one of: {names}")
+
+
+def _open(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {key: file.get_tensor(key) for key in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except (SafetensorError, OSError, ValueError) as error:
+        raise DvoError(
+            f"not a safetensors file ({error})",
+            file=path,
+            remedy="give dvo weights; a checkpoint of DPVO is converted by 'dvo weights import FILE'",
+        ) from error
+
+
+def _parse(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> WeightsInfo:
+    try:
+        config = ModelConfig.from_dict(json.loads(metadata["config"]))
+        card = json.loads(metadata.get("card", "{}"))
+    except (KeyError, ValueError, TypeError, AttributeError, DvoError) as error:
+        raise DvoError(
+            f"metadata does not tell the architecture ({error})", file=path, field="config", remedy="give dvo weights"
+        ) from error
+    preset = next((name for name, known in PRESETS.items() if known == config), "custom")
+    count = sum(t.numel() for t in tensors.values())
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return WeightsInfo(path.stem, path, preset, config, count, len(tensors), digest, card)
+
+
+def weights_info(name_or_file: str | Path) -> WeightsInfo:
+    """What is in a weights file. Raises DvoError as :func:`load_weights` does."""
+    path = find_weights(name_or_file)
+    return _parse(path, *_open(path))
+
+
+def list_weights() -> list[WeightsInfo]:
+    """The weights that ship with the package."""
+    return [weights_info(path) for path in sorted(FOLDER.glob("*.safetensors"))]
+
+
+def load_weights(name_or_file: str | Path, device: torch.device | str = "cpu") -> LoadedWeights:
+    """Read a network.
+
+    Args:
+        name_or_file: shipped weights by name, or a safetensors file.
+
+    Raises:
+        DvoError: no such file; not safetensors (a pickle is never opened here); tensors that are missing, of the wrong
+            shape, or not finite.
+    """
+    path = find_weights(name_or_file)
+    tensors, metadata = _open(path)
+    info = _parse(path, tensors, metadata)
+    model = PatchVO(info.config)
+    _fill(model, tensors, path)
+    return LoadedWeights(model.to(device).eval(), info.name, info.preset, info)
+
+
+def load_model(name_or_file: str | Path = "small", device: torch.device | str = "cpu") -> PatchVO:
+    """The bare network, see :func:`load_weights`."""
+    return load_weights(name_or_file, device).model
+
+
+def _fill(model: PatchVO, tensors: dict[str, Tensor], path: Path) -> None:
+    wanted = model.state_dict()
+    missing, extra = sorted(set(wanted) - set(tensors)), sorted(set(tensors) - set(wanted))
+    wrong = [k for k in wanted if k in tensors and wanted[k].shape != tensors[k].shape]
+    for problem, names in (("misses", missing), ("has unknown", extra), ("has wrongly shaped", wrong)):
+        if names:
+            raise DvoError(
+                f"{problem} tensors ({len(names)})", file=path, field=names[0], remedy="give weights of this network"
+            )
+    bad = [k for k, t in tensors.items() if not torch.isfinite(t.float()).all()]
+    if bad:
+        raise DvoError("holds numbers that are not finite", file=path, field=bad[0], remedy="use another checkpoint")
+    model.load_state_dict({k: t.float() for k, t in tensors.items()})
+
+
+def save_weights(path: str | Path, model: PatchVO, card: dict[str, Any], half: bool = True) -> None:
+    """Write a network as safetensors.
+
+    Args:
+        card: facts for the model card, JSON-able.
+        half: store float16.
+    """
+    dtype = torch.float16 if half else torch.float32
+    tensors = {k: t.detach().cpu().to(dtype).contiguous() for k, t in model.state_dict().items()}
+    metadata = {"config": json.dumps(model.config.to_dict()), "card": json.dumps(card), "format": "pt"}
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    save_file(tensors, path, metadata)
+
+
+def import_checkpoint(file: str | Path, out: str | Path) -> WeightsInfo:
+    """Convert an official DPVO checkpoint (a pickled state dict) into dvo weights of the ``full`` preset.
+
+    The pickle is read with ``weights_only=True``, which runs no code. The prefix ``module.`` and the unused
+    ``update.lmbda`` are dropped, and the input channels of the first convolutions are swapped, because DPVO is fed
+    BGR and dvo RGB.
+
+    Args:
+        out: the safetensors file to write.
+
+    Raises:
+        DvoError: no such file, not such a checkpoint, or one that holds more than tensors.
+    """
+    file = Path(file)
+    if not file.is_file():
+        raise DvoError("no such file", file=file, remedy="give a DPVO checkpoint (dpvo.pth)")
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DvoError(
+            f"cannot be read as plain tensors ({reason})", file=file, remedy="give an unmodified DPVO checkpoint"
+        ) from error
+    if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
+        state = state["state_dict"]
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise DvoError("holds no state dict", file=file, remedy="give a DPVO checkpoint (dpvo.pth)")
+    tensors = {key.removeprefix("module."): value.float() for key, value in state.items()}
+    tensors.pop("update.lmbda", None)
+    model = PatchVO(PRESETS["full"])
+    for name in ("patchify.fnet.conv1.weight", "patchify.inet.conv1.weight"):
+        if name in tensors and tensors[name].ndim == 4:
+            tensors[name] = tensors[name].flip(1)
+    _fill(model, tensors, file)
+    save_weights(out, model, {"origin": "DPVO checkpoint", "file": file.name}, half=False)
+    return weights_info(out)

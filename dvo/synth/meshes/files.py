@@ -1,0 +1,232 @@
+"""Reading meshes through trimesh: glTF, GLB, OBJ, PLY (and STL, OFF), with their textures, colours and defects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from dvo.errors import DvoError
+from dvo.synth.meshes.mesh import MeshScene
+from dvo.synth.meshes.space import View, free_space
+from dvo.synth.meshes.textures import TextureSet
+from dvo.synth.textures.patterns import PATTERNS
+
+Array = np.ndarray
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+MAX_TRIANGLES, MAX_BYTES, MAX_EDGE = 4_000_000, 2 * 1024**3, 4096
+DECIMATE = "decimate it first, for instance by trimesh's simplify_quadric_decimation or in Blender"
+SUN = np.array([0.45, -0.35, 0.82])  # where the light of meshes comes from (they bring none)
+CREASE = np.cos(np.radians(50))  # corners bent more than this are shaded flat
+
+
+def load_mesh(
+    path: Path | str,
+    *,
+    up: Literal["y", "z"] | None = None,
+    view: View = "auto",
+    ground: bool = True,
+    light: bool = True,
+    seed: int = 0,
+) -> MeshScene:
+    """Read a mesh file as something to render and to fly through.
+
+    Args:
+        path: glTF, GLB, OBJ, PLY, STL or OFF; textures are looked for where the file says.
+        up: which axis of the file points up; None: z for PLY, STL and OFF, y for the others.
+        view: whether cameras live within ("inside") or around the mesh ("outside"); "auto" finds out.
+        ground: stand a mesh that is seen from outside on a textured plane.
+        light: shade by one distant light; False where light is painted into the textures (scans).
+        seed: of the replacement for missing textures.
+
+    Raises:
+        DvoError: trimesh is not installed; no such file, or not a mesh; empty, broken or huge.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DvoError("no such file", file=path, field="mesh", remedy="give a glTF, GLB, OBJ or PLY file")
+    if path.suffix.lower() not in SUFFIXES:
+        raise DvoError("not a mesh format that dvo reads", file=path, remedy=f"give one of {', '.join(SUFFIXES)}")
+    if path.stat().st_size > MAX_BYTES:
+        raise DvoError(f"huge: {path.stat().st_size / 1024**3:.1f} GB", file=path, remedy=DECIMATE)
+    try:
+        import trimesh
+    except ImportError:
+        raise DvoError("meshes need trimesh", field="mesh", remedy="pip install 'dvo[synth]'") from None
+    try:
+        loaded = trimesh.load_scene(path, process=False)  # processing would hide defects
+    except Exception as error:  # whatever trimesh's readers stumble over
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise DvoError(
+            f"cannot be read as a mesh ({reason})",
+            file=path,
+            remedy="export it again; keep the files that it refers to",
+        ) from error
+    rotate = (up or ("z" if path.suffix.lower() in (".ply", ".stl", ".off") else "y")) == "y"
+    return mesh_scene(loaded, rotate=rotate, view=view, ground=ground, light=light, seed=seed, file=path)
+
+
+def mesh_scene(
+    loaded: Any, *, rotate: bool = False, view: View = "auto", ground: bool = True, light: bool = True, seed: int = 0,
+    file: Path | None = None,
+) -> MeshScene:  # fmt: skip
+    """A ``trimesh.Trimesh`` or ``trimesh.Scene`` as a :class:`MeshScene`.
+
+    Args:
+        rotate: the y axis points up, and is turned onto z.
+        view, ground, light, seed: see :func:`load_mesh`.
+        file: for messages.
+
+    Raises:
+        DvoError: empty, broken or huge.
+    """
+    parts = loaded.dump() if hasattr(loaded, "dump") else [loaded]
+    meshes = [part for part in parts if hasattr(part, "faces") and len(part.faces)]
+    if not meshes:
+        what = "points but no triangles" if any(len(getattr(p, "vertices", ())) for p in parts) else "no triangles"
+        raise DvoError(f"empty: {what} in it", file=file, remedy="export a mesh with faces")
+    total = sum(len(mesh.faces) for mesh in meshes)
+    if total > MAX_TRIANGLES:
+        raise DvoError(f"huge: {total:,} triangles, {MAX_TRIANGLES:,} at most", file=file, remedy=DECIMATE)
+    warnings: list[str] = []
+    pictures = [_fallback(seed, 0), _fallback(seed, 1)]
+    gathered = [_gather(mesh, pictures, light, rotate, file, warnings) for mesh in meshes]
+    corners, tint, texture, uv = (np.concatenate([part[i] for part in gathered]) for i in range(4))
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    extent = corners.max((0, 1)) - corners.min((0, 1))
+    good = area > 1e-14 * float(extent.max()) ** 2
+    if not good.any():
+        raise DvoError("empty: all its triangles have no area", file=file, remedy="export it again, with its real size")
+    if not good.all():
+        warnings.append(f"left out {int((~good).sum())} of {len(good)} triangles, which have no area")
+    corners, tint, texture, uv = corners[good], tint[good], texture[good], uv[good]
+    space = free_space(corners, view)
+    low, high = corners.min((0, 1)), corners.max((0, 1))
+    scale = 0.35 * float(np.sort(space.bounds[1] - space.bounds[0])[1]) if space.inside else float(extent.max())
+    bare = np.isnan(uv).any((1, 2))
+    if bare.any():
+        share = "no texture" if bare.all() else f"no texture on {bare.mean():.0%} of the triangles"
+        warnings.append(f"{share}: painted with a procedural one")
+        uv[bare] = _projected(corners[bare], 0.9 * scale)
+    if not space.inside and ground:
+        reach = 12 * float(np.linalg.norm(extent[:2]) + extent[2])
+        middle = (low + high) / 2
+        square = middle + reach * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        square[:, 2] = low[2] - 1e-3 * float(extent.max())
+        floor = square[[[0, 1, 2], [0, 2, 3]]]
+        corners, uv = np.concatenate([corners, floor]), np.concatenate([uv, _projected(floor, 0.8 * scale)])
+        tint = np.concatenate([tint, np.full((2, 3, 3), 0.9, np.float32)])
+        texture = np.concatenate([texture, [1, 1]])
+        space = type(space)(corners, space.bounds, space.low, space.cell, space.free, False)
+        warnings.append("stands on a textured ground plane that is not in the file")
+    focus = (
+        (space.bounds[0], space.bounds[1]) if space.inside else (low + 0.35 * (high - low), low + 0.65 * (high - low))
+    )
+    hints: dict[str, Any] = {"heading": None, "focus": focus, "inside": space.inside}
+    # Pictures that nothing uses would only cost memory.
+    used = np.unique(texture[texture >= 0])
+    renumbered = np.searchsorted(used, texture)
+    texture = np.where(texture >= 0, renumbered, -1)
+    textures = TextureSet([pictures[i] for i in used])
+    return MeshScene(corners, tint, texture, uv, textures, space, scale, hints, warnings=warnings)
+
+
+def _fallback(seed: int, kind: int) -> Array:
+    """A procedural picture without a seam: stains for meshes, a rough one for the ground."""
+    rng = np.random.default_rng([seed, 7501, kind])
+    picture = PATTERNS["stains" if kind == 0 else "fractal"][0](rng, 512)
+    picture = 0.4 * picture + 0.6 * picture.mean(2, keepdims=True)  # muted: a stand-in, and a ground to stand on
+    return np.clip(picture * (0.55 / max(float(picture.mean()), 0.1)), 0, 1).astype(np.float32)
+
+
+def _projected(corners: Array, metres: float) -> Array:
+    """Coordinates of a picture ``metres`` wide laid along the axis that each triangle faces most, ``(T, 3, 2)``."""
+    normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    axes = np.array([[1, 2], [0, 2], [0, 1]])[normal.argmax(1)]
+    return np.take_along_axis(corners, axes[:, None].repeat(3, 1), 2) * [1, -1] / metres
+
+
+def _gather(
+    mesh: Any, pictures: list[Array], light: bool, rotate: bool, file: Path | None, warnings: list[str]
+) -> tuple[Array, Array, Array, Array]:
+    """Corners, tint, texture, texture coordinates of one part; coordinates are NaN where it has neither picture nor
+    colours (texture 0 is then the replacement)."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise DvoError("broken: a face names a vertex that is not there", file=file, remedy="export it again")
+    if not np.isfinite(vertices[np.unique(faces)]).all():
+        raise DvoError("broken: a vertex is not finite", file=file, remedy="export it again")
+    if mesh.visual.kind is None:  # smooth shading needs to know which triangles share a corner
+        mesh = mesh.copy()
+        mesh.merge_vertices()
+        vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    tint: Array = np.ones((len(faces), 3, 3), np.float32)
+    texture = np.zeros(len(faces), np.int64)
+    uv = np.full((len(faces), 3, 2), np.nan)
+    kind, material = mesh.visual.kind, getattr(mesh.visual, "material", None)
+    coordinates = getattr(mesh.visual, "uv", None)
+    image = _image(material)
+    if kind == "texture" and image is not None and coordinates is not None and len(coordinates) == len(vertices):
+        found = np.asarray(coordinates, np.float64)[:, :2]
+        if not np.isfinite(found).all():
+            raise DvoError("broken: a texture coordinate is not finite", file=file, remedy="export it again")
+        uv = (found * [1, -1] + [0, 1])[faces]  # trimesh counts v from the bottom
+        texture[:] = len(pictures)
+        pictures.append(_picture(image, warnings))
+        if getattr(material, "alphaMode", None) in ("MASK", "BLEND"):
+            warnings.append("transparent textures are drawn opaque")
+    elif kind in ("vertex", "face"):
+        if kind == "vertex":
+            colours = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(np.float32)[faces] / 255
+        else:
+            colours = np.asarray(mesh.visual.face_colors)[:, None, :3].astype(np.float32).repeat(3, 1) / 255
+        tint = tint * colours
+        if np.ptp(colours, axis=(0, 1)).max() > 0.02:  # colours that say something
+            texture[:], uv = -1, np.zeros((len(faces), 3, 2))
+    tint = tint * _factor(material)
+    if light:
+        tint = tint * _light(mesh, vertices, faces, rotate)[..., None]
+    if rotate:
+        vertices = vertices[:, [0, 2, 1]] * [1, -1, 1]
+    return vertices[faces], tint, texture, uv
+
+
+def _image(material: Any) -> Any:
+    """The picture of a material, a PIL image, or None."""
+    found = getattr(material, "baseColorTexture", None)
+    return found if found is not None else getattr(material, "image", None)
+
+
+def _factor(material: Any) -> Array:
+    """Colour that a material multiplies on, as sRGB in [0, 1]; glTF states it in linear light."""
+    factor = getattr(material, "baseColorFactor", None)
+    if factor is not None:
+        linear = np.asarray(factor, float)[:3] / (255 if np.max(factor) > 1 else 1)
+        return (linear ** (1 / 2.2)).astype(np.float32)
+    if material is not None and getattr(material, "image", None) is None and hasattr(material, "diffuse"):
+        return np.asarray(material.main_color[:3], np.float32) / 255
+    return np.ones(3, np.float32)
+
+
+def _picture(image: Any, warnings: list[str]) -> Array:
+    picture: Array = np.asarray(image.convert("RGB"), np.float32) / 255
+    shrink = MAX_EDGE / max(picture.shape[:2])
+    if shrink < 1:
+        warnings.append(f"a texture of {picture.shape[1]}x{picture.shape[0]} was reduced to {MAX_EDGE} pixels")
+        picture = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return picture
+
+
+def _light(mesh: Any, vertices: Array, faces: Array, rotate: bool) -> Array:
+    """Light on each corner ``(T, 3)``: ambient, a distant lamp, smooth over bends and hard at creases."""
+    corners = vertices[faces]
+    flat: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+    smooth: Array = np.nan_to_num(np.asarray(mesh.vertex_normals, np.float64))[faces]
+    bent = np.einsum("tcd,td->tc", smooth, flat) < CREASE
+    normal: Array = np.where(bent[..., None], flat[:, None], smooth)
+    sun = SUN[[0, 2, 1]] * [1, 1, -1] if rotate else SUN
+    up = normal[..., 1] if rotate else normal[..., 2]
+    return (0.55 + 0.5 * np.maximum(normal @ sun, 0) + 0.12 * up).astype(np.float32)

@@ -1,0 +1,242 @@
+"""Long camera paths: walks, drives, orbits that stay in free space for as long as wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvo.errors import DvoError
+from dvo.synth.motion.paths import KINDS, UP, find_start
+from dvo.synth.poses import look_rotation, pose_from, so3_exp
+from dvo.synth.render.renderer import render_depth
+from dvo.synth.scenes.scene import Scene
+
+Array = np.ndarray
+# What long sequences add to the kinds of clips: a circuit that comes back, a way that never turns, a hasty hand.
+LONG_KINDS = tuple(dict.fromkeys((*KINDS, "loop", "straight", "fast")))
+TURNS = 1.4  # how often a loop is walked round
+
+
+@dataclass(frozen=True)
+class SplinePath:
+    """A long path: uniform cubic B-spline through position, yaw, pitch and roll, plus shake.
+
+    Attributes:
+        kind: which of ``LONG_KINDS``.
+        control: ``(K, 6)`` x, y, z, yaw, pitch, roll (rad; yaw 0 looks along y, pitch up is positive).
+        interval: seconds between control points.
+        frequency, shake: as in :class:`Path`; added in body axes.
+    """
+
+    kind: str
+    control: Array
+    interval: float
+    frequency: Array
+    shake: Array
+
+    @property
+    def duration(self) -> float:
+        """Seconds that the control points cover."""
+        return (len(self.control) - 3) * self.interval
+
+    def poses_wc(self, times: Array) -> Array:
+        """Camera-to-world poses ``(T, 7)`` float64 at ``times (T,)`` seconds in [0, duration]."""
+        times = np.asarray(times, float)
+        # A little before 0 the first piece goes on: a shutter opens before the time of its frame.
+        place = np.clip(times / self.interval, -0.2, len(self.control) - 3 - 1e-9)
+        index = np.maximum(np.floor(place), 0).astype(int)
+        s = place - index
+        weight = np.stack([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3], -1) / 6
+        state = (weight[..., None] * self.control[index[:, None] + np.arange(4)]).sum(1)
+        yaw, pitch, roll = state[:, 3:].T
+        forward = np.stack([-np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], -1)
+        rotation = np.stack([look_rotation(f, UP, r) for f, r in zip(forward, roll, strict=True)])
+        angle = times[:, None] * self.frequency
+        shake = np.einsum("tfk,fkc->tc", np.stack([np.sin(angle), np.cos(angle) - 1], -1), self.shake)
+        position = state[:, :3] + (rotation @ shake[:, :3, None])[..., 0]
+        return pose_from(rotation @ so3_exp(shake[:, 3:]), position)
+
+
+def _yaw_towards(direction: Array) -> float:
+    return float(np.arctan2(-direction[0], direction[1]))
+
+
+def _nearest_turn(angle: float, previous: float) -> float:
+    return previous + (angle - previous + np.pi) % (2 * np.pi) - np.pi
+
+
+def long_path(
+    scene: Scene, seed: int, kind: str, duration: float, *, speed: float = 1.0, shake: float = 1.0
+) -> SplinePath:
+    """A path of ``duration`` seconds that stays in free space all along: a walk, a drive, an orbit...
+
+    Args:
+        scene: where to move.
+        seed: same seed, same path.
+        kind: one of ``LONG_KINDS``.
+        duration: seconds.
+        speed: 1 is a relaxed pace: a tenth of the scene's scale in a second, six times that for a vehicle in a street.
+        shake: multiplies the amplitude of the hand's shake.
+
+    Raises:
+        DvoError: no such kind, or no room for such a path.
+    """
+    if kind not in LONG_KINDS:
+        raise DvoError(f"no path kind {kind!r}", field="kind", remedy=f"choose one of {', '.join(LONG_KINDS)}")
+    rng = np.random.default_rng([seed, 7202])
+    best: tuple[float, SplinePath] | None = None
+    for attempt in range(24):
+        pace = speed * 0.85 ** (attempt // 4)
+        if kind == "loop":
+            path = _draw_loop(scene, rng, duration, pace, shake)
+        else:
+            path = _draw_long(scene, rng, kind, duration, pace, shake)
+        times = np.linspace(0, duration, max(20, int(duration * 10)))
+        room_left = scene.clearance(path.poses_wc(times)[:, :3]).min() / scene.scale
+        if room_left < 0.03:
+            continue
+        k = np.array([16.0, 16.0, 11.5, 8.5])
+        depth = render_depth(scene, path.poses_wc(times[:: max(1, len(times) // 12)]), k, 18, 24)[0].numpy()
+        near = np.quantile(depth, 0.03, axis=(1, 2)) / np.median(depth)
+        score = float(np.minimum(near, 0.3).min() + np.minimum(near, 0.3).mean())
+        if best is None or score > best[0]:
+            best = (score, path)
+        if score > 0.35:
+            break
+    if best is None:
+        raise DvoError("found no free path through the scene", field="seed", remedy="try another seed or less speed")
+    return best[1]
+
+
+def _draw_long(
+    scene: Scene, rng: np.random.Generator, kind: str, duration: float, speed: float, shake: float
+) -> SplinePath:
+    interval = 0.8
+    count = int(np.ceil(duration / interval)) + 4
+    start = find_start(scene, rng, 2)
+    heading = scene.hints.get("heading")
+    pace = 0.1 * scene.scale * speed * interval  # metres a control interval
+    forward = start.rotation[:, 2]
+    control = np.zeros((count, 6))
+    position, yaw = start.position.copy(), _yaw_towards(forward)
+    drift = rng.normal(size=3) * [1, 1, 0.4]
+    direction = drift / np.linalg.norm(drift)
+    low, high = scene.hints.get("focus", (scene.bounds[0], scene.bounds[1]))
+    focus, side = rng.uniform(low, high), float(rng.choice([-1, 1]))
+    hasty = kind == "fast"
+    if hasty:
+        pace, shake = 3 * pace, 2.5 * shake
+    if kind == "straight" and heading is None:
+        direction, room = _longest_way(scene, rng, position)
+        pace, yaw = min(pace, 0.85 * room / count), _yaw_towards(direction)
+    if heading is not None and kind in ("forward", "stop_and_go", "drone", "sideways", "straight"):
+        along = scene.bounds[:, 1]
+        pace *= 6 if scene.family == "street" else 1.5
+        pace = min(pace, 0.8 * (along[1] - along[0]) / count)
+        towards = float(rng.choice([-1, 1]))
+        first = along[0] + 0.05 * np.ptp(along) if towards > 0 else along[1] - 0.05 * np.ptp(along)
+        position = np.array([start.position[0] * 0.5, first, start.position[2]])
+        direction, yaw = heading * towards, _yaw_towards(heading * towards)
+        if kind == "sideways":
+            yaw += side * np.pi / 2 * rng.uniform(0.4, 1)
+    radius = float(np.linalg.norm((position - focus)[:2]))
+    rate = np.clip(pace / max(radius, 1e-3), 0, 0.25)
+    pitch = float(np.clip(np.arcsin(forward[2]), -0.7, 0.5)) * 0.7
+    for i in range(count):
+        calm = 1.0 if kind != "stop_and_go" else float(np.clip(0.6 + 0.9 * np.sin(i * 1.1 + side), 0.02, 1.3))
+        if kind == "orbit":
+            angle = np.arctan2(*(position - focus)[1::-1]) + side * rate
+            target = focus + [radius * np.cos(angle), radius * np.sin(angle), position[2] - focus[2]]
+            position = target + rng.normal(0, 0.1, 3) * pace
+            yaw = _nearest_turn(_yaw_towards(focus - position), yaw)
+            pitch = float(np.arctan2(focus[2] - position[2], max(radius, 1e-3)))
+        elif kind == "straight":
+            position = position + direction * pace
+            pitch = pitch * 0.7
+        elif heading is not None and kind in ("forward", "stop_and_go", "drone", "sideways"):
+            position = position + direction * pace * calm
+            position[0] = np.clip(position[0] + rng.normal(0, 0.12) * pace, *(scene.bounds[:, 0] * 0.5))
+            wander = yaw if kind == "sideways" else _yaw_towards(direction)
+            yaw = yaw + 0.3 * (_nearest_turn(wander, yaw) - yaw) + rng.normal(0, 0.02)
+            pitch = pitch * 0.7
+        else:
+            step = pace * calm * (0.15 if kind == "rotation" else 1.0)
+            for _ in range(12):  # turn until the way is free
+                trial = position + direction * step
+                ahead = position + direction * max(4 * step, 0.15 * scene.scale)
+                if scene.clearance(np.stack([trial, ahead])).min() > 0.06 * scene.scale:
+                    break
+                fresh = rng.normal(size=3) * [1, 1, 0.3]
+                direction = fresh / np.linalg.norm(fresh)
+            else:
+                trial = position
+            position = trial
+            direction = direction + rng.normal(0, 0.25, 3) * [1, 1, 0.4]
+            direction /= np.linalg.norm(direction)
+            if rng.random() < (0.35 if hasty else 0.12):
+                focus = rng.uniform(low, high)
+            wanted = _yaw_towards(direction if kind == "forward" else focus - position)
+            swing = 0.35 if kind == "rotation" else 0.5 if hasty else 0.15
+            if kind == "rotation":
+                wanted = yaw + side
+                side = -side if rng.random() < 0.08 else side
+            yaw = yaw + float(np.clip(_nearest_turn(wanted, yaw) - yaw, -swing, swing))
+            pitch = 0.8 * pitch + rng.normal(0, 0.04)
+        control[i] = [*position, yaw, pitch, 0.6 * control[i - 1, 5] + rng.normal(0, 0.015)]
+    vehicle = scene.family == "street" and kind in ("forward", "stop_and_go", "straight")
+    return SplinePath(kind, control, interval, *_shake(scene, rng, shake, vehicle))
+
+
+def _shake(scene: Scene, rng: np.random.Generator, shake: float, vehicle: bool) -> tuple[Array, Array]:
+    """Frequencies and amplitudes of a hand, or of a car."""
+    hertz = np.exp(rng.uniform(np.log(0.4), np.log(3.0), 6))
+    amplitude = rng.normal(size=(6, 2, 6)) / hertz[:, None, None] / np.sqrt(6) * shake
+    amplitude[..., :3] *= 0.003 * scene.scale * (0.3 if vehicle else 1)
+    amplitude[..., 3:] *= 0.012 * (0.25 if vehicle else 1)
+    return hertz * 2 * np.pi, amplitude
+
+
+def _longest_way(scene: Scene, rng: np.random.Generator, position: Array) -> tuple[Array, float]:
+    """The level direction in which most free space lies ahead, of sixteen, and how far it goes."""
+    reach = np.linspace(0, 6 * scene.scale, 60)[1:]
+    best = (np.array([0.0, 1.0, 0.0]), 0.0)
+    for angle in rng.uniform(0, 2 * np.pi) + np.arange(16) * np.pi / 8:
+        direction = np.array([np.cos(angle), np.sin(angle), 0.0])
+        blocked = scene.clearance(position + reach[:, None] * direction) < 0.08 * scene.scale
+        free = float(reach[blocked.argmax()] if blocked.any() else reach[-1])
+        if free > best[1]:
+            best = (direction, free)
+    return best
+
+
+def _draw_loop(scene: Scene, rng: np.random.Generator, duration: float, speed: float, shake: float) -> SplinePath:
+    """A rounded circuit that is walked ``TURNS`` times: the second round repeats the first but for the shake.
+
+    Where there is time for it the camera turns all the way round, else it looks about and comes back to where it
+    looked.
+    """
+    once = duration / TURNS
+    steps = max(8, int(np.ceil(once / 0.8)))
+    interval = once / steps
+    count = int(np.ceil(duration / interval)) + 4
+    radius = 0.1 * scene.scale * speed * once / (2 * np.pi)
+    start = find_start(scene, rng, 2)
+    spots = np.concatenate([start.position[None], rng.uniform(scene.bounds[0], scene.bounds[1], (40, 3))])
+    spots[:, 2] = start.position[2]
+    centre = spots[int(scene.clearance(spots).argmax())]
+    room = np.minimum(centre - scene.bounds[0], scene.bounds[1] - centre)
+    angle = rng.uniform(0, 2 * np.pi) + float(rng.choice([-1, 1])) * 2 * np.pi * np.arange(count) / steps
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    bulge = 1 + 0.25 * np.cos(2 * angle + phase[0]) + 0.12 * np.cos(3 * angle + phase[1])
+    offset = np.stack([np.cos(angle), np.sin(angle), 0.12 * np.sin(angle + phase[2])], -1) * bulge[:, None]
+    position = centre + offset * np.minimum(radius, 0.6 * room)
+    forward = start.rotation[:, 2]
+    if once > 9 and rng.random() < 0.6:
+        way = np.gradient(position, axis=0)
+        yaw = np.unwrap(np.arctan2(-way[:, 0], way[:, 1])) + rng.choice([0.0, -0.7, 0.7])
+    else:
+        yaw = _yaw_towards(forward) + rng.uniform(0.5, 0.9) * np.sin(angle + phase[2])
+    pitch = 0.7 * float(np.clip(np.arcsin(forward[2]), -0.5, 0.4)) + 0.06 * np.sin(2 * angle + phase[0])
+    control = np.column_stack([position, yaw, pitch, 0.02 * np.sin(angle + phase[1])])
+    return SplinePath("loop", control, interval, *_shake(scene, rng, shake, False))

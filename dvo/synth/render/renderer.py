@@ -1,0 +1,298 @@
+"""The renderer: flat surfaces rasterised exactly, textured and lit, in plain torch.
+
+In the camera of frame n a plane has an inverse depth that is linear in the pixel, and so are u / Z and v / Z of its
+surface coordinates and Z-scaled distances to its edges. So per frame and surface there are a few 3-vectors (computed in
+float64), a pixel (x, y, 1) is covered where all edge functions are positive, and the surface of largest inverse depth
+wins. Depth, identity and surface coordinates are exact; nothing is interpolated over pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.errors import DvoError
+from dvo.synth.meshes.mesh import MeshScene, mesh_depth, render_mesh, trace_mesh
+from dvo.synth.render.antialias import smooth_outlines
+from dvo.synth.render.view import SLACK, View, look
+from dvo.synth.scenes.bodies import Stage
+from dvo.synth.scenes.scene import CELL, Scene
+from dvo.synth.textures.pool import sample
+
+PIECE = 9600  # pixels shaded at once on a CPU
+Array = np.ndarray
+
+
+@dataclass
+class Rendering:
+    """What N cameras see.
+
+    Attributes:
+        images: ``(N, 3, H, W)`` float32 RGB in [0, 1].
+        depth: ``(N, H, W)`` float32 Z along the optical axis, world units; 0 where no surface is hit.
+        surface: ``(N, H, W)`` int64 index of the surface, -1 where none is hit.
+        uv: ``(N, H, W, 2)`` float32 coordinates in the surface, world units (see :class:`Scene`).
+    """
+
+    images: Tensor
+    depth: Tensor
+    surface: Tensor
+    uv: Tensor
+
+
+def cast(view: View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
+    """Largest inverse depth ``(N, H, W)``, the position in ``view.index`` of its surface (int32, -1 for none), and the
+    functions ``(N, Q, 5, 3)`` that decided it: inverse depth and edges.
+    """
+    n = len(view.seen)
+    slack = 0.02  # pixels; the windows are exact but for rounding and SLACK
+    x0, y0 = (np.clip(np.ceil(view.window[..., i] - slack), 0, m).astype(int) for i, m in ((0, width), (1, height)))
+    x1, y1 = (
+        np.clip(np.floor(view.window[..., i] + slack) + 1, 0, m).astype(int) for i, m in ((2, width), (3, height))
+    )
+    seen = view.seen & (x1 > x0) & (y1 > y0)
+    functions = np.concatenate([view.basis[:, :, 2:], view.edges], 2)  # (N, Q, 5, 3)
+    functions[~seen] = [0.0, 0.0, -1.0]  # hidden from this camera, but seen by another one of the batch
+    table = torch.from_numpy(functions.astype(np.float32)).to(device)
+    nearest = torch.full((n, height, width), 1e-12, device=device)
+    surface = torch.full((n, height, width), -1, dtype=torch.int32, device=device)
+    xs = torch.arange(width, dtype=torch.float32, device=device)
+    ys = torch.arange(height, dtype=torch.float32, device=device)
+    big = np.iinfo(np.int64).max
+    left, top = np.where(seen, x0, big).min(0), np.where(seen, y0, big).min(0)
+    right, bottom = np.where(seen, x1, 0).max(0), np.where(seen, y1, 0).max(0)
+    for q in np.flatnonzero(seen.any(0)).tolist():
+        a, b, c, d = int(left[q]), int(right[q]), int(top[q]), int(bottom[q])
+        which = np.flatnonzero(seen[:, q])
+        n0, n1 = int(which[0]), int(which[-1]) + 1
+        rows = table[n0:n1, q]
+        value = (
+            torch.addcmul(rows[..., 2:], rows[..., 1:2], ys[c:d])[..., None] + (rows[..., :1] * xs[a:b])[..., None, :]
+        )
+        inverse, best = value[:, 0], nearest[n0:n1, c:d, a:b]
+        hit = (value[:, 1:].amin(1) >= -SLACK) & (inverse > best)
+        best.copy_(torch.where(hit, inverse, best))
+        surface[n0:n1, c:d, a:b].masked_fill_(hit, q)
+    return nearest, surface, table
+
+
+def _linear(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Evaluate functions ``(3, M)`` at pixels ``(M,)``."""
+    return torch.addcmul(torch.addcmul(rows[2], rows[0], x), rows[1], y)
+
+
+def functions_of(scene: Scene, view: View, device: torch.device | str) -> Tensor:
+    """Coefficients ``(N Q, 15)`` of 1/Z, s/Z, t/Z and of the light-map coordinates over Z."""
+    texture = scene.texture_map[view.index] @ view.basis
+    light = scene.light_map[view.index] @ view.basis
+    packed = np.concatenate([view.basis[:, :, 2:], texture, light], 2).astype(np.float32)
+    return torch.from_numpy(packed.reshape(-1, 15)).to(device)
+
+
+def shade(scene: Scene, functions: Tensor, row: Tensor, surface: Tensor, x: Tensor, y: Tensor, taps: int) -> Tensor:
+    """Colour ``(3, M)`` in [0, 1] of M pixels (x, y) that show ``surface (M,)``, with functions in ``row (M,)``."""
+    tables = scene.tensors(surface.device)
+    f = functions.index_select(0, row).t().contiguous().view(5, 3, -1)
+    about = tables["surface"].index_select(1, surface)
+    z = 1 / _linear(f[0], x, y)
+    s, t = _linear(f[1], x, y) * z, _linear(f[2], x, y) * z
+    # Jacobian of texel coordinates by pixel, from the quotient rule.
+    sx, sy = torch.addcmul(f[1, 0], s, f[0, 0], value=-1) * z, torch.addcmul(f[1, 1], s, f[0, 1], value=-1) * z
+    tx, ty = torch.addcmul(f[2, 0], t, f[0, 0], value=-1) * z, torch.addcmul(f[2, 1], t, f[0, 1], value=-1) * z
+    along_x, along_y = torch.hypot(sx, tx), torch.hypot(sy, ty)
+    major = torch.maximum(along_x, along_y)
+    minor = (sx * ty - sy * tx).abs_() / major.clamp_min(1e-9)
+    footprint = torch.maximum(minor, major / taps)
+    wide = along_x >= along_y
+    shift = ((torch.arange(taps, device=x.device) + 0.5) / taps - 0.5)[:, None]
+    places_s, places_t = s + shift * torch.where(wide, sx, sy), t + shift * torch.where(wide, tx, ty)
+    colour = sample(scene.pool, about[10], about[11], places_s, places_t, footprint)
+    colour = torch.addcmul(about[7:10], colour, about[4:7])
+    light = tables["light"]
+    across, down = light.shape[3], light.shape[2]
+    lx = (_linear(f[3], x, y) * z).clamp_(0, CELL - 1).add_(about[12]).mul_(2 / (across - 1)).sub_(1)
+    ly = (_linear(f[4], x, y) * z).clamp_(0, CELL - 1).mul_(2 / (down - 1)).sub_(1)
+    grid = torch.stack([lx, ly], -1).view(1, 1, -1, 2)
+    shine = torch.nn.functional.grid_sample(light, grid, padding_mode="border", align_corners=True)
+    return colour.mul_(shine.view(3, -1)).clamp_(0, 1)
+
+
+def _cameras(poses_wc: object, intrinsics: object) -> tuple[Array, Array]:
+    def to_numpy(value: object) -> Array:
+        if isinstance(value, Tensor):
+            value = value.detach().cpu().numpy()
+        return np.asarray(value, np.float64)
+
+    poses, k = to_numpy(poses_wc), to_numpy(intrinsics)
+    if poses.ndim != 2 or poses.shape[1] != 7 or not np.isfinite(poses).all():
+        raise DvoError(f"expected finite poses of shape (N, 7), got {poses.shape}", field="poses_wc")
+    if k.shape not in ((4,), (len(poses), 4)):
+        raise DvoError(f"expected shape (4,) or ({len(poses)}, 4), got {k.shape}", field="intrinsics")
+    if not np.isfinite(k).all() or (k[..., :2] <= 0).any():
+        raise DvoError("focal lengths must be positive and all numbers finite", field="intrinsics")
+    return poses, np.broadcast_to(k, (len(poses), 4))
+
+
+def sight(
+    scene: Scene | Stage, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None, times: object = None
+) -> tuple[Scene, View]:
+    """What cameras ``(N, 7)`` see at ``times (N,)``, and the scene whose paint and light goes with it.
+
+    Raises:
+        DvoError: moving bodies and no time for every camera.
+    """
+    if not isinstance(scene, Stage):
+        return scene, look(scene, poses_wc, intrinsics, size)
+    when = np.asarray(times, np.float64) if times is not None else np.zeros(0)
+    if when.shape != (len(poses_wc),):
+        raise DvoError("a scene with moving bodies needs a time for every pose", field="times")
+    return scene.surfaces, scene.look(poses_wc, intrinsics, size, when)
+
+
+def render_depth(
+    scene: Scene | Stage | MeshScene, poses_wc: object, intrinsics: object, height: int, width: int, *,
+    device: torch.device | str = "cpu", times: object = None,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
+    poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        return mesh_depth(scene, poses, k, height, width, device)
+    _, view = sight(scene, poses, k, (height, width), times)
+    nearest, local, _ = cast(view, height, width, device)
+    return torch.where(local >= 0, 1 / nearest, 0.0), named(view, local)
+
+
+def named(view: View, local: Tensor) -> Tensor:
+    """Positions in ``view.index`` -> surfaces of the scene, int64; -1 stays."""
+    names = torch.from_numpy(np.append(view.index, -1).astype(np.int64)).to(local.device)
+    return names[local.long()]
+
+
+def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:
+    """Images ``(N, 3, H, W)`` of a cast grid, in pieces that stay in the processor's cache."""
+    n, height, width = local.shape
+    device = local.device
+    images = torch.empty(n, 3, height * width, device=device)
+    functions = functions_of(scene, view, device)
+    x = torch.arange(width, dtype=torch.float32, device=device).expand(height, width).reshape(-1)
+    y = torch.arange(height, dtype=torch.float32, device=device)[:, None].expand(height, width).reshape(-1)
+    names = torch.from_numpy(view.index).to(device)
+    piece = height * width if torch.device(device).type != "cpu" else PIECE
+    for frame in range(n):
+        flat = local[frame].reshape(-1).long()
+        hit = flat >= 0
+        flat.clamp_min_(0)
+        for a in range(0, flat.numel(), piece):
+            part = slice(a, a + piece)
+            row = flat[part] + frame * len(view.index)
+            images[frame, :, part] = shade(scene, functions, row, names[flat[part]], x[part], y[part], taps)
+        if not hit.all():
+            images[frame].masked_fill_(~hit, 0.0)
+    return images.view(n, 3, height, width)
+
+
+def render(
+    scene: Scene | Stage | MeshScene,
+    poses_wc: object,
+    intrinsics: object,
+    height: int,
+    width: int,
+    *,
+    supersample: int = 1,
+    device: torch.device | str = "cpu",
+    taps: int = 2,
+    antialias: bool = True,
+    coordinates: bool = True,
+    times: object = None,
+) -> Rendering:
+    """Render N frames.
+
+    Args:
+        scene: what to render; a :class:`Stage` has bodies that move; of a mesh, ``surface`` is the triangle and ``uv``
+            the barycentric weights of its second and third corner.
+        poses_wc: ``(N, 7)`` camera to world, tensor or array.
+        intrinsics: ``(N, 4)`` or ``(4,)`` fx fy cx cy in pixels of the ``height`` x ``width`` image.
+        height, width: image size in pixels.
+        supersample: rays per pixel edge for the colours (depth, surface and uv are always those of pixel centres).
+        device: where to render.
+        taps: texture samples along the longer axis of a pixel's footprint (anisotropic filter).
+        antialias: smooth outlines by coverage (with one ray a pixel; more rays smooth by themselves).
+        coordinates: fill ``uv`` too; without, it is empty ``(N, 0, 0, 2)``.
+        times: ``(N,)`` seconds, for the places of moving bodies.
+
+    Raises:
+        DvoError: poses or intrinsics of the wrong shape or not finite, or bodies without times.
+    """
+    poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        rays = max(supersample, 2 if antialias else 1)
+        return Rendering(
+            *render_mesh(
+                scene, poses, k, height, width, supersample=rays, device=device, taps=taps, coordinates=coordinates
+            )
+        )
+    painted, view = sight(scene, poses, k, (height, width), times)
+    nearest, local, functions = cast(view, height, width, device)
+    depth = torch.where(local >= 0, 1 / nearest, 0.0)
+    if supersample == 1:
+        images = _colours(painted, view, local, taps)
+        if antialias:
+            smooth_outlines(images, local, functions, SLACK)
+    else:
+        m = supersample
+        fine = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
+        _, fine_view = sight(scene, poses, fine, (height * m, width * m), times)
+        _, fine_local, _ = cast(fine_view, height * m, width * m, device)
+        images = torch.nn.functional.avg_pool2d(_colours(painted, fine_view, fine_local, taps), m)
+    uv = coordinates_of(view, local, depth) if coordinates else torch.zeros(len(poses), 0, 0, 2, device=device)
+    return Rendering(images, depth, named(view, local), uv)
+
+
+def coordinates_of(view: View, local: Tensor, depth: Tensor) -> Tensor:
+    """Surface coordinates ``(N, H, W, 2)`` of a cast grid."""
+    n, height, width = local.shape
+    device = local.device
+    uv = torch.from_numpy(view.basis[:, :, :2].astype(np.float32).reshape(-1, 6)).to(device)
+    frame = torch.arange(n, device=device)[:, None, None] * len(view.index)
+    chosen = uv[(frame + local.clamp_min(0)).reshape(-1)].view(n, height, width, 2, 3)
+    xs = torch.arange(width, dtype=torch.float32, device=device)[:, None]
+    ys = torch.arange(height, dtype=torch.float32, device=device)[:, None, None]
+    return (chosen[..., 0] * xs + chosen[..., 1] * ys + chosen[..., 2]) * depth[..., None]
+
+
+def trace(
+    scene: Scene | Stage | MeshScene, poses_wc: object, intrinsics: object, pixels: Array, times: object = None,
+    size: tuple[int, int] | None = None,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """What single rays hit, in float64: the reference for tests and for tracks.
+
+    Args:
+        scene: what to look at.
+        poses_wc: ``(N, 7)``; intrinsics: ``(N, 4)`` or ``(4,)``.
+        pixels: ``(N, M, 2)`` x, y (need not be integers nor inside an image).
+        times: ``(N,)`` seconds, for the places of moving bodies.
+        size: height and width of pictures in which all pixels lie: spares work on what cannot show there.
+
+    Returns:
+        depth ``(N, M)``, surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
+    """
+    poses, k = _cameras(poses_wc, intrinsics)
+    if isinstance(scene, MeshScene):
+        return trace_mesh(scene, poses, k, pixels)
+    _, view = sight(scene, poses, k, size, times)
+    homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1).swapaxes(1, 2)  # (N, 3, M)
+    if not len(view.index):
+        nothing = np.zeros(pixels.shape[:2])
+        return nothing, np.full(nothing.shape, -1), np.zeros(pixels.shape)
+    inverse = view.basis[:, :, 2] @ homogeneous  # (N, Q, M)
+    inside = (view.edges @ homogeneous[:, None]).min(2) >= -SLACK
+    inverse = np.where(inside & view.seen[..., None] & (inverse > 0), inverse, 0)
+    chosen = inverse.argmax(1)
+    best = inverse.max(1)
+    depth = np.divide(1, best, out=np.zeros_like(best), where=best > 0)
+    rows = view.basis[np.arange(len(poses))[:, None], chosen, :2]  # (N, M, 2, 3)
+    uv = (rows @ homogeneous.swapaxes(1, 2)[..., None])[..., 0] * depth[..., None]
+    return depth, np.where(best > 0, view.index[chosen], -1), uv

@@ -1,0 +1,117 @@
+"""What an inertial sensor on the camera measures, from the continuous path.
+
+Model (Kalibr's, and of Forster et al., "On-manifold preintegration", 2017, eq. 27-28): in the frame of the camera,
+
+    gyro  = omega + bias_g + noise,    accel = R_wc^T (a_w - g_w) + bias_a + noise,
+
+with white noise of density n (deviation ``n sqrt(rate)`` of a sample) and biases that walk randomly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvo.errors import DvoError
+from dvo.synth.poses import split
+from dvo.synth.scenes.bodies import Motion
+
+Array = np.ndarray
+GRAVITY = np.array([0.0, 0.0, -9.81])  # world, m/s^2; z is up
+STEP = 2e-4  # seconds on either side of a sample over which motion is differentiated
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Of the sensor; the defaults are those of the ADIS16448 that EuRoC's calibration gives (Burri et al., 2016).
+
+    Attributes:
+        gyro: rad/s/sqrt(Hz).
+        gyro_walk: rad/s^2/sqrt(Hz).
+        accel: m/s^2/sqrt(Hz).
+        accel_walk: m/s^3/sqrt(Hz).
+        gyro_bias, accel_bias: deviation of the bias at the start, rad/s and m/s^2.
+    """
+
+    gyro: float = 1.6968e-4
+    gyro_walk: float = 1.9393e-5
+    accel: float = 2.0e-3
+    accel_walk: float = 3.0e-3
+    gyro_bias: float = 2e-3
+    accel_bias: float = 2e-2
+
+
+@dataclass(frozen=True)
+class Imu:
+    """Samples in the frame of the camera (x right, y down, z forward).
+
+    Attributes:
+        timestamps: ``(T,)`` seconds.
+        gyro: ``(T, 3)`` rad/s. accel: ``(T, 3)`` m/s^2, gravity's reaction included (at rest: -R^T g).
+        gyro_bias, accel_bias: ``(T, 3)`` that are part of them.
+        gravity: ``(3,)`` in the world.
+    """
+
+    timestamps: Array
+    gyro: Array
+    accel: Array
+    gyro_bias: Array
+    accel_bias: Array
+    gravity: Array
+
+
+def measure_imu(
+    path: Motion, times: Array, *, noise: ImuNoise | None = None, seed: int = 0, gravity: Array = GRAVITY
+) -> Imu:
+    """IMU samples at ``times (T,)``, evenly spaced seconds.
+
+    Rates of turn and accelerations are central differences over ``STEP`` of the path in float64 (rounding: some
+    1e-6 m/s^2 and 1e-11 rad/s).
+
+    Args:
+        path: camera to world, in metres.
+        times: when to measure.
+        noise: of the sensor; None measures without any noise or bias.
+        seed: of the noise.
+        gravity: in the world, m/s^2.
+
+    Raises:
+        DvoError: times that are not evenly spaced.
+    """
+    times = np.asarray(times, float)
+    steps = np.diff(times)
+    if times.ndim != 1 or len(times) < 2 or not (steps > 0).all() or np.ptp(steps) > 1e-6 * steps.mean():
+        raise DvoError("need two evenly spaced times or more", field="times", remedy="give np.arange(...) / rate")
+    (before, left), (now, here), (after, right) = (split(path.poses_wc(times + s * STEP)) for s in (-1, 0, 1))
+    omega = rotation_vector(np.swapaxes(before, -1, -2) @ after) / (2 * STEP)
+    # ``before^T after`` turns about an axis in the frame of ``before``; half way is the frame of ``now``.
+    omega = (np.swapaxes(now, -1, -2) @ before @ omega[..., None])[..., 0]
+    acceleration = ((right - here) - (here - left)) / STEP**2
+    accel = (np.swapaxes(now, -1, -2) @ (acceleration - gravity)[..., None])[..., 0]
+    biases = np.zeros((2, len(times), 3))
+    if noise is not None:
+        rng = np.random.default_rng([seed, 7602])
+        rate = 1 / steps.mean()
+        for k, (start, walk) in enumerate(((noise.gyro_bias, noise.gyro_walk), (noise.accel_bias, noise.accel_walk))):
+            wander = rng.normal(0, walk / np.sqrt(rate), (len(times), 3))
+            wander[0] = rng.normal(0, start, 3)
+            biases[k] = np.cumsum(wander, 0)
+        omega = omega + biases[0] + rng.normal(0, noise.gyro * np.sqrt(rate), omega.shape)
+        accel = accel + biases[1] + rng.normal(0, noise.accel * np.sqrt(rate), accel.shape)
+    return Imu(times, omega, accel, biases[0], biases[1], np.asarray(gravity, float))
+
+
+def rotation_vector(rotation: Array) -> Array:
+    """Matrices ``(..., 3, 3)`` of turns well below pi -> rotation vectors ``(..., 3)``, accurate for tiny ones."""
+    twist = 0.5 * np.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )  # sin(angle) * axis
+    sine = np.linalg.norm(twist, axis=-1, keepdims=True)
+    cosine = (np.trace(rotation, axis1=-2, axis2=-1)[..., None] - 1) / 2
+    return twist * np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-300), 1.0)

@@ -1,0 +1,201 @@
+"""Predictions by key: a run is repeated only if something that it depends on has changed.
+
+A prediction is a folder that appears whole or not at all, named by the hash of everything that its trajectory depends
+on (``key.json`` holds it in words): so a run that was killed goes on where it stopped, and an old trajectory is never
+taken for a new one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from dvo.data.source import Source
+from dvo.odometry.results import jsonable
+from eval.execution.predict import RECORD, Job, Prediction, predict, read_prediction
+from eval.execution.versions import code_digest, feels_threads, library_versions, reader_digest
+from eval.suites.suite import Sequence
+from eval.systems.registry import System, find_system
+
+KEY = "key.json"
+CONTENT_LIMIT = 64 * 2**20  # bytes of a sequence up to which its files are hashed; beyond, names, sizes and times
+# Fields of a sequence that change tables, or whose content is in the fingerprint; what is left chooses images.
+NOT_IN_KEY = ("name", "about", "judged_by", "path", "calib", "times", "groundtruth")
+PASSING = ("unavailable", "no data")  # states that the user mends without changing the key
+
+
+@dataclass(frozen=True)
+class SystemFacts:
+    """What the key and the report need of a system, asked once for a whole evaluation.
+
+    Attributes:
+        label: the name as in the tables: without the folders of a file in it.
+        version: as in the tables, ``""`` if the system cannot say.
+        missing: why it cannot run, or None.
+        code, libraries, threads: see :mod:`eval.execution.versions`; ``threads`` is whether their number may change
+            results.
+    """
+
+    name: str
+    label: str
+    licence: str
+    about: str
+    version: str
+    missing: str | None
+    code: str
+    libraries: dict[str, str]
+    threads: bool
+
+
+def system_facts(name: str, weights: str | None = None) -> SystemFacts:
+    """Ask a system.
+
+    Raises:
+        DvoError: no such system.
+    """
+    system = find_system(name, weights)
+    missing = system.missing()
+    on_torch = feels_threads(system)
+    libraries = library_versions()
+    return SystemFacts(
+        name=name,
+        label=name.replace(name.partition(":")[2], Path(name).name) if name.startswith("dvo:") else Path(name).name,
+        licence=system.licence,
+        about=system.about,
+        version="" if missing is not None else _version(system),
+        missing=missing,
+        code=code_digest(system),
+        libraries={name: version for name, version in libraries.items() if name != "torch" or on_torch},
+        threads=on_torch,
+    )
+
+
+def data_fingerprint(source: Source, sequence: Sequence) -> str:
+    """A hash of the images and the calibration of an open sequence.
+
+    Files of a small sequence are hashed whole, so that a copy elsewhere is the same; of a large one names, sizes and
+    times of change count.
+    """
+    digest = hashlib.sha256()
+    _add(digest, [asdict(source.recorded_camera), reader_digest()])
+    root = source.path
+    files = sorted(file for file in root.rglob("*") if file.is_file()) if root.is_dir() else [root]
+    files += [root / name for name in (sequence.calib, sequence.times) if name and (root / name).is_file()]
+    by_content = sum(file.stat().st_size for file in files) <= CONTENT_LIMIT
+    for file in files:
+        about = file.stat()
+        name = str(file.relative_to(root)) if file.is_relative_to(root) else file.name
+        _add(digest, [name, about.st_size])
+        if by_content:
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+        else:
+            _add(digest, about.st_mtime_ns)
+    return digest.hexdigest()[:16]
+
+
+def job_key(job: Job, facts: SystemFacts, fingerprint: str, suite: dict[str, Any]) -> dict[str, Any]:
+    """Everything that the trajectory of a job depends on, JSON-able.
+
+    Args:
+        fingerprint: of the data, see :func:`data_fingerprint`.
+        suite: name and other facts of the suite that choose the images (its version).
+    """
+    sequence = {name: value for name, value in jsonable(asdict(job.sequence)).items() if name not in NOT_IN_KEY}
+    return {
+        "format": 1,
+        "system": job.system,
+        "version": facts.version,
+        "code": facts.code,
+        "libraries": facts.libraries,
+        "suite": suite,
+        "sequence": sequence,
+        "data": fingerprint,
+        "seed": job.seed,
+        "stride": job.stride,
+        "device": job.device,
+        "threads": job.threads if facts.threads else None,
+    }
+
+
+def digest_of(key: dict[str, Any]) -> str:
+    """Twelve letters for the name of a folder."""
+    return hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def reusable(job: Job, retry: bool = False) -> Prediction | None:
+    """The prediction that lies in the job's folder, unless it has to be made (again).
+
+    Args:
+        retry: make failed ones again.
+    """
+    folder = Path(job.folder)
+    if not (folder / RECORD).is_file():
+        return None
+    found = read_prediction(folder)
+    if found.status in PASSING or (retry and found.status != "ok"):
+        return None
+    if found.status == "timeout" and job.time_limit > (found.time_limit or 0):
+        return None
+    return found
+
+
+def obtain(
+    job: Job,
+    key: dict[str, Any],
+    *,
+    run: Callable[[Job], Prediction] = predict,
+    retry: bool = False,
+) -> tuple[Prediction, bool]:
+    """The prediction of a job, and whether it was there already. What is written appears in one step."""
+    found = reusable(job, retry)
+    if found is not None:
+        return found, True
+    part = part_folder(job)
+    prediction = run(replace(job, folder=str(part)))
+    commit(part, Path(job.folder), key)
+    return prediction, False
+
+
+def part_folder(job: Job) -> Path:
+    """Where a job works until it is done: beside its folder, so that a rename is enough."""
+    folder = Path(job.folder)
+    part = folder.with_name(f".part-{folder.name}-{os.getpid()}-{threading.get_ident()}")
+    part.mkdir(parents=True, exist_ok=True)
+    return part
+
+
+def commit(part: Path, folder: Path, key: dict[str, Any]) -> None:
+    """Make a finished prediction appear."""
+    (part / KEY).write_text(json.dumps(key, indent=1) + "\n", encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(part, folder)
+
+
+def sweep(predictions: Path) -> None:
+    """Remove what killed runs have left half done. Only for the one who holds the folder."""
+    for part in predictions.rglob(".part-*"):
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def slug(name: str) -> str:
+    """A name as part of a path."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_") or "_"
+
+
+def _version(system: System) -> str:
+    try:
+        return system.version()
+    except Exception:  # the run itself will say what is wrong with a system that cannot name its version
+        return ""
+
+
+def _add(digest: Any, value: Any) -> None:
+    digest.update(json.dumps(jsonable(value), sort_keys=True, default=str).encode() + b"\0")

@@ -1,0 +1,208 @@
+"""The first half of an evaluation: run a system on a sequence and keep what it says, without looking at ground truth.
+
+Each run has its own process (:func:`predict`), so that peak memory is its own, a hang meets the time limit, and a crash
+of native code stays outside; its folder then holds ``trajectory.txt`` and ``prediction.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.data.trajectory import Trajectory, read_tum, write_tum
+from dvo.errors import DvoError
+from dvo.odometry.protocol import Odometry
+from dvo.odometry.results import jsonable, peak_memory_mb
+from eval.execution.process import run_limited
+from eval.scoring.blackout import dark_spans, is_dark
+from eval.suites.suite import ROOT, Sequence, open_sequence
+from eval.systems.registry import find_system
+
+RECORD, TRAJECTORY, LOG = "prediction.json", "trajectory.txt", "log.txt"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run.
+
+    Attributes:
+        system, weights, seed, device, threads: what runs, and how.
+        sequence, data, stride: on what.
+        folder: where the prediction is written.
+        time_limit: seconds.
+        parallel: runs at the same time on the machine; above 1, timings are those of a machine that is shared.
+    """
+
+    system: str
+    sequence: Sequence
+    data: str
+    folder: str
+    seed: int = 0
+    stride: int = 1
+    weights: str | None = None
+    device: str = "cpu"
+    threads: int = 2
+    time_limit: float = 1800.0
+    parallel: int = 1
+
+
+@dataclass
+class Prediction:
+    """What a run left behind.
+
+    Attributes:
+        status: ``ok``, ``crashed``, ``timeout``, ``invalid`` (poses that are not finite), ``unavailable`` (the system),
+            ``no data`` (the sequence).
+        reason: in words, where the status is not ok.
+        version: of the system.
+        stamps: times of the frames that were fed, seconds.
+        tracked: rows of the trajectory.
+        resolution: size at which the system worked, else of the images: ``WIDTHxHEIGHT``.
+        fps: frames fed per second inside ``track`` and ``finish``; reading is not counted.
+        latency_p95_ms: 95th percentile of the time of one ``track``.
+        peak_memory_mb: of the whole process.
+        threads, device, parallel, time_limit: of the job, under which the resources were measured.
+        dark: stretches of frames that show nothing, between lit ones: first and last stamp of each.
+        info: what the system says of itself.
+    """
+
+    status: str
+    reason: str = ""
+    version: str = ""
+    stamps: list[float] = field(default_factory=list)
+    tracked: int = 0
+    resolution: str = ""
+    fps: float | None = None
+    latency_p95_ms: float | None = None
+    peak_memory_mb: float | None = None
+    threads: int = 0
+    device: str = ""
+    parallel: int = 1
+    time_limit: float | None = None
+    dark: list[list[float]] = field(default_factory=list)
+    info: dict[str, Any] = field(default_factory=dict)
+
+
+def predict(job: Job) -> Prediction:
+    """Run a job in a process of its own and wait for it. Never raises on a run that fails."""
+    folder = Path(job.folder)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    system = find_system(job.system, job.weights)
+    reason = system.missing()
+    if reason is not None:
+        return write_prediction(job, Prediction("unavailable", reason))
+    (folder / "job.json").write_text(json.dumps(asdict(job), indent=1), encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    environment |= {name: str(job.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+    command = [sys.executable, "-m", "eval.execution.worker", str(folder / "job.json")]
+    ending = run_limited(command, environment, job.time_limit, folder / LOG)
+    if ending.code is None:
+        late = Prediction("timeout", f"not done after {job.time_limit:g} s", system.version())
+        return write_prediction(job, late)
+    if not (folder / RECORD).is_file():
+        return write_prediction(job, Prediction("crashed", str(ending), system.version()))
+    return read_prediction(folder)
+
+
+def predict_here(job: Job) -> Prediction:
+    """Run a job in this process: what the worker does."""
+    folder = Path(job.folder)
+    system = find_system(job.system, job.weights)
+    version = ""
+    try:
+        source, _ = open_sequence(job.sequence, Path(job.data), job.stride)
+    except DvoError as error:
+        return write_prediction(job, Prediction("no data", str(error)))
+    try:
+        version = system.version()
+        prediction, trajectory = drive(system.build(job.seed, job.device), source)
+    except Exception as error:  # whatever a system raises is its result, and becomes a row
+        return write_prediction(job, Prediction("crashed", f"{type(error).__name__}: {error}", version))
+    prediction.version = version
+    if prediction.status == "ok":
+        write_tum(folder / TRAJECTORY, trajectory)
+    return write_prediction(job, prediction)
+
+
+def drive(odometry: Odometry, source: Any) -> tuple[Prediction, Trajectory]:
+    """Feed every frame of a source to an odometry, with a clock."""
+    stamps, seconds, dark, resolution = [], [], [], ""
+    for frame in source:
+        begin = time.perf_counter()
+        odometry.track(frame)
+        seconds.append(time.perf_counter() - begin)
+        stamps.append(frame.timestamp)
+        dark.append(is_dark(frame.image))
+        resolution = f"{frame.camera.width}x{frame.camera.height}"
+    begin = time.perf_counter()
+    result = odometry.finish()
+    total = sum(seconds) + time.perf_counter() - begin
+    worked = result.info.get("working_size")
+    prediction = Prediction(
+        status="ok",
+        stamps=stamps,
+        tracked=len(result.trajectory),
+        resolution=f"{worked[0]}x{worked[1]}" if worked else resolution,
+        fps=len(stamps) / max(total, 1e-9),
+        latency_p95_ms=1000 * float(np.percentile(seconds, 95)) if seconds else None,
+        peak_memory_mb=process_peak_mb(),
+        dark=[list(span) for span in dark_spans(np.array(stamps), np.array(dark, dtype=bool))],
+        info=result.info,
+    )
+    broken = int((~np.isfinite(result.trajectory.poses_wc)).any(axis=1).sum())
+    if broken:
+        prediction.status, prediction.reason = "invalid", f"{broken} poses are not finite"
+    return prediction, result.trajectory
+
+
+def read_prediction(folder: Path | str) -> Prediction:
+    """Read a record.
+
+    Raises:
+        DvoError: there is none.
+    """
+    path = Path(folder) / RECORD
+    if not path.is_file():
+        raise DvoError("no such prediction", file=path, remedy="run the evaluation first")
+    return Prediction(**json.loads(path.read_text(encoding="utf-8")))
+
+
+def read_trajectory(folder: Path | str) -> Trajectory:
+    """The trajectory of a run, without rows where it left none."""
+    path = Path(folder) / TRAJECTORY
+    if not path.is_file() or path.read_text(encoding="utf-8").count("\n") < 2:
+        return Trajectory(np.zeros(0), np.zeros((0, 7)))
+    return read_tum(path)
+
+
+def process_peak_mb() -> float | None:
+    """Largest resident memory of this program in MB.
+
+    ``ru_maxrss`` survives exec on Linux, so a child would report its parent's peak; VmHWM does not.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text(encoding="utf-8").splitlines():
+            if line.startswith("VmHWM:"):
+                return round(int(line.split()[1]) * 1024 / 1e6, 1)
+    return peak_memory_mb()
+
+
+def write_prediction(job: Job, prediction: Prediction) -> Prediction:
+    """Put a record into the job's folder, whole or not at all."""
+    prediction.threads, prediction.device = job.threads, job.device
+    prediction.parallel, prediction.time_limit = job.parallel, job.time_limit
+    path = Path(job.folder) / RECORD
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(jsonable(prediction), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(part, path)
+    return prediction

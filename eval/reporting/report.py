@@ -1,0 +1,299 @@
+"""The report of an evaluation: results.csv, Markdown tables, figures, and one HTML page that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.data.trajectory import Trajectory, read_tum
+from dvo.errors import DvoError
+from eval.execution.cache import slug
+from eval.execution.plan import Manifest, groundtruth_file
+from eval.execution.predict import RECORD, read_prediction, read_trajectory
+from eval.reporting.plots import plot_axis, plot_sequence, plot_speed, styles
+from eval.reporting.tables import (
+    DIGITS,
+    FIGURES,
+    NULL,
+    RESOURCES,
+    UNITS,
+    VOID,
+    Axis,
+    Cell,
+    axes_of,
+    axis_table,
+    best_of,
+    cell,
+    errors_of,
+    markdown,
+    one_line,
+    speed_note,
+    summary,
+    write_csv,
+)
+from eval.reporting.verdict import verdicts
+from eval.scoring.score import Row
+from eval.suites.suite import Sequence, Suite
+
+RESULTS, TABLE, AXES, PAGE, FIGURE_FOLDER = "results.csv", "table.md", "axes.md", "report.html", "figures"
+TEMPLATES = Path(__file__).resolve().parent / "templates"
+# Title, field, digits, meaning; of the table of systems.
+OVERALL = (
+    ("complete %", "completeness", 0),
+    ("rot. error / rot.", "rotation_error_ratio", 2),
+    ("scale drift", "scale_drift", 2),
+    ("ATE AUC", "auc", 2),
+    ("pose AUC 1°", "pose_auc_1", 2),
+    ("2°", "pose_auc_2", 2),
+    ("5°", "pose_auc_5", 2),
+    ("10°", "pose_auc_10", 2),
+    ("RPE per distance %", "rpe_distance_percent", 1),
+    ("t_rel %", "t_rel", 2),
+    ("r_rel °/100 m", "r_rel", 2),
+    ("ATE m, true scale per frame", "ate_per_frame_scale", 3),
+)
+AREAS = ("auc", "pose_auc_1", "pose_auc_2", "pose_auc_5", "pose_auc_10")  # means over runs; the rest are medians
+BLACKOUT = (("segment ATE %", "segment_ate_percent", 2), ("recovery s", "recovery_s", 1))
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A cell of the table of systems by axis, ready for the page."""
+
+    text: str
+    spread: str
+    failed: str
+    best: bool
+    shade: str
+
+
+def write_tables(out: Path, manifest: Manifest, rows: list[Row]) -> str:
+    """Write results.csv, table.md (a table per suite) and axes.md; returns the text of table.md."""
+    write_csv(out / RESULTS, rows)
+    table = "\n".join(markdown(manifest, suite, rows) for suite in manifest.suites)
+    (out / TABLE).write_text(table, encoding="utf-8")
+    (out / AXES).write_text(axis_table(manifest, rows), encoding="utf-8")
+    return table
+
+
+def write_report(
+    out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str], None] = lambda text: None
+) -> Path:
+    """Write report.html with all figures in it, and the figures beside it as SVG files.
+
+    Raises:
+        DvoError: jinja2 is not installed.
+    """
+    try:
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    except ImportError:
+        raise DvoError("jinja2 is not installed", remedy="pip install -e '.[eval]'") from None
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("report.html").render(**content(out, manifest, rows, say))
+    (out / PAGE).write_text(page, encoding="utf-8")
+    return out / PAGE
+
+
+def content(out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str], None]) -> dict[str, Any]:
+    """Everything that the page shows."""
+    axes = axes_of(manifest)
+    figures = Figures(out / FIGURE_FOLDER)
+    sections = []
+    for suite in manifest.suites:
+        for sequence in suite.sequences:
+            say(f"figure of {suite.name}, {sequence.name}")
+            sections.append(sequence_section(out, manifest, suite, sequence, rows, figures))
+    look = styles(manifest.systems)
+    return {
+        "manifest": manifest,
+        "suites": manifest.suites,
+        "systems": [(name, manifest.facts[name], look[name].color) for name in manifest.systems],
+        "runs": len(rows),
+        "failed": sum(row.failed and row.status not in VOID for row in rows),
+        "void": sum(row.status in VOID for row in rows),
+        "verdicts": verdicts(manifest, rows),
+        "axes": [(axis, shown_cells(axis, manifest, rows)) for axis in axes],
+        "axis_figures": [axis_figure(axis, manifest, rows, figures) for axis in axes],
+        "speed_figures": speed_figures(axes, manifest, rows, figures),
+        "speed_note": speed_note(manifest, rows),
+        "overall_titles": [title for title, _, _ in OVERALL] + [title for title, _, _ in RESOURCES],
+        "overall": [(name, overall(name, rows)) for name in manifest.systems],
+        "failures": [(row, one_line(row.reason)) for row in rows if row.failed],
+        "sections": sections,
+        "open_sections": len(sections) <= 6,
+        "null": NULL,
+        "has_null": NULL in manifest.systems,
+    }
+
+
+class Figures:
+    """Keeps every figure as a file and gives what ``<img src>`` needs to hold it in the page."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def __call__(self, name: str, svg: str) -> str:
+        text = svg if "xmlns=" in svg[:400] else svg.replace("<svg", '<svg xmlns="http://www.w3.org/2000/svg"', 1)
+        (self.folder / f"{slug(name)}.svg").write_text(text, encoding="utf-8")
+        return "data:image/svg+xml;base64," + base64.b64encode(text.encode()).decode()
+
+
+def shown_cells(axis: Axis, manifest: Manifest, rows: list[Row]) -> list[Shown]:
+    """A line of the table of systems by axis."""
+    cells = {name: cell(axis, name, rows) for name in manifest.systems}
+    digits = DIGITS.get(axis.judged_by, 2)
+    best = best_of(cells, digits)
+    zero = cells[NULL].median if NULL in cells else math.nan
+    shown = []
+    for name, found in cells.items():
+        if found.note:
+            shown.append(Shown(found.note, "", "", False, "void"))
+            continue
+        text = f"{found.median:.{digits}f}" if math.isfinite(found.median) else "–"
+        low, high = (f"{value:.{digits}f}" if math.isfinite(value) else "∞" for value in (found.low, found.high))
+        spread = f"{low} – {high}" if low != high else ""
+        failed = f"{found.failed} of {found.runs} failed" if found.failed else ""
+        shown.append(Shown(text, spread, failed, name in best, "zero" if name == NULL else shade(found, zero)))
+    return shown
+
+
+def shade(found: Cell, zero: float) -> str:
+    """Class of a cell: how its median stands to that of knowing nothing (null), in steps."""
+    if not math.isfinite(found.median):
+        return "lost"
+    if not (math.isfinite(zero) and zero > 0):
+        return "plain"
+    ratio = found.median / zero
+    steps = ((0.1, "good3"), (0.25, "good2"), (0.5, "good1"), (1.0, "plain"))
+    return next((name for limit, name in steps if ratio < limit), "bad")
+
+
+def axis_figure(axis: Axis, manifest: Manifest, rows: list[Row], figures: Figures) -> tuple[str, str]:
+    """Alternative text and source of the figure of an axis."""
+    names = {sequence.name for sequence in axis.sequences}
+    values: dict[str, list[float]] = {}
+    for system in manifest.systems:
+        mine = [row for row in rows if row.system == system and row.suite == axis.suite.name and row.sequence in names]
+        known = errors_of([row for row in mine if row.status not in VOID], axis.judged_by)
+        values[system] = [value for value in known if not math.isnan(value)]
+    zero = cell(axis, NULL, rows).median if NULL in manifest.systems else math.nan
+    svg = plot_axis(axis.title, axis.unit, values, zero)
+    return f"{axis.title}: {axis.unit} of every run, by system", figures(f"axis_{axis.title}_{axis.judged_by}", svg)
+
+
+def speed_figures(axes: list[Axis], manifest: Manifest, rows: list[Row], figures: Figures) -> list[tuple[str, str]]:
+    """Error against speed, a figure for each kind of error; the null system has no speed worth showing."""
+    found = []
+    for judge in dict.fromkeys(axis.judged_by for axis in axes):
+        places = [
+            (axis.suite.name, sequence.name) for axis in axes if axis.judged_by == judge for sequence in axis.sequences
+        ]
+        points: dict[str, list[tuple[float, float]]] = {}
+        for system in manifest.systems:
+            if system == NULL:
+                continue
+            for place in places:
+                mine = [
+                    r for r in rows if r.system == system and (r.suite, r.sequence) == place and r.status not in VOID
+                ]
+                if mine:
+                    pair = (_median([row.fps for row in mine]), _median(errors_of(mine, judge)))
+                    points.setdefault(system, []).append(pair)
+        if any(math.isfinite(error) and error > 0 for pairs in points.values() for _, error in pairs):
+            unit = UNITS.get(judge, judge)
+            svg = plot_speed(points, unit)
+            found.append((f"{unit} against frames a second, by system", figures(f"speed_{judge}", svg)))
+    return found
+
+
+def overall(system: str, rows: list[Row]) -> list[str]:
+    """A line of the table of systems: over all their runs."""
+    mine = [row for row in rows if row.system == system and row.status not in VOID]
+    cells = []
+    for _, field, digits in OVERALL:
+        values = [float(getattr(row, field)) for row in mine]
+        known = [value for value in values if not math.isnan(value)]
+        if field == "completeness":
+            known = [100 * value for value in known]
+        found = (np.mean(known) if field in AREAS else np.median(known)) if known else math.nan
+        cells.append(f"{found:.{digits}f}" if math.isfinite(found) else "–")
+    for _, field, digits in RESOURCES:
+        found = _median([getattr(row, field) for row in mine])
+        cells.append(f"{found:.{digits}f}" if math.isfinite(found) else "–")
+    return cells
+
+
+def sequence_section(
+    out: Path, manifest: Manifest, suite: Suite, sequence: Sequence, rows: list[Row], figures: Figures
+) -> dict[str, Any]:
+    """Table and figure of a sequence; the run that is drawn of a system is the one of median error."""
+    mine = [row for row in rows if row.suite == suite.name and row.sequence == sequence.name]
+    groups = {name: [row for row in mine if row.system == name] for name in manifest.systems}
+    dark = any(row.blackouts for row in mine)
+    columns = [*FIGURES, *(BLACKOUT if dark else ()), *RESOURCES]
+    judged = {name: _median(errors_of(group, sequence.judged_by)) for name, group in groups.items()}
+    best = min((value for value in judged.values() if math.isfinite(value)), default=math.nan)
+    lines = []
+    for name, group in groups.items():
+        texts = []
+        for _, field, digits in columns:
+            resource = any(field == other for _, other, _ in RESOURCES)
+            values = [getattr(row, field) for row in group] if resource else errors_of(group, field)
+            texts.append((summary(values, digits), field == sequence.judged_by and judged[name] == best))
+        complete = summary([100 * row.completeness for row in group], 0)
+        failed = sum(row.failed for row in group)
+        states = ", ".join(dict.fromkeys(row.status for row in group if row.failed))
+        lines.append((name, f"{failed}/{len(group)}" + (f" {states}" if states else ""), complete, texts))
+    truth_file = groundtruth_file(out, suite.name, sequence.name)
+    figure = None
+    if truth_file.is_file():
+        tracks, spans = _tracks(out, manifest, suite, sequence, groups)
+        svg = plot_sequence(suite, sequence.judged_by, read_tum(truth_file), tracks, spans)
+        figure = figures(f"{suite.name}__{sequence.name}", svg)
+    known = [row.path_length for row in mine if math.isfinite(row.path_length)]
+    return {
+        "id": slug(f"{suite.name}-{sequence.name}"),
+        "suite": suite,
+        "sequence": sequence,
+        "frames": max((row.frames for row in mine), default=0),
+        "length": max(known, default=math.nan),
+        "columns": [title for title, _, _ in columns],
+        "lines": lines,
+        "figure": figure,
+        "reason": next((one_line(row.reason) for row in mine if row.status == "no data"), ""),
+    }
+
+
+def _tracks(
+    out: Path, manifest: Manifest, suite: Suite, sequence: Sequence, groups: dict[str, list[Row]]
+) -> tuple[dict[str, Trajectory], list[list[float]]]:
+    folders = {(run.system, run.suite, run.sequence, run.seed): out / run.folder for run in manifest.runs}
+    tracks: dict[str, Trajectory] = {}
+    dark: list[list[float]] = []
+    for name, group in groups.items():
+        ranked = sorted(group, key=lambda row: errors_of([row], sequence.judged_by)[0])
+        if not ranked:
+            continue
+        folder = folders[name, suite.name, sequence.name, ranked[(len(ranked) - 1) // 2].seed]
+        tracks[name] = read_trajectory(folder)
+        if (folder / RECORD).is_file():
+            dark = dark or read_prediction(folder).dark
+    return tracks, dark
+
+
+def _median(values: list[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.median(known)) if known else math.nan

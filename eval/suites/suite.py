@@ -1,0 +1,207 @@
+"""Suites of sequences (configs/eval/*.yaml) and where their data lie."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import yaml
+
+from dvo.data.source import Source, open_source
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+from dvo.metrics import Alignment, associate
+from eval.suites.axes import choose, expand
+from eval.suites.rendered import rendered_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+SUITES = ROOT / "configs" / "eval"
+AXES = "axes"  # the file of the rendered suites, and the name of them all
+Judge = Literal["ate_percent", "rpe_rot_deg"]
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """One recording, or rendering, with ground truth.
+
+    Attributes:
+        name: in the tables.
+        path: folder or file, relative to the data folder; empty if rendered.
+        judged_by: the column that decides between systems: ``ate_percent`` or, where scale is weak, ``rpe_rot_deg``.
+        about: a few words.
+        calib, times, groundtruth: files relative to the folder, where the layout itself does not say.
+        rendered: options of :func:`dvo.synth.make_sequence` and ``version``, as pairs, for a sequence that is rendered
+            into a cache (:mod:`eval.suites.rendered`) when it is first wanted; None for a recording.
+    """
+
+    name: str
+    path: str = ""
+    judged_by: Judge = "ate_percent"
+    about: str = ""
+    calib: str | None = None
+    times: str | None = None
+    groundtruth: str | None = None
+    rendered: tuple[tuple[str, Any], ...] | None = None
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Sequences and the protocol under which systems are compared on them.
+
+    Attributes:
+        name: of the suite, in results.csv.
+        label: what the figures are good for; printed above the table.
+        sequences: in the order of the table.
+        alignment: fitted before errors are taken.
+        rpe_gap: frame gap of the relative errors; their median is reported.
+        stride: every how many-th image is fed.
+        lost_below: a run with poses for a smaller part of the frames counts as failed.
+        time_limit: seconds for one run.
+        download: where the data can be had, if they are public.
+    """
+
+    name: str
+    label: str
+    sequences: tuple[Sequence, ...]
+    alignment: Alignment = "sim3"
+    rpe_gap: int = 2
+    stride: int = 1
+    lost_below: float = 0.5
+    time_limit: float = 1800.0
+    download: str = ""
+
+    def only(self, names: list[str]) -> Suite:
+        """The suite with these sequences.
+
+        Raises:
+            DvoError: a name that is not in it.
+        """
+        known = {sequence.name: sequence for sequence in self.sequences}
+        for name in names:
+            if name not in known:
+                raise DvoError(
+                    f"no sequence '{name}' in the suite '{self.name}'",
+                    field="--sequences",
+                    remedy=f"choose from {', '.join(known)}",
+                )
+        return replace(self, sequences=tuple(known[name] for name in names))
+
+
+def read_suites(text: str) -> list[Suite]:
+    """Suites by what stands on a command line.
+
+    ``fast`` is the mini tier of the validation split of a rendered axis, ``fast/test``, ``fast/large`` and
+    ``fast/test/large`` the others; ``axes`` (or ``axes/test``, ...) stands for all twelve. Anything else is the name of
+    a config or a file, as for :func:`read_suite`.
+
+    Raises:
+        DvoError: no such suite.
+    """
+    name, file = text.split("/")[0], SUITES / f"{AXES}.yaml"
+    table = _table(file)
+    if name != AXES and name not in table["axes"]:
+        return [read_suite(text)]
+    built = []
+    for axis, split, tier in choose(text, table, AXES):
+        entry = expand(table, file, axis, split, tier)
+        entry["sequences"] = tuple(_build(Sequence, one, file) for one in entry["sequences"])
+        built.append(_checked(_build(Suite, entry, file), file))
+    return built
+
+
+def read_suite(name_or_file: str | Path) -> Suite:
+    """A suite by name (configs/eval/NAME.yaml) or from a file.
+
+    Raises:
+        DvoError: no such suite, or a file with unknown or missing settings.
+    """
+    path = Path(name_or_file)
+    if path.suffix not in (".yaml", ".yml"):
+        path = SUITES / f"{name_or_file}.yaml"
+    if not path.is_file():
+        names = ", ".join(
+            [*sorted(file.stem for file in SUITES.glob("*.yaml")), *_table(SUITES / f"{AXES}.yaml")["axes"]]
+        )
+        raise DvoError("no such suite", file=path, field="--suite", remedy=f"give a file, or one of: {names}")
+    table = _table(path)
+    if not isinstance(table, dict) or not isinstance(table.get("sequences"), list):
+        raise DvoError("no list of sequences", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
+    sequences = tuple(_build(Sequence, entry, path) for entry in table.pop("sequences"))
+    return _checked(_build(Suite, {**table, "sequences": sequences}, path), path)
+
+
+def _table(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="mend the file") from error
+
+
+def _checked(suite: Suite, path: Path) -> Suite:
+    _check(suite.alignment, get_args(Alignment), "alignment", path)
+    for sequence in suite.sequences:
+        if not sequence.path and sequence.rendered is None:
+            raise DvoError(
+                f"incomplete sequence ({sequence.name} has no path)", file=path, field="path", remedy="add it"
+            )
+        _check(sequence.judged_by, get_args(Judge), f"{sequence.name}: judged_by", path)
+    return suite
+
+
+def data_folder(given: str | Path | None = None) -> Path:
+    """Where recordings lie: the argument, else ``$DVO_DATA``, else ``../shared/data`` beside the checkout.
+
+    Raises:
+        DvoError: not there.
+    """
+    path = Path(given or os.environ.get("DVO_DATA") or ROOT.parent / "shared" / "data")
+    if not path.is_dir():
+        raise DvoError("no such data folder", file=path, field="--data", remedy="set DVO_DATA or give --data DIR")
+    return path
+
+
+def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, Trajectory]:
+    """The frames of a sequence and its ground truth; rendered ones are rendered if they are not in the cache.
+
+    Raises:
+        DvoError: the data are not there, or hold no ground truth.
+    """
+    if sequence.rendered is not None:
+        place = rendered_folder(sequence.name, dict(sequence.rendered))
+    else:
+        place = data / sequence.path
+    source = open_source(
+        place,
+        calib=sequence.calib,
+        times=sequence.times,
+        groundtruth=sequence.groundtruth,
+        stride=stride,
+    )
+    if source.groundtruth is None:
+        raise DvoError("no ground truth", file=place, remedy="name its file under 'groundtruth'")
+    return source, source.groundtruth
+
+
+def reference_for(groundtruth: Trajectory, stamps: np.ndarray, max_dt: float = 0.02) -> Trajectory:
+    """The ground truth of exactly the frames that were fed: one row for each that has one, at the frame's time."""
+    fed, rows = associate(Trajectory(stamps, np.zeros((len(stamps), 7))), groundtruth, max_dt)
+    return Trajectory(stamps[fed], groundtruth.poses_wc[rows])
+
+
+def _build(kind: type, entry: Any, path: Path) -> Any:
+    known = {field.name for field in fields(kind)}
+    if not isinstance(entry, dict) or not set(entry) <= known:
+        unknown = ", ".join(sorted(set(entry) - known)) if isinstance(entry, dict) else repr(entry)
+        raise DvoError(f"unknown setting {unknown}", file=path, remedy=f"known are {', '.join(sorted(known))}")
+    try:
+        return kind(**entry)
+    except TypeError as error:
+        raise DvoError(f"incomplete {kind.__name__.lower()} ({error})", file=path, remedy="add it") from error
+
+
+def _check(value: str, allowed: tuple[str, ...], field: str, path: Path) -> None:
+    if value not in allowed:
+        raise DvoError(f"'{value}'", file=path, field=field, remedy=f"choose one of {', '.join(allowed)}")

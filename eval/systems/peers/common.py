@@ -1,0 +1,100 @@
+"""What the wrappers share: pictures as the peers want them, and the trajectory out of what they said."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dvo.data.frame import Frame
+from dvo.data.trajectory import Trajectory
+from dvo.geometry.camera import Camera
+from dvo.geometry.poses import poses_from_matrices
+from dvo.geometry.undistort import Undistorter
+from dvo.odometry.protocol import Result, SparseMap
+
+WIDE = 560  # smaller images are doubled: these systems expect VGA, and do not even start on 320x240
+
+
+class Pictures:
+    """Turns frames into grey images of a pinhole camera, of VGA size or more.
+
+    Attributes:
+        camera: of the images that come out; None before the first.
+    """
+
+    def __init__(self, smallest: int = WIDE) -> None:
+        self.camera: Camera | None = None
+        self._smallest = smallest
+        self._undistorter: Undistorter | None = None
+
+    def __call__(self, frame: Frame) -> np.ndarray:
+        """``(H, W)`` uint8, contiguous."""
+        if self._undistorter is None:
+            self._undistorter = Undistorter(frame.camera)
+        image, camera = self._undistorter(frame.image), self._undistorter.camera
+        if camera.width < self._smallest:
+            camera = camera.resized(2 * camera.width, 2 * camera.height)
+            image = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        self.camera = camera
+        return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+    def facts(self) -> dict[str, Any]:
+        """For ``Result.info``."""
+        if self.camera is None:
+            return {"working_size": [0, 0], "working_intrinsics": []}
+        size = [self.camera.width, self.camera.height]
+        return {"working_size": size, "working_intrinsics": self.camera.intrinsics.tolist()}
+
+
+@dataclass
+class Row:
+    """One frame that a system placed.
+
+    Attributes:
+        timestamp: seconds.
+        T_wc: ``(4, 4)`` camera to world.
+        part: number of the map in whose world that is.
+    """
+
+    timestamp: float
+    T_wc: np.ndarray
+    part: int
+
+
+def longest_part(rows: list[Row]) -> list[Row]:
+    """The rows of the map that holds most frames; each map has a world and a scale of its own, so they cannot mix."""
+    if not rows:
+        return []
+    parts = [row.part for row in rows]
+    best = max(dict.fromkeys(parts), key=parts.count)
+    return [row for row in rows if row.part == best]
+
+
+def result(rows: list[Row], frames: int, info: dict[str, Any]) -> Result:
+    """A result without a map."""
+    matrices = np.array([row.T_wc for row in rows]).reshape(-1, 4, 4)
+    trajectory = Trajectory(np.array([row.timestamp for row in rows]), poses_from_matrices(matrices))
+    return Result(trajectory, SparseMap(), frames, frames - len(rows), info)
+
+
+def version_of(package: str) -> Callable[[], str]:
+    """Gives the version of a package, ``-`` if it is not installed."""
+
+    def version() -> str:
+        try:
+            return importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            return "-"
+
+    return version
+
+
+def missing_module(module: str, remedy: str) -> str | None:
+    """Why a peer cannot run: its module is not there. Looks without importing."""
+    return None if find_spec(module) is not None else f"{module} is not installed; {remedy}"

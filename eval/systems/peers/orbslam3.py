@@ -1,0 +1,192 @@
+"""ORB-SLAM3 (Campos et al. 2021), monocular, from the package ``pyorbslam3`` (GPL-3).
+
+Its threads race: fed faster than the camera delivers, mapping starves. So frames are fed no faster than their stamps
+say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). Poses are collected frame
+by frame; at the end the keyframes, which bundle adjustment has moved since, carry the frames around them along.
+
+It ships no vocabulary. ``DVO_ORB_VOCABULARY`` names the file (``python -m eval.systems.peers.vocabulary`` trains one),
+else the small one beside the test data is taken: figures with either are not those of the official vocabulary.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.data.frame import Frame
+from dvo.data.trajectory import read_tum
+from dvo.errors import DvoError
+from dvo.geometry.camera import Camera
+from dvo.geometry.poses import pose_matrices, poses_from_matrices
+from dvo.odometry.protocol import Estimate, Result, Status
+from eval.suites.suite import data_folder
+from eval.systems.peers.common import Pictures, Row, longest_part, missing_module, result, version_of
+
+VOCABULARY = "DVO_ORB_VOCABULARY"
+FEATURES = 1500
+version = version_of("pyorbslam3")
+
+
+def vocabulary_file() -> Path:
+    """The vocabulary that is used.
+
+    Raises:
+        DvoError: there is none.
+    """
+    given = os.environ.get(VOCABULARY)
+    path = Path(given) if given else data_folder(None) / "orb_vocabulary" / "tiny_orb_vocabulary.txt"
+    if not path.is_file():
+        raise DvoError(
+            "no ORB vocabulary",
+            file=path,
+            remedy=f"python -m eval.systems.peers.vocabulary --out FILE, then {VOCABULARY}=FILE",
+        )
+    return path
+
+
+def missing() -> str | None:
+    """Why it cannot run here, or None."""
+    reason = missing_module("pyorbslam3", "pip install pyorbslam3 (GPL-3; Linux x86-64)")
+    if reason is None:
+        try:
+            vocabulary_file()
+        except DvoError as error:
+            reason = str(error)
+    return reason
+
+
+class OrbSlam3:
+    """See the module. Frames before its initialisation and lost ones have no row; not deterministic (threads)."""
+
+    name = "orbslam3"
+
+    def __init__(self) -> None:
+        import pyorbslam3
+
+        self._package = pyorbslam3
+        self._vocabulary = vocabulary_file()
+        self._folder = tempfile.TemporaryDirectory(prefix="orbslam3-")
+        self._pictures = Pictures()
+        self._slam: Any = None
+        self._rows: list[Row] = []
+        self._frames = self._part = 0
+        self._was_tracking = False
+        self._begin = self._first = self._computing = 0.0
+
+    def track(self, frame: Frame) -> Estimate:
+        image = self._pictures(frame)
+        if self._slam is None:
+            assert self._pictures.camera is not None
+            file = Path(self._folder.name) / "settings.yaml"
+            file.write_text(settings(self._pictures.camera), encoding="utf-8")
+            monocular = self._package.Sensor.MONOCULAR
+            self._slam = self._package.Slam(str(self._vocabulary), str(file), monocular, use_viewer=False)
+            self._begin, self._first = time.perf_counter(), frame.timestamp
+        self._frames += 1
+        time.sleep(max(0.0, frame.timestamp - self._first - (time.perf_counter() - self._begin)))
+        start = time.perf_counter()
+        said = self._slam.track_monocular(image, frame.timestamp)
+        self._computing += time.perf_counter() - start
+        states = self._package.TrackingState
+        if said.state in (states.NO_IMAGES_YET, states.NOT_INITIALIZED) and self._was_tracking:
+            self._part, self._was_tracking = self._part + 1, False
+        # While it is RECENTLY_LOST the pose is the motion model's guess.
+        if not said.pose_valid or said.state not in (states.OK, states.OK_KLT):
+            seen = self._was_tracking or self._part > 0
+            return Estimate(frame.timestamp, None, Status.LOST if seen else Status.INITIALISING)
+        self._was_tracking = True
+        T_wc = np.array(said.pose_wc, np.float64)
+        self._rows.append(Row(frame.timestamp, T_wc, self._part))
+        return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5)
+
+    def finish(self) -> Result:
+        rows = longest_part(self._rows)
+        moved = 0
+        if self._slam is not None:
+            self._slam.shutdown()
+            rows, moved = self._refine(rows)
+        self._folder.cleanup()
+        info = {
+            **self._pictures.facts(),
+            "vocabulary": self._vocabulary.name,
+            "vocabulary_words": count_words(self._vocabulary),
+            "maps_started": self._part + 1,
+            "keyframes": moved,
+            "computing_fps": self._frames / self._computing if self._computing else None,
+        }
+        return result(rows, self._frames, info)
+
+    def _refine(self, rows: list[Row]) -> tuple[list[Row], int]:
+        """Move frames along with the last keyframe at or before each; only the last map has keyframes to offer."""
+        file = Path(self._folder.name) / "keyframes.txt"
+        self._slam.save_keyframe_trajectory_tum(str(file))
+        if not rows or rows[-1].part != self._part or not file.is_file() or not file.read_text().strip():
+            return rows, 0
+        keyframes = read_tum(file)
+        return follow_keyframes(rows, keyframes.timestamps, pose_matrices(keyframes.poses_wc))
+
+
+def follow_keyframes(rows: list[Row], stamps: np.ndarray, T_wk: np.ndarray) -> tuple[list[Row], int]:
+    """Carry frames along with keyframes that moved after they were tracked.
+
+    Args:
+        rows: frames as they were tracked, in order of time.
+        stamps: ``(K,)`` increasing times of keyframes, seconds.
+        T_wk: ``(K, 4, 4)`` where the keyframes are in the end.
+
+    Returns:
+        The rows, each moved by what its last keyframe (for the first frames: the first) moved by, and how many of the
+        keyframes were found among them.
+    """
+    times = np.array([row.timestamp for row in rows])
+    corrections: list[tuple[float, np.ndarray]] = []
+    for stamp, T in zip(stamps, T_wk, strict=True):
+        near = int(np.argmin(np.abs(times - stamp)))
+        if abs(times[near] - stamp) < 1e-4:
+            corrections.append((times[near], T @ np.linalg.inv(rows[near].T_wc)))
+    if not corrections:
+        return rows, 0
+    starts = np.array([time for time, _ in corrections])
+    which = np.maximum(np.searchsorted(starts, times, side="right") - 1, 0)
+    return [
+        Row(row.timestamp, corrections[k][1] @ row.T_wc, row.part) for row, k in zip(rows, which, strict=True)
+    ], len(corrections)
+
+
+def settings(camera: Camera) -> str:
+    """Its settings file for an undistorted camera."""
+    lines = {
+        "File.version": '"1.0"',
+        "Camera.type": '"PinHole"',
+        "Camera1.fx": camera.fx,
+        "Camera1.fy": camera.fy,
+        "Camera1.cx": camera.cx,
+        "Camera1.cy": camera.cy,
+        **{f"Camera1.{name}": 0.0 for name in ("k1", "k2", "p1", "p2")},
+        "Camera.width": camera.width,
+        "Camera.height": camera.height,
+        "Camera.fps": 30,
+        "Camera.RGB": 1,
+        "ORBextractor.nFeatures": FEATURES,
+        "ORBextractor.scaleFactor": 1.2,
+        "ORBextractor.nLevels": 8,
+        "ORBextractor.iniThFAST": 20,
+        "ORBextractor.minThFAST": 7,
+        # The viewer is off, but its settings are asked for.
+        **{f"Viewer.{name}": 0.1 for name in ("KeyFrameSize", "GraphLineWidth", "PointSize", "CameraSize")},
+        **{f"Viewer.{name}": 1.0 for name in ("KeyFrameLineWidth", "CameraLineWidth", "ViewpointX", "ViewpointY")},
+        **{f"Viewer.{name}": 1.0 for name in ("ViewpointZ", "ViewpointF")},
+    }
+    return "%YAML:1.0\n" + "".join(f"{name}: {value}\n" for name, value in lines.items())
+
+
+def count_words(vocabulary: Path) -> int:
+    """Leaves of a DBoW2 text vocabulary: the second number of a line is 1 for a word."""
+    with vocabulary.open(encoding="utf-8") as file:
+        next(file, None)
+        return sum(line.split(maxsplit=2)[1] == "1" for line in file if line.strip())

@@ -1,0 +1,114 @@
+"""Table and curves of :mod:`train.studies.study`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dvo.viz.plot import ACCENT, INK, PAPER, START, TRUTH
+
+if TYPE_CHECKING:
+    from train.studies.study import StudyConfig
+
+COLOURS = (TRUTH, ACCENT, START, INK)
+
+
+def curves(results: list[dict[str, Any]], arm: str, rate: float, measure: str) -> tuple[np.ndarray, np.ndarray]:
+    """Steps ``(S,)`` and values ``(seeds, S)`` of an arm at a learning rate."""
+    rows = [r["curve"] for r in sorted(results, key=lambda r: r["seed"]) if (r["arm"], r["rate"]) == (arm, rate)]
+    steps = np.array([row["step"] for row in rows[0]])
+    return steps, np.array([[row[measure] for row in curve] for curve in rows])
+
+
+def steps_to(steps: np.ndarray, values: np.ndarray, target: float) -> float:
+    """First step at which a curve is at or below a value; infinity if never."""
+    below = np.flatnonzero(values <= target)
+    return float(steps[below[0]]) if len(below) else float("inf")
+
+
+def table(results: list[dict[str, Any]], config: StudyConfig) -> str:
+    """Markdown: error after the last step by arm and rate, the paired difference to the first arm, and the step at
+    which the first arm's final error is reached."""
+    arms, rates = list(config.arms), list(config.rates)
+    lines = [
+        "| learning rate | arm | pose error after the last step: median [min-max] over seeds | rotation error / motion "
+        f"| better than {arms[0]}, paired, % | steps to {arms[0]}'s final error | skipped steps |",
+        "| --: | --- | --: | --: | --: | --: | --: |",
+    ]
+    for rate in rates:
+        steps, first = curves(results, arms[0], rate, "pose")
+        for arm in arms:
+            _, pose = curves(results, arm, rate, "pose")
+            _, ratio = curves(results, arm, rate, "rotation_ratio")
+            end = pose[:, -1]
+            gain = 100 * (1 - end / first[:, -1])
+            reach = [steps_to(steps, mine, theirs) for mine, theirs in zip(pose, first[:, -1], strict=True)]
+            reached = ", ".join("never" if np.isinf(r) else f"{r:.0f}" for r in reach)
+            skipped = sum(r["skipped"] for r in results if (r["arm"], r["rate"]) == (arm, rate))
+            lines.append(
+                f"| {rate:g} | {arm} | {np.median(end):.4f} [{end.min():.4f}-{end.max():.4f}] "
+                f"| {np.median(ratio[:, -1]):.3f} | {'' if arm == arms[0] else _spread(gain)} | {reached} | {skipped} |"
+            )
+    return "\n".join(lines)
+
+
+def _spread(values: np.ndarray) -> str:
+    return f"{np.median(values):+.1f} [{values.min():+.1f}, {values.max():+.1f}]"
+
+
+def write_report(results: list[dict[str, Any]], config: StudyConfig) -> list[Path]:
+    """Write ``OUT.md`` and ``OUT.png``."""
+    out = Path(config.out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    picture = out.with_suffix(".png")
+    _plot(picture, results, config)
+    seconds = np.mean([r["seconds_a_step"] for r in results])
+    text = f"""# V2V on a small scale
+
+Does weighting the flow loss by the confidence, and balancing it against the pose loss, make training faster or better?
+Preset `{config.model}`, clips of {config.frames} frames of {config.size[1]}x{config.size[0]} pixels,
+{config.updates} updates, {config.steps} steps of one OneCycle after {config.start_steps} steps that train the flow head
+alone and are shared. For a seed all arms see the same clips and draw the same patches. The pose error (translation in
+median depths plus rotation in radians over all pairs of frames) is taken on {config.validation_clips} held-out clips.
+Reproduced by
+
+    python -m train study --config configs/train/study.yaml
+
+{table(results, config)}
+
+![validation error against steps]({picture.name})
+
+Lines are medians over {len(config.seeds)} seeds, bands their range. A step took {seconds:.2f} s of the processor.
+"""
+    report = out.with_suffix(".md")
+    report.write_text(text, encoding="utf-8")
+    return [report, picture]
+
+
+def _plot(path: Path, results: list[dict[str, Any]], config: StudyConfig) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    measures = {"pose": "pose error (median depths + rad)", "rotation_ratio": "rotation error / motion"}
+    figure = Figure(figsize=(5.2 * len(config.rates), 7.0), dpi=110, facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    plots = figure.subplots(len(measures), len(config.rates), sharex=True, sharey="row", squeeze=False)
+    for row, (measure, label) in enumerate(measures.items()):
+        for column, rate in enumerate(config.rates):
+            plot = plots[row, column]
+            for arm, colour in zip(config.arms, COLOURS, strict=False):
+                steps, values = curves(results, arm, rate, measure)
+                plot.plot(steps, np.median(values, 0), color=colour, lw=1.8, label=arm)
+                plot.fill_between(steps, values.min(0), values.max(0), color=colour, alpha=0.15, lw=0)
+            plot.set_yscale("log")
+            plot.grid(color=INK, alpha=0.1, lw=0.6, which="both")
+            if row == 0:
+                plot.set_title(f"learning rate {rate:g}", loc="left", fontsize=11, color=INK)
+            else:
+                plot.set_xlabel("steps", color=INK)
+            if column == 0:
+                plot.set_ylabel(label, color=INK)
+    plots[0, 0].legend(frameon=False, fontsize=9)
+    figure.savefig(path, metadata={"Software": None})

@@ -1,13 +1,20 @@
-"""The sliding window of the tracker: keyframes, their patches, and the edges between them.
+"""Sliding window of a tracker: keyframes, their patches, and the edges between them.
 
-All indices are positions in the window; frames leave by :meth:`Window.remove`, which renumbers the rest, so nothing
-here grows with the length of the video.
+Frames are numbered in three ways, each with a name of its own:
+
+- the *position* of a keyframe in the window, which ``ii``, ``jj`` and ``kk`` count in and which changes when a frame
+  leaves (:meth:`Window.remove` renumbers);
+- its *identifier*, a running number that is never reused, by which the archive and the log refer to it;
+- its *map slot*, the place of its feature maps in the correlation caches, reused after it has left.
+
+An edge has an *edge slot*, its place in the correlation caches, for as long as it lives.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,25 +23,38 @@ from dvo.graph.edges import PatchGraph, build_graph
 
 @dataclass
 class Keyframe:
-    """One frame of the window.
+    """Keyframe of the window.
 
     Attributes:
-        identifier: running number of the keyframe, never reused.
+        identifier: running number, never reused.
         timestamp: seconds.
-        slot: where the feature maps of the frame lie.
-        matching: ``(M, C, p, p)`` features of its patches.
-        context: ``(M, D)``.
-        colors: ``(M, 3)`` uint8.
-        intrinsics: ``(4,)`` of the feature map.
+        map_slot: place of its feature maps in the correlation caches.
+        matching: ``(M, C, p, p)`` matching features of its patches.
+        context: ``(M, D)`` context features of its patches.
+        colors: ``(M, 3)`` uint8 RGB at the patch centres.
+        intrinsics: ``(4,)`` fx fy cx cy of the feature map.
+        image: ``(H, W, 3)`` uint8 RGB working image, None if it is not kept.
     """
 
     identifier: int
     timestamp: float
-    slot: int
+    map_slot: int
     matching: Tensor
     context: Tensor
     colors: Tensor
     intrinsics: Tensor
+    image: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class WindowSnapshot:
+    """Poses, patches and edge states of a window, to return to."""
+
+    poses_cw: Tensor
+    patches: Tensor
+    hidden: Tensor
+    targets: Tensor
+    weights: Tensor
 
 
 @dataclass
@@ -42,91 +62,146 @@ class Window:
     """Keyframes and edges.
 
     Attributes:
-        per_frame: patches a frame ``M``; patch ``k`` belongs to frame ``k // M``.
+        per_frame: patches of a frame ``M``; patch ``k`` belongs to the frame at position ``k // M``.
+        poses_cw: ``(n, 7)`` world to camera.
+        patches: ``(n * M, 3, p, p)`` x, y (feature-map pixels) and inverse depth.
+        hidden: ``(E, D)`` state of the update operator.
+        targets: ``(E, 2)`` positions of the patch centres that the last update asked for, feature-map pixels.
+        weights: ``(E, 2)`` their confidence; 0 for an edge that no update has seen yet.
+        jj, kk: ``(E,)`` target frame and patch of each edge.
+        edge_slots: ``(E,)`` place of each edge in the correlation caches.
         frames: the keyframes, oldest first.
-        poses_cw: ``(n, 7)``.
-        patches: ``(n * M, 3, p, p)``.
-        ii, jj, kk: ``(E,)`` edges.
-        hidden: ``(E, D)``.
-        weights: ``(E, 2)`` confidence of the last update.
-        slots: ``(E,)`` where caches keep what belongs to an edge; the number stays with the edge for its life.
-        graph: index structure of the edges, built when first asked for after a change.
     """
 
     per_frame: int
     poses_cw: Tensor
     patches: Tensor
     hidden: Tensor
+    targets: Tensor
     weights: Tensor
     jj: Tensor
     kk: Tensor
-    slots: Tensor
+    edge_slots: Tensor
     frames: list[Keyframe] = field(default_factory=list)
-    _graph: PatchGraph | None = None
+    _edges: PatchGraph | None = None
 
     @classmethod
     def empty(cls, per_frame: int, patch_size: int, hidden: int, device: torch.device) -> Window:
+        """Window without frames.
+
+        Args:
+            per_frame: patches of a frame.
+            patch_size: side of a patch.
+            hidden: channels of the state of the update operator.
+            device: of all tensors.
+        """
+
         def zeros(*shape: int) -> Tensor:
             return torch.zeros(*shape, device=device)
 
         index = torch.zeros(0, dtype=torch.long, device=device)
-        size = (0, 3, patch_size, patch_size)
-        return cls(per_frame, zeros(0, 7), zeros(*size), zeros(0, hidden), zeros(0, 2), index, index, index)
+        patches = zeros(0, 3, patch_size, patch_size)
+        return cls(per_frame, zeros(0, 7), patches, zeros(0, hidden), zeros(0, 2), zeros(0, 2), index, index, index)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     @property
     def ii(self) -> Tensor:
+        """``(E,)`` source frame of each edge."""
         return self.kk // self.per_frame
 
     @property
     def intrinsics(self) -> Tensor:
-        """``(n, 4)``."""
+        """``(n, 4)`` fx fy cx cy of the feature maps."""
         return torch.stack([frame.intrinsics for frame in self.frames])
 
     @property
-    def graph(self) -> PatchGraph:
-        if self._graph is None:
-            self._graph = build_graph(self.ii, self.jj, self.kk)
-        return self._graph
+    def context(self) -> Tensor:
+        """``(n * M, D)`` context features of the patches."""
+        return torch.cat([frame.context for frame in self.frames])
 
-    def free_slot(self) -> int:
-        """The lowest number that no frame of the window has."""
-        used = {frame.slot for frame in self.frames}
+    @property
+    def matching(self) -> Tensor:
+        """``(n * M, C, p, p)`` matching features of the patches."""
+        return torch.cat([frame.matching for frame in self.frames])
+
+    @property
+    def map_slots(self) -> Tensor:
+        """``(n,)`` map slot of each frame."""
+        return torch.tensor([frame.map_slot for frame in self.frames], device=self.jj.device)
+
+    @property
+    def edges(self) -> PatchGraph:
+        """Index structure of the edges; built when first asked for after a change."""
+        if self._edges is None:
+            self._edges = build_graph(self.ii, self.jj, self.kk)
+        return self._edges
+
+    def free_map_slot(self) -> int:
+        """Lowest map slot that no frame of the window has."""
+        used = {frame.map_slot for frame in self.frames}
         return next(slot for slot in range(len(used) + 1) if slot not in used)
 
     def append(self, frame: Keyframe, pose_cw: Tensor, patches: Tensor) -> None:
+        """Add the newest keyframe.
+
+        Args:
+            frame: its features.
+            pose_cw: ``(7,)`` world to camera.
+            patches: ``(M, 3, p, p)``.
+        """
         self.frames.append(frame)
         self.poses_cw = torch.cat([self.poses_cw, pose_cw[None]])
         self.patches = torch.cat([self.patches, patches])
 
     def connect(self, kk: Tensor, jj: Tensor) -> Tensor:
-        """Add edges with an empty state; returns their slots, the lowest free ones."""
-        self._graph = None
+        """Add edges with an empty state.
+
+        Args:
+            kk, jj: ``(e,)`` patch and target frame of each new edge.
+
+        Returns:
+            ``(e,)`` their edge slots, the lowest free ones.
+        """
+        self._edges = None
         count = len(kk)
-        free = torch.ones(len(self.slots) + count, dtype=torch.bool, device=kk.device)
-        used = self.slots[self.slots < len(free)]
+        free = torch.ones(len(self.edge_slots) + count, dtype=torch.bool, device=kk.device)
+        used = self.edge_slots[self.edge_slots < len(free)]
         free[used] = False
         slots = free.nonzero()[:count, 0]
-        self.slots = torch.cat([self.slots, slots])
+        self.edge_slots = torch.cat([self.edge_slots, slots])
         self.kk, self.jj = torch.cat([self.kk, kk]), torch.cat([self.jj, jj])
         self.hidden = torch.cat([self.hidden, self.hidden.new_zeros(count, self.hidden.shape[1])])
+        self.targets = torch.cat([self.targets, self.targets.new_zeros(count, 2)])
         self.weights = torch.cat([self.weights, self.weights.new_zeros(count, 2)])
         return slots
 
     def keep(self, mask: Tensor) -> None:
-        """Drop the edges where ``mask`` is False."""
-        self._graph = None
-        self.kk, self.jj = self.kk[mask], self.jj[mask]
-        self.hidden, self.weights, self.slots = self.hidden[mask], self.weights[mask], self.slots[mask]
+        """Remove the edges where ``mask (E,)`` is False."""
+        self._edges = None
+        self.kk, self.jj, self.edge_slots = self.kk[mask], self.jj[mask], self.edge_slots[mask]
+        self.hidden, self.targets, self.weights = self.hidden[mask], self.targets[mask], self.weights[mask]
 
-    def remove(self, index: int) -> Keyframe:
-        """Take a frame out, with its patches and every edge that touches it."""
+    def touching(self, position: int) -> Tensor:
+        """``(E,)`` bool: edges from or into the frame at a position."""
+        return (self.ii == position) | (self.jj == position)
+
+    def remove(self, position: int) -> Keyframe:
+        """Take a frame out, with its patches and every edge that touches it; later frames move up by one position."""
         m = self.per_frame
-        self.keep((self.ii != index) & (self.jj != index))
-        self.kk = self.kk - m * (self.ii > index)
-        self.jj = self.jj - (self.jj > index).long()
-        self.poses_cw = torch.cat([self.poses_cw[:index], self.poses_cw[index + 1 :]])
-        self.patches = torch.cat([self.patches[: index * m], self.patches[(index + 1) * m :]])
-        return self.frames.pop(index)
+        self.keep(~self.touching(position))
+        self.kk = self.kk - m * (self.ii > position)
+        self.jj = self.jj - (self.jj > position).long()
+        self.poses_cw = torch.cat([self.poses_cw[:position], self.poses_cw[position + 1 :]])
+        self.patches = torch.cat([self.patches[: position * m], self.patches[(position + 1) * m :]])
+        return self.frames.pop(position)
+
+    def snapshot(self) -> WindowSnapshot:
+        """Poses, patches and edge states as they are now."""
+        return WindowSnapshot(self.poses_cw, self.patches, self.hidden, self.targets, self.weights)
+
+    def restore(self, before: WindowSnapshot) -> None:
+        """Return to a snapshot; frames and edges must be those of the snapshot."""
+        self.poses_cw, self.patches = before.poses_cw, before.patches
+        self.hidden, self.targets, self.weights = before.hidden, before.targets, before.weights

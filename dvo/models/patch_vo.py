@@ -1,64 +1,77 @@
 """Patch-flow recurrent visual odometry as one network (DPVO: Teed, Lipson, Deng, NeurIPS 2023).
 
-Features and patches of the frames, then updates. Each one reprojects the patches, looks up how well they correlate
-there, revises flow and confidence, and lets a few Gauss-Newton steps of bundle adjustment explain the revised flow by
-poses and inverse depths.
+An encoder gives features of the frames, patches are cut from them, and steps (:mod:`dvo.models.step`) refine poses and
+inverse depths: each reprojects the patches, correlates them there, revises flow and confidence, and solves a bundle
+adjustment of the revised flow.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from dvo.ba.cold_start import damping_at
-from dvo.ba.layer import bundle_adjust
-from dvo.geometry.projection import reproject
+from dvo.geometry import se3
 from dvo.graph.edges import PatchGraph
-from dvo.models.schedule import Stage
+from dvo.models.schedule import Stage, to_device, training_schedule
+from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import ModelConfig
-from dvo.nets.correlation import CorrelationVolume
+from dvo.nets.correlation import Correlation, CorrelationVolume
 from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates, random_centres
 from dvo.nets.update import Update
 
-Mode = Literal["joint", "structure", "flow"]
-
-
-@dataclass(frozen=True)
-class UpdateState:
-    """What one update leaves behind; poses are world to camera, lengths in feature pixels.
-
-    Attributes:
-        graph: edges of this update.
-        frames: frames present.
-        poses_cw: ``(B, frames, 7)``.
-        patches: ``(B, frames * M, 3, p, p)``.
-        coords: ``(B, E, p, p, 2)`` reprojection under these poses and depths.
-        targets: ``(B, E, 2)`` where the network wants the patch centres, what bundle adjustment was given.
-        weights: ``(B, E, 2)`` confidence.
-    """
-
-    graph: PatchGraph
-    frames: int
-    poses_cw: Tensor
-    patches: Tensor
-    coords: Tensor
-    targets: Tensor
-    weights: Tensor
+__all__ = ["Mode", "PatchVO", "UpdateState"]
 
 
 class PatchVO(nn.Module):
-    """The network. Its state dict with the ``full`` configuration has DPVO's names and shapes."""
+    """Encoder and update operator. The state dict of the ``full`` configuration has DPVO's names and shapes.
+
+    Args:
+        config: sizes, see :class:`dvo.nets.config.ModelConfig`.
+
+    Example:
+        >>> model = PatchVO(preset("tiny"))
+        >>> images = torch.zeros(1, 5, 3, 96, 128, dtype=torch.uint8)
+        >>> intrinsics = torch.tensor([80.0, 80.0, 64.0, 48.0]).expand(1, 5, 4)
+        >>> state = model(images, intrinsics, updates=4)
+        >>> state.poses_cw.shape
+        torch.Size([1, 5, 7])
+    """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
         self.config = config
         self.patchify = Patchifier(config)
         self.update = Update(config)
+
+    def forward(
+        self,
+        images: Float[Tensor, "B N 3 H W"],
+        intrinsics: Float[Tensor, "B N 4"],
+        *,
+        updates: int = 10,
+        generator: torch.Generator | None = None,
+    ) -> UpdateState:
+        """State after the last update of a clip whose frames are all joined with each other.
+
+        Args:
+            images: uint8 RGB (or float in the same range).
+            intrinsics: ``fx fy cx cy`` in image pixels.
+            updates: number of steps.
+            generator: of the patch centres; on the CPU.
+
+        Returns:
+            Poses ``T_cw`` relative to the first frame, up to scale; patches, targets and confidence of every edge.
+        """
+        b, n = images.shape[:2]
+        stages = training_schedule(n, self.config.training_patches, updates, self_edges=self.config.self_edges)
+        start = se3.identity(b, n, device=images.device)
+        stages = to_device(stages, images.device)
+        return deque(self.unroll(images, intrinsics, stages, poses_cw=start, generator=generator), maxlen=1)[0]
 
     def unroll(
         self,
@@ -83,17 +96,16 @@ class PatchVO(nn.Module):
                 unless poses are held as given.
             inverse_depth: of each patch at the start, 1 if None (clips are normalised to median depth 1; a random
                 start ruins bundle adjustment at small resolution).
-            mode: ``joint`` refines poses and depths; ``structure`` holds the poses; ``flow`` leaves bundle adjustment
-                out and moves each edge by its own revision alone, the cheapest way to learn to see motion (for a
-                schedule in which no frame joins later).
+            mode: see :data:`dvo.models.step.Mode`. ``flow`` is the cheapest way to learn to see motion, for a schedule
+                in which no frame joins later.
             generator: draws patch centres and the edges that train the features; on the CPU. With one for each clip a
                 clip draws the same in any batch.
             correlation_gradient: share of the edges whose correlation sends a gradient to the features.
-            ba_iterations: Gauss-Newton steps an update.
+            ba_iterations: Gauss-Newton iterations an update.
 
         Yields:
-            the state after each update. Poses and depths are detached between updates (DPVO 3.3): only the hidden
-            state carries gradients across.
+            The state after each update, with ``coords``. Poses and depths are detached between updates (DPVO 3.3): only
+            the hidden state carries gradients across.
         """
         config = self.config
         b, n = images.shape[:2]
@@ -111,58 +123,40 @@ class PatchVO(nn.Module):
         if inverse_depth is None:
             inverse_depth = torch.ones(b, n * m, device=images.device)
         all_patches = patch_coordinates(centres, inverse_depth, config.patch_size)
-        frames = stages[0].frames
-        poses, patches = poses_cw[:, :frames], all_patches[:, : frames * m]
-        hidden = context.new_zeros(b, len(stages[0].graph), config.hidden_channels)
-        coords: Tensor | None = None
+        frames, graph = stages[0].frames, stages[0].graph
+        hidden = context.new_zeros(b, len(graph), config.hidden_channels)
+        start = poses_cw[:, :frames], all_patches[:, : frames * m], scaled[:, :frames]
+        state = UpdateState(graph, *start, context, hidden)
+
+        def lookup(coords: Tensor, graph: PatchGraph) -> Correlation:
+            learn = None
+            if correlation_gradient < 1 and torch.is_grad_enabled():
+                learn = _draw_edges(b, len(graph), correlation_gradient, generator).to(images.device)
+            return Correlation(volume.lookup(coords, graph.kk, graph.jj, learn))
 
         for update, stage in enumerate(stages):
-            graph = stage.graph
-            poses, patches = poses.detach(), patches.detach()
+            poses, patches, hidden = state.poses_cw.detach(), state.patches.detach(), state.hidden
+            coords = state.coords
             if stage.carry is not None:
                 arriving = poses_cw[:, frames : stage.frames] if mode == "structure" else poses[:, -1:]
                 poses = torch.cat([poses, arriving.expand(-1, stage.frames - frames, -1)], 1)
                 joined = all_patches[:, frames * m : stage.frames * m].clone()
-                joined[:, :, 2] = patches[:, -2 * m :, 2, 0, 0].median(dim=1).values[:, None, None, None]
+                joined[:, :, 2] = recent_depth(patches, m, 2)[:, None, None, None]
                 patches = torch.cat([patches, joined], 1)
                 hidden = hidden.index_select(1, stage.carry.clamp(min=0)) * (stage.carry >= 0)[:, None]
                 frames, coords = stage.frames, None
-            now = scaled[:, :frames]
-            if coords is None:
-                coords = reproject(poses, patches, now, graph.ii, graph.jj, graph.kk).coords
-            coords = coords.detach()
-            learn = None
-            if correlation_gradient < 1 and torch.is_grad_enabled():
-                learn = _draw_edges(b, len(graph), correlation_gradient, generator).to(images.device)
-            correlation = volume.lookup(coords, graph.kk, graph.jj, learn)
-            hidden, delta, weights = self.update(hidden, context.index_select(1, graph.kk), correlation, graph)
-            targets = coords[:, :, config.patch_size // 2, config.patch_size // 2] + delta
-            if mode == "flow":
-                coords = coords + delta[:, :, None, None]
-            else:
-                poses, patches = bundle_adjust(
-                    poses,
-                    patches,
-                    now,
-                    targets,
-                    weights,
-                    graph.ii,
-                    graph.jj,
-                    graph.kk,
-                    fixed=1,
-                    iterations=ba_iterations,
-                    damping=damping_at(update),
-                    structure_only=mode == "structure",
-                    bounds=(width, height),
-                )
-                coords = reproject(poses, patches, now, graph.ii, graph.jj, graph.kk).coords
-            yield UpdateState(graph, frames, poses, patches, coords, targets, weights)
+            state = UpdateState(stage.graph, poses, patches, scaled[:, :frames], context, hidden, coords)
+            options = StepOptions(mode, 1, ba_iterations, damping_at(update), (width, height))
+            state = step(self, state, lookup, options)
+            if state.coords is None:
+                state = state.reprojected()
+            yield state
 
 
 def _draw_edges(
     clips: int, edges: int, share: float, generator: torch.Generator | list[torch.Generator] | None
 ) -> Tensor:
-    """A share of the ``clips * edges`` edges of a batch, drawn over all of them or, with a generator each, by clip."""
+    """Draw a share of the ``clips * edges`` edges of a batch, over all of them or, with a generator each, by clip."""
     if not isinstance(generator, list):
         return torch.randperm(clips * edges, generator=generator)[: max(1, round(share * clips * edges))]
     count = max(1, round(share * edges))

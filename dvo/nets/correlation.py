@@ -1,25 +1,23 @@
 """Correlation of patches with neighbourhoods of feature maps (DPVO 3.2).
 
 For each edge and each of the ``p * p`` patch pixels, at its reprojected position: dot products of the pixel's feature
-with the ``(2r + 2)^2`` nearest map features, bilinearly blended to ``(2r + 1)^2``; zero outside the map. The
-channels of a level are ordered as DPVO's weights expect: x offset slowest, then y offset, patch row, patch column.
+with the ``(2r + 2)^2`` nearest map features, bilinearly blended to ``(2r + 1)^2``; zero outside the map.
 
-Ways to the same numbers:
+Three implementations give the same numbers:
 
 - :func:`correlate_reference`, the specification: bilinear sampling of the features, then dot products.
 - :class:`CorrelationVolume`: all products of a clip as one matrix product, then cheap look-ups. For training.
-- :func:`correlate_windows`: gathers one window of features an edge, where the volume would not fit;
-  :class:`dvo.nets.edge_correlation.EdgeCorrelation`, which the tracker uses, remembers such windows between updates.
+- :class:`dvo.nets.edge_correlation.EdgeCorrelation`: products with one window of features an edge, kept between
+  updates. For tracking, where the volume would not fit.
 
-They return one tensor a level; DPVO interleaves them (level fastest), which :class:`dvo.nets.update.Update` undoes on
-the weights of its first layer, a small tensor, rather than on every edge.
-
-Positions receive no gradient, as in RAFT.
+An update operator receives them as :class:`Correlation`, which states the order of the channels. Positions receive no
+gradient, as in RAFT.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -27,7 +25,39 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from dvo.geometry.precision import full_precision
+from dvo.graph.edges import PatchGraph
 from dvo.nets.patchifier import pool_levels
+
+ChannelOrder = Literal["offsets_first", "pixels_first"]
+"""``offsets_first``: x offset slowest, then y offset, patch row, patch column, as DPVO's weights expect.
+``pixels_first``: patch row slowest, then patch column, y offset, x offset, as windows of memory are read fastest."""
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Correlation channels of a set of edges.
+
+    Attributes:
+        levels: ``(B, E, (2r+1)^2 * p^2)`` a level of the pyramid. DPVO interleaves the levels (level fastest);
+            :class:`dvo.nets.update.Update` undoes that on the weights of its first layer rather than on every edge.
+        order: order of the channels of a level.
+    """
+
+    levels: list[Tensor]
+    order: ChannelOrder = "offsets_first"
+
+
+class CorrelationLookup(Protocol):
+    """Correlation of the edges of a graph at given positions; the part of a step that differs between loops."""
+
+    def __call__(self, coords: Float[Tensor, "B E p p 2"], graph: PatchGraph) -> Correlation:
+        """Look up the correlation.
+
+        Args:
+            coords: reprojected patch pixels ``x, y`` in feature pixels.
+            graph: the edges.
+        """
+        ...
 
 
 def correlate_reference(
@@ -203,51 +233,3 @@ class CorrelationVolume:
             args = (position / scale, (h, w), self.radius, learn, store)
             levels.append(_Lookup.apply(token, volume, start, *args).reshape(b, e, -1))
         return levels
-
-
-def correlate_windows(
-    patches: Float[Tensor, "K C p p"],
-    levels: list[Tensor],
-    coords: Float[Tensor, "E p p 2"],
-    kk: Int[Tensor, " E"],
-    jj: Int[Tensor, " E"],
-    pyramid: tuple[int, ...] = (1, 4),
-    radius: int = 3,
-    slack: int = 2,
-) -> list[Tensor]:
-    """Correlation channels ``(E, c)`` of each level for tracking, without gradients.
-
-    One window of ``2r + 2 + 2 slack`` map pixels is gathered an edge and multiplied with all patch pixels, which is
-    exact while the reprojected patch pixels lie within ``slack`` of their centre. A pixel further away (a patch seen
-    from much closer, or behind the camera) is correlated at that distance instead.
-
-    Args:
-        levels: a channels-last map ``(N, h, w, C)`` for each scale of the pyramid.
-    """
-    e, p = coords.shape[:2]
-    side = 2 * radius + 2 + 2 * slack
-    features = patches.flatten(2)[kk]  # E C pp
-    taps = torch.arange(side, device=coords.device) - radius - slack
-    out = []
-    for level, scale in zip(levels, pyramid, strict=True):
-        n, h, w, c = level.shape
-        at = coords.reshape(e, p * p, 2) / scale
-        middle = at[:, p * p // 2].clamp(-1e4, 1e4).floor()
-        index = middle.long()[:, None, :] + taps[:, None]  # E side 2
-        ix, iy = index[..., 0], index[..., 1]
-        inside = ((iy >= 0) & (iy < h))[:, :, None] & ((ix >= 0) & (ix < w))[:, None, :]
-        flat = (jj[:, None] * h + iy.clamp(0, h - 1))[:, :, None] * w + ix.clamp(0, w - 1)[:, None, :]
-        window = level.reshape(-1, c).index_select(0, flat.flatten()).view(e, side * side, c)
-        products = torch.bmm(window, features).view(e, side, side, p * p) * inside[..., None]
-        # Sub-pixel look-up inside the window, each patch pixel with its own offset from the centre.
-        local = (at - middle[:, None]).clamp(-float(slack), slack + 1 - 1e-4) + radius + slack
-        base = local.floor()
-        fraction = (local - base)[:, None, None]
-        x0, y0 = (base.long() - radius).unbind(-1)
-        steps = torch.arange(2 * radius + 2, device=coords.device)
-        pick = (y0[:, None, None, :] + steps[:, None]) * side + x0[:, None, None, :] + steps[:, None, None]
-        pick = pick * (p * p) + torch.arange(p * p, device=coords.device)  # E X Y pp
-        values = products.reshape(e, -1).gather(1, pick.reshape(e, -1)).view(pick.shape)
-        rows = torch.lerp(values[:, :, :-1], values[:, :, 1:], fraction[..., 1])
-        out.append(torch.lerp(rows[:, :-1], rows[:, 1:], fraction[..., 0]).reshape(e, -1))
-    return out

@@ -1,9 +1,9 @@
-"""Correlation of a tracker's edges, remembered between updates.
+"""Correlation of the edges of a sliding window, cached between updates.
 
-Between two updates an edge moves by a pixel or so, while most of the cost of
-:func:`dvo.nets.correlation.correlate_windows` is fetching features. Here the products of a patch with a window larger
-than needed are kept in a slot of the edge and looked up; they are fetched again only when the edge has moved out of
-them. Equal to it in value, up to the order of the channels.
+Between two updates an edge moves by about a pixel, while most of the cost of correlating it is fetching features. Here
+the products of a patch with a window larger than needed are kept in a slot of the edge and looked up; they are computed
+again only when the edge has moved out of them. Equal to :func:`dvo.nets.correlation.correlate_reference` in value, up
+to the order of the channels.
 
 Memory is read in runs: the maps carry a border of zeros as wide as a window, so that a row of a window is one piece of
 memory wherever it lies, and products are kept with x fastest, so that a row of a look-up is one too.
@@ -34,6 +34,10 @@ class EdgeCorrelation:
         self._maps = torch.zeros(0, 0, 0, 0, device=device)
         self._products = torch.zeros(0, pixels, side, side, device=device)
         self._origin = torch.zeros(0, 2, dtype=torch.long, device=device)
+
+    def __len__(self) -> int:
+        """Number of edge slots that memory is reserved for."""
+        return len(self._origin)
 
     def keep_map(self, slot: int, level: Float[Tensor, "C h w"]) -> None:
         """Put the features of a frame into a slot for frames; the store grows while it fills."""

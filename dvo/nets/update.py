@@ -1,8 +1,11 @@
-"""The recurrent update operator (DPVO 3.2): correlation in, flow revision and confidence out, one state an edge."""
+"""Gated recurrent update operator (DPVO 3.2): correlation in, flow revision and confidence out, one state an edge.
+
+Any module with the signature of :meth:`Update.forward` can take its place (:class:`UpdateOperator`).
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float
@@ -11,6 +14,17 @@ from torch.nn import functional
 
 from dvo.graph.edges import Groups, PatchGraph
 from dvo.nets.config import ModelConfig
+from dvo.nets.correlation import Correlation
+
+
+class UpdateOperator(Protocol):
+    """Signature of an update operator: state, context and correlation of the edges to state, revision, confidence."""
+
+    def __call__(
+        self, hidden: Tensor, context: Tensor, correlation: Correlation, graph: PatchGraph
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """See :meth:`Update.forward`."""
+        ...
 
 
 class _ClampGradient(torch.autograd.Function):
@@ -35,6 +49,8 @@ class GradientClamp(nn.Module):
 
 
 class GatedResidual(nn.Module):
+    """Residual block whose residual is multiplied by a learned gate (DPVO 3.2)."""
+
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.gate = nn.Sequential(nn.Linear(channels, channels), nn.Sigmoid())
@@ -65,10 +81,7 @@ class SoftAggregation(nn.Module):
 
 
 class Update(nn.Module):
-    """One revision of all edges.
-
-    Submodule names are those of DPVO's checkpoint.
-    """
+    """DPVO's update operator. Submodule names are those of DPVO's checkpoint."""
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -93,12 +106,12 @@ class Update(nn.Module):
         self.d = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp())
         self.w = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp(), nn.Sigmoid())
 
-    def _correlate(self, levels: list[Tensor], pixels_first: bool) -> Tensor:
-        """The first layer on its channels, level by level: DPVO's weights interleave the levels, level fastest."""
-        first = self.corr[0]
+    def _encode_correlation(self, correlation: Correlation) -> Tensor:
+        """First layer on the channels, level by level: DPVO's weights interleave the levels, level fastest."""
+        levels, first = correlation.levels, self.corr[0]
         assert isinstance(first, nn.Linear)
         table = first.weight.unflatten(1, (-1, len(levels)))
-        if pixels_first:
+        if correlation.order == "pixels_first":
             table = table.unflatten(1, (self.taps, self.taps, -1)).permute(0, 3, 2, 1, 4).flatten(1, 3)
         weights = table.unbind(-1)
         out = functional.linear(levels[0], weights[0], first.bias)
@@ -110,24 +123,21 @@ class Update(nn.Module):
         self,
         hidden: Float[Tensor, "B E D"],
         context: Float[Tensor, "B E D"],
-        correlation: list[Tensor],
+        correlation: Correlation,
         graph: PatchGraph,
-        *,
-        pixels_first: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Revise.
+        """Revise the flow of every edge.
 
         Args:
             hidden: state, zero for a new edge.
             context: context features of the edge's patch.
-            correlation: ``(B, E, c)`` a level, see :mod:`dvo.nets.correlation`.
-            pixels_first: channels are ordered patch row, patch column, y offset, x offset, as
-                :class:`dvo.nets.edge_correlation.EdgeCorrelation` finds them, rather than as DPVO's weights expect.
+            correlation: see :mod:`dvo.nets.correlation`.
+            graph: the edges and their neighbourhoods.
 
         Returns:
-            new state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
+            New state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
         """
-        net = self.norm(hidden + context + self.corr[1:](self._correlate(correlation, pixels_first)))
+        net = self.norm(hidden + context + self.corr[1:](self._encode_correlation(correlation)))
         # The mask multiplies the input, so an edge without a neighbour still receives c(0) (as DPVO's weights expect).
         net = net + self.c1(net.index_select(1, graph.previous) * graph.has_previous)
         net = net + self.c2(net.index_select(1, graph.following) * graph.has_following)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from dvo.graph.edges import build_graph, group_edges
 from dvo.models.schedule import full_graph, training_schedule
 from dvo.nets.config import preset
+from dvo.nets.correlation import Correlation
 from dvo.nets.update import GradientClamp, SoftAggregation, Update
 
 
@@ -48,7 +49,7 @@ def run(update, graph, order=None):
     inputs = [torch.randn(1, e, dim).double() for _ in range(2)] + [torch.randn(1, e, channels).double() for _ in "ab"]
     if order is not None:
         inputs = [x[:, order] for x in inputs]
-    return update(inputs[0], inputs[1], inputs[2:], graph)
+    return update(inputs[0], inputs[1], Correlation(inputs[2:]), graph)
 
 
 def test_edges_in_any_order_give_the_same_revision():
@@ -76,9 +77,11 @@ def test_first_layer_by_levels_equals_dpvos_interleaved_channels():
     update = Update(preset("tiny")).double()
     levels = [torch.randn(1, 5, 441).double() for _ in range(2)]
     interleaved = torch.stack(levels, -1).flatten(2)
-    torch.testing.assert_close(update._correlate(levels, False), update.corr[0](interleaved))
+    torch.testing.assert_close(update._encode_correlation(Correlation(levels)), update.corr[0](interleaved))
     turned = [level.view(1, 5, 7, 7, 9).permute(0, 1, 4, 3, 2).flatten(2) for level in levels]  # pixel, y, x
-    torch.testing.assert_close(update._correlate(turned, True), update.corr[0](interleaved))
+    torch.testing.assert_close(
+        update._encode_correlation(Correlation(turned, "pixels_first")), update.corr[0](interleaved)
+    )
 
 
 def test_gradient_clamp_removes_nan_and_scales_with_the_batch():

@@ -11,6 +11,7 @@ from dvo.geometry.projection import reproject
 from dvo.metrics import evaluate
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.config import preset
+from dvo.nets.correlation import Correlation
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.protocol import Status
 from dvo.odometry.tracker import PatchOdometry
@@ -19,29 +20,44 @@ from dvo.synth.clip import make_clip
 CONFIG = TrackerConfig(pixels=0, initial_motion=0.3, initial_parallax=0.3, keyframe_motion=2.0)
 
 
-class Perfect(PatchOdometry):
-    """Sees the true flow of every edge whose target lies in the image."""
+class TrueFlow:
+    """Correlation look-up that gives, as its only level, the true flow of every edge, and whether it is visible."""
 
-    def __init__(self, clip, config):
-        torch.manual_seed(0)
-        super().__init__(PatchVO(preset("tiny")), config)
-        self.clip = clip
+    def __init__(self, odometry, clip):
+        self.odometry, self.clip = odometry, clip
 
-    def _revise(self):
-        window = self.window
-        graph = window.graph
+    def __call__(self, coords, graph):
+        window = self.odometry.window
         edges = (graph.ii, graph.jj, graph.kk)
-        now = reproject(window.poses_cw[None], window.patches[None], window.intrinsics[None], *edges).coords
         at = torch.tensor([round(f.timestamp * 10) for f in window.frames])
         exact = window.patches[None].clone()
         x, y = exact[0, :, 0, 1, 1].long() * 4, exact[0, :, 1, 1, 1].long() * 4
-        frame = at.repeat_interleave(self.config.patches)
+        frame = at.repeat_interleave(self.odometry.config.patches)
         exact[0, :, 2] = 1 / self.clip.depth[frame, y, x][:, None, None]
         true = reproject(self.clip.poses_cw[at][None], exact, window.intrinsics[None], *edges)
-        target, centre = true.coords[0, :, 1, 1], now[0, :, 1, 1]
-        w, h = self._bounds
-        seen = true.valid[0, :, 1, 1] & (target >= 0).all(-1) & (target[:, 0] < w) & (target[:, 1] < h)
-        return window.hidden, target - centre, seen[:, None].float().expand(-1, 2), centre
+        target, centre = true.coords[:, :, 1, 1], coords[:, :, 1, 1]
+        w, h = coords.new_tensor(self.odometry._step.bounds)
+        inside = (target >= 0).all(-1) & (target[..., 0] < w) & (target[..., 1] < h)
+        seen = true.valid[:, :, 1, 1] & inside
+        return Correlation([torch.cat([target - centre, seen[..., None].float()], -1)])
+
+
+class Copy(torch.nn.Module):
+    """Update operator that hands on what the look-up found."""
+
+    def forward(self, hidden, context, correlation, graph):
+        found = correlation.levels[0]
+        return hidden, found[..., :2], found[..., 2:].expand(-1, -1, 2)
+
+
+def perfect(clip, config):
+    """A tracker whose operator and correlation are exchanged for ones that know the truth."""
+    torch.manual_seed(0)
+    model = PatchVO(preset("tiny"))
+    model.update = Copy()
+    odometry = PatchOdometry(model, config)
+    odometry._step.lookup = TrueFlow(odometry, clip)
+    return odometry
 
 
 def test_exact_flow_gives_the_exact_trajectory():
@@ -49,7 +65,7 @@ def test_exact_flow_gives_the_exact_trajectory():
         clip = make_clip(21, index, frames=40, height=96, width=128, flow_range=(2.0, 4.0), sensor=False)
         fx, fy, cx, cy = clip.intrinsics[0].tolist()
         camera = Camera(fx, fy, cx, cy, 128, 96)
-        odometry = Perfect(clip, CONFIG)
+        odometry = perfect(clip, CONFIG)
         states = []
         for i, image in enumerate(clip.images):
             frame = Frame(i, 0.1 * i, image.permute(1, 2, 0).contiguous().numpy(), camera)

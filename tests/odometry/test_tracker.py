@@ -86,8 +86,7 @@ def test_window_does_not_grow():
     sizes = []
     for frame in frames(40):
         odometry.track(frame)
-        slots = max(len(c._origin) for c in odometry._correlations)
-        sizes.append((len(odometry.window), len(odometry.window.kk), slots))
+        sizes.append((len(odometry.window), len(odometry.window.kk), odometry.correlation.capacity))
     assert max(sizes[20:]) == max(sizes[15:20])
 
 

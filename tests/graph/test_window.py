@@ -15,7 +15,9 @@ def window(count=4, m=2):
         patches = patch_coordinates(centres, torch.full((1, m), 0.5), 3)[0]
         intrinsics = torch.tensor([40.0, 40.0, 20.0, 15.0])
         empty = torch.zeros(0)
-        w.append(Keyframe(index, 0.1 * index, w.free_slot(), empty, empty, empty, intrinsics), se3.identity(), patches)
+        w.append(
+            Keyframe(index, 0.1 * index, w.free_map_slot(), empty, empty, empty, intrinsics), se3.identity(), patches
+        )
     return w
 
 
@@ -26,8 +28,8 @@ def test_remove_renumbers_patches_frames_and_edges():
     before = {(int(k), int(j)): float(h) for k, j, h in zip(w.kk, w.jj, w.hidden[:, 0], strict=True)}
     assert w.remove(1).identifier == 1
     assert [f.identifier for f in w.frames] == [0, 2, 3]
-    assert [f.slot for f in w.frames] == [0, 2, 3]
-    assert w.free_slot() == 1
+    assert [f.map_slot for f in w.frames] == [0, 2, 3]
+    assert w.free_map_slot() == 1
     after = {(int(k), int(j)): float(h) for k, j, h in zip(w.kk, w.jj, w.hidden[:, 0], strict=True)}
     frame = [0, 2, 3]
     expected = {(m, j): before[(frame[m // 2] * 2 + m % 2, frame[j])] for m in range(6) for j in range(3)}
@@ -41,7 +43,7 @@ def test_slots_are_unique_and_reused():
     second = w.connect(torch.tensor([3, 4]), torch.tensor([1, 1]))
     assert first.tolist() == [0, 1, 2]
     assert second.tolist() == [1, 3]
-    assert len(set(w.slots.tolist())) == len(w.slots) == 4
+    assert len(set(w.edge_slots.tolist())) == len(w.edge_slots) == 4
 
 
 def test_prediction_goes_on_with_half_the_motion():

@@ -1,0 +1,222 @@
+"""Archive of a keyframe graph: keyframes and measurements that have left the active window, within a bound of memory.
+
+A keyframe keeps its pose, its patches with their inverse depths (points are anchored on it: they move when it moves),
+their colours, float16 features and the working image as JPEG, from which feature maps can be computed again. An edge
+keeps its target and weight. Global bundle adjustment, loop edges, export and saving work on what is here.
+
+With the ``small`` network a keyframe takes about 34 kB of features, 15 to 25 kB of JPEG and 8 kB of edges. When the
+total exceeds :attr:`ArchiveConfig.max_bytes`, features and images of the oldest keyframes are released first, then the
+oldest edges, then the oldest patches; poses (56 bytes a keyframe) stay.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dvo.errors import DvoError
+
+
+@dataclass(frozen=True)
+class ArchiveConfig:
+    """Bound and content of an archive.
+
+    Attributes:
+        max_bytes: bound of the memory of features, images, edges and patches.
+        features: keep float16 features of the patches.
+        images: keep working images.
+        jpeg_quality: 1 to 100.
+    """
+
+    max_bytes: int = 256 * 2**20
+    features: bool = True
+    images: bool = True
+    jpeg_quality: int = 90
+
+    def __post_init__(self) -> None:
+        if self.max_bytes < 0 or not 1 <= self.jpeg_quality <= 100:
+            raise DvoError("out of range", field="archive", remedy="give max_bytes >= 0 and jpeg_quality of 1 to 100")
+
+
+@dataclass(frozen=True)
+class ArchivedKeyframe:
+    """Keyframe that has left the active window.
+
+    Attributes:
+        identifier: running number in the sequence.
+        timestamp: seconds.
+        intrinsics: ``(4,)`` float32 fx fy cx cy of the feature map.
+        pose_cw: ``(7,)`` float64 world to camera; with an ``anchor``, the pose relative to that keyframe, applied after
+            the anchor's.
+        anchor: identifier of the keyframe that a dropped keyframe is relative to, None for one that was kept.
+        centres: ``(M, 2)`` float32 patch centres, feature-map pixels; empty once released.
+        inverse_depth: ``(M,)`` float32.
+        colors: ``(M, 3)`` uint8 RGB.
+        matching: ``(M, C, p, p)`` float16 matching features of the patches, None if not kept.
+        context: ``(M, D)`` float16 context features of the patches, None if not kept.
+        jpeg: working image, None if not kept.
+    """
+
+    identifier: int
+    timestamp: float
+    intrinsics: np.ndarray
+    pose_cw: np.ndarray
+    anchor: int | None
+    centres: np.ndarray
+    inverse_depth: np.ndarray
+    colors: np.ndarray
+    matching: np.ndarray | None = None
+    context: np.ndarray | None = None
+    jpeg: bytes | None = None
+
+    @property
+    def feature_bytes(self) -> int:
+        """Memory of features and image."""
+        arrays = (self.matching, self.context)
+        return sum(a.nbytes for a in arrays if a is not None) + len(self.jpeg or b"")
+
+    @property
+    def patch_bytes(self) -> int:
+        """Memory of the patches."""
+        return self.centres.nbytes + self.inverse_depth.nbytes + self.colors.nbytes
+
+    def image(self) -> np.ndarray | None:
+        """Working image ``(H, W, 3)`` uint8 RGB, decoded; None if it is not kept."""
+        if self.jpeg is None:
+            return None
+        import cv2
+
+        decoded = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        return None if decoded is None else np.ascontiguousarray(decoded[..., ::-1])
+
+
+@dataclass(frozen=True)
+class ArchivedEdges:
+    """Measurements between keyframes, one row an edge.
+
+    Attributes:
+        source: ``(E,)`` int32 identifier of the keyframe of the patch.
+        patch: ``(E,)`` int16 index of the patch in it.
+        target: ``(E,)`` int32 identifier of the keyframe that it was seen in.
+        position: ``(E, 2)`` float32 measured position of the patch centre, feature-map pixels.
+        weight: ``(E, 2)`` float16 confidence.
+    """
+
+    source: np.ndarray
+    patch: np.ndarray
+    target: np.ndarray
+    position: np.ndarray
+    weight: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays."""
+        return sum(a.nbytes for a in (self.source, self.patch, self.target, self.position, self.weight))
+
+    @classmethod
+    def concatenate(cls, parts: list[ArchivedEdges]) -> ArchivedEdges:
+        """All edges of several parts, in order."""
+        empty = (np.zeros(0, np.int32), np.zeros(0, np.int16), np.zeros(0, np.int32),
+                 np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float16))  # fmt: skip
+        columns = zip(empty, *((p.source, p.patch, p.target, p.position, p.weight) for p in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+
+class Archive:
+    """Keyframes by identifier, and edges in the order in which they left the window."""
+
+    def __init__(self, config: ArchiveConfig | None = None) -> None:
+        self.config = config or ArchiveConfig()
+        self._keyframes: dict[int, ArchivedKeyframe] = {}
+        self._edges: deque[ArchivedEdges] = deque()
+        self._bytes = 0
+        # Identifiers in the order of archiving: those with features or an image, and those with patches.
+        self._with_features: deque[int] = deque()
+        self._with_patches: deque[int] = deque()
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def __iter__(self) -> Iterator[ArchivedKeyframe]:
+        """Keyframes by increasing identifier, dropped ones included."""
+        return (self._keyframes[identifier] for identifier in sorted(self._keyframes))
+
+    def __contains__(self, identifier: object) -> bool:
+        return identifier in self._keyframes
+
+    def __getitem__(self, identifier: int) -> ArchivedKeyframe:
+        return self._keyframes[identifier]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of features, images, edges and patches; at most ``config.max_bytes`` after every call."""
+        return self._bytes
+
+    def add(self, keyframe: ArchivedKeyframe) -> None:
+        """Add a keyframe, or replace the one of the same identifier."""
+        before = self._keyframes.get(keyframe.identifier)
+        if before is not None:
+            self._bytes -= before.feature_bytes + before.patch_bytes
+        self._keyframes[keyframe.identifier] = keyframe
+        self._bytes += keyframe.feature_bytes + keyframe.patch_bytes
+        if keyframe.feature_bytes:
+            self._with_features.append(keyframe.identifier)
+        self._with_patches.append(keyframe.identifier)
+        self._shrink()
+
+    def add_edges(self, edges: ArchivedEdges) -> None:
+        """Add measurements."""
+        if len(edges):
+            self._edges.append(edges)
+            self._bytes += edges.nbytes
+            self._shrink()
+
+    def edges(self) -> ArchivedEdges:
+        """All measurements that are kept, oldest first."""
+        return ArchivedEdges.concatenate(list(self._edges))
+
+    def set_pose(self, identifier: int, pose_cw: np.ndarray, inverse_depth: np.ndarray | None = None) -> None:
+        """Correct a keyframe, for instance after a global bundle adjustment; its points move along.
+
+        Args:
+            identifier: of the keyframe; a dropped one is freed of its anchor.
+            pose_cw: ``(7,)`` world to camera.
+            inverse_depth: ``(M,)`` of its patches; None leaves them.
+        """
+        keyframe = self._keyframes[identifier]
+        depth = keyframe.inverse_depth if inverse_depth is None else np.asarray(inverse_depth, np.float32)
+        self._keyframes[identifier] = replace(
+            keyframe, pose_cw=np.asarray(pose_cw, np.float64), anchor=None, inverse_depth=depth
+        )
+
+    def _shrink(self) -> None:
+        """Release the least useful memory until the bound holds."""
+        limit = self.config.max_bytes
+        while self._bytes > limit and self._with_features:
+            self._release(self._with_features.popleft(), matching=None, context=None, jpeg=None)
+        while self._bytes > limit and self._edges:
+            self._bytes -= self._edges.popleft().nbytes
+        while self._bytes > limit and self._with_patches:
+            centres, depth = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
+            colors = np.zeros((0, 3), np.uint8)
+            self._release(self._with_patches.popleft(), centres=centres, inverse_depth=depth, colors=colors)
+
+    def _release(self, identifier: int, **without: object) -> None:
+        before = self._keyframes[identifier]
+        after = replace(before, **without)  # type: ignore[arg-type]
+        self._keyframes[identifier] = after
+        self._bytes += after.feature_bytes + after.patch_bytes - before.feature_bytes - before.patch_bytes
+
+
+def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+    """JPEG of an image ``(H, W, 3)`` uint8 RGB."""
+    import cv2
+
+    _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return data.tobytes()

@@ -1,0 +1,44 @@
+"""Feature maps of archived keyframes, computed again when they are asked for and kept in a bounded cache."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+from torch import Tensor
+
+from dvo.errors import DvoError
+from dvo.graph.archive import Archive
+
+
+class FeatureCache:
+    """Feature maps by keyframe; the ones not used for longest are forgotten.
+
+    Args:
+        archive: holds the working images.
+        encode: feature maps of an image ``(H, W, 3)`` uint8 RGB.
+        capacity: number of keyframes whose maps are kept.
+    """
+
+    def __init__(self, archive: Archive, encode: Callable[[np.ndarray], Tensor], capacity: int = 8) -> None:
+        if capacity < 1:
+            raise DvoError(f"must be 1 or more, got {capacity}", field="capacity", remedy="keep at least one keyframe")
+        self.archive, self.encode, self.capacity = archive, encode, capacity
+        self._maps: OrderedDict[int, Tensor] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def maps(self, identifier: int) -> Tensor | None:
+        """Feature maps of a keyframe; None if its image was not kept or has been released."""
+        if identifier in self._maps:
+            self._maps.move_to_end(identifier)
+            return self._maps[identifier]
+        image = self.archive[identifier].image() if identifier in self.archive else None
+        if image is None:
+            return None
+        self._maps[identifier] = self.encode(image)
+        while len(self._maps) > self.capacity:
+            self._maps.popitem(last=False)
+        return self._maps[identifier]

@@ -1,0 +1,214 @@
+"""Keyframe graph of a tracker: the active window, the archive of what has left it, and the log of frames.
+
+Whatever leaves the window goes through one of three doors: :meth:`KeyframeGraph.archive_oldest` for a keyframe that was
+kept, :meth:`KeyframeGraph.drop` for one that adds nothing (its frames stay relative to the keyframe before it, and its
+measurements are archived), and :meth:`KeyframeGraph.discard` for a frame that must leave no trace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.geometry import se3
+from dvo.graph.archive import Archive, ArchiveConfig, ArchivedEdges, ArchivedKeyframe, encode_jpeg
+from dvo.graph.keyframe_log import KeyframeLog
+from dvo.graph.window import Keyframe, Window
+
+NEAR = 0.05
+"""A point whose inverse depth is below this share of its keyframe's median is left out of the map: its depth is a
+guess."""
+
+
+@dataclass(frozen=True)
+class GraphProblem:
+    """Bundle adjustment problem of archived keyframes, in the form of :func:`dvo.ba.layer.bundle_adjust`.
+
+    Attributes:
+        identifiers: ``(N,)`` keyframe of each pose.
+        poses_cw: ``(1, N, 7)`` float64 world to camera.
+        patches: ``(1, K, 3, 1, 1)`` float64 x, y (feature-map pixels), inverse depth.
+        intrinsics: ``(1, N, 4)`` float64 of the feature maps.
+        targets, weights: ``(1, E, 2)`` float64.
+        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge.
+    """
+
+    identifiers: np.ndarray
+    poses_cw: Tensor
+    patches: Tensor
+    intrinsics: Tensor
+    targets: Tensor
+    weights: Tensor
+    ii: Tensor
+    jj: Tensor
+    kk: Tensor
+
+
+class KeyframeGraph:
+    """Keyframes, patches and measurements of one sequence.
+
+    Args:
+        per_frame: patches of a frame.
+        patch_size: side of a patch.
+        hidden: channels of the state of the update operator.
+        device: of the window's tensors.
+        archive: bound and content of the archive.
+
+    Attributes:
+        window: active keyframes and edges.
+        archive: what has left the window.
+        log: every frame that was read, relative to a keyframe.
+    """
+
+    def __init__(
+        self, per_frame: int, patch_size: int, hidden: int, device: torch.device, archive: ArchiveConfig | None = None
+    ) -> None:
+        self.window = Window.empty(per_frame, patch_size, hidden, device)
+        self.archive = Archive(archive)
+        self.log = KeyframeLog()
+
+    def keep_edges(self, mask: Tensor) -> None:
+        """Archive the edges of the window where ``mask (E,)`` is False, and remove them from it."""
+        self._archive_edges(~mask)
+        self.window.keep(mask)
+
+    def drop(self, position: int) -> None:
+        """Remove a keyframe that is not needed; its frames are relative to the keyframe before it from now on.
+
+        Args:
+            position: in the window, at least 1.
+        """
+        window = self.window
+        relative = se3.relative(window.poses_cw[position - 1], window.poses_cw[position]).double().cpu().numpy()
+        anchor, oldest = window.frames[position - 1].identifier, window.frames[0].identifier
+        self._archive_edges(window.touching(position))
+        self._archive_keyframe(position, relative, anchor)
+        self.log.reanchor(window.remove(position).identifier, anchor, relative, oldest)
+
+    def archive_oldest(self) -> None:
+        """Move the oldest keyframe of the window to the archive."""
+        window = self.window
+        pose_cw = window.poses_cw[0].double().cpu().numpy()
+        self._archive_edges(window.touching(0))
+        self._archive_keyframe(0, pose_cw, None)
+        self.log.set_pose(window.frames[0].identifier, pose_cw)
+        window.remove(0)
+
+    def discard(self, position: int) -> Keyframe:
+        """Remove a frame of the window and everything that was measured with it."""
+        return self.window.remove(position)
+
+    def correct(self, identifier: int, pose_cw: np.ndarray, inverse_depth: np.ndarray | None = None) -> None:
+        """Set the pose of an archived keyframe; its frames and points move along.
+
+        Args:
+            identifier: of a keyframe that was not dropped.
+            pose_cw: ``(7,)`` float64 world to camera.
+            inverse_depth: ``(M,)`` of its patches; None leaves them.
+        """
+        self.archive.set_pose(identifier, pose_cw, inverse_depth)
+        self.log.set_pose(identifier, np.asarray(pose_cw, np.float64))
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Map points of the archived keyframes, from their anchors' present poses.
+
+        Returns:
+            ``(P, 3)`` float32 in the world, in the unit of the poses; ``(P, 3)`` uint8 RGB.
+        """
+        points, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
+        for keyframe in self.archive:
+            if keyframe.anchor is not None or not len(keyframe.inverse_depth):
+                continue
+            depth = torch.from_numpy(keyframe.inverse_depth)
+            x, y = torch.from_numpy(keyframe.centres).unbind(-1)
+            fx, fy, cx, cy = torch.from_numpy(keyframe.intrinsics)
+            rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
+            pose = torch.from_numpy(keyframe.pose_cw).to(depth.dtype)
+            world = se3.act(se3.inverse(pose), rays / depth[:, None])
+            near = (depth > NEAR * depth.median()).numpy()
+            points.append(world.numpy()[near])
+            colors.append(keyframe.colors[near])
+        return np.concatenate(points), np.concatenate(colors)
+
+    def problem(self, dropped: bool = True) -> GraphProblem:
+        """Bundle adjustment problem of everything that is archived.
+
+        Args:
+            dropped: dropped keyframes are frames of the problem too.
+        """
+        poses: dict[int, Tensor] = {}
+        frames = []
+        for keyframe in self.archive:
+            pose = torch.from_numpy(keyframe.pose_cw)
+            if keyframe.anchor is not None:
+                if keyframe.anchor not in poses:
+                    continue
+                pose = se3.compose(pose, poses[keyframe.anchor])
+            poses[keyframe.identifier] = pose
+            if len(keyframe.inverse_depth) and (dropped or keyframe.anchor is None):
+                frames.append(keyframe)
+        m = self.window.per_frame
+        identifiers = np.array([frame.identifier for frame in frames], dtype=np.int64)
+        edges = self.archive.edges()
+        known = np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers)
+        ii = np.searchsorted(identifiers, edges.source[known])
+        jj = np.searchsorted(identifiers, edges.target[known])
+        patches = [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
+        shape = (1, len(frames) * m, 3, 1, 1)
+        return GraphProblem(
+            identifiers=identifiers,
+            poses_cw=torch.stack([poses[i] for i in identifiers.tolist()])[None] if frames else torch.zeros(1, 0, 7),
+            patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(shape),
+            intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(1, -1, 4)),
+            targets=torch.from_numpy(edges.position[known].astype(np.float64))[None],
+            weights=torch.from_numpy(edges.weight[known].astype(np.float64))[None],
+            ii=torch.from_numpy(ii),
+            jj=torch.from_numpy(jj),
+            kk=torch.from_numpy(ii * m + edges.patch[known]),
+        )
+
+    def _archive_edges(self, mask: Tensor) -> None:
+        """Archive the edges where ``mask (E,)`` is True and that an update has seen."""
+        window = self.window
+        chosen = mask & (window.weights > 0).any(-1)
+        if not chosen.any():
+            return
+        identifiers = np.array([frame.identifier for frame in window.frames], dtype=np.int32)
+        kk, jj = window.kk[chosen].cpu().numpy(), window.jj[chosen].cpu().numpy()
+        m = window.per_frame
+        self.archive.add_edges(
+            ArchivedEdges(
+                source=identifiers[kk // m],
+                patch=(kk % m).astype(np.int16),
+                target=identifiers[jj],
+                position=window.targets[chosen].float().cpu().numpy(),
+                weight=window.weights[chosen].half().cpu().numpy(),
+            )
+        )
+
+    def _archive_keyframe(self, position: int, pose_cw: np.ndarray, anchor: int | None) -> None:
+        """Archive a keyframe; of a dropped one, which has an ``anchor``, without features and image."""
+        window, config = self.window, self.archive.config
+        frame, m = window.frames[position], window.per_frame
+        centre = window.patches.shape[-1] // 2
+        patches = window.patches[position * m : (position + 1) * m, :, centre, centre].float().cpu().numpy()
+        features = config.features and anchor is None
+        image = frame.image if config.images and anchor is None else None
+        self.archive.add(
+            ArchivedKeyframe(
+                identifier=frame.identifier,
+                timestamp=frame.timestamp,
+                intrinsics=frame.intrinsics.float().cpu().numpy(),
+                pose_cw=pose_cw,
+                anchor=anchor,
+                centres=patches[:, :2].copy(),
+                inverse_depth=patches[:, 2].copy(),
+                colors=frame.colors.cpu().numpy(),
+                matching=frame.matching.half().cpu().numpy() if features else None,
+                context=frame.context.half().cpu().numpy() if features else None,
+                jpeg=None if image is None else encode_jpeg(image, config.jpeg_quality),
+            )
+        )

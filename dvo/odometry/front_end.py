@@ -1,0 +1,86 @@
+"""Front end of the tracker: a frame to features and patches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.data.frame import Frame
+from dvo.models.patch_vo import PatchVO
+from dvo.nets.patchifier import normalise_images, random_centres
+from dvo.odometry.working_image import working_image
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Features and patches of one frame.
+
+    Attributes:
+        image: ``(H, W, 3)`` uint8 RGB working image.
+        image_intrinsics: ``(4,)`` float64 fx fy cx cy of the working image.
+        intrinsics: ``(4,)`` of the feature map.
+        maps: ``(1, 1, C, h, w)`` matching features.
+        centres: ``(1, 1, M, 2)`` patch centres, feature-map pixels.
+        matching: ``(M, C, p, p)`` matching features of the patches.
+        context: ``(M, D)`` context features of the patches.
+        colors: ``(M, 3)`` uint8 RGB at the patch centres.
+    """
+
+    image: np.ndarray
+    image_intrinsics: np.ndarray
+    intrinsics: Tensor
+    maps: Tensor
+    centres: Tensor
+    matching: Tensor
+    context: Tensor
+    colors: Tensor
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """Width and height of the feature map."""
+        return self.maps.shape[-1], self.maps.shape[-2]
+
+
+def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Tensor:
+    """Matching features ``(1, 1, C, h, w)`` of an image ``(H, W, 3)`` uint8 RGB."""
+    rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
+    return model.patchify.encode(normalise_images(rgb)[None, None]).matching
+
+
+def observe(
+    model: PatchVO, frame: Frame, pixels: int, patches: int, generator: torch.Generator, device: torch.device
+) -> Observation:
+    """Resize, encode, choose patches.
+
+    Args:
+        model: the network.
+        frame: without lens distortion.
+        pixels: pixel budget of the working image, see :func:`dvo.odometry.working_image.working_image`.
+        patches: number of patches.
+        generator: of the patch centres, on the CPU.
+        device: of the network.
+
+    Raises:
+        DvoError: the camera of the frame has distortion.
+    """
+    image, camera = working_image(frame, pixels)
+    rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
+    features = model.patchify.encode(normalise_images(rgb)[None, None])
+    h, w = features.matching.shape[-2:]
+    centres = random_centres(1, patches, h, w, generator).to(device)
+    matching, context = model.patchify.cut(features, centres)
+    stride = model.config.STRIDE
+    x, y = (centres[0, 0] * stride).unbind(-1)
+    return Observation(
+        image=image,
+        image_intrinsics=camera.intrinsics,
+        intrinsics=torch.tensor(camera.intrinsics / stride, dtype=torch.float32, device=device),
+        maps=features.matching,
+        centres=centres,
+        matching=matching[0],
+        context=context[0],
+        colors=rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu(),
+    )

@@ -1,0 +1,54 @@
+"""Start of a track: whether a frame moves enough, and the first joint optimisation."""
+
+from __future__ import annotations
+
+from dvo.ba.cold_start import damping_at, robust_cost, solve_from_nothing
+from dvo.geometry import se3
+from dvo.graph.window import Window
+from dvo.models.step import Revision, StepOptions
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.motion import parallax
+from dvo.odometry.window_step import WindowStep
+
+
+def median_revision(revision: Revision, window: Window) -> float:
+    """Median revision of the flow from the last keyframe to the newest frame, if poses did not change, pixels."""
+    n = len(window)
+    edges = (window.ii == n - 2) & (window.jj == n - 1)
+    return float(revision.delta[0][edges].norm(dim=-1).median())
+
+
+def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
+    """Optimise the first window.
+
+    Half way, the window is also solved from identity with the flow as seen by then, and the better of the two solutions
+    is kept (:func:`dvo.ba.cold_start.solve_from_nothing`).
+
+    Args:
+        window: the first keyframes.
+        step: takes the steps.
+        config: settings of the tracker.
+
+    Returns:
+        Whether there is enough parallax to go on from.
+    """
+    for age in range(config.initial_updates):
+        step(StepOptions(fixed=1, damping=damping_at(age)))
+        if age == config.initial_updates // 2:
+            _solve_again(window, step)
+    n = len(window)
+    seen = parallax(window, 0, n - 1)
+    if n > config.initial_frames:
+        seen = max(seen, parallax(window, n // 2, n - 1))
+    return seen >= config.initial_parallax
+
+
+def _solve_again(window: Window, step: WindowStep) -> None:
+    """Replace poses and depths by a solution from identity, if that explains the present flow better."""
+    revision = step.revise()
+    measured = (revision.targets, revision.weights, window.ii, window.jj, window.kk)
+    intrinsics = window.intrinsics[None]
+    poses, patches, cost = solve_from_nothing(window.patches[None], intrinsics, *measured, bounds=step.bounds)
+    if cost < robust_cost(window.poses_cw[None], window.patches[None], intrinsics, *measured):
+        window.poses_cw = se3.normalise(se3.compose(poses[0], window.poses_cw[0]))
+        window.patches = patches[0]

@@ -1,0 +1,63 @@
+"""Correlation of the edges of a sliding window."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dvo.graph.edges import PatchGraph
+from dvo.graph.window import Window
+from dvo.nets.config import ModelConfig
+from dvo.nets.correlation import Correlation
+from dvo.nets.edge_correlation import EdgeCorrelation
+from dvo.nets.patchifier import pool_levels
+
+# Sides leave room for several pixels of motion before a window of features must be fetched again.
+_SIDE_FINE, _SIDE_COARSE = 14, 12
+
+
+class WindowCorrelation:
+    """:class:`dvo.nets.correlation.CorrelationLookup` over a window, with a cache for each level of the pyramid.
+
+    Args:
+        window: whose edges are looked up; batch size 1.
+        config: of the network.
+        device: of the caches.
+    """
+
+    def __init__(self, window: Window, config: ModelConfig, device: torch.device) -> None:
+        self.window, self.pyramid = window, config.pyramid
+        self.levels = [
+            EdgeCorrelation(
+                scale, config.patch_size**2, config.radius, _SIDE_FINE if scale == 1 else _SIDE_COARSE, device
+            )
+            for scale in config.pyramid
+        ]
+
+    @property
+    def capacity(self) -> int:
+        """Number of edge slots that memory is reserved for."""
+        return max(len(level) for level in self.levels)
+
+    def keep_maps(self, map_slot: int, maps: Tensor) -> None:
+        """Store the feature maps of a frame.
+
+        Args:
+            map_slot: their place; what was there is overwritten.
+            maps: ``(1, 1, C, h, w)`` matching features.
+        """
+        for level, pooled in zip(self.levels, pool_levels(maps, self.pyramid), strict=True):
+            level.keep_map(map_slot, pooled[0, 0])
+
+    def forget(self, edge_slots: Tensor) -> None:
+        """Invalidate the slots ``(e,)`` of new edges."""
+        for level in self.levels:
+            level.forget(edge_slots)
+
+    def __call__(self, coords: Tensor, graph: PatchGraph) -> Correlation:
+        """Look up the edges of the window, see :class:`dvo.nets.correlation.CorrelationLookup`."""
+        window = self.window
+        matching = window.matching.flatten(2)
+        maps = window.map_slots[graph.jj]
+        found = [level.lookup(coords[0], window.edge_slots, matching, graph.kk, maps)[None] for level in self.levels]
+        return Correlation(found, "pixels_first")

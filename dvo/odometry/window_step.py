@@ -1,0 +1,45 @@
+"""Steps of a model on the window of a tracker."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from dvo.graph.window import Window
+from dvo.models.step import Revision, StepModel, StepOptions, UpdateState, revise, step
+from dvo.nets.correlation import CorrelationLookup
+
+
+class WindowStep:
+    """Takes steps of a model on a window, which it changes.
+
+    Args:
+        model: the network.
+        window: keyframes and edges.
+        lookup: correlation of the window's edges.
+
+    Attributes:
+        bounds: ``(width, height)`` of the feature map.
+    """
+
+    def __init__(self, model: StepModel, window: Window, lookup: CorrelationLookup) -> None:
+        self.model, self.window, self.lookup = model, window, lookup
+        self.bounds = (0, 0)
+
+    def state(self) -> UpdateState:
+        """State of the window, as a batch of one."""
+        w = self.window
+        return UpdateState(
+            w.edges, w.poses_cw[None], w.patches[None], w.intrinsics[None], w.context[None], w.hidden[None]
+        )
+
+    def revise(self) -> Revision:
+        """Output of the network; the window does not change."""
+        return revise(self.model, self.state(), self.lookup)
+
+    def __call__(self, options: StepOptions) -> None:
+        """Take a step; see :func:`dvo.models.step.step`. ``bounds`` are those of the feature map."""
+        after = step(self.model, self.state(), self.lookup, replace(options, bounds=self.bounds))
+        assert after.targets is not None and after.weights is not None
+        window = self.window
+        window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]
+        window.targets, window.weights = after.targets[0], after.weights[0]

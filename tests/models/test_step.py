@@ -1,0 +1,133 @@
+"""The public step: the same for a clip that is unrolled and for a window that is tracked."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from dvo.ba.cold_start import damping_at
+from dvo.geometry import se3
+from dvo.graph.window import Keyframe, Window
+from dvo.models.patch_vo import PatchVO
+from dvo.models.schedule import training_schedule
+from dvo.models.step import StepOptions, UpdateState, recent_depth, revise, step
+from dvo.nets.config import preset
+from dvo.nets.correlation import Correlation, correlate_reference
+from dvo.nets.patchifier import normalise_images, patch_coordinates, random_centres
+from dvo.odometry.window_correlation import WindowCorrelation
+from dvo.odometry.window_step import WindowStep
+from dvo.synth.clip import make_clip
+
+FRAMES, PATCHES, UPDATES = 5, 12, 6
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return make_clip(3, 1, frames=FRAMES, height=96, width=128, flow_range=(2.0, 4.0))
+
+
+@pytest.fixture(scope="module")
+def model():
+    torch.manual_seed(0)
+    return PatchVO(replace(preset("tiny"), training_patches=PATCHES)).eval()
+
+
+def as_window(model, clip, generator):
+    """The frames of a clip as the window of a tracker, with all edges."""
+    features = model.patchify.encode(normalise_images(clip.images[None]))
+    h, w = features.matching.shape[-2:]
+    centres = random_centres(FRAMES, PATCHES, h, w, generator, 1)
+    matching, context = model.patchify.cut(features, centres)
+    patches = patch_coordinates(centres, torch.ones(1, FRAMES * PATCHES), 3)[0]
+    window = Window.empty(PATCHES, 3, model.config.hidden_channels, torch.device("cpu"))
+    correlation = WindowCorrelation(window, model.config, torch.device("cpu"))
+    for i in range(FRAMES):
+        part = slice(i * PATCHES, (i + 1) * PATCHES)
+        slot = window.free_map_slot()
+        correlation.keep_maps(slot, features.matching[:, i : i + 1])
+        frame = Keyframe(i, 0.1 * i, slot, matching[0, part], context[0, part], torch.zeros(0), clip.intrinsics[i] / 4)
+        window.append(frame, se3.identity(), patches[part])
+    graph = training_schedule(FRAMES, PATCHES, 1, self_edges=False)[0].graph
+    correlation.forget(window.connect(graph.kk, graph.jj))
+    stepper = WindowStep(model, window, correlation)
+    stepper.bounds = (w, h)
+    return window, stepper
+
+
+@torch.no_grad()
+def test_both_loops_take_the_same_steps_on_one_graph(model, clip):
+    """Training's unroll and the tracker's window, from the same patches: equal poses, depths, targets and weights."""
+    stages = training_schedule(FRAMES, PATCHES, UPDATES, self_edges=False)
+    unrolled = model.unroll(
+        clip.images[None], clip.intrinsics[None], stages, poses_cw=se3.identity(1, FRAMES),
+        generator=torch.Generator().manual_seed(5),
+    )  # fmt: skip
+    window, stepper = as_window(model, clip, torch.Generator().manual_seed(5))
+    for update, state in enumerate(unrolled):
+        stepper(StepOptions(damping=damping_at(update)))
+        for ours, theirs in (
+            (window.poses_cw, state.poses_cw), (window.patches, state.patches), (window.hidden, state.hidden),
+            (window.targets, state.targets), (window.weights, state.weights),
+        ):  # fmt: skip
+            torch.testing.assert_close(ours, theirs[0], rtol=1e-3, atol=1e-3)
+    assert (window.poses_cw[1:] - se3.identity(FRAMES - 1)).abs().max() > 1e-3  # it did move
+
+
+@torch.no_grad()
+def test_forward_is_the_last_state_of_an_unroll(model, clip):
+    stages = training_schedule(FRAMES, PATCHES, 3, self_edges=False)
+    states = list(
+        model.unroll(clip.images[None], clip.intrinsics[None], stages, poses_cw=se3.identity(1, FRAMES),
+                     generator=torch.Generator().manual_seed(2))
+    )  # fmt: skip
+    found = model(clip.images[None], clip.intrinsics[None], updates=3, generator=torch.Generator().manual_seed(2))
+    assert torch.equal(found.poses_cw, states[-1].poses_cw) and torch.equal(found.targets, states[-1].targets)
+
+
+def reference_lookup(matching, maps):
+    def lookup(coords, graph):
+        return Correlation(correlate_reference(matching, maps, coords, graph.kk, graph.jj))
+
+    return lookup
+
+
+def start(model, clip):
+    features = model.patchify.encode(normalise_images(clip.images[None]))
+    h, w = features.matching.shape[-2:]
+    centres = random_centres(FRAMES, PATCHES, h, w, torch.Generator().manual_seed(1), 1)
+    matching, context = model.patchify.cut(features, centres)
+    graph = training_schedule(FRAMES, PATCHES, 1, self_edges=False)[0].graph
+    patches = patch_coordinates(centres, torch.ones(1, FRAMES * PATCHES), 3)
+    hidden = torch.zeros(1, len(graph), model.config.hidden_channels)
+    state = UpdateState(graph, se3.identity(1, FRAMES), patches, clip.intrinsics[None] / 4, context, hidden)
+    return state, reference_lookup(matching, features.matching), (float(w), float(h))
+
+
+@torch.no_grad()
+def test_modes(model, clip):
+    state, lookup, bounds = start(model, clip)
+    revision = revise(model, state, lookup)
+    flow = step(model, state, lookup, StepOptions(mode="flow"))
+    assert torch.equal(flow.poses_cw, state.poses_cw) and torch.equal(flow.patches, state.patches)
+    torch.testing.assert_close(flow.coords[:, :, 1, 1], revision.targets)
+    structure = step(model, state, lookup, StepOptions(mode="structure", bounds=bounds))
+    assert torch.equal(structure.poses_cw, state.poses_cw) and structure.coords is None
+    joint = step(model, state, lookup, StepOptions(fixed=2, bounds=bounds))
+    assert torch.equal(joint.poses_cw[:, :2], state.poses_cw[:, :2])
+    assert not torch.equal(joint.poses_cw[:, 2:], state.poses_cw[:, 2:])
+
+
+def test_gradients_reach_encoder_and_operator(model, clip):
+    state, lookup, bounds = start(model, clip)
+    after = step(model, state, lookup, StepOptions(bounds=bounds))
+    loss = after.targets.square().mean() + after.weights.mean() + after.poses_cw[..., :3].square().sum()
+    gradients = torch.autograd.grad(loss, [*model.parameters()], allow_unused=True)
+    assert sum(g is not None and bool(g.abs().sum() > 0) for g in gradients) > 0.9 * len(gradients)
+
+
+def test_depth_of_a_new_frame_is_the_median_of_the_newest():
+    depth = torch.tensor([9.0, 9.0, 1.0, 2.0, 3.0, 4.0])
+    patches = torch.zeros(1, 6, 3, 3, 3)
+    patches[0, :, 2] = depth[:, None, None]
+    assert recent_depth(patches, 2, 2).tolist() == [2.0]
+    assert recent_depth(patches, 2, 3).tolist() == [3.0]

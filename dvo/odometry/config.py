@@ -2,20 +2,42 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
 from dvo.errors import DvoError
+from dvo.settings import check_settings
+
+_RANGES = {
+    "pixels": (0, 2**28),
+    "patches": (1, 2**14),
+    "lifetime": (1, 1000),
+    "removal": (1, 1000),
+    "optimisation": (1, 1000),
+    "initial_frames": (2, 1000),
+    "initial_updates": (1, 1000),
+    "final_updates": (0, 1000),
+    "updates": (1, 1000),
+    "initial_motion": (0, math.inf),
+    "initial_parallax": (0, math.inf),
+    "keyframe_motion": (0, math.inf),
+    "keyframe_index": (2, 1000),
+    "motion_damping": (0, 1),
+    "lost_confidence": (0, 1),
+    "patience": (0, 10**9),
+    "search_updates": (1, 1000),
+}
 
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """How :class:`dvo.odometry.tracker.PatchOdometry` runs.
+    """Settings of :class:`dvo.odometry.tracker.PatchOdometry`.
 
     Attributes:
         pixels: pixel budget of the working image; the aspect is kept (0: the image as it is).
-        patches: patches drawn from a frame.
-        lifetime: a patch meets the frames up to this far before and after its own.
+        patches: patches of a frame.
+        lifetime: a patch has edges into the frames up to this far before and after its own.
         removal: edges of patches from frames older than this are dropped.
         optimisation: poses of this many newest frames are optimised.
         initial_frames: keyframes before the first joint optimisation.
@@ -23,16 +45,18 @@ class TrackerConfig:
         updates: updates a frame.
         initial_motion: revision of the flow, in feature pixels, that makes a frame worth a keyframe before
             initialisation.
-        initial_parallax: median parallax, in feature pixels and freed of rotation, above which the tracker says
-            ``tracking``.
+        initial_parallax: median parallax without rotation, in feature pixels, above which the status is ``tracking``.
         keyframe_motion: a keyframe is dropped again if the mean flow between its neighbours, in feature pixels, is
             below this.
         keyframe_index: how many keyframes back that test looks.
         motion_damping: share of the last motion expected to go on.
-        patience: so many lost frames in a row stay out of the graph, so that the first good one after them joins those
-            before them; after more it is given up to find them again, and lost frames stay in the graph.
-        search_updates: recurrent updates of a frame after a lost one, to find the way again.
-        lost_confidence: below this mean confidence of the newest frame's edges the tracker says ``lost``.
+        patience: up to this many lost frames in a row stay out of the graph, so that the first good one after them
+            joins those before them; later ones stay in the graph.
+        search_updates: recurrent updates of a frame after a lost one, to track it again.
+        lost_confidence: mean confidence of the newest frame's edges below which the status is ``lost``.
+
+    Raises:
+        DvoError: a value of the wrong type or out of range, with the name of the setting.
     """
 
     pixels: int = 320 * 240
@@ -53,9 +77,16 @@ class TrackerConfig:
     patience: int = 15
     search_updates: int = 8
 
+    def __post_init__(self) -> None:
+        check_settings(self, _RANGES)
+
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrackerConfig:
-        """Raises DvoError for a key that is no attribute."""
+        """Settings from plain values.
+
+        Raises:
+            DvoError: a key that is no attribute, or a value out of range.
+        """
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
             raise DvoError("unknown tracker setting", field=", ".join(unknown), remedy="see TrackerConfig")

@@ -105,6 +105,10 @@ def _tracking_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
     parser.add_argument("--device", metavar="D", default="auto", help="torch device (default: an accelerator or cpu)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
+    parser.add_argument("--config", metavar="FILE", help="YAML file with settings of the odometry")
+    parser.add_argument(
+        "--set", metavar="NAME=VALUE", action="append", default=[], help="one setting, such as patches=48; repeatable"
+    )
 
 
 def _positive_int(text: str) -> int:

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from rich.console import Console
 from rich.progress import Progress
 
-import dvo
 from dvo.commands.console import device_of, seed_everything
-from dvo.commands.run import track
+from dvo.commands.run import load_odometry, track
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.synth.sequence import make_sequence
@@ -58,7 +57,7 @@ def demo(arguments: argparse.Namespace) -> int:
     """Entry point of ``dvo demo``; returns the exit code."""
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
-    odometry = dvo.load(arguments.weights, device=device, seed=arguments.seed)  # before the rendering: fail early
+    odometry = load_odometry(arguments, device)  # before the rendering: fail early
     clip = render_clip(arguments.frames)
     facts = {
         "source": f"rendered on the spot: {FAMILY}, seed {SCENE}",

@@ -41,40 +41,42 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
                 raise DvoError(f"out of range: {value}", field=item.name, remedy=f"give a number {limits}")
 
 
-def parse_settings(kind: type, items: Iterable[str]) -> dict[str, Any]:
-    """Values of ``NAME=VALUE`` texts, converted to the types of a settings dataclass.
+def parse_settings(items: Iterable[str]) -> dict[str, Any]:
+    """Values of ``NAME=VALUE`` texts; values are YAML scalars.
 
     Args:
-        kind: the dataclass.
         items: such as ``"patches=48"``.
 
     Raises:
-        DvoError: an unknown name, or a value that is not of the field's type.
+        DvoError: a text without a name or a value.
 
     Example:
-        >>> parse_settings(TrackerConfig, ["patches=48", "motion_damping=0.3"])
+        >>> parse_settings(["patches=48", "motion_damping=0.3"])
         {'patches': 48, 'motion_damping': 0.3}
     """
-    hints = get_type_hints(kind)
+    import yaml
+
     found = {}
     for item in items:
-        name, separator, text = item.partition("=")
-        name = name.strip()
-        if not separator or name not in hints:
-            raise _unknown(kind, name or item)
-        found[name] = _convert(name, text.strip(), hints[name])
+        name, _, text = (part.strip() for part in item.partition("="))
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            value = None
+        if not name.isidentifier() or value is None:
+            raise DvoError(f"not a setting: {item!r}", field=name or None, remedy="give NAME=VALUE, such as patches=48")
+        found[name] = value
     return found
 
 
-def read_settings(kind: type, file: str | Path) -> dict[str, Any]:
+def read_settings(file: str | Path) -> dict[str, Any]:
     """Values of a YAML file with one ``name: value`` a line.
 
     Args:
-        kind: the settings dataclass.
         file: path.
 
     Raises:
-        DvoError: no such file, not such YAML, or an unknown name.
+        DvoError: no such file, or not such YAML.
     """
     import yaml
 
@@ -85,29 +87,20 @@ def read_settings(kind: type, file: str | Path) -> dict[str, Any]:
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="fix the file") from error
-    if not isinstance(table, dict):
+    if not isinstance(table, dict) or not all(isinstance(name, str) for name in table):
         raise DvoError("not a table of settings", file=path, remedy="give one 'name: value' a line")
-    names = {item.name for item in fields(kind)}
-    for name in table:
-        if name not in names:
-            unknown = _unknown(kind, str(name))
-            raise DvoError(unknown.message, file=path, field=unknown.field, remedy=unknown.remedy)
     return table
 
 
-def _convert(name: str, text: str, kind: Any) -> Any:
-    if kind is bool:
-        known = {"true": True, "false": False, "1": True, "0": False, "yes": True, "no": False}
-        if text.lower() in known:
-            return known[text.lower()]
-        raise DvoError(f"must be true or false, got {text!r}", field=name, remedy=f"give {name}=true or {name}=false")
-    try:
-        return int(text) if kind is int else float(text) if kind is float else text
-    except ValueError:
-        what = "a whole number" if kind is int else "a number"
-        raise DvoError(f"must be {what}, got {text!r}", field=name, remedy=f"give {name}=NUMBER") from None
+def check_names(kind: type, values: Mapping[str, Any]) -> None:
+    """Check that every key of ``values`` is a field of the dataclass ``kind``.
 
-
-def _unknown(kind: type, name: str) -> DvoError:
-    names = ", ".join(item.name for item in fields(kind))
-    return DvoError(f"no setting '{name}' in {kind.__name__}", field=name, remedy=f"use one of {names}")
+    Raises:
+        DvoError: an unknown name.
+    """
+    names = [item.name for item in fields(kind)]
+    unknown = sorted(set(values) - set(names))
+    if unknown:
+        raise DvoError(
+            f"unknown setting of {kind.__name__}", field=", ".join(unknown), remedy=f"use one of {', '.join(names)}"
+        )

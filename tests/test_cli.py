@@ -50,6 +50,24 @@ def summary(out: Path) -> dict:
     return json.loads((out / "run.json").read_text())
 
 
+def test_settings_reach_the_odometry(given, image_folder, tmp_path, capsys):
+    """``--config`` gives settings, ``--set`` wins over it; an unknown or wrong one is bad input."""
+    odometry = given()
+    file = tmp_path / "tracker.yaml"
+    file.write_text("patches: 12\nupdates: 2\n")
+    line = arguments(image_folder, tmp_path / "out", "--config", str(file), "--set", "patches=48")
+    assert main(line) == 0
+    assert odometry.asked["patches"] == 48 and odometry.asked["updates"] == 2
+    assert main(arguments(image_folder, tmp_path / "other", "--set", "seed=3")) == 2
+    assert "use the option of that name" in capsys.readouterr().err.lower()
+
+
+@pytest.mark.parametrize("setting", ["patches=-3", "colour=1", "patches=many", "patches"])
+def test_a_wrong_setting_is_bad_input(setting, image_folder, tmp_path, capsys):
+    assert main(arguments(image_folder, tmp_path / "out", "--set", setting)) == 2
+    assert "patches" in capsys.readouterr().err
+
+
 def test_run_writes_the_results_folder(given, image_folder, tmp_path, capsys):
     odometry = given()
     out = tmp_path / "out"

@@ -10,14 +10,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
+
 import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, seed_everything
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
 from dvo.metrics import Metrics, align_trajectory, associate, evaluate, fit_alignment
 from dvo.odometry import results, session
 from dvo.odometry.protocol import Odometry
+from dvo.settings import parse_settings, read_settings
 from dvo.viz.plot import plot_trajectory
 
 
@@ -49,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     for warning in source.warnings:
         print(f"dvo: note: {warning}", file=sys.stderr)
     seed_everything(arguments.seed)
-    odometry = dvo.load(arguments.weights, device=device, seed=arguments.seed)
+    odometry = load_odometry(arguments, device)
     facts = {
         "source": str(arguments.source),
         "kind": getattr(source, "kind", None),
@@ -61,6 +65,20 @@ def run(arguments: argparse.Namespace) -> int:
         "stride": arguments.stride,
     }
     return track(odometry, source, arguments.out, stride=arguments.stride, facts=facts)
+
+
+def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
+    """Odometry of ``--weights`` with the settings of ``--config`` and, over these, ``--set``.
+
+    Raises:
+        DvoError: no such weights, or a setting that the odometry does not have or accept.
+    """
+    settings = read_settings(arguments.config) if arguments.config else {}
+    settings |= parse_settings(arguments.set)
+    reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
+    if reserved:
+        raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")
+    return dvo.load(arguments.weights, device=device, seed=arguments.seed, **settings)
 
 
 def track(odometry: Odometry, clip: Clip, out: str | None, *, stride: int = 1, facts: dict[str, Any]) -> int:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
-from dvo.errors import DvoError
-from dvo.settings import check_settings
+from dvo.settings import check_names, check_settings
 
 _RANGES = {
     "pixels": (0, 2**28),
@@ -87,9 +86,7 @@ class TrackerConfig:
         Raises:
             DvoError: a key that is no attribute, or a value out of range.
         """
-        unknown = sorted(set(values) - {f.name for f in fields(cls)})
-        if unknown:
-            raise DvoError("unknown tracker setting", field=", ".join(unknown), remedy="see TrackerConfig")
+        check_names(cls, values)
         return cls(**values)
 
 

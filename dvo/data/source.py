@@ -16,7 +16,7 @@ from dvo.data.recording import ImageRecording, Log, RawFrame, Reader, Recording,
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import Undistorter, bends
+from dvo.geometry.undistort import Undistorter, needs_undistortion
 
 # Asked in this order: the narrow layouts first, the plain folder last.
 READERS: tuple[Reader, ...] = (
@@ -58,7 +58,7 @@ class Source:
         self._log = Log()
         self.name, self.kind, self.path = recording.name, recording.kind, recording.path
         self.recorded_camera, self.groundtruth, self.stride = recorded_camera, groundtruth, stride
-        self._undistorter = Undistorter(recorded_camera) if undistort and bends(recorded_camera) else None
+        self._undistorter = Undistorter(recorded_camera) if undistort and needs_undistortion(recorded_camera) else None
         self.camera = self._undistorter.camera if self._undistorter else recorded_camera
         count = recording.frame_count
         self.frame_count: int | None = None if count is None else -(-count // stride)

@@ -20,7 +20,7 @@ from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 
 
-def bends(camera: Camera) -> bool:
+def needs_undistortion(camera: Camera) -> bool:
     """Whether images of the camera need undistortion; a fisheye with zero coefficients is no pinhole either."""
     return camera.model == "fisheye" or camera.is_distorted
 
@@ -68,7 +68,7 @@ def _kannala_brandt(theta: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.n
 def distort(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Ideal normalised coordinates ``(..., 2)`` to where the lens puts them, also normalised."""
     points = np.asarray(points, dtype=np.float64)
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return points.copy()
     if camera.model == "radtan":
         return _radtan(points, camera)[0]
@@ -90,7 +90,7 @@ def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.nd
         range: beyond the radius at which the polynomial folds back, or at 90 degrees and more for ``fisheye``).
     """
     points = np.asarray(points, dtype=np.float64)
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return points.copy()
     if camera.model == "fisheye":
         bent = np.linalg.norm(points, axis=-1)
@@ -174,7 +174,7 @@ def undistorted_camera(camera: Camera) -> Camera:
     Raises:
         DvoError: at twice the focal length the lens model still folds the image over itself or leaves it.
     """
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return _scaled(camera, 1.0)
     low, high = 0.75, 2.0
     if _all_seen(camera, low):
@@ -223,7 +223,7 @@ class Undistorter:
         """``(H, W)`` or ``(H, W, C)`` image of ``source`` to the image of ``camera``, bilinear; same type and size."""
         if image.shape[:2] != (self.source.height, self.source.width):
             raise ValueError(f"image {image.shape[:2]} is not {self.source.height}x{self.source.width}")
-        if not bends(self.source):
+        if not needs_undistortion(self.source):
             return image
         import cv2
 

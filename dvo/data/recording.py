@@ -99,7 +99,7 @@ class Recording(Protocol):
         calibration: of the images as recorded; None if the data set has none.
         groundtruth: camera-to-world poses; None if the data set has none.
         warnings: guesses and oddities that the user should know, a sentence each.
-        stereo: right camera, where frames have right images.
+        stereo: reads the calibration of the right camera; None where frames have no right images.
         inertial: reads all inertial samples of the recording, times on the clock of the frames; None for none.
     """
 
@@ -112,7 +112,7 @@ class Recording(Protocol):
     warnings: list[str]
 
     @property
-    def stereo(self) -> StereoRig | None: ...
+    def stereo(self) -> Callable[[], StereoRig | None] | None: ...
 
     @property
     def inertial(self) -> Callable[[], InertialSamples] | None: ...
@@ -207,8 +207,8 @@ class ImageRecording:
         self.frame_count: int | None = len(self.images)
 
     @property
-    def stereo(self) -> StereoRig | None:
-        """Right camera, if there are right images."""
+    def stereo(self) -> Callable[[], StereoRig | None] | None:
+        """Reads the calibration of the right camera, if there are right images."""
         return self.sensors.stereo
 
     @property

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -35,22 +35,32 @@ class StereoRig:
     T_left_right: np.ndarray
 
 
+def rectified(calibration: Calibration, baseline: float) -> Callable[[], StereoRig]:
+    """Loader of the right camera of a rectified pair: same intrinsics, parallel axes.
+
+    Args:
+        calibration: of both cameras.
+        baseline: metres from the left to the right camera, along x.
+    """
+    return partial(StereoRig, calibration, np.array([baseline, 0, 0, 0, 0, 0, 1.0]))
+
+
 @dataclass(frozen=True)
 class Sensors:
-    """Other sensors of a recording; all are optional.
+    """Other sensors of a recording; all are optional. Nothing is read before it is needed.
 
     Attributes:
         depth: depth image of an image.
         depth_scale: units of a metre in depth images of integers.
         right: right image of an image; needs ``stereo``.
-        stereo: calibration of the right camera.
+        stereo: reads the calibration of the right camera; None from it if there is none.
         inertial: reads all samples of the recording.
     """
 
     depth: Finder | None = None
     depth_scale: float | None = None
     right: Finder | None = None
-    stereo: StereoRig | None = None
+    stereo: Callable[[], StereoRig | None] | None = None
     inertial: Callable[[], InertialSamples] | None = None
 
 

@@ -92,7 +92,7 @@ class VideoRecording:
     kind = "video"
     calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
-    stereo: StereoRig | None = None
+    stereo: Callable[[], StereoRig | None] | None = None
     inertial: Callable[[], InertialSamples] | None = None
 
     def __init__(self, path: Path, request: Request) -> None:

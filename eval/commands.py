@@ -155,7 +155,7 @@ def _state(suite, sequence, data: Path | None) -> str:  # type: ignore[no-untype
         return "rendered when needed"
     if data is None:
         return "no data folder"
-    there = data / settle(suite, sequence, data, Path()).path
+    there = data / settle(suite, sequence, data).path
     return "there" if there.exists() else f"missing: {data / sequence.path}"
 
 

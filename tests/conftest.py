@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import torch
 from hypothesis import settings
 
 from dvo.data.frame import Frame
+from dvo.data.root import data_root as find_data_root
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 
@@ -39,7 +39,7 @@ def repository() -> Path:
 @pytest.fixture(scope="session")
 def data_root() -> Path:
     """The folder of real clips: ``$DVO_DATA``, else ``../shared/data``. Skips where there is none."""
-    path = Path(os.environ.get("DVO_DATA", REPOSITORY.parent / "shared" / "data"))
+    path = find_data_root(required=False)
     if not path.is_dir():
         pytest.skip(f"no real data at {path} (set DVO_DATA to the folder that holds it)")
     return path

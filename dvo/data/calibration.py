@@ -1,4 +1,4 @@
-"""Calibration files: the common text line, and the YAML dialects that people have lying about."""
+"""Calibration files: the common text line, and the YAML dialects of EuRoC, Kalibr, ROS, OpenCV and ORB-SLAM."""
 
 from __future__ import annotations
 
@@ -38,8 +38,10 @@ class Calibration:
     Attributes:
         fx, fy, cx, cy: pixels; pixel centres at integers.
         model, coefficients: as in :class:`dvo.geometry.camera.Camera`.
-        width, height: the image size that it was made for, if the file says so.
-        file: where it came from, for messages.
+        width, height: size of the images that it was made for, if the file states it.
+        file: file that it was read from, for messages.
+        depth_scale: units of a metre in depth images of integers that belong to the images.
+        baseline: metres from the camera to the right camera of a rectified pair with the same intrinsics.
     """
 
     fx: float
@@ -51,9 +53,14 @@ class Calibration:
     width: int | None = None
     height: int | None = None
     file: Path | None = None
+    depth_scale: float | None = None
+    baseline: float | None = None
 
     def camera(self, width: int, height: int) -> Camera:
-        """The camera of images of this size.
+        """Camera of images of this size.
+
+        Args:
+            width, height: size of the images in pixels.
 
         Raises:
             DvoError: the intrinsics do not fit: another resolution stated, a focal length below 0.1 or above 20 image
@@ -81,7 +88,11 @@ class Calibration:
             raise DvoError(error.message, file=self.file, field=error.field, remedy=error.remedy) from None
 
     def doubts(self, width: int, height: int) -> list[str]:
-        """What looks unusual for images of this size, in sentences; nothing in it need be wrong."""
+        """Oddities of the calibration for images of this size, in sentences; nothing in it need be wrong.
+
+        Args:
+            width, height: size of the images in pixels.
+        """
         found = []
         if abs(self.cx - width / 2) > width / 4 or abs(self.cy - height / 2) > height / 4:
             found.append(
@@ -99,10 +110,20 @@ def read_calibration(path: Path | str) -> Calibration:
     Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` (radial-tangential) separated by blanks or commas, ``#`` comments;
     or a 3x3 matrix K on three lines. YAML: ``fx, fy, cx, cy`` with optional ``width, height,
     model: none|radtan|fisheye, coefficients``; EuRoC ``sensor.yaml``; Kalibr camchain (its ``cam0``); ROS camera_info
-    and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys.
+    and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state ``depth_scale`` (ORB-SLAM:
+    ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too.
+
+    Args:
+        path: text or YAML file.
 
     Raises:
-        DvoError: missing or malformed file, a distortion model or a number of coefficients that dvo does not know.
+        DvoError: missing or malformed file, an unknown distortion model, or a wrong number of coefficients.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("calib.txt").write_text("525 525 319.5 239.5")
+        >>> read_calibration("calib.txt").camera(640, 480).fx
+        525.0
     """
     path = Path(path)
     if not path.is_file():
@@ -153,11 +174,19 @@ def _from_matrix(matrix: np.ndarray, path: Path) -> Calibration:
 
 
 def load_yaml(text: str, path: Path) -> Any:
-    """A YAML document, also with OpenCV's ``%YAML:1.0`` head and its ``!!opencv-matrix`` tags. Plain data only."""
+    """Parse a YAML document, also with OpenCV's ``%YAML:1.0`` head and its ``!!opencv-matrix`` tags. Plain data only.
+
+    Args:
+        text: the document.
+        path: file that it comes from, for messages.
+
+    Raises:
+        DvoError: not valid YAML.
+    """
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Knows one tag more than the safe loader."""
+        """Safe loader with one tag more."""
 
     def mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
         return loader.construct_mapping(node, deep=True)
@@ -203,6 +232,7 @@ def _from_yaml(text: str, path: Path) -> Calibration:
     if size.shape != (2,) or (size < 0).any() or not np.isfinite(size).all():
         raise DvoError("expected width and height", file=path, field="resolution", remedy="give two whole numbers")
     calibration = replace(calibration, width=int(size[0]) or None, height=int(size[1]) or None)
+    calibration = _with_sensors(calibration, data, path)
     return _with_distortion(calibration, data, path)
 
 
@@ -222,6 +252,25 @@ def _yaml_intrinsics(data: dict[str, Any], path: Path) -> Calibration:
         raise DvoError("expected 4 numbers or a 3x3 matrix", file=path, field="intrinsics", remedy=_LINE)
     fx, fy, cx, cy = (float(number) for number in numbers)
     return Calibration(fx, fy, cx, cy, file=path)
+
+
+def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:
+    found: dict[str, float | None] = {}
+    keys = {
+        "depth_scale": ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor"),
+        "baseline": ("baseline", "Stereo.b"),
+    }
+    for name, names in keys.items():
+        value = _find(data, *names)
+        if value is None and name == "baseline" and data.get("Camera.bf") is not None:
+            value = _numbers(data["Camera.bf"], path, "Camera.bf") / calibration.fx
+        number = None if value is None else _numbers(value, path, name)
+        if number is not None and (number.shape != () or not np.isfinite(number) or number <= 0):
+            raise DvoError(
+                "expected one positive number", file=path, field=name, remedy="give a number, or leave it out"
+            )
+        found[name] = None if number is None else float(number)
+    return replace(calibration, depth_scale=found["depth_scale"], baseline=found["baseline"])
 
 
 def _with_distortion(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:

@@ -1,4 +1,5 @@
-"""EuRoC MAV (Burri et al., IJRR 2016), the ASL layout: ``mav0/cam0``, ``mav0/state_groundtruth_estimate0``.
+"""EuRoC MAV (Burri et al., IJRR 2016), the ASL layout: ``cam0``, ``cam1``, ``imu0``, ``state_groundtruth_estimate0``
+in ``mav0``.
 
 Trap: the ground truth is the pose of the body (the inertial sensor) in the world, with the quaternion as ``w x y z``.
 ``T_BS`` in ``cam0/sensor.yaml`` takes camera coordinates to the body, so ``T_world_camera = T_world_body T_BS``.
@@ -6,13 +7,16 @@ Trap: the ground truth is the pose of the body (the inertial sensor) in the worl
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from dvo.data.calibration import Calibration, load_yaml, read_calibration
 from dvo.data.folder import camera_images
+from dvo.data.frame import InertialSamples
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
+from dvo.data.sensors import SameName, Sensors, StereoRig
 from dvo.data.stamps import choose_times, read_times
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.errors import DvoError
@@ -29,7 +33,13 @@ def matches(path: Path) -> bool:
 
 
 def read_extrinsics(sensor: Path) -> np.ndarray | None:
-    """``(7,)`` pose ``T_BS`` (sensor to body) of a ``sensor.yaml``; None if there is no such file or key.
+    """Read the pose of a sensor on the body.
+
+    Args:
+        sensor: ``sensor.yaml``.
+
+    Returns:
+        ``(7,)`` pose ``T_BS``, sensor to body, metres; None if there is no such file or key.
 
     Raises:
         DvoError: ``T_BS`` is no rigid 4x4 matrix.
@@ -51,7 +61,10 @@ def read_extrinsics(sensor: Path) -> np.ndarray | None:
 
 
 def read_state_groundtruth(path: Path) -> Trajectory:
-    """Body-to-world poses of ``state_groundtruth_estimate0/data.csv``: ``ns, x, y, z, qw, qx, qy, qz, ...``.
+    """Read body-to-world poses.
+
+    Args:
+        path: ``state_groundtruth_estimate0/data.csv``, rows ``ns, x, y, z, qw, qx, qy, qz, ...``.
 
     Raises:
         DvoError: a malformed row, or no rows.
@@ -67,7 +80,7 @@ def read_state_groundtruth(path: Path) -> Trajectory:
             time, values = 0, np.zeros(0)
         if values.shape != (7,) or not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 1e-6:
             raise DvoError(
-                "not 'ns, x, y, z, qw, qx, qy, qz'", file=path, field=f"line {number}", remedy="mend the row"
+                "not 'ns, x, y, z, qw, qx, qy, qz'", file=path, field=f"line {number}", remedy="correct the row"
             )
         times.append(time / 1e9)
         rows.append(values)
@@ -76,6 +89,66 @@ def read_state_groundtruth(path: Path) -> Trajectory:
     table = np.array(rows)
     table[:, 3:] /= np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
     return Trajectory(np.array(times), table[:, [0, 1, 2, 4, 5, 6, 3]])
+
+
+def read_inertial(path: Path, T_camera_imu: np.ndarray | None = None) -> InertialSamples:
+    """Read inertial samples.
+
+    Args:
+        path: ``imu0/data.csv``, rows ``ns, wx, wy, wz, ax, ay, az`` in rad/s and m/s^2.
+        T_camera_imu: ``(7,)`` pose of the inertial sensor in the camera's coordinates, to go with the samples.
+
+    Raises:
+        DvoError: a malformed row, or times that do not increase.
+    """
+    times: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        fields = line.split("#")[0].replace(",", " ").split()
+        if not fields:
+            continue
+        try:
+            time, values = int(fields[0]), [float(field) for field in fields[1:7]]
+        except ValueError:
+            time, values = 0, []
+        if len(values) != 6 or not np.isfinite(values).all() or (times and time <= times[-1]):
+            raise DvoError(
+                "not 'ns, wx, wy, wz, ax, ay, az' with increasing times",
+                file=path,
+                field=f"line {number}",
+                remedy="correct the row",
+            )
+        times.append(time)
+        rows.append(values)
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    return InertialSamples(np.array(times, dtype=np.int64) / 1e9, table[:, :3], table[:, 3:], T_camera_imu)
+
+
+def _rig(mav: Path) -> StereoRig | None:
+    """Calibration of ``cam1``; None if one of the cameras has no extrinsics."""
+    body_left, body_right = (read_extrinsics(mav / name / "sensor.yaml") for name in ("cam0", "cam1"))
+    if body_left is None or body_right is None:
+        return None
+    T_left_right = compose_poses(invert_poses(body_left), body_right)
+    return StereoRig(read_calibration(mav / "cam1" / "sensor.yaml"), T_left_right)
+
+
+def _inertial(mav: Path) -> InertialSamples:
+    body_camera, body_imu = (read_extrinsics(mav / name / "sensor.yaml") for name in ("cam0", "imu0"))
+    T_camera_imu = None
+    if body_camera is not None and body_imu is not None:
+        T_camera_imu = compose_poses(invert_poses(body_camera), body_imu)
+    return read_inertial(mav / "imu0" / "data.csv", T_camera_imu)
+
+
+def _sensors(mav: Path, request: Request) -> Sensors:
+    """Right images and inertial samples, where there are files of them; nothing is read yet."""
+    # times that the user named need not be on the clock of the inertial sensor
+    has_inertial = (mav / "imu0" / "data.csv").is_file() and request.times is None
+    inertial = partial(_inertial, mav) if has_inertial else None
+    if not (mav / "cam1" / "data").is_dir():
+        return Sensors(inertial=inertial)
+    return Sensors(right=SameName(mav / "cam1" / "data"), stereo=partial(_rig, mav), inertial=inertial)
 
 
 def _groundtruth(mav: Path, timestamps: np.ndarray, warnings: list[str]) -> Trajectory | None:
@@ -108,7 +181,7 @@ def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray |
         if not fields[0]:
             continue
         if len(fields) < 2 or not fields[0].isdigit():
-            raise DvoError("not 'ns,filename'", file=listing, field=f"line {number}", remedy="mend the row")
+            raise DvoError("not 'ns,filename'", file=listing, field=f"line {number}", remedy="correct the row")
         rows.append((int(fields[0]), fields[1]))
     rows.sort()
     return [camera / "data" / name for _, name in rows], np.array([time / 1e9 for time, _ in rows])
@@ -116,6 +189,12 @@ def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray |
 
 def open_euroc(path: Path, request: Request) -> Recording:
     """Read the left camera of a sequence in EuRoC's layout; ground truth is that of the camera, at the images' times.
+
+    Frames carry the image of ``cam1`` of the same name (undistorted, not rectified) and the samples of ``imu0``.
+
+    Args:
+        path: folder that holds ``mav0``, or ``mav0``.
+        request: options of the user.
 
     Raises:
         DvoError: no images, or a malformed file.
@@ -136,8 +215,9 @@ def open_euroc(path: Path, request: Request) -> Recording:
     groundtruth = _groundtruth(mav, times, warnings)
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else None
     return ImageRecording(
-        "euroc", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings, name=name
-    )
+        "euroc", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings, name=name,
+        sensors=_sensors(mav, request),
+    )  # fmt: skip
 
 
 READER = Reader("euroc", matches, open_euroc)

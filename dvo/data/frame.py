@@ -1,26 +1,136 @@
-"""What a frame is: the thing that readers yield and every odometry is fed."""
+"""Frame: one image with its time and camera, and what other sensors measured at that time."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StereoView:
+    """Image of the right camera of a stereo pair, exposed together with the frame's own image.
+
+    The pair is rectified only if the data set is (KITTI, TartanAir): undistortion alone does not turn the cameras
+    parallel (EuRoC).
+
+    Attributes:
+        image: ``(H, W, 3)`` uint8 RGB.
+        camera: camera of exactly this image (same size).
+        T_left_right: ``(7,)`` float64 ``tx ty tz qx qy qz qw``, right camera to left camera, metres: the translation is
+            the centre of the right camera in the coordinates of the left one.
+    """
+
+    image: np.ndarray
+    camera: Camera
+    T_left_right: np.ndarray
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the two camera centres in metres."""
+        return float(np.linalg.norm(self.T_left_right[:3]))
+
+
+@dataclass(frozen=True)
+class InertialSamples:
+    """Samples of an inertial measurement unit, in its own axes.
+
+    Attributes:
+        timestamps: ``(K,)`` float64 seconds, strictly increasing, on the clock of the frames.
+        gyro: ``(K, 3)`` float64 angular rates, rad/s.
+        accel: ``(K, 3)`` float64 specific forces, m/s^2 (gravity included).
+        T_camera_imu: ``(7,)`` float64 ``tx ty tz qx qy qz qw``, inertial sensor to camera, or None if not calibrated.
+
+    Raises:
+        DvoError: arrays whose shapes do not match.
+    """
+
+    timestamps: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
+    T_camera_imu: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.timestamps)
+        if self.timestamps.shape != (count,) or self.gyro.shape != (count, 3) or self.accel.shape != (count, 3):
+            raise DvoError(
+                f"times {self.timestamps.shape}, gyro {self.gyro.shape} and accel {self.accel.shape} do not match",
+                field="inertial",
+                remedy="give (K,), (K, 3) and (K, 3) arrays",
+            )
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def between(self, after: float, until: float) -> InertialSamples:
+        """Samples with ``after < time <= until`` (seconds)."""
+        first, last = np.searchsorted(self.timestamps, [after, until], side="right")
+        part = slice(int(first), int(last))
+        return InertialSamples(self.timestamps[part], self.gyro[part], self.accel[part], self.T_camera_imu)
+
+
+class Lazy(Generic[T]):
+    """Optional field of a frozen dataclass that holds a value, or a function that is called when it is first read.
+
+    Descriptor-typed field (see :mod:`dataclasses`); its default is None. ``dataclasses.replace`` and ``==`` read the
+    field, and so load it.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._key = f"_{name}"
+
+    def __get__(self, instance: Any, owner: type | None = None) -> T | None:
+        if instance is None:  # dataclasses looks up the default
+            return None
+        value = instance.__dict__.get(self._key)
+        if callable(value):
+            value = value()
+            instance.__dict__[self._key] = value
+        return value
+
+    def __set__(self, instance: Any, value: T | Callable[[], T | None] | None) -> None:
+        instance.__dict__[self._key] = value
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One image with its time and camera.
+    """One image with its time and camera, and what other sensors measured at that time.
+
+    Depth, right image and inertial samples are None where the source has none. Readers pass functions, so that a file
+    is decoded only when the field is first read: an odometry that uses images alone pays nothing for them.
 
     Attributes:
         index: position in the source, counted from 0 before any stride.
         timestamp: seconds, float64.
         image: ``(H, W, 3)`` uint8 RGB.
-        camera: the camera of exactly this image (same size).
+        camera: camera of exactly this image (same size).
+        depth: ``(H, W)`` float32 metres along the optical axis (Z, not the length of the ray) of the pixels of
+            ``image``; nan where it is not known.
+        right: view of the right camera of a stereo pair.
+        inertial: samples later than the previous frame of the same pass, up to this frame's time; without samples for
+            the first frame.
+
+    Example:
+        >>> import numpy as np
+        >>> from dvo.data import Frame
+        >>> from dvo.geometry.camera import Camera
+        >>> camera = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
+        >>> frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), camera, depth=np.ones((48, 64), np.float32))
+        >>> frame.depth.shape, frame.right
+        ((48, 64), None)
     """
 
     index: int
     timestamp: float
     image: np.ndarray
     camera: Camera
+    depth: Lazy[np.ndarray] = Lazy()
+    right: Lazy[StereoView] = Lazy()
+    inertial: Lazy[InertialSamples] = Lazy()

@@ -62,7 +62,7 @@ def read_image(path: Path) -> np.ndarray | None:
         data = path.read_bytes()
     except OSError:
         return None
-    if not _is_complete(data):
+    if not is_complete(data):
         return None
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
@@ -76,7 +76,7 @@ def read_image(path: Path) -> np.ndarray | None:
         raise DvoError(error.message, file=path, remedy=error.remedy) from None
 
 
-def _is_complete(data: bytes) -> bool:
+def is_complete(data: bytes) -> bool:
     """Whether the end mark is there: the decoders return a cut file with its lower part grey, and no error."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" in data[-4096:]

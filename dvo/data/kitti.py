@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +11,25 @@ import numpy as np
 from dvo.data.calibration import Calibration
 from dvo.data.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
+from dvo.data.sensors import SameName, Sensors, StereoRig
 from dvo.data.stamps import choose_times, read_times
 from dvo.data.trajectory import Trajectory, read_kitti_poses
 from dvo.errors import DvoError
 from dvo.geometry.poses import compose_poses
 
 CAMERAS = ("image_0", "image_2", "image_1", "image_3")
+RIGHT_OF = {"image_0": "image_1", "image_2": "image_3"}
 KITTI_FPS = 1 / 0.1037  # the laser scanner that triggers the cameras
 
 
 def read_projections(path: Path) -> dict[str, np.ndarray]:
-    """The rows ``P0: ... P3:`` of KITTI's ``calib.txt``: name to ``(3, 4)`` matrix.
+    """Read the projections of the four rectified cameras.
+
+    Args:
+        path: KITTI's ``calib.txt``.
+
+    Returns:
+        Name ``P0`` to ``P3``, those that are there, to a ``(3, 4)`` float64 matrix ``K [I | t]``.
 
     Raises:
         DvoError: such a row without 12 numbers.
@@ -65,7 +74,11 @@ def open_kitti(path: Path, request: Request) -> Recording:
     """Read a KITTI odometry sequence: the left grey camera, else the left colour one, or the ``image_N`` that is named.
 
     Intrinsics are those of the camera that is read. KITTI's poses are those of camera 0; for another camera they are
-    moved by its baseline ``K^-1 P[:, 3]``.
+    moved by its baseline ``K^-1 P[:, 3]``. Frames of a left camera carry the right image where there is one.
+
+    Args:
+        path: ``sequences/XX`` or a folder of images in it.
+        request: options of the user.
 
     Raises:
         DvoError: no images, or malformed calibration, times or poses.
@@ -81,8 +94,7 @@ def open_kitti(path: Path, request: Request) -> Recording:
     if camera not in projections:
         raise DvoError("no such row", file=sequence / "calib.txt", field=camera, remedy="use KITTI's calib.txt")
     projection = projections[camera]
-    fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    calibration = Calibration(fx, fy, cx, cy, file=sequence / "calib.txt")
+    calibration = _calibration(projection, sequence / "calib.txt")
     times = _times(sequence, folder, images, request, warnings)
 
     groundtruth = None
@@ -93,14 +105,38 @@ def open_kitti(path: Path, request: Request) -> Recording:
         if rows is None:
             warnings.append(f"{poses_file} has {len(poses)} rows for {len(images)} images: not used as ground truth")
         else:
-            baseline = np.array([0, 0, 0, 0, 0, 0, 1.0])
-            baseline[:3] = -np.linalg.solve(projection[:, :3], projection[:, 3])  # the camera's centre in camera 0
-            groundtruth = Trajectory(times, compose_poses(poses[rows], baseline))
+            groundtruth = Trajectory(times, compose_poses(poses[rows], _pose_in_camera_0(projection)))
     name = sequence.resolve().name
     return ImageRecording(
         "kitti", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
-        name=f"kitti{name}" if name.isdigit() else name,
+        name=f"kitti{name}" if name.isdigit() else name, sensors=_sensors(sequence, folder, projections),
     )  # fmt: skip
+
+
+def _calibration(projection: np.ndarray, file: Path) -> Calibration:
+    fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Calibration(fx, fy, cx, cy, file=file)
+
+
+def _pose_in_camera_0(projection: np.ndarray) -> np.ndarray:
+    """``(7,)`` pose of a camera in the coordinates of camera 0; the rectified cameras are parallel."""
+    pose = np.array([0, 0, 0, 0, 0, 0, 1.0])
+    pose[:3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    return pose
+
+
+def _sensors(sequence: Path, folder: Path, projections: dict[str, np.ndarray]) -> Sensors:
+    name = RIGHT_OF.get(folder.resolve().name)
+    if name is None or not (sequence / name).is_dir() or f"P{name[-1]}" not in projections:
+        return Sensors()
+    left, right = projections[f"P{folder.resolve().name[-1]}"], projections[f"P{name[-1]}"]
+    return Sensors(right=SameName(sequence / name), stereo=partial(_rig, left, right, sequence / "calib.txt"))
+
+
+def _rig(left: np.ndarray, right: np.ndarray, file: Path) -> StereoRig:
+    T_left_right = _pose_in_camera_0(right)
+    T_left_right[:3] -= _pose_in_camera_0(left)[:3]
+    return StereoRig(_calibration(right, file), T_left_right)
 
 
 def _times(sequence: Path, folder: Path, images: list[Path], request: Request, warnings: list[str]) -> np.ndarray:

@@ -1,32 +1,38 @@
-"""What a dataset's reader hands back, before cameras and undistortion: images with times."""
+"""Recordings as a reader of a data set returns them, before cameras and undistortion: images with times."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from dvo.data.calibration import Calibration
+from dvo.data.depth import read_depth
+from dvo.data.frame import InertialSamples
 from dvo.data.images import read_image
+from dvo.data.sensors import Sensors, StereoRig
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asked for, as far as a reader is concerned.
+    """Options of :func:`dvo.data.source.open_source` that concern a reader.
 
     Attributes:
         times: file with the time of every image.
         fps: frames a second.
+        calibration: calibration that the user named; wins over the data set's own.
     """
 
     times: Path | None = None
     fps: float | None = None
+    calibration: Calibration | None = None
 
 
 @dataclass(frozen=True)
@@ -38,38 +44,64 @@ class RawFrame:
         timestamp: seconds.
         image: ``(H, W, 3)`` uint8 RGB.
         origin: file name or frame number, for messages.
+        depth: loads the depth image of this frame: ``(H, W)`` float32 metres with nan for unknown, or None.
+        right: loads the right image of this frame: ``(H, W, 3)`` uint8 RGB, or None.
     """
 
     index: int
     timestamp: float
     image: np.ndarray
     origin: str
+    depth: Callable[[], np.ndarray | None] | None = None
+    right: Callable[[], np.ndarray | None] | None = None
 
 
 @dataclass
 class Log:
-    """What went wrong on one pass over a recording without ending it.
+    """Faults of one pass over a recording that did not end it.
 
     Attributes:
         unreadable: names of the images that could not be decoded.
         notes: other sentences.
+        without: names of depth and right images that could not be decoded; their frames are kept.
     """
 
     unreadable: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    without: list[str] = field(default_factory=list)
 
     def messages(self) -> list[str]:
         """Sentences for people."""
         found = list(self.notes)
         if self.unreadable:
-            named = ", ".join(self.unreadable[:3]) + (", ..." if len(self.unreadable) > 3 else "")
             count = len(self.unreadable)
-            found.insert(0, f"{count} image{'s' * (count > 1)} could not be read and were skipped: {named}")
+            found.insert(
+                0, f"{count} image{'s' * (count > 1)} could not be read and were skipped: {_few(self.unreadable)}"
+            )
+        if self.without:
+            count = len(self.without)
+            found.append(f"{count} depth or right image{'s' * (count > 1)} could not be read: {_few(self.without)}")
         return found
 
 
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+
+
 class Recording(Protocol):
-    """Images with times, as a reader found them."""
+    """Images with times, as a reader found them.
+
+    Attributes:
+        name: of the sequence.
+        kind: name of the reader.
+        path: file or folder that the user named.
+        frame_count: number of frames; None if it is not known before they are read.
+        calibration: of the images as recorded; None if the data set has none.
+        groundtruth: camera-to-world poses; None if the data set has none.
+        warnings: guesses and oddities that the user should know, a sentence each.
+        stereo: reads the calibration of the right camera; None where frames have no right images.
+        inertial: reads all inertial samples of the recording, times on the clock of the frames; None for none.
+    """
 
     name: str
     kind: str
@@ -79,19 +111,46 @@ class Recording(Protocol):
     groundtruth: Trajectory | None
     warnings: list[str]
 
+    @property
+    def stereo(self) -> Callable[[], StereoRig | None] | None: ...
+
+    @property
+    def inertial(self) -> Callable[[], InertialSamples] | None: ...
+
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
-        """Every ``stride``-th frame, times strictly increasing; unreadable ones go into the log."""
+        """Frames from the first to the last.
+
+        Args:
+            log: receives what could not be read.
+            stride: every how many-th frame is wanted.
+
+        Yields:
+            Every ``stride``-th frame that can be read, times strictly increasing.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Reader:
-    """One dataset layout.
+    """Layout of one kind of data set.
 
     Attributes:
         name: its kind, as in ``Source.kind``.
         matches: whether a path has this layout; looks at names only.
         open: reads everything but the images.
+
+    Example:
+        A module of an outside package, announced by an entry point of the group ``dvo.readers`` or by
+        ``READERS.register("mine", "my_package.mine:READER")``::
+
+            def matches(path: Path) -> bool:
+                return (path / "mine.json").is_file()
+
+            def open_mine(path: Path, request: Request) -> Recording:
+                images = sorted((path / "frames").glob("*.png"))
+                return ImageRecording("mine", path, images, np.arange(len(images)) / 20)
+
+            READER = Reader("mine", matches, open_mine)
     """
 
     name: str
@@ -107,9 +166,10 @@ class ImageRecording:
         path: what the user named.
         images: ``N`` files in the order of recording.
         timestamps: ``(N,)`` seconds.
-        calibration, groundtruth: what the dataset knows.
-        warnings: what the user should know.
+        calibration, groundtruth: those of the data set, if it has any.
+        warnings: guesses and oddities that the user should know, a sentence each.
         name: of the sequence; the folder's by default.
+        sensors: files of other sensors.
 
     Raises:
         DvoError: no images.
@@ -126,12 +186,14 @@ class ImageRecording:
         groundtruth: Trajectory | None = None,
         warnings: list[str] | None = None,
         name: str | None = None,
+        sensors: Sensors | None = None,
     ) -> None:
         if not images:
             raise DvoError("no images in it", file=path, remedy="give a video, a folder of images or a sequence")
         self.kind, self.path, self.name = kind, path, name or path.resolve().name
         self.calibration, self.groundtruth = calibration, groundtruth
         self.warnings = list(warnings or [])
+        self.sensors = sensors or Sensors()
         later = np.ones(len(images), dtype=bool)
         later[1:] = timestamps[1:] > np.maximum.accumulate(timestamps)[:-1]
         if not later.all():
@@ -144,20 +206,66 @@ class ImageRecording:
         self.timestamps = np.asarray(timestamps, dtype=np.float64)[later]
         self.frame_count: int | None = len(self.images)
 
+    @property
+    def stereo(self) -> Callable[[], StereoRig | None] | None:
+        """Reads the calibration of the right camera, if there are right images."""
+        return self.sensors.stereo
+
+    @property
+    def inertial(self) -> Callable[[], InertialSamples] | None:
+        """Reads all inertial samples, if there are any."""
+        return self.sensors.inertial
+
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
         """See :class:`Recording`."""
         for index in range(0, len(self.images), stride):
-            image = read_image(self.images[index])
-            if image is None:
+            frame = self.frame(index, log)
+            if frame is None:
                 log.unreadable.append(self.images[index].name)
             else:
-                yield RawFrame(index, float(self.timestamps[index]), image, str(self.images[index]))
+                yield frame
+
+    def frame(self, index: int, log: Log) -> RawFrame | None:
+        """One frame, in any order.
+
+        Args:
+            index: position in ``images``.
+            log: receives depth and right images that cannot be read.
+
+        Returns:
+            The frame, or None if its image is corrupt.
+        """
+        file = self.images[index]
+        image = read_image(file)
+        if image is None:
+            return None
+        depth = partial(self._depth, file, log) if self.sensors.depth else None
+        right = partial(self._right, file, log) if self.sensors.right else None
+        return RawFrame(index, float(self.timestamps[index]), image, str(file), depth, right)
+
+    def _depth(self, image: Path, log: Log) -> np.ndarray | None:
+        file = self.sensors.depth(image) if self.sensors.depth else None
+        depth = read_depth(file, self.sensors.depth_scale) if file else None
+        if file and depth is None:
+            log.without.append(file.name)
+        return depth
+
+    def _right(self, image: Path, log: Log) -> np.ndarray | None:
+        file = self.sensors.right(image) if self.sensors.right else None
+        right = read_image(file) if file else None
+        if file and right is None:
+            log.without.append(file.name)
+        return right
 
 
 def rows_of_images(images: list[Path], rows: int) -> np.ndarray | None:
-    """Which of ``rows`` table rows (one per frame of the full sequence) belongs to which image.
+    """Rows of a table (one row per frame of the full sequence) that belong to the images.
 
     Row i is image i if there are as many; of a sequence copied in part, the number in the file's name is the row.
+
+    Args:
+        images: files in order.
+        rows: number of rows of the table.
 
     Returns:
         ``(len(images),)`` int, or None if neither holds.

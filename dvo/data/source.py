@@ -1,42 +1,35 @@
-"""The front door of the data: any video, image folder or dataset sequence as an iterable of frames."""
+"""Source: any video, folder of images or sequence of a data set as an iterable of frames."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from dvo.data import euroc, folder, kitti, sequence, tartanair, tum, video
 from dvo.data.calibration import Calibration, read_calibration
-from dvo.data.frame import Frame
-from dvo.data.images import read_image
-from dvo.data.recording import ImageRecording, Log, RawFrame, Reader, Recording, Request
-from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
+from dvo.data.frame import Frame, InertialSamples, StereoView
+from dvo.data.groundtruth import read_groundtruth
+from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
+from dvo.data.registry import find_reader
+from dvo.data.sensors import StereoRig
+from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import Undistorter, bends
-
-# Asked in this order: the narrow layouts first, the plain folder last.
-READERS: tuple[Reader, ...] = (
-    video.READER,
-    euroc.READER,
-    kitti.READER,
-    tartanair.READER,
-    tum.READER,
-    sequence.READER,
-    folder.READER,
-)
+from dvo.geometry.undistort import Undistorter, needs_undistortion
 
 
 class Source:
-    """Frames of one recording; may be iterated as often as one likes. Make it with :func:`open_source`.
+    """Frames of one recording, to be iterated any number of times. Made by :func:`open_source`.
+
+    Depth, right images and inertial samples, where the recording has them, are read when a frame's field is first read.
 
     Attributes:
         name: of the sequence.
-        kind: which reader: ``video, euroc, kitti, tartanair, tum, sequence, folder``.
-        path: what was opened.
+        kind: name of the reader, see :data:`dvo.data.registry.READERS`.
+        path: file or folder that was opened.
         camera: the camera of every frame (without distortion if frames are undistorted).
         recorded_camera: the camera as calibrated, distortion included.
         stride: every how many-th frame is read.
@@ -58,7 +51,9 @@ class Source:
         self._log = Log()
         self.name, self.kind, self.path = recording.name, recording.kind, recording.path
         self.recorded_camera, self.groundtruth, self.stride = recorded_camera, groundtruth, stride
-        self._undistorter = Undistorter(recorded_camera) if undistort and bends(recorded_camera) else None
+        self._undistort = undistort
+        self._undistorter = Undistorter(recorded_camera) if undistort and needs_undistortion(recorded_camera) else None
+        self._right_undistorter: Undistorter | None = None  # the size of right images is not known before the first
         self.camera = self._undistorter.camera if self._undistorter else recorded_camera
         count = recording.frame_count
         self.frame_count: int | None = None if count is None else -(-count // stride)
@@ -76,12 +71,12 @@ class Source:
 
     @property
     def warnings(self) -> list[str]:
-        """What the user should know, in sentences: guesses at opening, and troubles of the last pass so far."""
+        """Guesses at opening and faults of the last pass so far, in sentences for the user."""
         return [*self._recording.warnings, *self._doubts, *self._log.messages()]
 
     @property
     def skipped(self) -> int:
-        """How many images could not be decoded on the last pass so far."""
+        """Number of images that could not be decoded on the last pass so far."""
         return len(self._log.unreadable)
 
     @property
@@ -91,7 +86,13 @@ class Source:
         return recording.timestamps if isinstance(recording, ImageRecording) else None
 
     def frames_at(self, indices: Sequence[int]) -> list[tuple[Frame, Path]]:
-        """Single frames of a recording that is made of image files, with their files, in any order.
+        """Read single frames of a recording that is made of image files.
+
+        Args:
+            indices: positions in the recording, in any order.
+
+        Returns:
+            The frames, without inertial samples (there is no frame before), and the files of their images.
 
         Raises:
             DvoError: a video, or an image that cannot be read.
@@ -101,12 +102,10 @@ class Source:
             raise DvoError("a video is read in order only", file=self.path, remedy="extract its frames into a folder")
         frames = []
         for index in indices:
-            image = read_image(recording.images[index])
-            if image is None:
+            raw = recording.frame(index, self._log)
+            if raw is None:
                 raise DvoError("cannot be decoded", file=recording.images[index], remedy="remove or replace the image")
-            image = self._undistorter(image) if self._undistorter else image
-            frame = Frame(index, float(recording.timestamps[index]), image, self.camera)
-            frames.append((frame, recording.images[index]))
+            frames.append((self._frame(raw, None), recording.images[index]))
         return frames
 
     def __iter__(self) -> Iterator[Frame]:
@@ -116,6 +115,7 @@ class Source:
             DvoError: an image of another size than the first, naming it.
         """
         self._log = log = Log()
+        previous = float("inf")
         for raw in self._recording.frames(log, self.stride):
             height, width = raw.image.shape[:2]
             if (width, height) != (self.recorded_camera.width, self.recorded_camera.height):
@@ -125,8 +125,56 @@ class Source:
                     file=raw.origin,
                     remedy="give images of one size",
                 )
-            image = self._undistorter(raw.image) if self._undistorter else raw.image
-            yield Frame(raw.index, raw.timestamp, image, self.camera)
+            yield self._frame(raw, previous)
+            previous = raw.timestamp
+
+    def _frame(self, raw: RawFrame, previous: float | None) -> Frame:
+        """Frame of a recorded image; ``previous``: time after which its inertial samples begin, None for none."""
+        image = self._undistorter(raw.image) if self._undistorter else raw.image
+        depth = partial(self._depth, raw.depth, raw.origin) if raw.depth else None
+        right = partial(self._right, raw.right) if raw.right else None
+        inertial = None
+        if previous is not None and self._recording.inertial is not None:
+            inertial = partial(self._inertial, previous, raw.timestamp)
+        return Frame(raw.index, raw.timestamp, image, self.camera, depth, right, inertial)
+
+    def _depth(self, load: Callable[[], np.ndarray | None], origin: str) -> np.ndarray | None:
+        depth = load()
+        if depth is None:
+            return None
+        height, width = depth.shape
+        if (width, height) != (self.recorded_camera.width, self.recorded_camera.height):
+            raise DvoError(
+                f"the depth image is {width}x{height}, the image {self.recorded_camera.width}x"
+                f"{self.recorded_camera.height}",
+                file=origin,
+                field="depth",
+                remedy="register the depth to the images",
+            )
+        return self._undistorter.depth(depth) if self._undistorter else depth
+
+    @cached_property
+    def _rig(self) -> StereoRig | None:
+        return self._recording.stereo() if self._recording.stereo else None
+
+    def _right(self, load: Callable[[], np.ndarray | None]) -> StereoView | None:
+        rig = self._rig
+        image = load() if rig is not None else None
+        if rig is None or image is None:
+            return None
+        camera = rig.calibration.camera(image.shape[1], image.shape[0])
+        if self._undistort and needs_undistortion(camera):
+            if self._right_undistorter is None or self._right_undistorter.source != camera:
+                self._right_undistorter = Undistorter(camera)
+            image, camera = self._right_undistorter(image), self._right_undistorter.camera
+        return StereoView(image, camera, rig.T_left_right)
+
+    @cached_property
+    def _samples(self) -> InertialSamples | None:
+        return self._recording.inertial() if self._recording.inertial else None
+
+    def _inertial(self, previous: float, timestamp: float) -> InertialSamples | None:
+        return None if self._samples is None else self._samples.between(previous, timestamp)
 
 
 def open_source(
@@ -138,9 +186,10 @@ def open_source(
     stride: int = 1,
     groundtruth: Path | str | None = None,
     undistort: bool = True,
+    reader: str | None = None,
 ) -> Source:
-    """Open a video, a folder of images, or a dataset's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
-    or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it).
+    """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
+    ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it).
 
     Relative paths of the options are looked up from the working directory, then from the source's folder, so that
     ``--calib ../calib.txt`` beside an image folder is found from anywhere.
@@ -151,13 +200,25 @@ def open_source(
         times: file with the time of every image in its first column.
         fps: frames a second, where nothing else gives times; for a video it overrides the container.
         stride: read every ``stride``-th frame.
-        groundtruth: TUM trajectory (camera to world), or KITTI poses with one row per image of a folder; wins over the
-            dataset's own.
-        undistort: resample to a pinhole camera; otherwise frames carry the distorted camera.
+        groundtruth: TUM trajectory (camera to world), or a format without times for the images of a folder, see
+            :func:`dvo.data.groundtruth.read_groundtruth`; wins over the data set's own.
+        undistort: resample images, depth and right images to pinhole cameras; otherwise frames carry the distorted
+            cameras.
+        reader: name of the reader (``dvo.data.registry.READERS``); None: the first whose layout matches.
+
+    Returns:
+        Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
 
     Raises:
         DvoError: nothing there, unknown layout, no frame that decodes, no calibration, intrinsics that do not fit the
             images, malformed files.
+
+    Example:
+        ::
+
+            source = dvo.open("rgbd_dataset_freiburg1_xyz", stride=2)
+            for frame in source:
+                print(frame.timestamp, frame.image.shape, frame.depth is not None)
     """
     path = Path(source)
     if not path.exists():
@@ -166,21 +227,21 @@ def open_source(
         raise DvoError(f"stride {stride}", field="stride", remedy="give a whole number of at least 1")
     if times is not None and fps is not None:
         raise DvoError("both times and fps are given", field="times", remedy="give --times or --fps, not both")
-    request = Request(_locate(times, path, "times") if times is not None else None, fps)
-    reader = next(reader for reader in READERS if reader.matches(path))
-    recording = reader.open(path, request)
+    request = Request(
+        _locate(times, path, "times") if times is not None else None,
+        fps,
+        calib if calib is None or isinstance(calib, Calibration) else read_calibration(_locate(calib, path, "calib")),
+    )
+    recording = find_reader(path, reader).open(path, request)
     first = _first_frame(recording)
-    if isinstance(calib, Calibration):
-        calibration: Calibration | None = calib
-    else:
-        calibration = recording.calibration if calib is None else read_calibration(_locate(calib, path, "calib"))
+    calibration = recording.calibration if request.calibration is None else request.calibration
     if calibration is None:
         raise _no_calibration(path)
     height, width = first.image.shape[:2]
     camera = calibration.camera(width, height)
     truth = recording.groundtruth
     if groundtruth is not None:
-        truth = _read_groundtruth(_locate(groundtruth, path, "groundtruth"), recording)
+        truth = read_groundtruth(_locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
     try:
         return Source(recording, camera, truth, stride, undistort, calibration.doubts(width, height))
     except DvoError as error:  # the lens model does not know its file
@@ -217,22 +278,3 @@ def _no_calibration(path: Path) -> DvoError:
         field="calib",
         remedy=f"give --calib FILE{hint}: a text file with 'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML",
     )
-
-
-def _read_groundtruth(file: Path, recording: Recording) -> Trajectory:
-    """A TUM file as it stands; KITTI rows get the times of the images."""
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-        fields = line.split("#")[0].split()
-        if fields and len(fields) != 12:
-            break
-        if fields:
-            poses, times = read_kitti_poses(file), getattr(recording, "timestamps", np.zeros(0))
-            if len(times) != len(poses):
-                raise DvoError(
-                    f"{len(poses)} rows without times for {len(times)} images",
-                    file=file,
-                    field="groundtruth",
-                    remedy="give a TUM trajectory with times",
-                )
-            return Trajectory(np.asarray(times), poses)
-    return read_tum(file)

@@ -1,22 +1,25 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): ``rgb.txt`` or ``rgb/``, and ``groundtruth.txt``."""
+"""TUM RGB-D (Sturm et al., IROS 2012): ``rgb.txt`` or ``rgb/``, ``groundtruth.txt``, ``depth.txt`` or ``depth/``."""
 
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from dvo.data.calibration import Calibration
 from dvo.data.folder import camera_images
-from dvo.data.images import has_images
+from dvo.data.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
+from dvo.data.sensors import NearestInTime, Sensors
 from dvo.data.sequence import find_calibration
-from dvo.data.stamps import choose_times, read_times
+from dvo.data.stamps import choose_times, read_times, times_from_names
 from dvo.data.trajectory import Trajectory, interpolate, read_tum
 from dvo.errors import DvoError
 
 # The colour cameras as published with the benchmark (file_formats page); freiburg3 is delivered undistorted.
+DEPTH_SCALE = 5000.0  # units of a metre
 CALIBRATIONS = {
     "1": Calibration(517.3, 516.5, 318.6, 255.3, "radtan", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), 640, 480),
     "2": Calibration(520.9, 521.0, 325.1, 249.7, "radtan", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172), 640, 480),
@@ -30,7 +33,11 @@ def matches(path: Path) -> bool:
 
 
 def default_calibration(name: str) -> Calibration | None:
-    """The published calibration for a folder name such as ``rgbd_dataset_freiburg1_xyz`` or ``fr1_xyz``."""
+    """Published calibration of a sequence, or None for a name of another form.
+
+    Args:
+        name: of the folder, such as ``rgbd_dataset_freiburg1_xyz`` or ``fr1_xyz``.
+    """
     found = re.search(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)", name.lower())
     return CALIBRATIONS[found.group(1)] if found else None
 
@@ -47,7 +54,7 @@ def _listed_images(listing: Path) -> tuple[list[Path], np.ndarray]:
         except ValueError:
             time = float("nan")
         if len(fields) != 2 or not np.isfinite(time):
-            raise DvoError("not 'timestamp filename'", file=listing, field=f"line {number}", remedy="mend the row")
+            raise DvoError("not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row")
         rows.append((time, listing.parent / fields[1].strip()))
     rows.sort(key=lambda row: row[0])
     return [path for _, path in rows], np.array([time for time, _ in rows])
@@ -69,6 +76,11 @@ def open_tum(path: Path, request: Request) -> Recording:
 
     ``calib.txt`` in the folder wins over the published calibration. The motion capture runs at 100 Hz on a clock of its
     own: ground truth is interpolated to the times of the images, those without neighbours within 0.1 s get none.
+    Depth is registered to the colour images; a frame gets the depth image with the nearest stamp within 0.02 s.
+
+    Args:
+        path: folder of the sequence.
+        request: options of the user.
 
     Raises:
         DvoError: no images, or a malformed file.
@@ -77,6 +89,7 @@ def open_tum(path: Path, request: Request) -> Recording:
     listing = path / "rgb.txt"
     if listing.is_file():
         images, times = _listed_images(listing)
+        stamps: np.ndarray | None = times
         if request.times is not None:
             times = read_times(request.times, len(images))
         elif request.fps is not None:
@@ -84,11 +97,30 @@ def open_tum(path: Path, request: Request) -> Recording:
     else:
         images = camera_images(path / "rgb", warnings)
         times = choose_times(images, path / "rgb", times=request.times, fps=request.fps, warnings=warnings)
+        stamps = times_from_names(images)
     calibration = find_calibration(path) or default_calibration(f"{path.name} {path.resolve().name}")
     groundtruth = _groundtruth(path, times, warnings)
     return ImageRecording(
-        "tum", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings
-    )
+        "tum", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
+        sensors=_sensors(path, images, stamps, request.calibration or calibration),
+    )  # fmt: skip
+
+
+def _sensors(path: Path, images: list[Path], stamps: np.ndarray | None, calibration: Calibration | None) -> Sensors:
+    if stamps is None or not ((path / "depth.txt").is_file() or (path / "depth").is_dir()):
+        return Sensors()
+    times = dict(zip(images, stamps.tolist(), strict=True))
+    scale = (calibration.depth_scale if calibration else None) or DEPTH_SCALE
+    return Sensors(depth=NearestInTime(times, partial(_depth_images, path)), depth_scale=scale)
+
+
+def _depth_images(path: Path) -> tuple[list[Path], np.ndarray]:
+    """Files and times of ``depth.txt``, else of ``depth/`` if its names are stamps."""
+    if (path / "depth.txt").is_file():
+        return _listed_images(path / "depth.txt")
+    images = list_images(path / "depth")
+    stamps = times_from_names(images)
+    return (images, stamps) if stamps is not None else ([], np.zeros(0))
 
 
 READER = Reader("tum", matches, open_tum)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvo.data.calibration import Calibration
+from dvo.data.frame import InertialSamples
 from dvo.data.images import SUFFIXES, to_rgb8
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.sensors import StereoRig
 from dvo.data.stamps import NOMINAL_FPS, read_times
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
@@ -90,6 +92,8 @@ class VideoRecording:
     kind = "video"
     calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
+    stereo: Callable[[], StereoRig | None] | None = None
+    inertial: Callable[[], InertialSamples] | None = None
 
     def __init__(self, path: Path, request: Request) -> None:
         import cv2

@@ -1,4 +1,4 @@
-"""Cameras: pinhole intrinsics, the size of the image that they belong to, and the lens distortion.
+"""Camera: pinhole intrinsics, the size of the image that they belong to, and the lens distortion.
 
 Pixel centres lie at integer coordinates: the first pixel covers [-0.5, 0.5].
 """
@@ -27,6 +27,11 @@ class Camera:
 
     Raises:
         DvoError: intrinsics that cannot belong to an image of this size.
+
+    Example:
+        >>> camera = Camera(500.0, 500.0, 319.5, 239.5, 640, 480)
+        >>> camera.resized(320, 240).intrinsics.tolist()
+        [250.0, 250.0, 159.5, 119.5]
     """
 
     fx: float
@@ -67,10 +72,19 @@ class Camera:
 
     @property
     def is_distorted(self) -> bool:
+        """True if any distortion coefficient differs from 0.
+
+        Use :func:`dvo.geometry.undistort.needs_undistortion` to decide about images: a fisheye without coefficients is
+        no pinhole camera.
+        """
         return self.model != "none" and any(c != 0 for c in self.coefficients)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The camera of the same image resampled to ``width`` x ``height``: ``c' = (c + .5) s - .5``."""
+        """Camera of the same image resampled to another size: ``f' = f s``, ``c' = (c + .5) s - .5``.
+
+        Args:
+            width, height: new size in pixels.
+        """
         sx, sy = width / self.width, height / self.height
         return replace(
             self,
@@ -83,5 +97,13 @@ class Camera:
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The camera of the window whose top-left pixel is ``(left, top)``."""
+        """Camera of a window of the image.
+
+        Args:
+            left, top: column and row of the window's first pixel.
+            width, height: size of the window in pixels.
+
+        Raises:
+            DvoError: the principal point lies outside the window.
+        """
         return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height)

@@ -1,4 +1,4 @@
-"""Lens distortion: as functions on points, and as a resampling of images to a camera without any.
+"""Lens distortion: functions on points, and the resampling of images to a camera without distortion.
 
 Models (coordinates are normalised, ``x = X/Z``):
 
@@ -20,8 +20,11 @@ from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 
 
-def bends(camera: Camera) -> bool:
-    """Whether images of the camera need undistortion; a fisheye with zero coefficients is no pinhole either."""
+def needs_undistortion(camera: Camera) -> bool:
+    """True if images of the camera differ from those of a pinhole camera.
+
+    A fisheye with zero coefficients needs undistortion too: its model maps the angle, not its tangent.
+    """
     return camera.model == "fisheye" or camera.is_distorted
 
 
@@ -66,15 +69,23 @@ def _kannala_brandt(theta: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.n
 
 
 def distort(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Ideal normalised coordinates ``(..., 2)`` to where the lens puts them, also normalised."""
+    """Apply the lens model.
+
+    Args:
+        points: ``(..., 2)`` ideal normalised coordinates ``(X / Z, Y / Z)``.
+        camera: camera with its model and coefficients.
+
+    Returns:
+        ``(..., 2)`` float64 distorted normalised coordinates; a pixel is ``(fx x + cx, fy y + cy)`` of them.
+    """
     points = np.asarray(points, dtype=np.float64)
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return points.copy()
     if camera.model == "radtan":
         return _radtan(points, camera)[0]
     r = np.linalg.norm(points, axis=-1, keepdims=True)
-    bent, _ = _kannala_brandt(np.arctan(r), camera)
-    return points * np.where(r > 1e-9, bent / np.where(r > 1e-9, r, 1.0), 1.0)
+    distorted, _ = _kannala_brandt(np.arctan(r), camera)
+    return points * np.where(r > 1e-9, distorted / np.where(r > 1e-9, r, 1.0), 1.0)
 
 
 def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.ndarray:
@@ -90,18 +101,18 @@ def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.nd
         range: beyond the radius at which the polynomial folds back, or at 90 degrees and more for ``fisheye``).
     """
     points = np.asarray(points, dtype=np.float64)
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return points.copy()
     if camera.model == "fisheye":
-        bent = np.linalg.norm(points, axis=-1)
-        theta = bent.copy()
+        radius = np.linalg.norm(points, axis=-1)
+        theta = radius.copy()
         for _ in range(iterations):
             value, slope = _kannala_brandt(theta, camera)
-            step = (value - bent) / np.where(np.abs(slope) > 1e-6, slope, 1e-6)
+            step = (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6)
             theta = theta - np.clip(step, -0.3, 0.3)  # short steps stay on the first, rising branch
         value, slope = _kannala_brandt(theta, camera)
-        found = (np.abs(value - bent) < 1e-9) & (slope > 0) & (theta >= 0) & (theta < math.pi / 2 - 1e-6)
-        ratio = np.where(bent > 1e-9, np.tan(np.where(found, theta, 0.0)) / np.where(bent > 1e-9, bent, 1.0), 1.0)
+        found = (np.abs(value - radius) < 1e-9) & (slope > 0) & (theta >= 0) & (theta < math.pi / 2 - 1e-6)
+        ratio = np.where(radius > 1e-9, np.tan(np.where(found, theta, 0.0)) / np.where(radius > 1e-9, radius, 1.0), 1.0)
         return np.where(found[..., None], points * ratio[..., None], np.nan)
     ideal = points.copy()
     for _ in range(iterations):
@@ -123,9 +134,16 @@ def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.nd
 
 
 def in_range(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """``(...)`` bool: does the lens model grow outwards all the way from the centre to the ideal points ``(..., 2)``?
+    """Test whether points lie within the range of the lens model.
 
     Farther out the polynomials fold back, and :func:`distort` gives places that the lens never fills.
+
+    Args:
+        points: ``(..., 2)`` ideal normalised coordinates.
+        camera: camera with its model and coefficients.
+
+    Returns:
+        ``(...)`` bool, True where the distorted radius grows all the way from the centre to the point.
     """
     r = np.linalg.norm(points, axis=-1)[..., None] * np.linspace(0, 1, 17)
     if camera.model == "fisheye":
@@ -153,7 +171,7 @@ def _border(camera: Camera) -> np.ndarray:
 
 
 def _all_seen(camera: Camera, scale: float) -> bool:
-    """Whether every pixel of the undistorted image with focal lengths times ``scale`` falls into the real image."""
+    """True if every pixel of the undistorted image with focal lengths times ``scale`` falls into the real image."""
     target = _scaled(camera, scale)
     ideal = (_border(target) - [target.cx, target.cy]) / [target.fx, target.fy]
     if not in_range(ideal, camera).all():
@@ -164,17 +182,20 @@ def _all_seen(camera: Camera, scale: float) -> bool:
 
 
 def undistorted_camera(camera: Camera) -> Camera:
-    """The pinhole camera to which :class:`Undistorter` resamples.
+    """Pinhole camera to which :class:`Undistorter` resamples.
 
     Same size, same principal point, same aspect; the focal lengths are multiplied by the smallest factor in
     [0.75, 2] for which every pixel is seen by the real camera, so that there are no black edges for features to stick
     to. (OpenCV's ``getOptimalNewCameraMatrix(alpha=0)`` has the same aim, but stretches the two axes differently, and
     for wide fisheyes zooms out until the corners are smeared; 0.75 bounds that.)
 
+    Args:
+        camera: the real camera.
+
     Raises:
         DvoError: at twice the focal length the lens model still folds the image over itself or leaves it.
     """
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return _scaled(camera, 1.0)
     low, high = 0.75, 2.0
     if _all_seen(camera, low):
@@ -192,7 +213,10 @@ def undistorted_camera(camera: Camera) -> Camera:
 
 
 class Undistorter:
-    """Resamples images of one camera to an equal-sized pinhole camera; the maps are computed once, at the first image.
+    """Resample images of one camera to a pinhole camera of the same size; the maps are computed at the first image.
+
+    Args:
+        source: the real camera.
 
     Attributes:
         source: the real camera.
@@ -220,11 +244,47 @@ class Undistorter:
         )
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """``(H, W)`` or ``(H, W, C)`` image of ``source`` to the image of ``camera``, bilinear; same type and size."""
-        if image.shape[:2] != (self.source.height, self.source.width):
-            raise ValueError(f"image {image.shape[:2]} is not {self.source.height}x{self.source.width}")
-        if not bends(self.source):
+        """Resample an image of ``source`` to the image of ``camera``, bilinearly.
+
+        Args:
+            image: ``(H, W)`` or ``(H, W, C)``.
+
+        Returns:
+            Image of the same size and type; 0 where the real camera does not see (wide fisheyes only).
+
+        Raises:
+            ValueError: an image of another size than that of ``source``.
+        """
+        self._check(image)
+        if not needs_undistortion(self.source):
             return image
         import cv2
 
         return cv2.remap(image, *self._maps, interpolation=cv2.INTER_LINEAR)
+
+    def depth(self, depth: np.ndarray) -> np.ndarray:
+        """Resample a depth image of ``source`` to the image of ``camera``, to the nearest pixel.
+
+        Interpolation would invent surfaces between a foreground and its background. The two cameras share centre and
+        axes, so that the depth Z of a point is the same in both.
+
+        Args:
+            depth: ``(H, W)`` float32, Z of each pixel, nan where it is not known.
+
+        Returns:
+            ``(H, W)`` float32; nan also where the real camera does not see.
+
+        Raises:
+            ValueError: an image of another size than that of ``source``.
+        """
+        self._check(depth)
+        if not needs_undistortion(self.source):
+            return depth
+        import cv2
+
+        maps, border = self._maps, cv2.BORDER_CONSTANT
+        return cv2.remap(depth, *maps, interpolation=cv2.INTER_NEAREST, borderMode=border, borderValue=math.nan)
+
+    def _check(self, image: np.ndarray) -> None:
+        if image.shape[:2] != (self.source.height, self.source.width):
+            raise ValueError(f"image {image.shape[:2]} is not {self.source.height}x{self.source.width}")

@@ -10,7 +10,7 @@ import numpy as np
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import bends
+from dvo.geometry.undistort import needs_undistortion
 
 _MULTIPLE = 8
 
@@ -28,7 +28,7 @@ def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
     Raises:
         DvoError: the frame's camera has distortion, with which poses would be wrong without a word.
     """
-    if bends(frame.camera):
+    if needs_undistortion(frame.camera):
         raise DvoError(
             f"frames with {frame.camera.model} distortion cannot be tracked",
             field="camera",

@@ -14,7 +14,7 @@ from dvo.data.trajectory import Trajectory, write_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import NED_FROM_CAMERA, pose_matrices, poses_from_matrices
-from dvo.geometry.undistort import bends
+from dvo.geometry.undistort import needs_undistortion
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.motion.walks import long_path
 from dvo.synth.poses import inverse, split
@@ -89,7 +89,7 @@ def export_sequence(
     """
     if layout not in ("tum", "tartanair"):
         raise DvoError(f"no layout {layout!r}", field="layout", remedy="choose tum or tartanair")
-    if layout == "tartanair" and bends(sequence.camera):
+    if layout == "tartanair" and needs_undistortion(sequence.camera):
         raise DvoError("TartanAir's layout has no lens distortion", field="layout", remedy="choose tum")
     out = Path(out)
     try:

@@ -15,7 +15,7 @@ from eval.execution.cache import SystemFacts, slug
 from eval.suites.selection import suite_from
 from eval.suites.suite import Sequence, Suite
 
-MANIFEST, PREDICTIONS, GROUNDTRUTH, ADOPTED = "run.json", "predictions", "groundtruth", "adopted"
+MANIFEST, PREDICTIONS, GROUNDTRUTH = "run.json", "predictions", "groundtruth"
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,10 @@ from eval.execution.cache import (
     obtain,
     part_folder,
     reusable,
-    slug,
     sweep,
     system_facts,
 )
-from eval.execution.plan import ADOPTED, PREDICTIONS, Plan, Run, groundtruth_file, prediction_folder, write_manifest
+from eval.execution.plan import PREDICTIONS, Plan, Run, groundtruth_file, prediction_folder, write_manifest
 from eval.execution.predict import Job, Prediction, predict, write_prediction
 from eval.suites.selection import is_rendered, settle
 from eval.suites.suite import Sequence, Suite, open_sequence
@@ -100,7 +99,7 @@ def open_once(plan: Plan, suite: Suite, sequence: Sequence, say: Callable[[str],
     if is_rendered(sequence):
         say(f"{suite.name}: {sequence.name}")  # rendering it for the first time takes a while
     try:
-        there = settle(suite, sequence, plan.data, plan.out / ADOPTED / slug(suite.name) / slug(sequence.name))
+        there = settle(suite, sequence, plan.data)
         source, truth = open_sequence(there, plan.data, 1)
     except DvoError as error:
         truth_file.unlink(missing_ok=True)

@@ -11,6 +11,7 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
+from dvo.data.registry import READERS
 from eval.suites.suite import ROOT
 from eval.systems.registry import System
 
@@ -49,7 +50,8 @@ def code_digest(system: System) -> str:
 def reader_digest() -> str:
     """A hash of the code that turns files into frames."""
     found: dict[str, Path] = {}
-    _follow("dvo.data.source", found)
+    for module in ("dvo.data.source", *(READERS.target(name).partition(":")[0] for name in READERS)):
+        _follow(module, found)
     return _digest(sorted(found.values()))
 
 

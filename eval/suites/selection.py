@@ -6,16 +6,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from dvo.data.euroc import matches as is_euroc
-from dvo.data.kitti import matches as is_kitti
-from dvo.data.sequence import matches as is_sequence
-from dvo.data.tartanair import matches as is_tartanair
-from dvo.data.tum import matches as is_tum
+from dvo.data.registry import is_dataset
 from dvo.errors import DvoError
-from eval.suites.layouts import adopt
 from eval.suites.suite import SUITES, Sequence, Suite, data_folder, read_suites
-
-LAYOUTS = (is_euroc, is_kitti, is_tartanair, is_tum, is_sequence)
 
 
 def load_suites(names: list[str], only: list[str] | None = None, stride: int | None = None) -> list[Suite]:
@@ -53,7 +46,7 @@ def suite_of_folder(path: Path) -> Suite:
     Raises:
         DvoError: the folder has none of these layouts.
     """
-    if not any(matches(path) for matches in LAYOUTS):
+    if not is_dataset(path):
         raise DvoError(
             "no sequence in this folder",
             file=path,
@@ -89,11 +82,11 @@ def is_rendered(sequence: Sequence) -> bool:
     return sequence.rendered is not None
 
 
-def settle(suite: Suite, sequence: Sequence, data: Path, scratch: Path) -> Sequence:
+def settle(suite: Suite, sequence: Sequence, data: Path) -> Sequence:
     """The sequence with the place where its files really are.
 
     Files may lie in a folder of the suite's name within the data folder; calibrations that ship with a config are
-    looked up beside it; ground truth in the formats of TartanAir's test set and ICL-NUIM is rewritten into ``scratch``.
+    looked up beside it.
     """
     if is_rendered(sequence) or Path(sequence.path).is_absolute():
         return sequence
@@ -102,7 +95,7 @@ def settle(suite: Suite, sequence: Sequence, data: Path, scratch: Path) -> Seque
     calib = sequence.calib
     if calib and (SUITES / calib).is_file():
         calib = str(SUITES / calib)
-    return adopt(replace(sequence, path=str(there), calib=calib), data, scratch)
+    return replace(sequence, path=str(there), calib=calib)
 
 
 def sequence_from(entry: dict[str, Any]) -> Sequence:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from dvo.data import open_source, read_tum
-from dvo.data.clips import read_clips
 from dvo.geometry.poses import pose_matrices
 
 CLIPS = [
@@ -105,13 +104,3 @@ def test_euroc_layout_from_the_real_keyframes(data_root: Path, tmp_path: Path):
     assert np.abs(found[:, :3, 3] - wanted[:, :3, 3]).max() < 2e-3
     angle = np.arccos(np.clip((np.einsum("nij,nij->n", found[:, :3, :3], wanted[:, :3, :3]) - 1) / 2, -1, 1))
     assert np.rad2deg(angle).max() < 0.1
-
-
-def test_clips(data_root):
-    source = open_source(data_root / "tartanair_v1_60")
-    clips = list(read_clips(source, length=8, width=160, height=120, hop=20))
-    assert [clip.name for clip in clips] == [f"tartanair_v1_60@{i}" for i in (0, 20, 40)]
-    assert clips[0].images.shape == (8, 120, 160, 3) and clips[0].intrinsics[0] == pytest.approx(
-        [80, 80, 79.625, 59.625]
-    )
-    assert np.allclose(clips[1].poses_wc, source.groundtruth.poses_wc[20:28])

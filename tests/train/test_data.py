@@ -12,7 +12,7 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from train.data.clips import Course, MixedClips, _From
-from train.data.real import RealClips, RealData, read_depth
+from train.data.real import RealClips, RealData
 from train.tasks.patch_vo.objective import LossConfig
 
 DATA = Path(os.environ.get("DVO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
@@ -99,12 +99,3 @@ def test_a_step_runs_on_recordings(name, tmp_path, runs):
 def test_recordings_without_truth_or_too_short_are_refused(tmp_path):
     with pytest.raises(DvoError, match="in a row"):
         RealClips(0, RealData([str(DATA / "tartanair_v2_10")]), 30, 48, 64)
-
-
-def test_depth_that_is_not_there_is_none(tmp_path):
-    (tmp_path / "image_left").mkdir()
-    image = tmp_path / "image_left" / "000000_left.png"
-    assert read_depth(image) is None
-    (tmp_path / "depth_left").mkdir()
-    np.save(tmp_path / "depth_left" / "000000_left_depth.npy", np.array([[1.0, 0.0], [np.inf, 2.0]], np.float32))
-    np.testing.assert_array_equal(read_depth(image), np.array([[1, np.nan], [np.nan, 2]], np.float32))

@@ -6,7 +6,6 @@ count.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,12 +14,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dvo.data.clips import fit
+from dvo.data.depth import read_depth
+from dvo.data.fit import fit, fit_depth
 from dvo.data.source import Source, open_source
+from dvo.data.tartanair import depth_file
 from dvo.data.trajectory import interpolate
 from dvo.errors import DvoError
 from dvo.geometry import se3
-from dvo.geometry.camera import Camera
 from dvo.synth.clip import induced_flow
 
 STEP = 0.15
@@ -98,7 +98,7 @@ class RealClips(Dataset[dict[str, Tensor]]):
             image, camera = fit(frame.image, frame.camera, width, height)
             images.append(image)
             intrinsics.append(camera.intrinsics)
-            depths.append(_fit_depth(read_depth(file), frame.camera, camera))
+            depths.append(fit_depth(_depth(file), frame.camera, camera))
         poses = torch.from_numpy(self.poses[number][indices.start : indices.stop : hop])
         relative = se3.compose(se3.inverse(poses), poses[:1])  # world := first camera
         depth = np.stack(depths).astype(np.float32)
@@ -136,46 +136,15 @@ def poses_at_frames(source: Source) -> np.ndarray:
     return poses
 
 
-def depth_files(image: Path) -> Sequence[Path]:
-    """Where TartanAir keeps the depth of an image: v1 ``depth_left``, v2 ``depth_lcam_front``."""
-    sequence, stem = image.parent.parent, image.stem
-    if image.parent.name == "image_left":
-        return [sequence / "depth_left" / f"{stem}_depth{end}" for end in (".npy", ".npz")]
-    if image.parent.name == "image_lcam_front":
-        return [sequence / "depth_lcam_front" / f"{stem}_depth.png"]
-    return []
-
-
-def read_depth(image: Path) -> np.ndarray | None:
-    """Depth ``(H, W)`` in metres that belongs to an image, nan where it is not known, or None if there is none.
-
-    Raises:
-        DvoError: a file that is not what TartanAir writes.
-    """
-    import cv2
-
-    file = next((f for f in depth_files(image) if f.is_file()), None)
+def _depth(image: Path) -> np.ndarray | None:
+    """Depth of an image in metres where it is exact and whole, which only TartanAir's is."""
+    file = depth_file(image)
     if file is None:
         return None
-    if file.suffix == ".png":  # the four bytes of a pixel are one float
-        packed = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        if packed is None or packed.dtype != np.uint8 or packed.shape[2:] != (4,):
-            raise DvoError("not a depth map of TartanAir v2", file=file, remedy="download it again")
-        depth = np.ascontiguousarray(packed).view("<f4")[..., 0]
-    else:
-        loaded = np.load(file)
-        depth = loaded["depth"] if isinstance(loaded, np.lib.npyio.NpzFile) else loaded
-    return np.where((depth > 0) & np.isfinite(depth), depth, np.nan).astype(np.float32)
-
-
-def _fit_depth(depth: np.ndarray | None, camera: Camera, fitted: Camera) -> np.ndarray:
-    """Depth as the fitted camera sees it, the nearest pixel along each ray."""
+    depth = read_depth(file)
     if depth is None:
-        return np.full((fitted.height, fitted.width), np.nan, np.float32)
-    columns = (np.arange(fitted.width) - fitted.cx) / fitted.fx * camera.fx + camera.cx
-    rows = (np.arange(fitted.height) - fitted.cy) / fitted.fy * camera.fy + camera.cy
-    nearest = (np.clip(np.rint(x), 0, n - 1).astype(int) for x, n in zip((rows, columns), depth.shape, strict=True))
-    return depth[np.ix_(*nearest)]
+        raise DvoError("cannot be decoded", file=file, remedy="download it again")
+    return depth
 
 
 def _scale_of_motion(poses_wc: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
-from dvo.geometry.undistort import bends, distort, in_range, undistort
+from dvo.geometry.undistort import distort, in_range, needs_undistortion, undistort
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.renderer import Rendering, cast, render, sight, trace
 from dvo.synth.scenes.bodies import Stage
@@ -32,7 +32,7 @@ MARGIN = 2  # pixels of plate around what is needed
 def straight(pixels: Array, camera: Camera) -> Array:
     """Pixels ``(..., 2)`` of the lens camera to those ``(..., 2)`` of the pinhole camera with the same intrinsics, NaN
     where the lens model has no ray."""
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return pixels
     focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
     return undistort((pixels - centre) / focal, camera) * focal + centre
@@ -40,7 +40,7 @@ def straight(pixels: Array, camera: Camera) -> Array:
 
 def bent(pixels: Array, camera: Camera) -> Array:
     """Inverse of :func:`straight`; what lies beyond the range of the lens model goes to a place far off the picture."""
-    if not bends(camera):
+    if not needs_undistortion(camera):
         return pixels
     focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
     ideal = (pixels - centre) / focal

@@ -15,7 +15,7 @@ import torch
 
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import bends
+from dvo.geometry.undistort import needs_undistortion
 from dvo.synth.poses import compose, pose_from, quaternion_to_matrix, split
 from dvo.synth.render.lens import bent, plate_of, render_lens, straight
 from dvo.synth.render.renderer import Rendering, render, trace
@@ -77,7 +77,7 @@ class Shot:
     device: torch.device | str = "cpu"
 
     def __post_init__(self) -> None:
-        if self.readout > 0 and bends(self.camera):
+        if self.readout > 0 and needs_undistortion(self.camera):
             raise DvoError(
                 "a rolling shutter is not rendered through a lens with distortion",
                 field="readout, camera",
@@ -107,7 +107,7 @@ class Shot:
 
     def _render(self, poses_wc: Array, when: Array, supersample: int = 1, coordinates: bool = True) -> Rendering:
         """Sharp frames ``(N, ...)`` with a global shutter."""
-        if bends(self.camera):
+        if needs_undistortion(self.camera):
             return render_lens(
                 self.scene, poses_wc, self.camera, times=when, supersample=supersample, device=self.device,
                 coordinates=coordinates,
@@ -207,7 +207,7 @@ class Shot:
         k = self.camera.intrinsics
         if self.readout <= 0:
             when, size = np.array([time]), self._size
-            if bends(self.camera):  # through the pinhole picture that covers what the lens sees
+            if needs_undistortion(self.camera):  # through the pinhole picture that covers what the lens sees
                 plate = plate_of(self.camera, 2)
                 pixels = straight(pixels, self.camera) + (plate.intrinsics - k)[2:]
                 k, size = plate.intrinsics, plate.size

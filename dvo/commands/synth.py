@@ -13,10 +13,11 @@ from rich.progress import Progress
 
 from dvo.commands.console import device_of
 from dvo.errors import DvoError
-from dvo.synth import FAMILIES, HELD_OUT, MeshScene, load_mesh
+from dvo.synth import FAMILIES, MeshScene, load_mesh
 from dvo.synth.export import export_sequence, mesh_sequence
 from dvo.synth.preview import contact_sheet, family_sheet, sequence_rows
 from dvo.synth.sequence import SyntheticSequence, make_sequence
+from dvo.synth.specs import CameraSpec, MotionSpec, SceneSpec, SequenceFormat, SequenceSpec
 
 
 def preview(arguments: argparse.Namespace) -> int:
@@ -25,27 +26,22 @@ def preview(arguments: argparse.Namespace) -> int:
     if not out.parent.is_dir() or out.suffix.lower() not in (".png", ".jpg"):
         raise DvoError("cannot be written", file=out, field="--out", remedy="name a .png in a folder that exists")
     width, height = arguments.size
-    known = FAMILIES | HELD_OUT
     if arguments.source == "clips":  # what training sees
         sheet = contact_sheet(
             arguments.seed, arguments.rows or 8, height=height, width=width, clips_per_scene=1,
             textures=arguments.textures,
         )  # fmt: skip
-    elif arguments.source is None or arguments.source in known:
-        names = list(known) if arguments.source is None else [arguments.source] * (arguments.rows or 4)
+    elif arguments.source is None or arguments.source in FAMILIES:
+        names = list(FAMILIES) if arguments.source is None else [arguments.source] * (arguments.rows or 4)
         seeds = [arguments.seed + (i if arguments.source else 0) for i in range(len(names))]
         sheet = family_sheet(names, seeds, height, width, textures=arguments.textures)
     else:
         if arguments.textures is not None:
             raise DvoError("a mesh brings its own textures", field="--textures", remedy="leave it out")
         rows = arguments.rows or 3
-        mesh = _mesh(arguments, arguments.source)
-        sheet = np.concatenate(
-            [
-                sequence_rows(mesh_sequence(mesh, arguments.seed + i, frames=60, height=height, width=width, fps=10))
-                for i in range(rows)
-            ]
-        )
+        mesh, form = _mesh(arguments, arguments.source), SequenceFormat(60, height, width, fps=10)
+        sequences = [mesh_sequence(mesh, arguments.seed + i, form) for i in range(rows)]
+        sheet = np.concatenate([sequence_rows(sequence) for sequence in sequences])
     if not cv2.imwrite(str(out), sheet[..., ::-1]):
         raise DvoError("cannot be written", file=out, field="--out", remedy="name a file elsewhere")
     print(f"{out}: frames, depth (near is red), flow (hue is direction), path from above")
@@ -56,6 +52,8 @@ def export(arguments: argparse.Namespace) -> int:
     """A sequence in the layout of TUM RGB-D or TartanAir."""
     width, height = arguments.size
     device = device_of(arguments.device)
+    form = SequenceFormat(arguments.frames, height, width, arguments.fps)
+    motion = MotionSpec(arguments.path)
     sequence: SyntheticSequence
     if arguments.mesh is not None:
         options = {"--textures": arguments.textures, "--sensor": arguments.sensor, "--lens": arguments.lens}
@@ -63,15 +61,15 @@ def export(arguments: argparse.Namespace) -> int:
             if given not in (None, False, "none"):
                 raise DvoError("does not go with --mesh", field=option, remedy="leave it out")
         sequence = mesh_sequence(
-            _mesh(arguments, arguments.mesh), arguments.seed, frames=arguments.frames, height=height, width=width,
-            fps=arguments.fps, kind=arguments.path, name=Path(arguments.mesh).stem, device=device,
+            _mesh(arguments, arguments.mesh), arguments.seed, form, motion, name=Path(arguments.mesh).stem,
+            device=device,
         )  # fmt: skip
     else:
-        sequence = make_sequence(
-            arguments.seed, frames=arguments.frames, height=height, width=width, fps=arguments.fps,
-            family=arguments.family, kind=arguments.path, sensor=arguments.sensor, textures=arguments.textures,
-            lens=arguments.lens, device=device,
+        spec = SequenceSpec(
+            form, SceneSpec(arguments.family, textures=arguments.textures), motion,
+            CameraSpec(sensor=arguments.sensor, lens=arguments.lens),
         )  # fmt: skip
+        sequence = make_sequence(arguments.seed, spec, device=device)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=arguments.frames)
         notes = export_sequence(
@@ -86,7 +84,7 @@ def export(arguments: argparse.Namespace) -> int:
 
 def _mesh(arguments: argparse.Namespace, path: str) -> MeshScene:
     if Path(path).suffix == "" and not Path(path).exists():
-        known = ", ".join(FAMILIES | HELD_OUT)
+        known = ", ".join(FAMILIES)
         raise DvoError(f"neither a mesh file nor a family: {path}", field="SOURCE", remedy=f"families: {known}")
     scene = load_mesh(path, up=arguments.up, view=arguments.view, light=not arguments.unlit, seed=arguments.seed)
     where = "within" if scene.space.inside else "around"

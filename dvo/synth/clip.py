@@ -1,29 +1,66 @@
 """Training clips: scene, path, intrinsics and sensor drawn from a seed.
 
-A clip is a few frames whose mean induced flow between neighbours is a number drawn from a range, as DPVO samples its
-training data (REFERENCE 1.12), with depth normalised to median 1.
+A clip is a few frames whose mean induced flow between neighbours is drawn from a range, as in the training of DPVO
+(Teed et al., 2023), with depth normalised to median 1.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
 
 from dvo.errors import DvoError
+from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
+from dvo.synth import salts
 from dvo.synth.motion.paths import Path, find_start, random_path
-from dvo.synth.poses import compose, inverse, split
+from dvo.synth.render.quality import Quality
 from dvo.synth.render.renderer import render, render_depth
 from dvo.synth.scenes.families import random_scene
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.sensors.sensor import Sensor, expose, random_intrinsics, random_sensor, random_wear
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from dvo.synth.textures.pool import texture_pool
+from dvo.synth.specs import check_names
+from dvo.synth.textures.texture import texture_pool
 
 Array = np.ndarray
-LOW = 5  # planning looks at images this many times smaller
+LOW = 5  # planning renders depth this many times smaller
+
+
+@dataclass(frozen=True)
+class ClipSpec:
+    """Length, size and difficulty of training clips.
+
+    Args:
+        frames, height, width: size of a clip, frames and pixels.
+        flow_range: mean induced flow between neighbouring frames, pixels; a target is drawn from it log-uniformly and
+            met within about 10 %.
+        sensor: False gives clean renderings.
+        clips_per_scene: neighbouring indices that share a scene; more is faster and less varied.
+        supersample: rays per pixel edge for the colours.
+        textures: folder of photographs to use as textures; those shipped with scikit-image if None.
+
+    Raises:
+        DvoError: sizes or flow range out of order.
+    """
+
+    frames: int = 8
+    height: int = 120
+    width: int = 160
+    flow_range: tuple[float, float] = (2.0, 19.0)
+    sensor: bool = True
+    clips_per_scene: int = 2
+    supersample: int = 1
+    textures: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.frames < 2 or self.height < 16 or self.width < 16:
+            raise DvoError("a clip needs 2 frames or more of 16x16 pixels or more", field="frames, height, width")
+        if not 0 < self.flow_range[0] <= self.flow_range[1]:
+            raise DvoError(f"not a range: {self.flow_range}", field="flow_range", remedy="give low <= high, in pixels")
 
 
 @dataclass
@@ -44,11 +81,12 @@ class Clip:
 
 
 def induced_flow(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Array, Array]:
-    """Mean flow and visible share between neighbouring frames, by depth and pose.
+    """Mean flow and visible share between neighbouring frames, from depth and poses.
 
     Args:
-        depth: ``(N, h, w)``, a row per frame; intrinsics ``(4,)`` of that size.
-        poses_wc: ``(N, 7)``.
+        depth: ``(N, h, w)`` along the optical axis, 0 for none.
+        poses_wc: ``(N, 7)`` camera to world, in units of the depth.
+        intrinsics: ``(4,)`` fx fy cx cy in pixels of the depth map.
 
     Returns:
         ``(N-1,)`` mean flow in pixels over pixels that stay in view, ``(N-1,)`` share of pixels that do.
@@ -60,11 +98,20 @@ def induced_flow(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Arra
 
 
 def flow_field(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Array, Array]:
-    """Flow from each frame to the next ``(N-1, h, w, 2)`` in pixels, and where it stays in view ``(N-1, h, w)``."""
+    """Flow from each frame to the next, from depth and poses.
+
+    Args:
+        depth: ``(N, h, w)`` along the optical axis, 0 for none.
+        poses_wc: ``(N, 7)`` camera to world, in units of the depth.
+        intrinsics: ``(4,)`` fx fy cx cy in pixels of the depth map.
+
+    Returns:
+        ``(N-1, h, w, 2)`` pixels, and ``(N-1, h, w)`` bool: stays in view.
+    """
     _, h, w = depth.shape
     fx, fy, cx, cy = intrinsics
     y, x = np.mgrid[:h, :w]
-    r, t = split(compose(inverse(poses_wc[1:]), poses_wc[:-1]))
+    r, t = split(compose_rodrigues(invert_rodrigues(poses_wc[1:]), poses_wc[:-1]))
     ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones((h, w))])
     points = (r @ ray.reshape(3, -1)).reshape(-1, 3, h, w) * depth[:-1, None] + t[:, :, None, None]
     z = np.where(points[:, 2] > 1e-6, points[:, 2], np.inf)
@@ -152,86 +199,81 @@ def _scene(seed: int, number: int, textures: str | None) -> Scene:
 
 
 def make_clip(
-    seed: int,
-    index: int,
-    *,
-    frames: int = 8,
-    height: int = 120,
-    width: int = 160,
-    flow_range: tuple[float, float] = (2.0, 19.0),
-    device: torch.device | str = "cpu",
-    sensor: bool = True,
-    clips_per_scene: int = 2,
-    supersample: int = 1,
-    textures: str | None = None,
+    seed: int, index: int, spec: ClipSpec | None = None, *, device: torch.device | str = "cpu", **options: Any
 ) -> Clip:
-    """Draw clip ``index`` of the endless stream ``seed``: same arguments, same bytes (on one machine).
+    """Clip ``index`` of the endless stream ``seed``.
 
     Args:
-        seed: names the stream; also picks its texture pool.
-        index: which clip.
-        frames, height, width: size of the clip.
-        flow_range: the mean induced flow between neighbouring frames, pixels of this image, is drawn from it
-            log-uniformly (and met within about a tenth).
+        seed: of the stream; also selects its texture pool. Same arguments, same bytes (on one machine).
+        index: of the clip.
+        spec: length, size and difficulty; the defaults if None.
         device: where to render; the returned tensors live there.
-        sensor: False returns clean renderings.
-        clips_per_scene: neighbouring indices that share a scene; more is faster and less varied.
-        supersample: rays per pixel edge for the colours.
-        textures: folder of photographs to paint with; None: those that scikit-image ships.
+        options: single fields of :class:`ClipSpec` that replace those of ``spec``.
+
+    Returns:
+        The clip.
 
     Raises:
-        DvoError: sizes or flow range out of order.
+        DvoError: an unknown option, sizes or flow range out of order, or no camera path that meets the flow range.
+
+    Example:
+        >>> clip = make_clip(0, 7, frames=6, height=120, width=160)
+        >>> clip.images.shape
+        torch.Size([6, 3, 120, 160])
     """
-    if frames < 2 or height < 16 or width < 16:
-        raise DvoError("a clip needs 2 frames or more of 16x16 pixels or more", field="frames, height, width")
-    if not 0 < flow_range[0] <= flow_range[1]:
-        raise DvoError(f"not a range: {flow_range}", field="flow_range", remedy="give low <= high, in pixels")
-    scene = _scene(seed, index // clips_per_scene, textures)
-    rng = np.random.default_rng([seed, 7301, index])
-    target = float(np.exp(rng.uniform(*np.log(flow_range))))
-    rhythm = _rhythm(rng, frames)
-    intrinsics = random_intrinsics(rng, height, width)
-    plan: _Plan | None = None
-    for attempt in range(80):
-        if attempt % 5 == 0:
-            start = find_start(scene, rng)
-        if attempt % 10 == 9:  # perhaps the draw asks too much of this scene
-            target = float(np.exp(rng.uniform(*np.log(flow_range))))
-            intrinsics, rhythm = random_intrinsics(rng, height, width), np.arange(frames, dtype=float)
-        path = random_path(scene, int(rng.integers(2**31)), None if attempt < 50 else "rotation", start=start)
-        plan = _plan(scene, path, rhythm, flow_range, target, intrinsics, (height, width))
-        if plan is not None:
-            break
-    if plan is None:
-        raise DvoError(
-            f"no path in clip {index} meets the flow range {flow_range}", field="flow_range", remedy="ask for less flow"
-        )
+    check_names(options, (option.name for option in fields(ClipSpec)))
+    spec = replace(spec or ClipSpec(), **options)
+    scene = _scene(seed, index // spec.clips_per_scene, spec.textures)
+    rng = np.random.default_rng([seed, salts.CLIP, index])
+    plan, intrinsics = _draw_plan(scene, rng, spec, index)
     poses_wc = plan.path.poses_wc(plan.times)
     rendering = render(
-        scene, poses_wc, intrinsics, height, width, supersample=supersample, device=device, coordinates=False
-    )
+        scene, poses_wc, intrinsics, spec.height, spec.width, quality=Quality(spec.supersample), device=device,
+        coordinates=False,
+    )  # fmt: skip
     images = rendering.images
-    if sensor:
+    if spec.sensor:
         camera = random_sensor(rng)
         flow: torch.Tensor | None = None
         if camera.shutter > 0:
             field, _ = flow_field(rendering.depth.cpu().numpy(), poses_wc, intrinsics)
-            field = np.clip(np.concatenate([field, field[-1:]]), -width / 3, width / 3)
+            field = np.clip(np.concatenate([field, field[-1:]]), -spec.width / 3, spec.width / 3)
             flow = torch.from_numpy(field.astype(np.float32))
         times = plan.times - plan.times[0]
-        # From a stream of its own: what is drawn above stays what it was before there was wear.
-        camera = random_wear(np.random.default_rng([seed, 7302, index]), camera, float(times[-1]))
+        # From a stream of its own, so that the draws above do not depend on wear.
+        camera = random_wear(np.random.default_rng([seed, salts.CLIP_WEAR, index]), camera, float(times[-1]))
         images = expose(images, camera, rng, flow, times)
     scale = float(rendering.depth.median())
-    relative = compose(inverse(poses_wc), poses_wc[:1])  # world := first camera
+    relative = compose_rodrigues(invert_rodrigues(poses_wc), poses_wc[:1])  # world := first camera
     relative[:, :3] /= scale
     relative[0] = [0, 0, 0, 0, 0, 0, 1]
     return Clip(
         images=(images * 255).round_().to(torch.uint8),
         depth=rendering.depth / scale,
         poses_cw=torch.from_numpy(relative.astype(np.float32)).to(device),
-        intrinsics=torch.from_numpy(np.tile(intrinsics, (frames, 1)).astype(np.float32)).to(device),
+        intrinsics=torch.from_numpy(np.tile(intrinsics, (spec.frames, 1)).astype(np.float32)).to(device),
     )
+
+
+def _draw_plan(scene: Scene, rng: np.random.Generator, spec: ClipSpec, index: int) -> tuple[_Plan, Array]:
+    """Path, frame times and intrinsics ``(4,)`` of a clip."""
+    target = float(np.exp(rng.uniform(*np.log(spec.flow_range))))
+    rhythm = _rhythm(rng, spec.frames)
+    intrinsics = random_intrinsics(rng, spec.height, spec.width)
+    for attempt in range(80):
+        if attempt % 5 == 0:
+            start = find_start(scene, rng)
+        if attempt % 10 == 9:  # the target may be out of reach in this scene
+            target = float(np.exp(rng.uniform(*np.log(spec.flow_range))))
+            intrinsics, rhythm = random_intrinsics(rng, spec.height, spec.width), np.arange(spec.frames, dtype=float)
+        path = random_path(scene, int(rng.integers(2**31)), None if attempt < 50 else "rotation", start=start)
+        plan = _plan(scene, path, rhythm, spec.flow_range, target, intrinsics, (spec.height, spec.width))
+        if plan is not None:
+            return plan, intrinsics
+    raise DvoError(
+        f"no path in clip {index} meets the flow range {spec.flow_range}", field="flow_range",
+        remedy="set a lower flow range",
+    )  # fmt: skip
 
 
 def _rhythm(rng: np.random.Generator, frames: int) -> Array:

@@ -13,14 +13,15 @@ import torch
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.poses import NED_FROM_CAMERA, pose_matrices, poses_from_matrices
+from dvo.geometry.poses import NED_FROM_CAMERA, invert_rodrigues, pose_matrices, poses_from_matrices, split
 from dvo.geometry.undistort import needs_undistortion
+from dvo.synth import salts
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.motion.walks import long_path
-from dvo.synth.poses import inverse, split
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.sensors.sensor import random_intrinsics
 from dvo.synth.sequence import SyntheticSequence
+from dvo.synth.specs import MotionSpec, SequenceFormat
 
 Array = np.ndarray
 Layout = Literal["tum", "tartanair"]
@@ -40,33 +41,36 @@ def scene_triangles(scene: Scene) -> tuple[Array, Array, Array]:
 
 
 def mesh_sequence(
-    scene: MeshScene, seed: int, *, frames: int = 100, height: int = 240, width: int = 320, fps: float = 30.0,
-    kind: str | None = None, speed: float = 1.0, name: str = "mesh", device: torch.device | str = "cpu",
+    scene: MeshScene, seed: int, form: SequenceFormat | None = None, motion: MotionSpec | None = None, *,
+    name: str = "mesh", device: torch.device | str = "cpu",
 ) -> SyntheticSequence:  # fmt: skip
-    """Clean frames along a path around a mesh (an orbit) or through it (a hand-held walk).
+    """Sequence of clean frames along a path around a mesh (an orbit) or through it (a hand-held walk).
 
     Args:
+        scene: the mesh.
         seed: draws path and intrinsics; same seed, same bytes.
-        frames, height, width, fps: length and format.
-        kind: kind of path (``dvo.synth.KINDS``), to suit the mesh if None.
-        speed: 1 is a relaxed pace.
+        form: length, size and rate; 100 frames of 320x240 at 30 Hz if None.
+        motion: kind of path (one that suits the mesh if its ``kind`` is None), speed and shake.
         name: of the sequence.
         device: where to render.
 
+    Returns:
+        The sequence, in units of the mesh.
+
     Raises:
-        DvoError: no such kind, sizes out of order, or no room for a camera.
+        DvoError: an unknown kind of path, or no room for a camera.
     """
-    if frames < 1 or height < 16 or width < 16 or fps <= 0:
-        raise DvoError("a sequence needs a frame or more of 16x16 pixels or more and fps > 0", field="frames, fps")
-    rng = np.random.default_rng([seed, 7601])
-    drawn = kind or ("handheld" if scene.space.inside else "orbit")
-    world: Any = scene  # planning asks it for bounds, clearance and depth, as it asks a Scene
-    path = long_path(world, int(rng.integers(2**31)), drawn, frames / fps, speed=speed)
-    fx, fy, cx, cy = random_intrinsics(rng, height, width).tolist()
-    camera = Camera(fx, fy, cx, cy, width, height)
-    times = np.arange(frames) / fps
+    form, motion = form or SequenceFormat(frames=100), motion or MotionSpec()
+    rng = np.random.default_rng([seed, salts.MESH_SEQUENCE])
+    kind = motion.kind or ("handheld" if scene.space.inside else "orbit")
+    world: Any = scene  # a MeshScene has the bounds, clearance and depth of a Scene
+    path_seed = int(rng.integers(2**31))
+    path = long_path(world, path_seed, kind, form.duration, speed=motion.speed, shake=motion.shake)
+    fx, fy, cx, cy = random_intrinsics(rng, form.height, form.width).tolist()
+    camera = Camera(fx, fy, cx, cy, form.width, form.height)
+    times = np.arange(form.frames) / form.fps
     truth = Trajectory(times, path.poses_wc(times))
-    return SyntheticSequence(f"{name}-{drawn}-{seed}", camera, truth, world, path, None, seed, device=device)
+    return SyntheticSequence(f"{name}-{kind}-{seed}", camera, truth, world, path, None, seed, form.supersample, device)
 
 
 def export_sequence(
@@ -194,7 +198,7 @@ def static_flow(first: Array, second: Array, poses_wc: Array, intrinsics: Any) -
     fx, fy, cx, cy = (float(value) for value in intrinsics)
     height, width = first.shape
     y, x = np.mgrid[:height, :width]
-    (r0, t0), (r1, t1) = split(poses_wc[0]), split(inverse(poses_wc[1]))
+    (r0, t0), (r1, t1) = split(poses_wc[0]), split(invert_rodrigues(poses_wc[1]))
     ray = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones(first.shape)], -1)
     near = first[..., None].astype(float) > 0
     points = np.where(near, (ray * first[..., None]) @ r0.T + t0, ray @ r0.T)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import torch
 
+from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth.clip import Clip, make_clip
-from dvo.synth.poses import compose, inverse, split
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 
 Array = np.ndarray
@@ -47,7 +47,7 @@ def flow_colours(flow: Array, largest: float) -> Array:
 def plan_view(poses_cw: Array, size: tuple[int, int]) -> Array:
     """Camera centres and viewing directions from above (x right, z up the picture) -> ``(H, W, 3)`` uint8 RGB."""
     height, width = size
-    poses_wc = inverse(poses_cw)
+    poses_wc = invert_rodrigues(poses_cw)
     centre, forward = poses_wc[:, [0, 2]], split(poses_wc)[0][:, [0, 2], 2]
     extent = max(float(np.ptp(centre, 0).max()), 0.05)
     scale = 0.6 * min(size) / extent
@@ -95,7 +95,7 @@ def sequence_rows(sequence: SyntheticSequence, columns: int = 4) -> Array:
     scale = float(seen.median()) if len(seen) else 1.0
     near = int(np.searchsorted(times, times[0] + 0.1).clip(1, len(sequence) - 1)) if len(sequence) > 1 else 0
     shown = np.unique(np.concatenate([[0, near], np.linspace(0, len(sequence) - 1, 24).round().astype(int)]))
-    relative = compose(inverse(poses_wc[shown]), poses_wc[:1])
+    relative = compose_rodrigues(invert_rodrigues(poses_wc[shown]), poses_wc[:1])
     relative[:, :3] /= scale
     # The frames for the pictures, two poses for the flow, some more for the plan.
     images = torch.cat([(picture.images * 255).round().to(torch.uint8) for picture in pictures]).cpu()

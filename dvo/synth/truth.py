@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvo.synth import salts
 from dvo.synth.render.renderer import Rendering
 from dvo.synth.render.shot import Shot
 from dvo.synth.scenes.bodies import Stage
@@ -121,7 +122,7 @@ def tracks(shot: Shot, times: Array, count: int = 200, *, seed: int = 0, sources
         seed: same seed, same points.
         sources: the points are drawn evenly in as many of the frames, spread over the time.
     """
-    rng = np.random.default_rng([seed, 7601])
+    rng = np.random.default_rng([seed, salts.TRACKS])
     times = np.asarray(times, float)
     frames = np.unique(np.linspace(0, len(times) - 1, min(sources, len(times))).round().astype(int))
     drawn = []

@@ -22,9 +22,10 @@ import torch
 import yaml
 
 from dvo.allocator import reuse_freed_memory
-from dvo.synth import FAMILIES, random_path, random_scene, render
+from dvo.synth import random_path, random_scene, render
 from dvo.synth.clip import make_clip
-from dvo.synth.textures.pool import texture_pool
+from dvo.synth.scenes.families import SHARES
+from dvo.synth.textures.texture import texture_pool
 
 SIZES = ((120, 160), (240, 320), (480, 640))
 RECIPE = Path(__file__).resolve().parents[2] / "configs" / "train" / "small.yaml"
@@ -32,8 +33,8 @@ RECIPE = Path(__file__).resolve().parents[2] / "configs" / "train" / "small.yaml
 
 def frames_per_second(device: torch.device, frames: int) -> list[tuple[str, list[float]]]:
     """For each family (and their mean time, last), frames a second at ``SIZES``."""
-    rows, seconds = [], np.zeros((len(FAMILIES), len(SIZES)))
-    for i, family in enumerate(FAMILIES):
+    rows, seconds = [], np.zeros((len(SHARES), len(SIZES)))
+    for i, family in enumerate(SHARES):
         scene = random_scene(0, family, pool=texture_pool(0))
         poses = random_path(scene, 0, "handheld").scaled(0.3).poses_wc(np.arange(frames) / 20)
         for j, (height, width) in enumerate(SIZES):

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from dvo.errors import DvoError
+from dvo.synth import salts
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.meshes.space import View, free_space
 from dvo.synth.meshes.textures import TextureSet
@@ -135,7 +136,7 @@ def mesh_scene(
 
 def _fallback(seed: int, kind: int) -> Array:
     """A procedural picture without a seam: stains for meshes, a rough one for the ground."""
-    rng = np.random.default_rng([seed, 7501, kind])
+    rng = np.random.default_rng([seed, salts.MESH_TEXTURE, kind])
     picture = PATTERNS["stains" if kind == 0 else "fractal"][0](rng, 512)
     picture = 0.4 * picture + 0.6 * picture.mean(2, keepdims=True)  # muted: a stand-in, and a ground to stand on
     return np.clip(picture * (0.55 / max(float(picture.mean()), 0.1)), 0, 1).astype(np.float32)
@@ -220,7 +221,7 @@ def _picture(image: Any, warnings: list[str]) -> Array:
 
 
 def _light(mesh: Any, vertices: Array, faces: Array, rotate: bool) -> Array:
-    """Light on each corner ``(T, 3)``: ambient, a distant lamp, smooth over bends and hard at creases."""
+    """Light on each corner ``(T, 3)``: ambient, a distant lamp, smooth over needs_undistortion and hard at creases."""
     corners = vertices[faces]
     flat: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)

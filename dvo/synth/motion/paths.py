@@ -6,61 +6,19 @@ motion blur and rolling shutter can be read off the same path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from dvo.errors import DvoError
-from dvo.synth.poses import look_rotation, pose_from, quaternion_to_matrix, se3_exp, so3_exp
+from dvo.geometry.poses import look_rotation, pose_from, quaternion_to_matrix
+from dvo.synth import salts
+from dvo.synth.motion.motion import UP, Path
 from dvo.synth.render.renderer import render_depth
 from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
-UP = np.array([0.0, 0.0, 1.0])
 KINDS = ("handheld", "forward", "sideways", "orbit", "rotation", "drone", "stop_and_go")
-
-
-@dataclass(frozen=True)
-class Path:
-    """One smooth path.
-
-    Attributes:
-        kind: which of ``KINDS``.
-        rotation, position: ``(3, 3)``, ``(3,)`` camera to world at rest.
-        twist: ``(6,)`` body velocity ``[v, omega]``, world units and rad per second.
-        frequency: ``(F,)`` of the shake, rad/s.
-        shake: ``(F, 2, 6)`` sine and cosine amplitudes ``[position (body axes), rotation vector]``.
-        depth: median depth in view at the start.
-        warp: amplitude, rad/s and phase of the time warp; an amplitude near 1 nearly stops.
-        gain: scales the whole motion.
-    """
-
-    kind: str
-    rotation: Array
-    position: Array
-    twist: Array
-    frequency: Array
-    shake: Array
-    depth: float
-    warp: tuple[float, float, float] = (0.0, 1.0, 0.0)
-    gain: float = 1.0
-
-    def scaled(self, gain: float) -> Path:
-        """The same path with its motion scaled by ``gain`` (-1: the other way)."""
-        return replace(self, gain=self.gain * gain)
-
-    def poses_wc(self, times: Array) -> Array:
-        """Camera-to-world poses ``(T, 7)`` float64 at ``times (T,)`` seconds."""
-        times = np.asarray(times, float)
-        amplitude, rate, phase = self.warp
-        warped = times + amplitude / rate * (np.sin(rate * times + phase) - np.sin(phase))
-        turn, move = se3_exp(self.gain * warped[:, None] * self.twist)
-        angle = warped[:, None] * self.frequency
-        wave = np.stack([np.sin(angle), np.cos(angle) - 1], -1)  # zero at time 0
-        shake = self.gain * np.einsum("tfk,fkc->tc", wave, self.shake)
-        rotation = self.rotation @ turn @ so3_exp(shake[:, 3:])
-        position = self.position + (move + (turn @ shake[:, :3, None])[..., 0]) @ self.rotation.T
-        return pose_from(rotation, position)
 
 
 @dataclass(frozen=True)
@@ -129,7 +87,7 @@ def random_path(
     Raises:
         DvoError: no such kind.
     """
-    rng = np.random.default_rng([seed, 7201])
+    rng = np.random.default_rng([seed, salts.PATH])
     vehicle = scene.hints.get("heading") is not None
     odds = [0.1, 0.5, 0.08, 0.02, 0.08, 0.1, 0.12] if vehicle else [0.3, 0.1, 0.14, 0.16, 0.1, 0.1, 0.1]
     drawn = str(rng.choice(KINDS, p=odds))

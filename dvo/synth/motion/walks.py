@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from dvo.errors import DvoError
-from dvo.synth.motion.paths import KINDS, UP, find_start
-from dvo.synth.poses import look_rotation, pose_from, so3_exp
+from dvo.synth import salts
+from dvo.synth.motion.motion import SplinePath
+from dvo.synth.motion.paths import KINDS, find_start
 from dvo.synth.render.renderer import render_depth
 from dvo.synth.scenes.scene import Scene
 
@@ -16,46 +15,6 @@ Array = np.ndarray
 # What long sequences add to the kinds of clips: a circuit that comes back, a way that never turns, a hasty hand.
 LONG_KINDS = tuple(dict.fromkeys((*KINDS, "loop", "straight", "fast")))
 TURNS = 1.4  # how often a loop is walked round
-
-
-@dataclass(frozen=True)
-class SplinePath:
-    """A long path: uniform cubic B-spline through position, yaw, pitch and roll, plus shake.
-
-    Attributes:
-        kind: which of ``LONG_KINDS``.
-        control: ``(K, 6)`` x, y, z, yaw, pitch, roll (rad; yaw 0 looks along y, pitch up is positive).
-        interval: seconds between control points.
-        frequency, shake: as in :class:`Path`; added in body axes.
-    """
-
-    kind: str
-    control: Array
-    interval: float
-    frequency: Array
-    shake: Array
-
-    @property
-    def duration(self) -> float:
-        """Seconds that the control points cover."""
-        return (len(self.control) - 3) * self.interval
-
-    def poses_wc(self, times: Array) -> Array:
-        """Camera-to-world poses ``(T, 7)`` float64 at ``times (T,)`` seconds in [0, duration]."""
-        times = np.asarray(times, float)
-        # A little before 0 the first piece goes on: a shutter opens before the time of its frame.
-        place = np.clip(times / self.interval, -0.2, len(self.control) - 3 - 1e-9)
-        index = np.maximum(np.floor(place), 0).astype(int)
-        s = place - index
-        weight = np.stack([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3], -1) / 6
-        state = (weight[..., None] * self.control[index[:, None] + np.arange(4)]).sum(1)
-        yaw, pitch, roll = state[:, 3:].T
-        forward = np.stack([-np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], -1)
-        rotation = np.stack([look_rotation(f, UP, r) for f, r in zip(forward, roll, strict=True)])
-        angle = times[:, None] * self.frequency
-        shake = np.einsum("tfk,fkc->tc", np.stack([np.sin(angle), np.cos(angle) - 1], -1), self.shake)
-        position = state[:, :3] + (rotation @ shake[:, :3, None])[..., 0]
-        return pose_from(rotation @ so3_exp(shake[:, 3:]), position)
 
 
 def _yaw_towards(direction: Array) -> float:
@@ -84,7 +43,7 @@ def long_path(
     """
     if kind not in LONG_KINDS:
         raise DvoError(f"no path kind {kind!r}", field="kind", remedy=f"choose one of {', '.join(LONG_KINDS)}")
-    rng = np.random.default_rng([seed, 7202])
+    rng = np.random.default_rng([seed, salts.LONG_PATH])
     best: tuple[float, SplinePath] | None = None
     for attempt in range(24):
         pace = speed * 0.85 ** (attempt // 4)

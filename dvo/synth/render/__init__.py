@@ -1,0 +1,1 @@
+"""Rendering of scenes and meshes with exact ground truth: frames, lenses, shutters. Begin with ``renderer.py``."""

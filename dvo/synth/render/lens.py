@@ -1,4 +1,4 @@
-"""Pictures through a lens that bends straight lines: exact depth, surfaces and texture coordinates, resampled colours.
+"""Pictures through a lens that needs_undistortion straight lines: exact depth, surfaces and texture coordinates, resampled colours.
 
 A pinhole picture, the plate, covers all that the lens sees. Where the four plate pixels around the place of a lens
 pixel show one surface, that surface's linear functions are evaluated at the place itself; the other pixels, those along
@@ -19,6 +19,7 @@ from dvo.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
 from dvo.geometry.undistort import distort, in_range, needs_undistortion, undistort
 from dvo.synth.meshes.mesh import MeshScene
+from dvo.synth.render.quality import STANDARD, Quality
 from dvo.synth.render.renderer import Rendering, cast, render, sight, trace
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import Scene
@@ -116,8 +117,8 @@ def random_lens(rng: np.random.Generator, camera: Camera, model: DistortionModel
 
 
 def render_lens(
-    scene: Scene | Stage, poses_wc: Array, camera: Camera, *, times: Array | None = None, supersample: int = 1,
-    device: torch.device | str = "cpu", taps: int = 2, coordinates: bool = True,
+    scene: Scene | Stage, poses_wc: Array, camera: Camera, *, times: Array | None = None, quality: Quality = STANDARD,
+    device: torch.device | str = "cpu", coordinates: bool = True,
 ) -> Rendering:  # fmt: skip
     """Render N frames of a camera with distortion.
 
@@ -125,15 +126,15 @@ def render_lens(
         scene: what to render.
         poses_wc: ``(N, 7)`` camera to world.
         camera: with its distortion.
-        times, supersample, device, taps, coordinates: as for :func:`dvo.synth.render.renderer.render`; at least 2 x 2
-            places a pixel are read for the colours.
+        times, quality, device, coordinates: as for :func:`dvo.synth.render.renderer.render`; at least 2 x 2 samples
+            are taken of each pixel for the colours.
 
     Raises:
         DvoError: a mesh (its triangles are too small for this), or a lens that no plane can hold.
     """
     if isinstance(scene, MeshScene):
         raise DvoError("meshes are not rendered through a lens", field="camera", remedy="give a camera without model")
-    parts = max(2, supersample)  # one place a pixel would let fine textures shimmer where the lens compresses
+    parts = max(2, quality.supersample)  # one place a pixel would let fine textures shimmer where the lens compresses
     plate = plate_of(camera, parts)
     height, width = plate.size
     scale = np.array([parts, parts, parts, parts])
@@ -146,8 +147,9 @@ def render_lens(
         one = None if times is None else np.asarray(times)[n : n + 1]
         pose = np.asarray(poses_wc, float)[n : n + 1]
         sharp = render(
-            scene, pose, fine_k, height * parts, width * parts, device=device, taps=taps, coordinates=False, times=one
-        )
+            scene, pose, fine_k, height * parts, width * parts, quality=Quality(taps=quality.taps), device=device,
+            coordinates=False, times=one,
+        )  # fmt: skip
         read = torch.nn.functional.grid_sample(sharp.images, plate.fine.to(device), align_corners=False)
         images[n] = torch.nn.functional.avg_pool2d(read, parts)[0]
         z, name, uv = _exact(scene, pose, plate, one, device)

@@ -8,19 +8,21 @@ wins. Depth, identity and surface coordinates are exact; nothing is interpolated
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dvo.errors import DvoError
-from dvo.synth.meshes.mesh import MeshScene, mesh_depth, render_mesh, trace_mesh
+from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.antialias import smooth_outlines
-from dvo.synth.render.view import SLACK, View, look
+from dvo.synth.render.meshes import mesh_depth, render_mesh, trace_mesh
+from dvo.synth.render.quality import STANDARD, Quality
+from dvo.synth.render.view import SLACK, View, look, look_at_stage
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import CELL, Scene
-from dvo.synth.textures.pool import sample
+from dvo.synth.textures.texture import sample
 
 PIECE = 9600  # pixels shaded at once on a CPU
 Array = np.ndarray
@@ -149,7 +151,7 @@ def sight(
     when = np.asarray(times, np.float64) if times is not None else np.zeros(0)
     if when.shape != (len(poses_wc),):
         raise DvoError("a scene with moving bodies needs a time for every pose", field="times")
-    return scene.surfaces, scene.look(poses_wc, intrinsics, size, when)
+    return scene.surfaces, look_at_stage(scene, poses_wc, intrinsics, size, when)
 
 
 def render_depth(
@@ -195,58 +197,54 @@ def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:
 
 
 def render(
-    scene: Scene | Stage | MeshScene,
-    poses_wc: object,
-    intrinsics: object,
-    height: int,
-    width: int,
-    *,
-    supersample: int = 1,
-    device: torch.device | str = "cpu",
-    taps: int = 2,
-    antialias: bool = True,
-    coordinates: bool = True,
-    times: object = None,
-) -> Rendering:
+    scene: Scene | Stage | MeshScene, poses_wc: object, intrinsics: object, height: int, width: int, *,
+    quality: Quality = STANDARD, device: torch.device | str = "cpu", coordinates: bool = True, times: object = None,
+) -> Rendering:  # fmt: skip
     """Render N frames.
 
     Args:
-        scene: what to render; a :class:`Stage` has bodies that move; of a mesh, ``surface`` is the triangle and ``uv``
-            the barycentric weights of its second and third corner.
+        scene: a static scene, a :class:`Stage` with moving bodies, or a mesh (``surface`` is then the triangle and
+            ``uv`` the barycentric weights of its second and third corner).
         poses_wc: ``(N, 7)`` camera to world, tensor or array.
         intrinsics: ``(N, 4)`` or ``(4,)`` fx fy cx cy in pixels of the ``height`` x ``width`` image.
-        height, width: image size in pixels.
-        supersample: rays per pixel edge for the colours (depth, surface and uv are always those of pixel centres).
+        height, width: image size, pixels.
+        quality: rays and texture samples per pixel; depth, surface and uv do not depend on it.
         device: where to render.
-        taps: texture samples along the longer axis of a pixel's footprint (anisotropic filter).
-        antialias: smooth outlines by coverage (with one ray a pixel; more rays smooth by themselves).
         coordinates: fill ``uv`` too; without, it is empty ``(N, 0, 0, 2)``.
-        times: ``(N,)`` seconds, for the places of moving bodies.
+        times: ``(N,)`` seconds, for the poses of moving bodies.
+
+    Returns:
+        Images, depth, surfaces and texture coordinates.
 
     Raises:
         DvoError: poses or intrinsics of the wrong shape or not finite, or bodies without times.
+
+    Example:
+        >>> scene = random_scene(0, "room")
+        >>> pose_wc = random_path(scene, 0).poses_wc([0.0])
+        >>> rendering = render(scene, pose_wc, [160.0, 160.0, 79.5, 59.5], 120, 160)
+        >>> rendering.images.shape, rendering.depth.shape
+        (torch.Size([1, 3, 120, 160]), torch.Size([1, 120, 160]))
     """
     poses, k = _cameras(poses_wc, intrinsics)
     if isinstance(scene, MeshScene):
-        rays = max(supersample, 2 if antialias else 1)
-        return Rendering(
-            *render_mesh(
-                scene, poses, k, height, width, supersample=rays, device=device, taps=taps, coordinates=coordinates
-            )
-        )
+        rays = max(quality.supersample, 2 if quality.antialias else 1)
+        fine = replace(quality, supersample=rays)
+        parts = render_mesh(scene, poses, k, height, width, quality=fine, device=device, coordinates=coordinates)
+        return Rendering(*parts)
     painted, view = sight(scene, poses, k, (height, width), times)
     nearest, local, functions = cast(view, height, width, device)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
-    if supersample == 1:
-        images = _colours(painted, view, local, taps)
-        if antialias:
+    if quality.supersample == 1:
+        images = _colours(painted, view, local, quality.taps)
+        if quality.antialias:
             smooth_outlines(images, local, functions, SLACK)
     else:
-        m = supersample
-        fine = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
-        _, fine_view = sight(scene, poses, fine, (height * m, width * m), times)
+        m = quality.supersample
+        fine_k = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
+        _, fine_view = sight(scene, poses, fine_k, (height * m, width * m), times)
         _, fine_local, _ = cast(fine_view, height * m, width * m, device)
-        images = torch.nn.functional.avg_pool2d(_colours(painted, fine_view, fine_local, taps), m)
+        images = torch.nn.functional.avg_pool2d(_colours(painted, fine_view, fine_local, quality.taps), m)
     uv = coordinates_of(view, local, depth) if coordinates else torch.zeros(len(poses), 0, 0, 2, device=device)
     return Rendering(images, depth, named(view, local), uv)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dvo.errors import DvoError
 from dvo.synth.render.antialias import smooth_outlines
+from dvo.synth.render.quality import STANDARD, Quality
 from dvo.synth.render.renderer import PIECE, Rendering, cast, coordinates_of, functions_of, named, shade, sight
 from dvo.synth.render.view import SLACK, View
 from dvo.synth.scenes.bodies import Stage
@@ -31,8 +32,7 @@ def row_offsets(rows: Array, height: int, readout: float) -> Array:
 
 def render_rows(
     scene: Scene | Stage, poses_wc: Array, intrinsics: Array, width: int, *, times: Array | None = None,
-    supersample: int = 1, device: torch.device | str = "cpu", taps: int = 2, antialias: bool = True,
-    coordinates: bool = True,
+    quality: Quality = STANDARD, device: torch.device | str = "cpu", coordinates: bool = True,
 ) -> Rendering:  # fmt: skip
     """Render one frame whose rows have poses of their own.
 
@@ -42,7 +42,7 @@ def render_rows(
         intrinsics: ``(4,)`` fx fy cx cy in pixels of the ``H`` x ``width`` image.
         width: pixels.
         times: ``(H,)`` seconds, for moving bodies.
-        supersample, device, taps, antialias, coordinates: as for :func:`dvo.synth.render.renderer.render`.
+        quality, device, coordinates: as for :func:`dvo.synth.render.renderer.render`.
 
     Returns:
         A batch of one frame. Depth is measured along the optical axis that the row's camera had.
@@ -56,17 +56,17 @@ def render_rows(
     painted, view = _look_rows(scene, poses_wc, np.asarray(intrinsics, float), width, times)
     nearest, local, functions = cast(view, 1, width, device)  # (H, 1, W)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
-    if supersample == 1:
-        images = _colours(painted, view, local[:, 0], taps)
-        if antialias:
+    if quality.supersample == 1:
+        images = _colours(painted, view, local[:, 0], quality.taps)
+        if quality.antialias:
             smooth_outlines(images, local.view(1, height, width), functions[None], SLACK, by_row=True)
     else:
-        m = supersample
+        m = quality.supersample
         fine = intrinsics * [m, m, m, m] + np.array([0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5])
         often = None if times is None else np.repeat(times, m)
         _, fine_view = _look_rows(scene, np.repeat(poses_wc, m, 0), fine, width * m, often)
         _, fine_local, _ = cast(fine_view, 1, width * m, device)
-        images = torch.nn.functional.avg_pool2d(_colours(painted, fine_view, fine_local[:, 0], taps), m)
+        images = torch.nn.functional.avg_pool2d(_colours(painted, fine_view, fine_local[:, 0], quality.taps), m)
     uv = torch.zeros(1, 0, 0, 2, device=device)
     if coordinates:
         uv = coordinates_of(view, local, depth).view(1, height, width, 2)

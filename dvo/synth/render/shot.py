@@ -15,12 +15,14 @@ import torch
 
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.geometry.poses import compose_rodrigues, pose_from, quaternion_to_matrix, split
 from dvo.geometry.undistort import needs_undistortion
-from dvo.synth.poses import compose, pose_from, quaternion_to_matrix, split
+from dvo.synth.protocols import Motion
 from dvo.synth.render.lens import bent, plate_of, render_lens, straight
+from dvo.synth.render.quality import Quality
 from dvo.synth.render.renderer import Rendering, render, trace
 from dvo.synth.render.rolling import render_rows, row_offsets
-from dvo.synth.scenes.bodies import Motion, Stage
+from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
@@ -37,7 +39,7 @@ class Offset:
     def poses_wc(self, times: Array) -> Array:
         """Poses ``(T, 7)`` at ``times (T,)``."""
         poses = self.motion.poses_wc(times)
-        return compose(poses, np.broadcast_to(self.mount, poses.shape))
+        return compose_rodrigues(poses, np.broadcast_to(self.mount, poses.shape))
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class Shot:
             poses = self.path.poses_wc(when)
             return render_rows(
                 self.scene, poses, self.camera.intrinsics, self.camera.width, times=when,
-                supersample=self.supersample, device=self.device,
+                quality=Quality(self.supersample), device=self.device,
             )  # fmt: skip
         when = np.array([time])
         pose = self.path.poses_wc(when) if pose_wc is None else pose_wc
@@ -109,11 +111,11 @@ class Shot:
         """Sharp frames ``(N, ...)`` with a global shutter."""
         if needs_undistortion(self.camera):
             return render_lens(
-                self.scene, poses_wc, self.camera, times=when, supersample=supersample, device=self.device,
+                self.scene, poses_wc, self.camera, times=when, quality=Quality(supersample), device=self.device,
                 coordinates=coordinates,
             )  # fmt: skip
         return render(
-            self.scene, poses_wc, self.camera.intrinsics, *self._size, times=when, supersample=supersample,
+            self.scene, poses_wc, self.camera.intrinsics, *self._size, times=when, quality=Quality(supersample),
             device=self.device, coordinates=coordinates,
         )  # fmt: skip
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from dvo.synth.poses import split
+from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
+from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import Scene
 
 NEAR = 1e-3  # metres; cameras keep farther away than this from everything
@@ -79,3 +80,16 @@ def look(scene: Scene, poses_wc: Array, intrinsics: Array, size: tuple[int, int]
     high = [np.where(usable, c, -1e9).max(-1) for c in (x, y)]
     window = np.stack([*low, *high], -1)
     return View(index, basis, scene.edges[index] @ basis, seen & usable.any(-1), window)
+
+
+def look_at_stage(stage: Stage, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None, times: Array) -> View:
+    """As :func:`look`; ``times (N,)`` of the cameras say where the bodies are."""
+    views = [look(stage.scene, poses_wc, intrinsics, size)]
+    for body, start in zip(stage.bodies, stage.starts[1:-1], strict=True):
+        seen_from = compose_rodrigues(invert_rodrigues(body.motion.poses_wc(times)), poses_wc)
+        view = look(body.scene, seen_from, intrinsics, size)
+        views.append(replace(view, index=view.index + start))
+    if len(views) == 1:
+        return views[0]
+    joined = {f.name: np.concatenate([getattr(v, f.name) for v in views], int(f.name != "index")) for f in fields(View)}
+    return View(**joined)

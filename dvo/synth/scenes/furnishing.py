@@ -1,10 +1,10 @@
-"""What fills a scene: objects' paint, pictures on walls, furniture, free-floating things."""
+"""Furnishing shared by families: materials of objects, pictures on walls, furniture, free-floating objects."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dvo.synth.poses import so3_exp
+from dvo.geometry.poses import so3_exp
 from dvo.synth.scenes.scene import Material, SceneBuilder
 
 Array = np.ndarray
@@ -14,23 +14,51 @@ OBJECTS = ("busy", "photo", "poster", "panel", "cloth", "floor", "stone", "wall"
 
 
 def yaw(angle: float) -> Array:
-    """Rotation ``(3, 3)`` about the vertical."""
+    """Rotation about the vertical.
+
+    Args:
+        angle: rad.
+
+    Returns:
+        ``(3, 3)``.
+    """
     return so3_exp(np.array([0.0, 0.0, angle]))
 
 
 def any_rotation(rng: np.random.Generator) -> Array:
+    """Random rotation.
+
+    Args:
+        rng: draws it.
+
+    Returns:
+        ``(3, 3)``.
+    """
     return so3_exp(rng.normal(size=3) * 1.5)
 
 
 def paint_object(b: SceneBuilder, metres: tuple[float, float], bland: float) -> Material:
-    """Material of an object; with chance ``bland`` a nearly textureless one."""
+    """Draw the material of an object.
+
+    Args:
+        b: supplies textures and random numbers.
+        metres: range of the width of one texture repeat.
+        bland: probability of a nearly textureless material.
+    """
     if b.rng.random() < bland:
         return b.material("plain", metres=metres, contrast=(0.5, 1.5))
     return b.material(*OBJECTS, metres=metres) if b.rng.random() < 0.8 else b.material(metres=metres)
 
 
 def decorate(b: SceneBuilder, centre: Array, half: Array, count: int, bland: float) -> None:
-    """Pictures, posters, doors and shelves on the four walls of a box room, a little in front of the wall."""
+    """Add pictures, posters, doors and shelves to the four walls of a box room, slightly in front of the walls.
+
+    Args:
+        b: collects the surfaces.
+        centre, half: ``(3,)`` centre and half sizes of the room, metres.
+        count: number of objects.
+        bland: probability of a nearly textureless material.
+    """
     rng = b.rng
     for _ in range(count):
         axis, sign = int(rng.integers(0, 2)), float(rng.choice([-1, 1]))
@@ -47,7 +75,14 @@ def decorate(b: SceneBuilder, centre: Array, half: Array, count: int, bland: flo
 
 
 def furnish(b: SceneBuilder, centre: Array, half: Array, count: int, bland: float) -> None:
-    """Boxes standing on the floor, some stacked, columns, tables with legs left out."""
+    """Add furniture: boxes on the floor, some with smaller ones on top, and columns.
+
+    Args:
+        b: collects the surfaces.
+        centre, half: ``(3,)`` centre and half sizes of the room, metres.
+        count: number of objects.
+        bland: probability of a nearly textureless material.
+    """
     rng = b.rng
     floor = centre[2] - half[2]
     for _ in range(count):
@@ -74,7 +109,15 @@ def furnish(b: SceneBuilder, centre: Array, half: Array, count: int, bland: floa
 
 
 def scatter(b: SceneBuilder, low: Array, high: Array, count: int, size: float, *, quads: float = 0.4) -> None:
-    """Free-floating boxes and tilted boards in the box ``low .. high``."""
+    """Add free-floating boxes and tilted boards.
+
+    Args:
+        b: collects the surfaces.
+        low, high: ``(3,)`` corners of the box that contains their centres.
+        count: number of objects.
+        size: median half size, metres.
+        quads: probability of a board instead of a box.
+    """
     rng = b.rng
     for _ in range(count):
         spot, rotation = rng.uniform(low, high), any_rotation(rng)

@@ -1,4 +1,4 @@
-"""Families that training never draws: hall, courtyard, gallery. Only suites that evaluate ask for them."""
+"""Held-out families, never drawn for training: hall, courtyard, gallery. Evaluation suites request them by name."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dvo.synth.scenes.furnishing import UP, furnish, yaw
 from dvo.synth.scenes.lighting import bake
 from dvo.synth.scenes.scene import Material, Scene, SceneBuilder
 from dvo.synth.scenes.vegetation import bush, frustum, sky, tree
-from dvo.synth.textures.pool import TexturePool
+from dvo.synth.textures.texture import TexturePool
 
 Array = np.ndarray
 
 
 def _column(b: SceneBuilder, foot: Array, radius: float, height: float, paint: Material) -> None:
-    """A round shaft between a square base and a square capital."""
+    """Add a round shaft between a square base and a square capital."""
     block = np.array([1.4 * radius, 1.4 * radius, 0.25])
     b.box(foot + UP * 0.25, block, np.eye(3), [paint], faces="xXyYZ")
-    frustum(b, foot + UP * 0.5, radius, 0.85 * radius, height - 0.9, 8, paint, lid=False)
+    frustum(b, foot + UP * 0.5, (radius, 0.85 * radius), height - 0.9, 8, paint, lid=False)
     b.box(foot + UP * (height - 0.2), block * [1, 1, 0.8], np.eye(3), [paint], faces="xXyYz")
 
 
 def _stairs(b: SceneBuilder, low: Array, high: Array, width: float, steps: int, paint: Material) -> None:
-    """Solid steps that climb along y from the point ``low`` to ``high`` (middle of their width)."""
+    """Add solid steps that climb along y from the point ``low`` to ``high`` (middle of their width)."""
     rise, run = (high[2] - low[2]) / steps, (high[1] - low[1]) / steps
     for i in range(steps):
         top = low[2] + (i + 1) * rise
@@ -32,7 +32,15 @@ def _stairs(b: SceneBuilder, low: Array, high: Array, width: float, steps: int, 
 
 
 def hall(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """A large interior with rows of columns, a mezzanine with its stairs, high windows and banners."""
+    """Large interior with rows of columns, a mezzanine with its stairs, high windows and banners.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     half = np.array([rng.uniform(7, 12), rng.uniform(10, 18), rng.uniform(2.6, 4.2)])
     centre = np.array([0, 0, half[2]])
@@ -86,7 +94,7 @@ def hall(rng: np.random.Generator, pool: TexturePool) -> Scene:
 
 
 def _facade(b: SceneBuilder, centre: Array, inward: Array, width: float, height: float) -> None:
-    """One side of a yard: storeys of windows, a door, awnings or an arcade of pillars, an overhanging roof."""
+    """Add one side of a yard: storeys of windows, a door, awnings or an arcade of pillars, an overhanging roof."""
     rng = b.rng
     along = np.cross(UP, inward)
     front = b.material("facade", metres=(3.5, 6))
@@ -103,7 +111,7 @@ def _facade(b: SceneBuilder, centre: Array, inward: Array, width: float, height:
         stone = b.material("stone", "marble", metres=(1, 2))
         out, turned = 1.8, np.stack([along, -inward, UP], 1)
         for t in np.arange(-width / 2 + 1.2, width / 2 - 0.6, rng.uniform(2.2, 3.4)):
-            frustum(b, centre + inward * out + along * t, 0.22, 0.18, 2.7, 6, stone, lid=False)
+            frustum(b, centre + inward * out + along * t, (0.22, 0.18), 2.7, 6, stone, lid=False)
         b.box(centre + inward * out / 2 + UP * 2.85, [width / 2, out / 2 + 0.25, 0.15], turned, [stone])
     else:
         for _ in range(int(rng.integers(1, 4))):
@@ -114,7 +122,15 @@ def _facade(b: SceneBuilder, centre: Array, inward: Array, width: float, height:
 
 
 def courtyard(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """A paved yard between four facades, with a fountain, trees, benches and lamp posts under a sky."""
+    """Paved yard between four facades, with a fountain, trees, benches and lamp posts under a sky.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     half = rng.uniform(8, 14, 2)
     above = sky(b, 400.0)
@@ -136,11 +152,11 @@ def courtyard(rng: np.random.Generator, pool: TexturePool) -> Scene:
                 bush(b, spot + [*(rng.uniform(-1, 1, 2) * half * 0.13), 0.05], rng.uniform(0.3, 0.6))
     stone, water = b.material("marble", "stone", metres=(0.8, 2)), b.material("sky", metres=(1, 3), bright=0.8)
     middle, radius = np.append(rng.uniform(-0.15, 0.15, 2) * half, 0.0), rng.uniform(1.3, 2.2)
-    frustum(b, middle, radius, radius, 0.5, 10, stone, lid=False)  # basin, water, pillar, bowl, jet
+    frustum(b, middle, (radius, radius), 0.5, 10, stone, lid=False)  # basin, water, pillar, bowl, jet
     b.rectangle(middle + UP * 0.42, UP, [0, 1, 0], 1.9 * radius, 1.9 * radius, water)
-    frustum(b, middle + UP * 0.4, 0.28, 0.18, 0.9, 6, stone, lid=False)
-    frustum(b, middle + UP * 1.3, 0.2, 0.6 * radius, 0.3, 8, stone)
-    frustum(b, middle + UP * 1.6, 0.15, 0.08, rng.uniform(0.5, 1.0), 6, stone)
+    frustum(b, middle + UP * 0.4, (0.28, 0.18), 0.9, 6, stone, lid=False)
+    frustum(b, middle + UP * 1.3, (0.2, 0.6 * radius), 0.3, 8, stone)
+    frustum(b, middle + UP * 1.6, (0.15, 0.08), rng.uniform(0.5, 1.0), 6, stone)
     iron = b.material("plain", "panel", metres=(0.4, 1), bright=0.6)
     wood = b.material("floor", metres=(0.4, 1))
     for _ in range(int(rng.integers(3, 7))):  # benches
@@ -153,7 +169,7 @@ def courtyard(rng: np.random.Generator, pool: TexturePool) -> Scene:
     for sx in (-0.25, 0.25):
         for sy in (-0.8, 0.8):
             foot = np.array([sx * half[0], sy * half[1], 0.0])
-            frustum(b, foot, 0.07, 0.05, 3.4, 5, iron)
+            frustum(b, foot, (0.07, 0.05), 3.4, 5, iron)
             b.box(foot + UP * 3.55, [0.16, 0.16, 0.2], np.eye(3), [b.material("plain", bright=1.8)])
     inner = np.array([[-0.86, -0.86], [0.86, 0.86]]) * half
     bounds = np.concatenate([inner, [[0.4], [3.2]]], 1)
@@ -164,7 +180,15 @@ def courtyard(rng: np.random.Generator, pool: TexturePool) -> Scene:
 
 
 def gallery(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """Rooms in a row, joined by doorways, hung with pictures; pedestals and benches stand about."""
+    """Row of rooms joined by doorways, with pictures on the walls, pedestals and benches.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     rooms = int(rng.integers(2, 5))
     wide, height = rng.uniform(2.4, 4), rng.uniform(3, 4.2)
@@ -189,7 +213,7 @@ def gallery(rng: np.random.Generator, pool: TexturePool) -> Scene:
             b.box([edge, y, top / 2], [0.06, 0.13, top / 2], np.eye(3), [trim], faces="xXyY")
 
     def hang(spot: Array, normal: Array, width: float, tall: float) -> None:
-        """A framed picture."""
+        """Add a framed picture."""
         b.rectangle(spot + 0.02 * normal, normal, UP, width + 0.12, tall + 0.12, trim)
         picture = b.material("painting", "painting", "photo", "poster", metres=(2, 3), contrast=(0.9, 1.2))
         b.rectangle(spot + 0.04 * normal, normal, UP, width, tall, picture)
@@ -216,8 +240,8 @@ def gallery(rng: np.random.Generator, pool: TexturePool) -> Scene:
             b.box(foot + UP * tall / 2, [0.2, 0.2, tall / 2], yaw(rng.uniform(0, 1)), [trim], faces="xXyYZ")
             stone = b.material("marble", "stone", "busy", metres=(0.3, 0.8))
             narrow = rng.uniform(0.08, 0.16)
-            frustum(b, foot + UP * tall, narrow, 1.4 * narrow, 0.25, 7, stone)
-            frustum(b, foot + UP * (tall + 0.25), 0.9 * narrow, 0.4 * narrow, rng.uniform(0.15, 0.4), 7, stone)
+            frustum(b, foot + UP * tall, (narrow, 1.4 * narrow), 0.25, 7, stone)
+            frustum(b, foot + UP * (tall + 0.25), (0.9 * narrow, 0.4 * narrow), rng.uniform(0.15, 0.4), 7, stone)
         if rng.random() < 0.6:
             spot = np.array([rng.uniform(-0.3, 0.3) * wide, (low + high) / 2, 0.4])
             seat = [b.material("cloth", "floor", metres=(0.5, 1))]

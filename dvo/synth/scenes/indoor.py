@@ -7,11 +7,19 @@ import numpy as np
 from dvo.synth.scenes.furnishing import UP, WALLS, decorate, furnish, paint_object, scatter, yaw
 from dvo.synth.scenes.lighting import bake
 from dvo.synth.scenes.scene import Scene, SceneBuilder
-from dvo.synth.textures.pool import TexturePool
+from dvo.synth.textures.texture import TexturePool
 
 
 def room(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """A furnished room."""
+    """Furnished room.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     half = np.array([rng.uniform(1.5, 5), rng.uniform(1.5, 5), rng.uniform(1.15, 1.9)])
     centre = np.array([0, 0, half[2]])
@@ -54,7 +62,15 @@ def room(rng: np.random.Generator, pool: TexturePool) -> Scene:
 
 
 def corridor(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """A long hall with doors, pillars and boards; often poor in texture."""
+    """Long corridor with doors, pillars and boards; often poor in texture.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     half = np.array([rng.uniform(0.9, 2.5), rng.uniform(7, 20), rng.uniform(1.15, 2)])
     centre = np.array([0, 0, half[2]])
@@ -111,7 +127,15 @@ def corridor(rng: np.random.Generator, pool: TexturePool) -> Scene:
 
 
 def tabletop(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """Objects on a table, seen from near, in a room."""
+    """Objects on a table in a room, seen from a short distance.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     half = np.array([rng.uniform(1.5, 3), rng.uniform(1.5, 3), 1.3])
     centre = np.array([0, 0, half[2]])
@@ -152,7 +176,15 @@ def tabletop(rng: np.random.Generator, pool: TexturePool) -> Scene:
 
 
 def planes(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """One or a few large planes at a distance, with little in front: nearly degenerate geometry."""
+    """One or a few large planes at a distance, with little in front: nearly degenerate geometry.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     size = float(np.exp(rng.uniform(np.log(1), np.log(10))))
     half = np.array([3, 3, 2]) * size

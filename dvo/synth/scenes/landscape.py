@@ -1,4 +1,4 @@
-"""Families without houses in rows: hilly terrain and forest."""
+"""Landscape families: hilly terrain and forest."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dvo.synth.scenes.furnishing import UP, WALLS, any_rotation, paint_object, s
 from dvo.synth.scenes.lighting import bake
 from dvo.synth.scenes.scene import Material, Scene, SceneBuilder
 from dvo.synth.scenes.vegetation import bush, conifer, frustum, rock, sky, tree
-from dvo.synth.textures.pool import TexturePool
+from dvo.synth.textures.texture import TexturePool
 
 Array = np.ndarray
 GRID = 13  # lines of the height field each way
@@ -18,7 +18,7 @@ GRID = 13  # lines of the height field each way
 
 @dataclass
 class Hills:
-    """A smooth height over the plane: waves of several lengths, higher away from the middle.
+    """Smooth height over the plane: waves of several lengths, higher away from the middle.
 
     Attributes:
         wave: ``(K, 2)`` rad per metre; phase, amplitude: ``(K,)``.
@@ -31,13 +31,27 @@ class Hills:
     size: float
 
     def height(self, xy: Array) -> Array:
-        """``(..., 2)`` -> ``(...)`` metres."""
+        """Height of the ground.
+
+        Args:
+            xy: ``(..., 2)`` metres.
+
+        Returns:
+            ``(...)`` metres.
+        """
         waves = (self.amplitude * np.sin(xy @ self.wave.T + self.phase)).sum(-1)
         away = np.linalg.norm(xy, axis=-1) / self.size
         return waves * (0.5 + 0.5 * away) + 0.12 * self.size * np.maximum(away - 0.8, 0) ** 1.3
 
     def normal(self, xy: Array) -> Array:
-        """``(..., 3)`` unit normals, by differences."""
+        """Unit normals of the ground, by finite differences.
+
+        Args:
+            xy: ``(..., 2)`` metres.
+
+        Returns:
+            ``(..., 3)``.
+        """
         step = 0.02 * self.size
         dx, dy = ((self.height(xy + shift) - self.height(xy - shift)) / (2 * step) for shift in ([step, 0], [0, step]))
         normal = np.stack([-dx, -dy, np.ones_like(dx)], -1)
@@ -45,6 +59,7 @@ class Hills:
 
 
 def _hills(rng: np.random.Generator, size: float) -> Hills:
+    """Draw hills of a given size (metres)."""
     length = size * np.array([2.2, 1.6, 0.9, 0.7, 0.5])
     turn = rng.uniform(0, 2 * np.pi, 5)
     wave = 2 * np.pi / length[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
@@ -52,7 +67,7 @@ def _hills(rng: np.random.Generator, size: float) -> Hills:
 
 
 def _height_field(b: SceneBuilder, hills: Hills, lines: Array, paints: list[Material]) -> list[int]:
-    """Triangles over the grid ``lines`` x ``lines`` and solids below it; returns their rows."""
+    """Add triangles over the grid ``lines`` x ``lines`` and solids below it; returns the rows of the triangles."""
     first = len(b.rows)
     shift = b.rng.uniform(0, 500, 2)
     x, y = np.meshgrid(lines, lines, indexing="ij")
@@ -73,7 +88,7 @@ def _height_field(b: SceneBuilder, hills: Hills, lines: Array, paints: list[Mate
 
 
 def _house(b: SceneBuilder, spot: Array, size: float) -> None:
-    """Four walls and a gable roof that overhangs."""
+    """Add four walls and an overhanging gable roof."""
     rng = b.rng
     half = size * np.array([rng.uniform(0.8, 1.3), rng.uniform(1.0, 1.8), rng.uniform(0.6, 1.0)])
     turned = yaw(rng.uniform(0, np.pi))
@@ -93,7 +108,15 @@ def _house(b: SceneBuilder, spot: Array, size: float) -> None:
 
 
 def terrain(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """Hills to the horizon, with rocks, trees and a house or two."""
+    """Hills to the horizon, with rocks, trees and up to two houses.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     size = float(np.exp(rng.uniform(np.log(8), np.log(25))))
     above = sky(b, 60 * size)
@@ -134,7 +157,15 @@ def terrain(rng: np.random.Generator, pool: TexturePool) -> Scene:
 
 
 def forest(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """Trunks, poles, bushes and fallen logs at all depths, under leaves: much that is thin and hides what is behind."""
+    """Trunks, poles, bushes and fallen logs at all depths under leaves: thin objects and many occlusions.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     size = float(rng.uniform(5, 12))
     above = sky(b, 40 * size)
@@ -158,11 +189,11 @@ def forest(rng: np.random.Generator, pool: TexturePool) -> Scene:
         radius = float(np.exp(rng.normal(np.log(0.16), 0.4)))
         if kind < 0.62:
             height = rng.uniform(7, 14)
-            frustum(b, foot, radius, 0.7 * radius, height, 5, barks[int(rng.integers(3))], lid=False)
+            frustum(b, foot, (radius, 0.7 * radius), height, 5, barks[int(rng.integers(3))], lid=False)
             if rng.random() < 0.35:  # roots
-                frustum(b, foot, 1.8 * radius, radius, 0.5, 5, barks[0], lid=False, solid=False)
+                frustum(b, foot, (1.8 * radius, radius), 0.5, 5, barks[0], lid=False, solid=False)
         elif kind < 0.74:
-            frustum(b, foot, 0.06, 0.05, rng.uniform(1.5, 5), 4, pole)
+            frustum(b, foot, (0.06, 0.05), rng.uniform(1.5, 5), 4, pole)
         elif kind < 0.86:
             tree(b, foot, size=rng.uniform(0.7, 1.3), cards=7)
         else:

@@ -1,4 +1,4 @@
-"""Light: a small map per surface, with lamps or a sun, soft shadows, contact darkening; baked once per scene."""
+"""Baked light: a small light map per surface, from lamps or a sun, with soft shadows and ambient light."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_OCCLUDERS = 48  # the largest surfaces cast shadows; small ones would hardly
 
 
 def _blocked(start: Array, end: Array, scene: Scene, occluders: Array) -> Array:
-    """``(M,)`` bool: does any occluder cut the segment from ``start`` to ``end (M, 3)``?"""
+    """``(M,)`` bool: any occluder cuts the segment from ``start`` to ``end (M, 3)``."""
     normal = scene.normal[occluders].astype(np.float32)
     origin = scene.origin[occluders].astype(np.float32)
     constant = (normal * origin).sum(1)
@@ -43,12 +43,12 @@ def bake(
     Args:
         scene: surfaces to light.
         rng: draws lamps, colours and strengths.
-        lamps: point lamps inside the bounds; each is sampled at two places for soft shadows.
+        lamps: number of point lamps inside the bounds; each is sampled at two points for soft shadows.
         sun: add a distant light.
-        glowing: indices of surfaces that shine by themselves (sky): constant light 1, cast no shadow.
+        glowing: indices of surfaces that emit light (sky): constant light 1, no shadow.
         shadows: trace shadow rays.
-        texel: aim for this edge of a light texel, in units of a quarter of the scene's scale.
-        exposure: below 1 where what faces the light is bright and wide (a floor in the sun).
+        texel: target edge of a light texel, in units of a quarter of the scene's scale.
+        exposure: target median; below 1 where large surfaces face the light (a floor in the sun).
         bend: from points ``(M, 3)``, their normals and surfaces to the normals to shade with (smooth hills).
     """
     count = len(scene)

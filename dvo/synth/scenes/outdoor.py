@@ -9,13 +9,13 @@ from dvo.synth.scenes.lighting import bake
 from dvo.synth.scenes.scene import Scene, SceneBuilder
 from dvo.synth.scenes.vegetation import sky as sky_box
 from dvo.synth.scenes.vegetation import tree
-from dvo.synth.textures.pool import TexturePool
+from dvo.synth.textures.texture import TexturePool
 
 Array = np.ndarray
 
 
 def _building(b: SceneBuilder, x: float, y: float, half: Array, sign: float) -> None:
-    """A house whose front faces the street, with a shop front, awnings and balconies."""
+    """Add a house that faces the street, with a shop front, awnings and balconies."""
     rng = b.rng
     front = (
         b.material("facade", "facade", "wall", "busy", metres=(4, 9))
@@ -36,6 +36,7 @@ def _building(b: SceneBuilder, x: float, y: float, half: Array, sign: float) -> 
 
 
 def _car(b: SceneBuilder, spot: Array, turned: Array) -> None:
+    """Add a parked car."""
     rng = b.rng
     paint = b.material("plain", "panel", metres=(1.5, 4))
     half = np.array([rng.uniform(0.8, 0.95), rng.uniform(1.8, 2.4), 0.35])
@@ -51,7 +52,15 @@ def _car(b: SceneBuilder, spot: Array, turned: Array) -> None:
 
 
 def street(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """Road between houses, with pavements, markings, cars, poles, trees and sky; y is along the street."""
+    """Road between houses, with pavements, markings, cars, poles, trees and sky; y is along the street.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     length, road = rng.uniform(35, 60), rng.uniform(3, 7)
     kerb = rng.uniform(1.5, 5)
@@ -103,7 +112,15 @@ def street(rng: np.random.Generator, pool: TexturePool) -> Scene:
 
 
 def clutter(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """Ground, a far wall or two, and boxes, poles and boards at all depths under a sky."""
+    """Ground, a few distant walls, and boxes, poles and boards at all depths under a sky.
+
+    Args:
+        rng: draws the layout.
+        pool: textures.
+
+    Returns:
+        The scene, with baked light.
+    """
     b = SceneBuilder(rng, pool)
     size = float(np.exp(rng.uniform(np.log(3), np.log(14))))
     sky = sky_box(b, 40 * size)

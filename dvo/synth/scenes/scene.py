@@ -1,8 +1,8 @@
-"""What a scene is: flat convex surfaces with textures and baked light, and where a camera may fly among them.
+"""Scenes: flat convex surfaces with textures and baked light, and the free space among them.
 
-World frame: z up, metres. A surface is a parallelogram-bounded convex polygon in the plane
-``origin + u * u_axis + v * v_axis`` (unit axes, u and v in metres). Seen from the front, u points right and v down, as
-in an image, so that textures stand upright; ``v_axis x u_axis`` is the front normal.
+World frame: z up, metres. A surface is a convex polygon in the plane ``origin + u * u_axis + v * v_axis`` (unit axes,
+u and v in metres). Seen from the front, u points right and v down, as in an image, so that textures stand upright;
+``v_axis x u_axis`` is the front normal.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from dvo.synth.textures.pool import TexturePool
+from dvo.synth.textures.texture import TexturePool
 
 Array = np.ndarray
 CELL = 24  # texels along a light map at most
@@ -29,13 +29,13 @@ def _cross(a: Array, b: Array) -> Array:
 
 @dataclass
 class Scene:
-    """P surfaces. Arrays are float64 unless said otherwise.
+    """P surfaces. Arrays are float64 unless stated otherwise.
 
     Attributes:
         origin, u_axis, v_axis: ``(P, 3)``.
         corners: ``(P, 4, 3)`` in the world (a triangle repeats its last corner).
         edges: ``(P, 4, 3)`` half-planes: a point (u, v) is inside where ``edges @ (u, v, 1) >= 0``; metres.
-        two_sided: ``(P,)`` bool; others are seen from their front only.
+        two_sided: ``(P,)`` bool; the others are visible from their front only.
         texture: ``(P,)`` int64 index into the pool.
         texture_map: ``(P, 2, 3)`` texel coordinates from (u, v, 1).
         gain, offset: ``(P, 3)`` colour = gain * texel + offset, in [0, 1].
@@ -43,10 +43,12 @@ class Scene:
         light_map: ``(P, 2, 3)`` light-map coordinates from (u, v, 1).
         pool: the textures.
         family: name of the family that laid it out.
-        bounds: ``(2, 3)`` corners of the box in which cameras live.
+        bounds: ``(2, 3)`` corners of the box of camera positions.
         solids: ``(K, 15)`` centre, half sizes, rotation (row-major, box to world) of boxes that cameras must not enter.
         scale: typical viewing distance, metres.
-        hints: what the family tells path planning ("heading", "targets", "height", ...).
+        hints: information for path planning: ``heading`` (3,) along a street or None, ``focus`` (low, high) box of
+            points
+            to look at, ``height`` (low, high) of cameras.
     """
 
     origin: Array
@@ -78,10 +80,15 @@ class Scene:
         return _cross(self.v_axis, self.u_axis)
 
     def tensors(self, device: torch.device | str) -> dict[str, Tensor]:
-        """What shading gathers per pixel, on a device (kept after the first call).
+        """Per-surface parameters of shading on a device, kept after the first call.
 
-        ``surface (13, P)``: linear part of the texture map (4), gain (3), offset (3), left and top of the texture's
-        cell, left edge of the light map's cell; ``light (1, 3, CELL, P CELL)``.
+        Args:
+            device: where.
+
+        Returns:
+            ``surface (13, P)``: linear part of the texture map (4), gain (3), offset (3), left and top of the texture's
+            cell,
+            left edge of the light map's cell; ``light (1, 3, CELL, P CELL)``.
         """
         key = str(device)
         if key not in self._cache:
@@ -112,7 +119,14 @@ class Scene:
         return np.stack([self.u_axis, self.v_axis, self.normal], 1), size.min(1), size.max(1)
 
     def clearance(self, points: Array) -> Array:
-        """Distance ``(T,)`` from points ``(T, 3)`` to the nearest surface; -1 inside a solid or out of bounds."""
+        """Distance from points to the nearest surface.
+
+        Args:
+            points: ``(T, 3)`` in the world.
+
+        Returns:
+            ``(T,)`` metres; -1 inside a solid or out of bounds.
+        """
         distance = np.full(len(points), -1.0)
         axes, low, high = self._frames
         for i in np.flatnonzero(self.is_free(points)):
@@ -122,7 +136,14 @@ class Scene:
         return distance
 
     def is_free(self, points: Array) -> Array:
-        """``(T,)`` bool: inside the bounds and outside every solid."""
+        """Membership in the free space: inside the bounds and outside every solid.
+
+        Args:
+            points: ``(T, 3)`` in the world.
+
+        Returns:
+            ``(T,)`` bool.
+        """
         free = ((points >= self.bounds[0]) & (points <= self.bounds[1])).all(1)
         if len(self.solids):
             local = (points[:, None] - self.solids[:, :3])[:, :, None] @ self.solids[:, 6:].reshape(-1, 3, 3)
@@ -132,14 +153,14 @@ class Scene:
 
 @dataclass
 class Material:
-    """How a surface is painted.
+    """Texture, size and colour of a surface.
 
     Attributes:
         texture: index into the pool.
         metres: width of one texture repeat.
         gain, offset: ``(3,)`` colour transform.
         turn: rotation of the texture in the surface, rad.
-        whole: a picture that looks wrong when repeated: stretched to most of the surface.
+        whole: stretch the texture to most of the surface (pictures that must not repeat).
     """
 
     texture: int
@@ -151,7 +172,12 @@ class Material:
 
 
 class SceneBuilder:
-    """Collects surfaces; ``build`` turns them into a :class:`Scene`."""
+    """Collects surfaces; :meth:`build` turns them into a :class:`Scene`.
+
+    Args:
+        rng: draws materials and texture offsets.
+        pool: textures.
+    """
 
     def __init__(self, rng: np.random.Generator, pool: TexturePool) -> None:
         self.rng, self.pool = rng, pool
@@ -162,7 +188,15 @@ class SceneBuilder:
         self, *tags: str, metres: tuple[float, float] = (0.6, 2.5), contrast: tuple[float, float] = (0.6, 1.2),
         bright: float = 1.0, turn: float = 0.0,
     ) -> Material:  # fmt: skip
-        """Pick a texture with one of the tags (any, without tags), a size, a tint and a contrast."""
+        """Draw a material.
+
+        Args:
+            tags: the texture has one of these tags; any texture without tags.
+            metres: range of the width of one texture repeat.
+            contrast: range of the share of the texture's contrast that is kept.
+            bright: factor on the brightness.
+            turn: rotation of the texture, rad.
+        """
         rng = self.rng
         texture = int(rng.choice(self.pool.tagged(*tags))) if tags else int(rng.integers(self.pool.count))
         mean = self.pool.use(texture)
@@ -178,10 +212,15 @@ class SceneBuilder:
         self, corners: ArrayLike, material: Material, *, up: Array | None = None, two_sided: bool = False,
         drape: Array | None = None,
     ) -> None:  # fmt: skip
-        """Add a convex planar polygon ``(3 or 4, 3)``, corners counter-clockwise seen from the front.
+        """Add a convex planar polygon.
 
-        ``drape (2,)`` lays the texture on from above, shifted by that many texels, so that it goes on from one polygon
-        to the next.
+        Args:
+            corners: ``(3 or 4, 3)``, counter-clockwise seen from the front.
+            material: of the surface.
+            up: direction in which the texture stands upright; z if None.
+            two_sided: visible from both sides.
+            drape: ``(2,)`` texels; projects the texture from above with this shift, so that it continues across
+                polygons.
         """
         corners = np.asarray(corners, float)
         if len(corners) == 3:
@@ -205,7 +244,16 @@ class SceneBuilder:
         self, centre: ArrayLike, normal: ArrayLike, up: ArrayLike, width: float, height: float, material: Material,
         *, two_sided: bool = False,
     ) -> None:  # fmt: skip
-        """Add a rectangle facing ``normal``; ``up`` (made orthogonal to it) is the direction of its height."""
+        """Add a rectangle.
+
+        Args:
+            centre: ``(3,)``.
+            normal: ``(3,)`` direction that it faces, of any length.
+            up: ``(3,)`` direction of its height; made orthogonal to the normal.
+            width, height: metres.
+            material: of the surface.
+            two_sided: visible from both sides.
+        """
         front, rise = np.asarray(normal, float), np.asarray(up, float)
         front = front / np.sqrt(front @ front)
         rise = rise - (rise @ front) * front
@@ -220,7 +268,16 @@ class SceneBuilder:
         self, centre: ArrayLike, half: ArrayLike, rotation: Array, materials: list[Material], *, inside: bool = False,
         faces: str = "xXyYzZ",
     ) -> None:  # fmt: skip
-        """Add a box (``inside=True``: a room seen from within). ``materials``: one, or side / top / bottom."""
+        """Add a box, and the solid that it occupies.
+
+        Args:
+            centre: ``(3,)``.
+            half: ``(3,)`` half sizes, metres.
+            rotation: ``(3, 3)`` box to world.
+            materials: one for all faces, or three for sides, top and bottom.
+            inside: faces point inwards (a room); no solid then.
+            faces: letters of the faces to add; lower case is the negative side of an axis.
+        """
         centre, half = np.asarray(centre, float), np.asarray(half, float)
         side, top, bottom = (materials * 3)[:3] if len(materials) == 1 else materials
         for axis in range(3):
@@ -238,7 +295,14 @@ class SceneBuilder:
             self.solids.append(np.concatenate([centre, half, rotation.ravel()]))
 
     def prism(self, foot: ArrayLike, radius: float, height: float, sides: int, material: Material) -> None:
-        """Add an upright column of ``sides`` faces with a lid."""
+        """Add an upright column.
+
+        Args:
+            foot: ``(3,)`` centre of its base.
+            radius, height: metres.
+            sides: number of faces.
+            material: of all faces.
+        """
         angle = np.arange(sides) * 2 * np.pi / sides + self.rng.uniform(0, 1)
         ring = np.asarray(foot, float) + radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(sides)], -1)
         rise = np.array([0, 0, height])
@@ -248,7 +312,14 @@ class SceneBuilder:
         self.solids.append(np.concatenate([np.asarray(foot) + rise / 2, half, np.eye(3).ravel()]))
 
     def build(self, family: str, bounds: Array, scale: float, **hints: Any) -> Scene:
-        """Stack everything and derive axes and edges (light is baked separately)."""
+        """Stack all surfaces and derive their axes and edges; :func:`dvo.synth.scenes.lighting.bake` then adds light.
+
+        Args:
+            family: name of the family.
+            bounds: ``(2, 3)`` box of camera positions.
+            scale: typical viewing distance, metres.
+            hints: see :class:`Scene`.
+        """
         rows: dict[str, Any] = {key: np.array([row[key] for row in self.rows]) for key in self.rows[0]}
         corners, down, drape = rows["corners"], rows.pop("down"), rows.pop("drape")
         first = corners[:, 1] - corners[:, 0]

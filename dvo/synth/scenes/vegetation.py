@@ -1,4 +1,4 @@
-"""What grows and stands outdoors: trees of leaf cards, conifers, bushes, rocks; and the sky above."""
+"""Outdoor objects: trees of leaf cards, conifers, bushes, rocks, and the sky box."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ Array = np.ndarray
 
 
 def sky(b: SceneBuilder, radius: float) -> list[int]:
-    """A far box of sky; returns its surfaces (they glow)."""
+    """Add a distant box of sky.
+
+    Args:
+        b: collects the surfaces.
+        radius: half its size, metres.
+
+    Returns:
+        Rows of its surfaces, which are lit from within (``glowing`` of :func:`dvo.synth.scenes.lighting.bake`).
+    """
     first = len(b.rows)
     drawn = b.material("sky", metres=(radius * 1.5, radius * 3), contrast=(0.3, 1.1), bright=1.3)
     # A tint of its own would make the sky pink or green.
@@ -22,10 +30,23 @@ def sky(b: SceneBuilder, radius: float) -> list[int]:
 
 
 def frustum(
-    b: SceneBuilder, foot: Array, radius: float, top: float, height: float, sides: int, material: Material,
+    b: SceneBuilder, foot: Array, radii: tuple[float, float], height: float, sides: int, material: Material,
     *, lid: bool = True, solid: bool = True, stretch: tuple[float, float] = (1.0, 1.0),
 ) -> None:  # fmt: skip
-    """A column that narrows from ``radius`` to ``top`` (0: a point); ``stretch`` makes it oval."""
+    """Add an upright column that narrows towards the top.
+
+    Args:
+        b: collects the surfaces.
+        foot: ``(3,)`` centre of its base.
+        radii: at the base and at the top, 0 at the top for a cone.
+        height: from base to top.
+        sides: number of faces.
+        material: of all faces.
+        lid: close the top.
+        solid: keep cameras out.
+        stretch: factors on x and y, for an oval.
+    """
+    radius, top = radii
     turn = b.rng.uniform(0, 2)
     angle = np.arange(sides) * 2 * np.pi / sides + turn
     ring = np.stack([np.cos(angle) * stretch[0], np.sin(angle) * stretch[1], np.zeros(sides)], -1)
@@ -43,7 +64,15 @@ def frustum(
 
 
 def leaf_card(b: SceneBuilder, centre: Array, normal: Array, size: float, paint: Material) -> None:
-    """An irregular quadrilateral that faces roughly along ``normal``, seen from both sides."""
+    """Add an irregular two-sided quadrilateral.
+
+    Args:
+        b: collects the surfaces.
+        centre: ``(3,)``.
+        normal: ``(3,)`` direction that it roughly faces.
+        size: half its diagonal, metres.
+        paint: material.
+    """
     rng = b.rng
     rotation = any_rotation(rng)
     front = normal + 0.5 * rng.normal(size=3)
@@ -57,12 +86,19 @@ def leaf_card(b: SceneBuilder, centre: Array, normal: Array, size: float, paint:
 
 
 def tree(b: SceneBuilder, spot: Array, *, size: float = 1.0, cards: int = 8) -> None:
-    """A trunk and a crown: leaf cards on an egg, facing outwards, darker below."""
+    """Add a tree: a trunk and a crown of leaf cards on an ellipsoid, facing outwards, darker below.
+
+    Args:
+        b: collects the surfaces.
+        spot: ``(3,)`` foot of the trunk.
+        size: factor on a tree of a few metres.
+        cards: number of leaf cards.
+    """
     rng = b.rng
     trunk, crown = size * rng.uniform(1.4, 3), size * rng.uniform(0.9, 2.0)
     radius = size * rng.uniform(0.09, 0.22)
     bark = b.material("bark", metres=(0.6, 1.5), bright=0.75)
-    frustum(b, spot, radius, 0.55 * radius, trunk + 0.7 * crown, 5, bark, lid=False)
+    frustum(b, spot, (radius, 0.55 * radius), trunk + 0.7 * crown, 5, bark, lid=False)
     light = b.material("plant", metres=(0.8, 2.5))
     dark = Material(light.texture, light.metres, 0.7 * light.gain, 0.7 * light.offset)
     middle = spot + UP * (trunk + 0.75 * crown)
@@ -76,34 +112,53 @@ def tree(b: SceneBuilder, spot: Array, *, size: float = 1.0, cards: int = 8) -> 
 
 
 def conifer(b: SceneBuilder, spot: Array, *, size: float = 1.0) -> None:
-    """Stacked cones on a short trunk."""
+    """Add a conifer: stacked cones on a short trunk.
+
+    Args:
+        b: collects the surfaces.
+        spot: ``(3,)`` foot of the trunk.
+        size: factor on a tree of a few metres.
+    """
     rng = b.rng
     height, radius = size * rng.uniform(3, 6), size * rng.uniform(0.8, 1.3)
     bark = b.material("bark", metres=(0.5, 1.2), bright=0.6)
-    frustum(b, spot, 0.12 * radius, 0.12 * radius, 0.25 * height, 4, bark, lid=False)
+    frustum(b, spot, (0.12 * radius, 0.12 * radius), 0.25 * height, 4, bark, lid=False)
     paint = b.material("plant", metres=(0.8, 2), bright=0.75)
     tiers = 3
     for i in range(tiers):
         foot = spot + UP * height * (0.18 + 0.25 * i)
         tier = radius * (1 - 0.26 * i)
-        frustum(b, foot, tier, 0.0, 0.38 * height, 6, paint, solid=i == 0)
+        frustum(b, foot, (tier, 0.0), 0.38 * height, 6, paint, solid=i == 0)
 
 
 def rock(b: SceneBuilder, spot: Array, size: float, paint: Material) -> None:
-    """A boulder: two stacked frustums, sunk a little into the ground."""
+    """Add a boulder: two stacked frustums, sunk slightly into the ground.
+
+    Args:
+        b: collects the surfaces.
+        spot: ``(3,)`` point of the ground.
+        size: radius, metres.
+        paint: material.
+    """
     rng = b.rng
     sides = int(rng.integers(5, 8))
     oval = (float(rng.uniform(0.7, 1.3)), float(rng.uniform(0.7, 1.3)))
     height = size * rng.uniform(0.5, 1.0)
     foot = spot - UP * 0.15 * size
     turn = b.rng.bit_generator.state  # both parts must be turned alike to meet
-    frustum(b, foot, size, 0.85 * size, 0.6 * height, sides, paint, lid=False, stretch=oval)
+    frustum(b, foot, (size, 0.85 * size), 0.6 * height, sides, paint, lid=False, stretch=oval)
     b.rng.bit_generator.state = turn
-    frustum(b, foot + UP * 0.6 * height, 0.85 * size, 0.4 * size, 0.4 * height, sides, paint, stretch=oval)
+    frustum(b, foot + UP * 0.6 * height, (0.85 * size, 0.4 * size), 0.4 * height, sides, paint, stretch=oval)
 
 
 def bush(b: SceneBuilder, spot: Array, size: float) -> None:
-    """A few leaf cards near the ground."""
+    """Add a bush: a few leaf cards near the ground.
+
+    Args:
+        b: collects the surfaces.
+        spot: ``(3,)`` point of the ground.
+        size: metres.
+    """
     paint = b.material("plant", metres=(0.6, 2), bright=0.9)
     for i in range(4):
         turn = i * np.pi / 2 + b.rng.uniform(-0.5, 0.5)

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dvo.errors import DvoError
-from dvo.synth.poses import split
-from dvo.synth.scenes.bodies import Motion
+from dvo.geometry.poses import split
+from dvo.synth import salts
+from dvo.synth.protocols import Motion
 
 Array = np.ndarray
 GRAVITY = np.array([0.0, 0.0, -9.81])  # world, m/s^2; z is up
@@ -91,7 +92,7 @@ def measure_imu(
     accel = (np.swapaxes(now, -1, -2) @ (acceleration - gravity)[..., None])[..., 0]
     biases = np.zeros((2, len(times), 3))
     if noise is not None:
-        rng = np.random.default_rng([seed, 7602])
+        rng = np.random.default_rng([seed, salts.IMU])
         rate = 1 / steps.mean()
         for k, (start, walk) in enumerate(((noise.gyro_bias, noise.gyro_walk), (noise.accel_bias, noise.accel_walk))):
             wander = rng.normal(0, walk / np.sqrt(rate), (len(times), 3))

@@ -124,7 +124,7 @@ def train(images: list[np.ndarray], branching: int, depth: int, seed: int) -> Vo
     everything = np.concatenate(images) if images else np.zeros((0, 32), np.uint8)
     if len(everything) < branching:
         raise DvoError(f"{len(everything)} descriptors are too few", field="--sequences", remedy="render more")
-    rng = np.random.default_rng([seed, 7601])
+    rng = np.random.default_rng([seed, 7701])
     parents, centres = [0], [np.zeros(32, np.uint8)]
     level = [(0, np.arange(len(everything)))]
     for _ in range(depth):

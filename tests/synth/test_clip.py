@@ -1,4 +1,4 @@
-"""Clips: determinism, free space, flow, normalisation, sensor."""
+"""Training clips: determinism, free space, flow, normalisation, sensor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 from torch.utils.data import DataLoader
 
 from dvo.errors import DvoError
+from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth.clip import Clip, induced_flow, make_clip
 from dvo.synth.dataset import ClipDataset
-from dvo.synth.poses import inverse
 
 SMALL = {"frames": 4, "height": 60, "width": 80, "flow_range": (1.0, 8.0)}
 SEED = 5
@@ -64,7 +64,7 @@ def test_depth_is_normalised_and_complete(clips: list[Clip]) -> None:
 def test_flow_is_in_range_and_neighbours_overlap(clips: list[Clip]) -> None:
     means = []
     for clip in clips:
-        poses_wc = inverse(clip.poses_cw.numpy().astype(float))
+        poses_wc = invert_rodrigues(clip.poses_cw.numpy().astype(float))
         flow, overlap = induced_flow(clip.depth.numpy(), poses_wc, clip.intrinsics[0].numpy().astype(float))
         means.append(flow.mean())
         assert 0.8 < flow.mean() < 9.5
@@ -79,9 +79,12 @@ def test_frames_carry_the_motion(clips: list[Clip]) -> None:
         depth, k = clip.depth[1].numpy().astype(float), clip.intrinsics[1].numpy().astype(float)
         y, x = np.mgrid[:60, :80]
         ray = np.stack([(x - k[2]) / k[0], (y - k[3]) / k[1], np.ones_like(depth)], -1)
-        from dvo.synth.poses import compose, split
 
-        r, t = split(compose(clip.poses_cw[0].numpy().astype(float), inverse(clip.poses_cw[1].numpy().astype(float))))
+        r, t = split(
+            compose_rodrigues(
+                clip.poses_cw[0].numpy().astype(float), invert_rodrigues(clip.poses_cw[1].numpy().astype(float))
+            )
+        )
         points = (ray * depth[..., None]) @ r.T + t
         u, v = (points[..., i] / points[..., 2] * k[i] + k[2 + i] for i in (0, 1))
         grid = torch.from_numpy(np.stack([u / 39.5 - 1, v / 29.5 - 1], -1).astype(np.float32))[None]

@@ -7,11 +7,13 @@ import pytest
 import torch
 
 from dvo.errors import DvoError
-from dvo.synth import FAMILIES, random_path, random_scene, render, trace
-from dvo.synth.poses import inverse, look_rotation, pose_from, split
+from dvo.geometry.poses import invert_rodrigues, look_rotation, pose_from, split
+from dvo.synth import random_path, random_scene, render, trace
+from dvo.synth.render.quality import Quality
 from dvo.synth.render.renderer import render_depth
+from dvo.synth.scenes.families import SHARES
 from dvo.synth.scenes.scene import Scene, SceneBuilder
-from dvo.synth.textures.pool import TexturePool, texture_pool
+from dvo.synth.textures.texture import TexturePool, texture_pool
 
 H, W = 48, 64
 K = np.array([52.0, 51.5, 31.2, 23.9])
@@ -37,12 +39,12 @@ def world_points(depth: np.ndarray, pose_wc: np.ndarray, k: np.ndarray = K) -> n
 
 def into(points: np.ndarray, pose_wc: np.ndarray, k: np.ndarray = K) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and depth of world points in a camera."""
-    rotation, centre = split(inverse(pose_wc))
+    rotation, centre = split(invert_rodrigues(pose_wc))
     local = points @ rotation.T + centre
     return local[..., :2] / local[..., 2:] * k[:2] + k[2:], local[..., 2]
 
 
-@pytest.mark.parametrize("family", list(FAMILIES))
+@pytest.mark.parametrize("family", list(SHARES))
 def test_pixel_lands_on_same_surface_and_texture_coordinate(pool: TexturePool, family: str) -> None:
     scene, poses = two_views(pool, family)
     frames = render(scene, poses, K, H, W)
@@ -70,7 +72,7 @@ def test_warp_is_photometrically_consistent() -> None:
     """Frame i warped to j by depth and pose equals frame j outside occlusions, in every family."""
     pool = texture_pool(5)
     errors, changes = [], []
-    for seed, family in enumerate(FAMILIES):
+    for seed, family in enumerate(SHARES):
         scene, poses = two_views(pool, family, seed)
         k = 2 * K + [0, 0, 0.5, 0.5]
         frames = render(scene, poses, k, 2 * H, 2 * W)
@@ -114,7 +116,7 @@ def test_depth_of_known_plane_and_texture_is_upright() -> None:
     rotation = look_rotation(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     frames = render(scene, pose_from(rotation, np.zeros(3))[None], K, H, W)
     hit = frames.surface[0] == 0
-    images = render(scene, pose_from(rotation, np.zeros(3))[None], K, H, W, antialias=False).images
+    images = render(scene, pose_from(rotation, np.zeros(3))[None], K, H, W, quality=Quality(antialias=False)).images
     assert torch.allclose(frames.depth[0][hit], torch.tensor(2.0), rtol=1e-6)
     assert (frames.depth[0][~hit] == 0).all() and (images[0][:, ~hit] == 0).all()
     rows, columns = np.nonzero(hit.numpy())

@@ -2,51 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from dvo.synth.poses import pose_from, so3_exp, split
+from dvo.geometry.poses import split
+from dvo.synth import salts
+from dvo.synth.motion.motion import Sway
+from dvo.synth.protocols import Motion
 from dvo.synth.render.renderer import render_depth
-from dvo.synth.scenes.bodies import Body, Motion
+from dvo.synth.scenes.bodies import Body
 from dvo.synth.scenes.furnishing import UP, paint_object, yaw
 from dvo.synth.scenes.lighting import bake
 from dvo.synth.scenes.scene import Scene, SceneBuilder
 
 Array = np.ndarray
-
-
-@dataclass(frozen=True)
-class Sway:
-    """A smooth motion: steady drift, a swing to and fro, a turn about the vertical and a wobble.
-
-    Attributes:
-        centre: ``(3,)`` position at time 0 without the swing.
-        drift: ``(3,)`` velocity, world units per second.
-        reach: ``(2, 3)`` amplitudes of the sine and cosine of ``rate t + phase``.
-        rate, phase: rad/s and rad.
-        heading, spin: yaw at time 0 (rad) and its rate (rad/s).
-        wobble: ``(3,)`` rotation vector that swings at 1.7 times the rate.
-    """
-
-    centre: Array
-    drift: Array
-    reach: Array
-    rate: float
-    phase: float
-    heading: float
-    spin: float
-    wobble: Array
-
-    def poses_wc(self, times: Array) -> Array:
-        """Body-to-world poses ``(T, 7)`` float64."""
-        times = np.asarray(times, float)
-        angle = self.rate * times + self.phase
-        swing = np.stack([np.sin(angle), np.cos(angle)], -1) @ self.reach
-        turn = np.zeros((len(times), 3))
-        turn[:, 2] = self.heading + self.spin * times
-        rotation = so3_exp(turn) @ so3_exp(np.sin(1.7 * angle)[:, None] * self.wobble)
-        return pose_from(rotation, self.centre + times[:, None] * self.drift + swing)
 
 
 def random_bodies(scene: Scene, camera_path: Motion, duration: float, seed: int, count: int) -> tuple[Body, ...]:
@@ -59,7 +27,7 @@ def random_bodies(scene: Scene, camera_path: Motion, duration: float, seed: int,
         seed: same seed, same bodies.
         count: how many.
     """
-    rng = np.random.default_rng([seed, 7501])
+    rng = np.random.default_rng([seed, salts.MOVERS])
     times = np.linspace(0, duration, max(16, int(8 * duration)))
     eyes = camera_path.poses_wc(times)
     k = np.array([16.0, 16.0, 11.5, 8.5])

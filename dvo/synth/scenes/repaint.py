@@ -1,4 +1,4 @@
-"""Scenes painted over: the same geometry with less to see."""
+"""Scenes with less texture: the same geometry and light, most surfaces bare."""
 
 from __future__ import annotations
 
@@ -6,14 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 
+from dvo.synth import salts
 from dvo.synth.scenes.scene import Scene
 
 
 def plainer(scene: Scene, share: float, seed: int) -> Scene:
-    """The scene with only about ``share`` of its textures' contrast left, in [0, 1]: most surfaces turn to a bare
-    colour (their own mean), the rest keep some. Light and shadows stay.
+    """Scene with part of its textures' contrast removed: most surfaces take their own mean colour, the rest keep some.
+
+    Args:
+        scene: original.
+        share: of the contrast that is kept, about, in [0, 1].
+        seed: draws the surfaces that turn bare.
+
+    Returns:
+        Scene of the same geometry, light and shadows.
     """
-    rng = np.random.default_rng([seed, 7405])
+    rng = np.random.default_rng([seed, salts.REPAINT])
     bare = rng.random(len(scene)) >= share
     left = np.where(bare, 0.04, np.minimum(1.0, 0.3 + share))[:, None]
     mean = np.stack([scene.pool.use(int(texture)) for texture in scene.texture])

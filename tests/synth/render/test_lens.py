@@ -1,4 +1,4 @@
-"""Pictures through a lens with distortion (that the flow is exact through it, too, is in test_synth_truth)."""
+"""Images through a lens with distortion (test_truth checks that the flow is exact through it)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from dvo.odometry.working_image import working_image
 from dvo.synth import Shot, make_sequence, mesh_scene, random_path, random_scene, render, trace
 from dvo.synth.export import export_sequence
 from dvo.synth.render.lens import bent, plate_of, random_lens, render_lens, straight
+from dvo.synth.render.quality import Quality
 from dvo.synth.sensors.sensor import random_intrinsics
-from dvo.synth.textures.pool import texture_pool
+from dvo.synth.textures.texture import texture_pool
 
 CAMERA = Camera(130.0, 129.0, 81.0, 58.5, 160, 120)
 LENSES = {
@@ -72,7 +73,7 @@ def test_undistorted_it_is_the_picture_without_a_lens(lens):
 
     def error(picture: np.ndarray, shift: float = 0.0) -> np.ndarray:
         k = pinhole.intrinsics + np.array([0, 0, shift, shift])
-        plain = render(scene, pose, k, pinhole.height, pinhole.width, supersample=2).images[0]
+        plain = render(scene, pose, k, pinhole.height, pinhole.width, quality=Quality(2)).images[0]
         return np.abs(picture - 255 * plain.permute(1, 2, 0).numpy())
 
     assert np.median(error(back)) < 1.5 and error(back).mean() < 0.45 * error(image).mean()
@@ -83,7 +84,7 @@ def test_undistorted_it_is_the_picture_without_a_lens(lens):
 def test_no_lens_is_the_pinhole_picture():
     scene, pose = scene_and_pose()
     faint = replace(CAMERA, model="radtan", coefficients=(1e-12, 0.0, 0.0, 0.0))
-    got, plain = render_lens(scene, pose, faint), render(scene, pose, CAMERA.intrinsics, 120, 160, supersample=2)
+    got, plain = render_lens(scene, pose, faint), render(scene, pose, CAMERA.intrinsics, 120, 160, quality=Quality(2))
     assert np.abs(got.images.numpy() - plain.images.numpy()).mean() < 0.5 / 255  # outlines are smoothed otherwise
     np.testing.assert_allclose(got.depth.numpy(), plain.depth.numpy(), rtol=1e-5)
 

@@ -1,4 +1,4 @@
-"""Ground truth of films: flow, occlusion, moving bodies, rolling shutter, tracks, inertial measurements, stereo."""
+"""Flow, occlusion, moving pixels and tracks of sequences."""
 
 from __future__ import annotations
 
@@ -7,44 +7,37 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth import (
-    ImuNoise,
     Scene,
     Shot,
     Stage,
     dynamic_mask,
     long_path,
-    measure_imu,
     optical_flow,
-    random_path,
     random_scene,
     tracks,
 )
-from dvo.synth.poses import compose, inverse, quaternion_to_matrix, so3_exp, split
-from dvo.synth.render.shot import Rest
-from dvo.synth.scenes.movers import random_bodies
-from dvo.synth.sensors.imu import GRAVITY, rotation_vector
-from dvo.synth.textures.pool import texture_pool
+from dvo.synth.motion.movers import random_bodies
+from dvo.synth.textures.texture import texture_pool
 from dvo.synth.truth import hits, shows
 
 CAMERA = Camera(82.0, 81.5, 47.7, 35.2, 96, 72)
 TIMES = (0.4, 0.55)
+LENSES = {
+    "radtan": replace(CAMERA, model="radtan", coefficients=(-0.17, 0.02, 1e-3, -8e-4)),
+    "fisheye": replace(CAMERA, model="fisheye", coefficients=(0.02, -0.004, 0.0, 0.0)),
+}
+CASES = {
+    "still": {}, "bodies": {"bodies": 4}, "rolling": {"readout": 0.03}, "both": {"bodies": 4, "readout": 0.03},
+    "radtan": {"bodies": 4, "camera": LENSES["radtan"]}, "fisheye": {"camera": LENSES["fisheye"]},
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return random_scene(4, "room", pool=texture_pool(5))
-
-
-LENSES = {
-    "radtan": replace(CAMERA, model="radtan", coefficients=(-0.17, 0.02, 1e-3, -8e-4)),
-    "fisheye": replace(CAMERA, model="fisheye", coefficients=(0.02, -0.004, 0.0, 0.0)),
-}
 
 
 def make_shot(
@@ -53,12 +46,6 @@ def make_shot(
     path = long_path(scene, 3, "handheld", 3.0, speed=2.0, shake=2.0)
     stage = Stage(scene, random_bodies(scene, path, 1.0, 2, bodies)) if bodies else scene
     return Shot(stage, path, camera, exposure, readout)
-
-
-CASES = {
-    "still": {}, "bodies": {"bodies": 4}, "rolling": {"readout": 0.03}, "both": {"bodies": 4, "readout": 0.03},
-    "radtan": {"bodies": 4, "camera": LENSES["radtan"]}, "fisheye": {"camera": LENSES["fisheye"]},
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -158,41 +145,6 @@ def test_occluded_pixels_are_hidden_by_something_nearer(scene: Scene) -> None:
     assert (seen[~one_sided] < z[chosen][~one_sided]).all() and one_sided.mean() < 0.5
 
 
-def test_rolling_shutter_of_a_still_camera_is_none(scene: Scene) -> None:
-    pose = long_path(scene, 3, "handheld", 3.0).poses_wc(np.array([0.5]))[0]
-    still, rolling = (Shot(scene, Rest(pose), CAMERA, readout=r).sharp(1.0) for r in (0.0, 0.05))
-    assert torch.equal(still.surface, rolling.surface)
-    # Where an outline runs along a row, a sub-pixel sample may fall on either side.
-    assert ((still.images - rolling.images).abs() > 2e-3).float().mean() < 0.005
-    assert torch.allclose(still.depth, rolling.depth, rtol=1e-5)
-    assert torch.allclose(still.uv, rolling.uv, atol=1e-4)
-
-
-def test_rolling_rows_are_those_of_their_own_times(scene: Scene) -> None:
-    shot = make_shot(scene, bodies=3, readout=0.04)
-    frame = shot.sharp(0.5)
-    for row in (0, 20, 71):
-        at_once = Shot(shot.scene, shot.path, CAMERA).sharp(0.5 + (row - 35.5) * 0.04 / 72)
-        assert (frame.surface[0, row] == at_once.surface[0, row]).float().mean() > 0.98
-        assert (frame.depth[0, row] / at_once.depth[0, row] - 1).abs().median() < 1e-5
-    middle = Shot(shot.scene, shot.path, CAMERA).sharp(0.5)
-    assert not torch.equal(middle.surface[0, 0], frame.surface[0, 0]), "the top row is read earlier than the middle"
-
-
-def test_blur_is_the_mean_along_the_path(scene: Scene) -> None:
-    shot = make_shot(scene, bodies=2, exposure=0.4)
-    middle = shot.sharp(0.5)
-    count = shot.sub_exposures(middle, 0.5)
-    assert count % 2 == 1 and count > 3
-    blurred = shot.rendering(0.5)
-    assert torch.equal(blurred.depth, middle.depth), "ground truth is that of mid-exposure"
-    offsets = ((np.arange(count) + 0.5) / count - 0.5) * 0.4
-    mean = torch.stack([shot.sharp(0.5 + s).images for s in offsets]).mean(0)
-    assert (blurred.images - mean).abs().max() < 1e-3
-    finer = torch.stack([shot.sharp(0.5 + s).images for s in np.linspace(-0.2, 0.2, 41)]).mean(0)
-    assert (blurred.images - finer).abs().mean() < 0.25 * (middle.images - finer).abs().mean()
-
-
 @pytest.mark.parametrize("case", ["bodies", "both"])
 def test_tracks_follow_surface_points(scene: Scene, case: str) -> None:
     shot = make_shot(scene, **CASES[case])
@@ -207,61 +159,3 @@ def test_tracks_follow_surface_points(scene: Scene, case: str) -> None:
         assert (surface == found.surface[seen]).mean() > 0.95
     again = tracks(shot, times, 60)
     assert np.array_equal(again.pixels, found.pixels) and np.array_equal(again.visible, found.visible)
-
-
-@pytest.mark.parametrize("kind", ["handheld", "rotation", "fast", "loop"])
-def test_exact_imu_integrates_back_to_the_path(scene: Scene, kind: str) -> None:
-    path = long_path(scene, 5, kind, 3.0)
-    rate = 500.0
-    middles = (np.arange(750) + 0.5) / rate
-    imu = measure_imu(path, middles)
-    ends = path.poses_wc(np.array([0.0, 1e-4, 1.5]))
-    rotation, position = split(ends[0])
-    velocity = (split(path.poses_wc(np.array([1e-4])))[1][0] - split(path.poses_wc(np.array([-1e-4])))[1][0]) / 2e-4
-    for omega, force in zip(imu.gyro, imu.accel, strict=True):
-        half = rotation @ so3_exp(omega * 0.5 / rate)
-        acceleration = half @ force + GRAVITY
-        position = position + velocity / rate + 0.5 * acceleration / rate**2
-        velocity = velocity + acceleration / rate
-        rotation = rotation @ so3_exp(omega / rate)
-    target, there = split(ends[2])
-    length = np.linalg.norm(np.diff(path.poses_wc(np.linspace(0, 1.5, 150))[:, :3], axis=0), axis=1).sum()
-    assert np.linalg.norm(rotation_vector(target.T @ rotation)) < 1e-4
-    assert np.linalg.norm(position - there) < 1e-3 * max(length, 0.3)
-
-
-def test_imu_noise_and_rest(scene: Scene) -> None:
-    pose = long_path(scene, 3, "handheld", 3.0).poses_wc(np.array([0.5]))[0]
-    times = np.arange(20_000) / 200
-    exact = measure_imu(Rest(pose), times)
-    assert np.abs(exact.gyro).max() < 1e-9
-    assert np.allclose(exact.accel, -quaternion_to_matrix(pose[3:]).T @ GRAVITY, atol=1e-5)
-    noise = ImuNoise()
-    noisy = measure_imu(Rest(pose), times, noise=noise, seed=3)
-    white = noisy.gyro - exact.gyro - noisy.gyro_bias
-    assert white.std() == pytest.approx(noise.gyro * np.sqrt(200), rel=0.02)
-    assert np.diff(noisy.accel_bias, axis=0).std() == pytest.approx(noise.accel_walk / np.sqrt(200), rel=0.02)
-    assert np.array_equal(noisy.accel, measure_imu(Rest(pose), times, noise=noise, seed=3).accel)
-    assert not np.array_equal(noisy.accel, measure_imu(Rest(pose), times, noise=noise, seed=4).accel)
-    with pytest.raises(DvoError, match="times"):
-        measure_imu(Rest(pose), np.array([0, 0.1, 0.3]))
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3), st.floats(-8, 0))
-def test_rotation_vectors_survive(direction: list[float], power: float) -> None:
-    phi = np.array(direction) * 10**power
-    assert np.allclose(rotation_vector(so3_exp(phi)), phi, rtol=1e-6, atol=1e-15)
-
-
-def test_second_camera_of_a_pair(scene: Scene) -> None:
-    """Rectified stereo: what both see lies on one row, shifted by fx b / Z."""
-    shot = Shot(scene, random_path(scene, 2, "handheld"), CAMERA)
-    right = shot.beside(0.1)
-    pixels, depth, surface = hits(shot.sharp(0.2))
-    there, z = right.place(0.2, shot.lift(0.2, pixels, depth, surface), surface)
-    assert np.allclose(there[:, 1], pixels[:, 1], atol=1e-6) and np.allclose(z, depth, rtol=1e-9)
-    assert np.allclose(pixels[:, 0] - there[:, 0], CAMERA.fx * 0.1 / depth)
-    assert shows(right, 0.2, there, z, surface).mean() > 0.5
-    relative = compose(inverse(shot.path.poses_wc(np.zeros(1))), right.path.poses_wc(np.zeros(1)))[0]
-    assert np.allclose(relative, [0.1, 0, 0, 0, 0, 0, 1], atol=1e-9)

@@ -1,4 +1,4 @@
-"""Export: what is written is read back by the project's own readers; the commands around it."""
+"""Sequences and meshes written in the layouts of data sets."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.errors import DvoError
+from dvo.geometry.poses import look_rotation, pose_from
 from dvo.synth import mesh_scene
 from dvo.synth.export import OCCLUDED, OUT_OF_VIEW, export_sequence, mesh_sequence, static_flow
-from dvo.synth.poses import look_rotation, pose_from
 from dvo.synth.sequence import SyntheticSequence, make_sequence
+from dvo.synth.specs import SequenceFormat
 
 
 @pytest.fixture(scope="module")
@@ -88,12 +89,12 @@ def test_flow_knows_what_is_hidden_and_out_of_view() -> None:
 def test_mesh_sequence_reads_back_with_the_background_as_no_depth(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh")
     scene = mesh_scene(trimesh.creation.icosphere(subdivisions=2), ground=False)
-    sequence = mesh_sequence(scene, 1, frames=3, height=48, width=64, fps=10)
+    sequence = mesh_sequence(scene, 1, SequenceFormat(3, 48, 64, fps=10))
     export_sequence(sequence, tmp_path / "ball", "tartanair")
     check_read_back(tmp_path / "ball", sequence, "tartanair")
     depth = np.load(tmp_path / "ball" / "depth_left" / "000001_left_depth.npy")
     assert (depth == 0).any() and (depth > 0).any()
-    again = mesh_sequence(scene, 1, frames=3, height=48, width=64, fps=10)
+    again = mesh_sequence(scene, 1, SequenceFormat(3, 48, 64, fps=10))
     assert np.array_equal(again.frame(2).image, sequence.frame(2).image)
 
 

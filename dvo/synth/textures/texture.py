@@ -6,7 +6,6 @@ window of it, a tint and a contrast. Textures are drawn when they are first used
 
 from __future__ import annotations
 
-import importlib.util
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,70 +15,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dvo.errors import DvoError
+from dvo.synth import salts
 from dvo.synth.textures.patterns import PATTERNS, SPECIAL, Rng
+from dvo.synth.textures.photographs import folder_photographs, photographs
 
-# Photographs inside the scikit-image wheel (read from its folder, so nothing is ever downloaded) and what they suit.
-PHOTOGRAPHS = {
-    "astronaut.png": "photo", "brick.png": "wall", "camera.png": "photo", "chelsea.png": "photo",
-    "coffee.png": "photo", "coins.png": "photo", "grass.png": "ground", "gravel.png": "stone",
-    "hubble_deep_field.jpg": "photo", "ihc.png": "busy", "moon.png": "stone", "motorcycle_left.png": "photo",
-    "retina.jpg": "photo", "rocket.jpg": "photo",
-    "cell.png": "stone", "clock_motion.png": "photo",
-}  # fmt: skip
 # How often each pattern is drawn in a pool, relative to the others.
 WEIGHTS = {"plain": 2.0, "leaves": 2.0, "fractal": 2.0, "facade": 2.0, "asphalt": 1.5, "stains": 2.0, "clouds": 0.7}
-
-
-def photographs() -> list[tuple[np.ndarray, str]]:
-    """The RGB photographs in [0, 1] that an installed scikit-image carries, with tags; empty without the package."""
-    spec = importlib.util.find_spec("skimage")
-    if spec is None or spec.origin is None:
-        return []
-    found = []
-    for name, tag in PHOTOGRAPHS.items():
-        image = cv2.imread(str(Path(spec.origin).parent / "data" / name), cv2.IMREAD_COLOR)
-        if image is not None:
-            found.append((cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255, tag))
-    return found
-
-
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
-MOST_PHOTOGRAPHS, EDGE = 96, 1024  # of a folder: how many a pool takes, and their longer edge in pixels
-TAGS = {tag for _, tag in (*PATTERNS.values(), *SPECIAL.values())} | {"photo"}
-
-
-def folder_photographs(folder: Path | str, seed: int) -> list[tuple[np.ndarray, str]]:
-    """RGB photographs in [0, 1] from a folder and its subfolders, with tags: up to ``MOST_PHOTOGRAPHS``, drawn by seed.
-
-    A subfolder named after a tag ("wall", "floor", "ground", ...) says what its pictures suit; others suit "photo".
-
-    Raises:
-        DvoError: no such folder, no pictures in it, or one that cannot be read.
-    """
-    folder = Path(folder)
-    remedy = f"give a folder with pictures ({', '.join(SUFFIXES[:3])}, ...)"
-    if not folder.is_dir():
-        raise DvoError("no such folder", file=folder, field="textures", remedy=remedy)
-    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES and file.is_file())
-    if not files:
-        raise DvoError("no pictures in it", file=folder, field="textures", remedy=remedy)
-    if len(files) > MOST_PHOTOGRAPHS:
-        chosen = np.random.default_rng([seed, 7003]).choice(len(files), MOST_PHOTOGRAPHS, replace=False)
-        files = [files[i] for i in sorted(chosen)]
-    found = []
-    for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
-        if image is None:
-            raise DvoError("cannot be read as a picture", file=file, field="textures", remedy="mend or remove the file")
-        if min(image.shape[:2]) < 16:
-            raise DvoError("smaller than 16 pixels", file=file, field="textures", remedy="remove the file")
-        shrink = EDGE / max(image.shape[:2])
-        if shrink < 1:
-            image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-        tag = file.parent.name if file.parent.name in TAGS else "photo"
-        found.append((cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255, tag))
-    return found
 
 
 def _window(rng: Rng, photo: np.ndarray, size: int) -> np.ndarray:
@@ -144,7 +85,7 @@ class TexturePool:
         # Every pattern at least once, then by weight.
         names = list(PATTERNS)
         weights = np.array([WEIGHTS.get(name, 1.0) for name in names])
-        chooser = np.random.default_rng([seed, 7001])
+        chooser = np.random.default_rng([seed, salts.POOL])
         plan = iter([*names, *chooser.choice(names, count, p=weights / weights.sum())])
         self._sources: list[str | int] = [
             i // 3 % len(self._photos) if self._photos and i % 3 == 2 else str(next(plan)) for i in range(count)
@@ -159,7 +100,7 @@ class TexturePool:
     def use(self, index: int) -> np.ndarray:
         """See to it that a texture is drawn; returns its mean colour ``(3,)``."""
         if not self._ready[index]:
-            rng = np.random.default_rng([self.seed, 7002, index])
+            rng = np.random.default_rng([self.seed, salts.TEXTURE, index])
             source = self._sources[index]
             if isinstance(source, int):
                 image = _window(rng, self._photos[source][0], self.size)

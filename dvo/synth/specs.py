@@ -1,0 +1,196 @@
+"""Specifications of a rendered sequence: format, scene, motion and camera, each a small frozen dataclass.
+
+Configuration files and keyword arguments name the settings flat (``frames``, ``family``, ``speed``, ``shutter``...);
+:func:`sequence_spec` is the one place that sorts them into the specifications.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from dvo.errors import DvoError
+from dvo.geometry.camera import DistortionModel
+
+
+@dataclass(frozen=True)
+class SequenceFormat:
+    """Length, image size and frame rate.
+
+    Args:
+        frames: number of frames.
+        height, width: image size, pixels.
+        fps: frames per second.
+        supersample: rays per pixel edge for the colours.
+
+    Raises:
+        DvoError: fewer than one frame, an image below 16x16 pixels, or a rate that is not positive.
+    """
+
+    frames: int = 300
+    height: int = 240
+    width: int = 320
+    fps: float = 30.0
+    supersample: int = 1
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.height < 16 or self.width < 16 or self.fps <= 0:
+            raise DvoError("a sequence needs a frame or more of 16x16 pixels or more and fps > 0", field="frames, fps")
+
+    @property
+    def duration(self) -> float:
+        """Length in seconds."""
+        return self.frames / self.fps
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """Choice of a scene and of its appearance.
+
+    Args:
+        family: name in ``dvo.synth.FAMILIES``; drawn from the training families if None.
+        texture: share of the textures' contrast that is kept, in [0, 1]; small values give bare walls.
+        movers: number of moving bodies.
+        apart: take a scene seed that training clips never draw (``dvo.synth.sequence.APART`` or above).
+        textures: folder of photographs to use as textures; those shipped with scikit-image if None.
+
+    Raises:
+        DvoError: a number out of range.
+    """
+
+    family: str | None = None
+    texture: float = 1.0
+    movers: int = 0
+    apart: bool = False
+    textures: str | None = None
+
+    def __post_init__(self) -> None:
+        _check_share("texture", self.texture)
+        _check_range("movers", self.movers >= 0)
+
+
+@dataclass(frozen=True)
+class MotionSpec:
+    """Choice of a camera path.
+
+    Args:
+        kind: one of ``dvo.synth.LONG_KINDS``; if None, a drive in streets and corridors and a hand-held walk elsewhere.
+        speed: relative to a relaxed pace.
+        shake: factor on the amplitude of the hand's shake.
+    """
+
+    kind: str | None = None
+    speed: float = 1.0
+    shake: float = 1.0
+
+
+@dataclass(frozen=True)
+class CameraSpec:
+    """Camera effects. The sensor's other parameters (noise, vignetting, gamma...) are drawn from the seed.
+
+    Args:
+        sensor: False gives clean renderings: no noise, and none of the effects below except ``lens``.
+        shutter: share of the frame interval during which light is gathered (motion blur along the path).
+        rolling_shutter: share of the frame interval that reading the rows takes.
+        lighting: strength of exposure changes (drifts and sudden jumps), stops.
+        light: share of the usual light that arrives, in (0, 1]; the camera amplifies it together with the noise.
+        blackout: seconds without light in the middle of the sequence.
+        drop: probability that a frame is lost.
+        jpeg: JPEG quality from 1 to 100, 0 for no compression.
+        lens: ``radtan`` or ``fisheye`` draws a lens with distortion; frames are delivered distorted.
+
+    Raises:
+        DvoError: a number out of range.
+    """
+
+    sensor: bool = True
+    shutter: float = 0.0
+    rolling_shutter: float = 0.0
+    lighting: float = 0.0
+    light: float = 1.0
+    blackout: float = 0.0
+    drop: float = 0.0
+    jpeg: int = 0
+    lens: DistortionModel = "none"
+
+    def __post_init__(self) -> None:
+        for name in ("shutter", "rolling_shutter", "light", "drop"):
+            _check_share(name, getattr(self, name))
+        _check_range("light", self.light > 0)
+        _check_range("lighting", self.lighting >= 0)
+        _check_range("blackout", self.blackout >= 0)
+        _check_range("jpeg", 0 <= self.jpeg <= 100)
+
+
+@dataclass(frozen=True)
+class SequenceSpec:
+    """Everything that a sequence is made from, except seed and device.
+
+    Args:
+        format: length, size and rate.
+        scene: scene and appearance.
+        motion: camera path.
+        camera: camera effects.
+
+    Raises:
+        DvoError: a blackout that lasts as long as the sequence.
+    """
+
+    format: SequenceFormat = field(default_factory=SequenceFormat)
+    scene: SceneSpec = field(default_factory=SceneSpec)
+    motion: MotionSpec = field(default_factory=MotionSpec)
+    camera: CameraSpec = field(default_factory=CameraSpec)
+
+    def __post_init__(self) -> None:
+        _check_range("blackout", self.camera.blackout < self.format.duration)
+
+
+def sequence_spec(base: SequenceSpec | None = None, **options: Any) -> SequenceSpec:
+    """Specification from flat option names, as configuration files have them.
+
+    Args:
+        base: specification that supplies the options not given; the defaults if None.
+        options: fields of :class:`SequenceFormat`, :class:`SceneSpec`, :class:`MotionSpec` and :class:`CameraSpec`.
+
+    Raises:
+        DvoError: an unknown name, or a number out of range.
+
+    Example:
+        >>> sequence_spec(frames=60, family="room", kind="handheld", shutter=0.5).motion
+        MotionSpec(kind='handheld', speed=1.0, shake=1.0)
+    """
+    base = base or SequenceSpec()
+    parts = {part.name: getattr(base, part.name) for part in fields(SequenceSpec)}
+    owner = {option.name: name for name, part in parts.items() for option in fields(part)}
+    check_names(options, owner)
+    changed = {
+        name: replace(part, **{option: value for option, value in options.items() if owner[option] == name})
+        for name, part in parts.items()
+    }
+    return SequenceSpec(**changed)
+
+
+def check_names(options: dict[str, Any], known: Any) -> None:
+    """Reject options of unknown name.
+
+    Args:
+        options: by name.
+        known: iterable of the names that exist.
+
+    Raises:
+        DvoError: an unknown name.
+    """
+    unknown = sorted(set(options) - set(known))
+    if unknown:
+        names = ", ".join(sorted(known))
+        raise DvoError(f"no rendering option '{unknown[0]}'", field=unknown[0], remedy=f"use one of {names}")
+
+
+def _check_share(name: str, value: float) -> None:
+    if not 0 <= value <= 1:
+        raise DvoError(f"not a share: {value}", field=name, remedy="give a number from 0 to 1")
+
+
+def _check_range(name: str, valid: bool) -> None:
+    if not valid:
+        raise DvoError("out of range", field=name, remedy="see dvo.synth.specs for its range")

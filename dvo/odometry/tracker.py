@@ -19,15 +19,15 @@ from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
+from dvo.graph.keyframe_log import KeyframeLog
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights
 from dvo.nets.edge_correlation import EdgeCorrelation
 from dvo.nets.patchifier import normalise_images, patch_coordinates, pool_levels, random_centres
-from dvo.odometry.chronicle import Chronicle
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.motion import flow_magnitude, parallax, predict_pose
-from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from dvo.odometry.working_image import working_image
 
 
@@ -66,7 +66,7 @@ class PatchOdometry:
             for scale in c.pyramid
         ]
         self._bounds = (0, 0)  # width and height of the feature map
-        self._chronicle = Chronicle()
+        self._log = KeyframeLog()
         self._count = 0
         self._initialised = False
         self._blind = 0
@@ -91,7 +91,7 @@ class PatchOdometry:
         self._connect()
         if not self._initialised and len(window) > 1 and self._probe() < config.initial_motion:
             return self._skip(frame)
-        record = self._chronicle.add(frame.timestamp, keyframe.identifier)
+        record = self._log.add(frame.timestamp, keyframe.identifier)
         before = window.poses_cw, window.patches, window.hidden, window.weights
         if self._initialised:
             searching = 0 < self._blind <= config.patience
@@ -122,17 +122,17 @@ class PatchOdometry:
                 self._update(COLD_UPDATES if self._initialised else age)
         while len(window):
             self._settle()
-        trajectory, read = self._chronicle.trajectory(), len(self._chronicle.frames)
+        trajectory, read = self._log.trajectory(), len(self._log.frames)
         info = {
-            **self._info, "keyframes": self._chronicle.keyframes, "seed": self.seed, "initialised": self._initialised,
+            **self._info, "keyframes": self._log.keyframes, "seed": self.seed, "initialised": self._initialised,
             "config": asdict(config),
         }  # fmt: skip
-        return Result(trajectory, self._chronicle.map(), read, read - len(trajectory), info)
+        return Result(trajectory, SparseMap(*self._log.points()), read, read - len(trajectory), info)
 
     # -- steps of a frame ----------------------------------------------------------------------------------------
 
     def _check(self, frame: Frame) -> None:
-        past = self._chronicle.frames
+        past = self._log.frames
         if past and frame.timestamp <= past[-1].timestamp:
             raise DvoError(
                 f"time {frame.timestamp} does not come after {past[-1].timestamp}",
@@ -236,7 +236,7 @@ class PatchOdometry:
     def _skip(self, frame: Frame) -> Estimate:
         """Before initialisation: a frame that shows too little motion shares the pose of the keyframe before it."""
         self.window.remove(len(self.window) - 1)
-        self._chronicle.add(frame.timestamp, self.window.frames[-1].identifier)
+        self._log.add(frame.timestamp, self.window.frames[-1].identifier)
         return Estimate(frame.timestamp, self._pose_wc(len(self.window) - 1), Status.INITIALISING)
 
     def _initialise(self) -> None:
@@ -281,7 +281,7 @@ class PatchOdometry:
         window = self.window
         relative = se3.relative(window.poses_cw[index - 1], window.poses_cw[index]).double().cpu().numpy()
         anchor, oldest = window.frames[index - 1].identifier, window.frames[0].identifier
-        self._chronicle.rehang(window.remove(index).identifier, anchor, relative, oldest)
+        self._log.reanchor(window.remove(index).identifier, anchor, relative, oldest)
 
     def _settle(self) -> None:
         """The oldest keyframe leaves the window: its pose and points are final."""
@@ -292,8 +292,8 @@ class PatchOdometry:
         rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
         world = se3.act(se3.inverse(pose), rays / d[:, None])
         near = (d > 0.05 * d.median()).cpu().numpy()  # a far point's depth is a guess
-        self._chronicle.add_points(world.float().cpu().numpy()[near], frame.colors.numpy()[near])
-        self._chronicle.settle(frame.identifier, pose.double().cpu().numpy())
+        self._log.add_points(world.float().cpu().numpy()[near], frame.colors.numpy()[near])
+        self._log.set_pose(frame.identifier, pose.double().cpu().numpy())
         window.remove(0)
 
     def _confidence(self) -> float:

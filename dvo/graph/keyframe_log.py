@@ -1,0 +1,175 @@
+"""Log of a keyframe tracker: frames relative to keyframes, poses of keyframes, points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dvo.data.trajectory import Trajectory
+from dvo.geometry import se3
+from dvo.geometry.poses import poses_from_matrices
+
+
+@dataclass
+class FrameRecord:
+    """Frame of the sequence.
+
+    Attributes:
+        timestamp: seconds.
+        anchor: keyframe that carries the frame; None while the frame has no pose.
+        relative: pose of the frame relative to its anchor, ``T_cw = relative T_cw[anchor]``; None for the identity.
+        lost: tracking was lost; the frame gets no row in the trajectory.
+    """
+
+    timestamp: float
+    anchor: int | None
+    relative: np.ndarray | None = None
+    lost: bool = False
+
+
+class KeyframeLog:
+    """Every frame relative to an anchor keyframe, so that a keyframe that moves takes its frames with it.
+
+    Keyframes are numbered by the caller. A pose is ``T_cw``, world to camera, either ``(7,)`` or a ``(4, 4)`` matrix,
+    float64; one log keeps to one of the two. A keyframe without a pose yet is one that is still being optimised: give
+    its pose with :meth:`set_pose` at any time before the trajectory is read, as often as it changes.
+
+    Attributes:
+        frames: record of every frame that was read, in order of time.
+
+    Example:
+        >>> log = KeyframeLog()
+        >>> _ = log.add(0.0, anchor=0)
+        >>> log.set_pose(0, np.array([0.0, 0, 0, 0, 0, 0, 1]))
+        >>> len(log.trajectory())
+        1
+    """
+
+    def __init__(self) -> None:
+        self.frames: list[FrameRecord] = []
+        self._poses: dict[int, np.ndarray] = {}
+        self._points: list[np.ndarray] = []
+        self._colors: list[np.ndarray] = []
+
+    def add(self, timestamp: float, anchor: int | None = None) -> FrameRecord:
+        """Append a frame with the pose of keyframe ``anchor``, or without a pose.
+
+        Args:
+            timestamp: seconds.
+            anchor: keyframe; None for a frame whose pose is not known yet, see :meth:`place`.
+
+        Returns:
+            The record, which may be edited.
+        """
+        self.frames.append(FrameRecord(timestamp, anchor))
+        return self.frames[-1]
+
+    def place(self, frame: int, anchor: int, T_cw: np.ndarray) -> None:
+        """Give a frame its pose, relative to a keyframe that has one.
+
+        Args:
+            frame: position in :attr:`frames`.
+            anchor: keyframe.
+            T_cw: pose of the frame.
+        """
+        record = self.frames[frame]
+        record.anchor, record.relative = anchor, _compose(T_cw, _inverse(self._poses[anchor]))
+        record.lost = False
+
+    def reanchor(self, gone: int, anchor: int, relative: np.ndarray | None = None, oldest: int | None = None) -> None:
+        """Remove keyframe ``gone``; its frames are relative to ``anchor`` from now on and stay where they are.
+
+        Args:
+            gone, anchor: keyframes.
+            relative: pose of ``gone`` relative to ``anchor``; None takes the poses of both from the log.
+            oldest: frames of keyframes older than this end the search; None searches all.
+        """
+        for frame in range(len(self.frames) - 1, -1, -1):
+            record = self.frames[frame]
+            if record.anchor == gone:
+                if relative is None:
+                    self.place(frame, anchor, _compose(record.relative, self._poses[gone]))
+                else:
+                    record.anchor, record.relative = anchor, _compose(record.relative, relative)
+            elif oldest is not None and record.anchor is not None and record.anchor < oldest:
+                break
+        self._poses.pop(gone, None)
+
+    def set_pose(self, keyframe: int, T_cw: np.ndarray) -> None:
+        """Set or change the pose of a keyframe.
+
+        Args:
+            keyframe: its number.
+            T_cw: ``(7,)`` or ``(4, 4)``.
+        """
+        self._poses[keyframe] = T_cw
+
+    def add_points(self, points: np.ndarray, colors: np.ndarray) -> None:
+        """Append world points.
+
+        Args:
+            points: ``(N, 3)`` float32, in the unit of the poses.
+            colors: ``(N, 3)`` uint8 RGB.
+        """
+        self._points.append(points)
+        self._colors.append(colors)
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes that have a pose."""
+        return len(self._poses)
+
+    def pose(self, frame: int) -> np.ndarray | None:
+        """Pose of a frame.
+
+        Args:
+            frame: position in :attr:`frames`; negative counts from the end.
+
+        Returns:
+            ``T_cw`` in the form of the keyframes' poses, or None while the frame or its keyframe has none.
+        """
+        record = self.frames[frame]
+        anchor = None if record.anchor is None else self._poses.get(record.anchor)
+        return None if anchor is None else _compose(record.relative, anchor)
+
+    def trajectory(self) -> Trajectory:
+        """Trajectory of every frame that has a pose and was not lost, camera to world."""
+        kept = [record for record in self.frames if not record.lost and record.anchor in self._poses]
+        rows = np.zeros((0, 7))
+        if kept:
+            anchors = np.stack([self._poses[record.anchor] for record in kept])  # type: ignore[index]
+            identity = _identity(anchors)
+            relative = np.stack([identity if record.relative is None else record.relative for record in kept])
+            rows = _rows(_inverse(_compose(relative, anchors)))
+        return Trajectory(np.array([record.timestamp for record in kept], dtype=np.float64), rows)
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """World points ``(M, 3)`` float32 and their colours ``(M, 3)`` uint8 RGB."""
+        points = np.concatenate([np.zeros((0, 3), np.float32), *self._points])
+        return points, np.concatenate([np.zeros((0, 3), np.uint8), *self._colors])
+
+
+def _is_matrix(pose: np.ndarray) -> bool:
+    return pose.shape[-1] == 4
+
+
+def _identity(pose: np.ndarray) -> np.ndarray:
+    """Identity in the form of ``pose``."""
+    return np.eye(4) if _is_matrix(pose) else np.array([0.0, 0, 0, 0, 0, 0, 1])
+
+
+def _compose(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
+    """``a b`` of two poses of one form; None stands for the identity."""
+    a = _identity(b) if a is None else a
+    return a @ b if _is_matrix(b) else se3.compose(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+
+
+def _inverse(pose: np.ndarray) -> np.ndarray:
+    return np.linalg.inv(pose) if _is_matrix(pose) else se3.inverse(torch.from_numpy(pose)).numpy()
+
+
+def _rows(poses: np.ndarray) -> np.ndarray:
+    """``(N, 7)`` with unit quaternions."""
+    return poses_from_matrices(poses) if _is_matrix(poses) else se3.normalise(torch.from_numpy(poses)).numpy()

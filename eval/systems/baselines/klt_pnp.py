@@ -7,7 +7,8 @@ new view (:meth:`_update_points`).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -59,8 +60,8 @@ class KltPnp:
 
     name = "klt-pnp"
 
-    def __init__(self, config: KltPnpConfig | None = None, seed: int = 0) -> None:
-        self.config = config or KltPnpConfig()
+    def __init__(self, config: KltPnpConfig | None = None, seed: int = 0, **settings: Any) -> None:
+        self.config = replace(config or KltPnpConfig(), **settings)
         self._seed = seed
         self._log = FrameLog()
         self._tracks = Tracks()

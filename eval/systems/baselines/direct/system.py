@@ -8,7 +8,8 @@ Keyframes stay where they were put: no pose graph, no joint optimisation.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -91,8 +92,8 @@ class DirectOdometry:
 
     name = "direct"
 
-    def __init__(self, config: DirectConfig | None = None, seed: int = 0) -> None:
-        self.config = config or DirectConfig()
+    def __init__(self, config: DirectConfig | None = None, seed: int = 0, **settings: Any) -> None:
+        self.config = replace(config or DirectConfig(), **settings)
         self._seed = seed
         self._log = FrameLog()
         self._intrinsics, self._size = np.ones(4), (0, 0)

@@ -8,7 +8,8 @@ triangulated and adjusted, and new corners begin. No loop closing: nothing older
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,8 +32,8 @@ class KeyframeOdometry:
 
     name = "keyframe"
 
-    def __init__(self, config: KeyframeConfig | None = None, seed: int = 0) -> None:
-        self.config = config or KeyframeConfig()
+    def __init__(self, config: KeyframeConfig | None = None, seed: int = 0, **settings: Any) -> None:
+        self.config = replace(config or KeyframeConfig(), **settings)
         self._seed = seed
         self._log = FrameLog()
         self._intrinsics, self._size = np.ones(4), (0, 0)

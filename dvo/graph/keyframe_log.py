@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import torch
 
 from dvo.data.trajectory import Trajectory
-from dvo.geometry import se3
 from dvo.geometry.poses import poses_from_matrices
 
 
@@ -163,13 +162,31 @@ def _identity(pose: np.ndarray) -> np.ndarray:
 def _compose(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
     """``a b`` of two poses of one form; None stands for the identity."""
     a = _identity(b) if a is None else a
-    return a @ b if _is_matrix(b) else se3.compose(torch.from_numpy(a), torch.from_numpy(b)).numpy()
+    if _is_matrix(b):
+        return a @ b
+    se3, tensor = _se3()
+    return se3.compose(tensor(a), tensor(b)).numpy()
 
 
 def _inverse(pose: np.ndarray) -> np.ndarray:
-    return np.linalg.inv(pose) if _is_matrix(pose) else se3.inverse(torch.from_numpy(pose)).numpy()
+    if _is_matrix(pose):
+        return np.linalg.inv(pose)
+    se3, tensor = _se3()
+    return se3.inverse(tensor(pose)).numpy()
 
 
 def _rows(poses: np.ndarray) -> np.ndarray:
     """``(N, 7)`` with unit quaternions."""
-    return poses_from_matrices(poses) if _is_matrix(poses) else se3.normalise(torch.from_numpy(poses)).numpy()
+    if _is_matrix(poses):
+        return poses_from_matrices(poses)
+    se3, tensor = _se3()
+    return se3.normalise(tensor(poses)).numpy()
+
+
+def _se3() -> tuple[Any, Any]:
+    """Group operations, imported when needed: a log of matrices does without torch and its memory."""
+    import torch
+
+    from dvo.geometry import se3
+
+    return se3, torch.from_numpy

@@ -14,14 +14,14 @@ import re
 import shutil
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from dvo.data.source import Source
 from dvo.odometry.results import jsonable
 from eval.execution.predict import RECORD, Job, Prediction, predict, read_prediction
-from eval.execution.versions import code_digest, feels_threads, library_versions, reader_digest
+from eval.execution.versions import code_digest, depends_on_threads, library_versions, reader_digest
 from eval.suites.suite import Sequence
 from eval.systems.registry import System, find_system
 
@@ -34,14 +34,17 @@ PASSING = ("unavailable", "no data")  # states that the user mends without chang
 
 @dataclass(frozen=True)
 class SystemFacts:
-    """What the key and the report need of a system, asked once for a whole evaluation.
+    """Properties of a system that the key and the report need, found once for a whole evaluation.
 
     Attributes:
-        label: the name as in the tables: without the folders of a file in it.
-        version: as in the tables, ``""`` if the system cannot say.
-        missing: why it cannot run, or None.
+        name: as on the command line.
+        label: as in the tables.
+        licence, about: see :class:`eval.systems.registry.System`.
+        version: ``""`` if the system cannot run or has none.
+        missing: reason why it cannot run, or None.
         code, libraries, threads: see :mod:`eval.execution.versions`; ``threads`` is whether their number may change
             results.
+        identity: target and settings, see :meth:`eval.systems.registry.System.identity`.
     """
 
     name: str
@@ -53,28 +56,34 @@ class SystemFacts:
     code: str
     libraries: dict[str, str]
     threads: bool
+    identity: dict[str, Any] = field(default_factory=dict)
 
 
 def system_facts(name: str, weights: str | None = None) -> SystemFacts:
-    """Ask a system.
+    """Look a system up and find its facts.
+
+    Args:
+        name: as on the command line.
+        weights: weights file for ``dvo-...`` systems in place of the package's own.
 
     Raises:
         DvoError: no such system.
     """
     system = find_system(name, weights)
     missing = system.missing()
-    on_torch = feels_threads(system)
+    threads = depends_on_threads(system)
     libraries = library_versions()
     return SystemFacts(
         name=name,
-        label=name.replace(name.partition(":")[2], Path(name).name) if name.startswith("dvo:") else Path(name).name,
+        label=system.name,
         licence=system.licence,
         about=system.about,
         version="" if missing is not None else _version(system),
         missing=missing,
         code=code_digest(system),
-        libraries={name: version for name, version in libraries.items() if name != "torch" or on_torch},
-        threads=on_torch,
+        libraries={name: version for name, version in libraries.items() if name != "torch" or threads},
+        threads=threads,
+        identity=system.identity(),
     )
 
 
@@ -110,8 +119,8 @@ def job_key(job: Job, facts: SystemFacts, fingerprint: str, suite: dict[str, Any
     """
     sequence = {name: value for name, value in jsonable(asdict(job.sequence)).items() if name not in NOT_IN_KEY}
     return {
-        "format": 1,
-        "system": job.system,
+        "format": 2,
+        **facts.identity,
         "version": facts.version,
         "code": facts.code,
         "libraries": facts.libraries,

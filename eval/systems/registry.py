@@ -1,212 +1,236 @@
-"""The systems that can be chosen by name, each behind :class:`dvo.odometry.protocol.Odometry`.
+"""Registry of the systems that can be compared, each behind :class:`dvo.odometry.protocol.Odometry`.
 
-The classical ones and the peers are here; ``dvo-NAME`` is the learned tracker with weights NAME of the package,
-``dvo:FILE`` the same with a weights file, ``FILE.py:NAME`` a system of one's own (:mod:`eval.systems.plugin`). A system
-that cannot run says why instead of raising.
+A system is a class (or a function that returns an odometry), given as ``"module:Class"``, and its settings. On the
+command line it is chosen by
+
+- a name of the registry: the classical baselines and the peers below, and those that other packages announce under the
+  entry-point group ``dvo.systems``;
+- ``dvo-NAME``, the learned odometry with weights NAME of the package, or ``dvo:FILE`` with a weights file;
+- ``package.module:Class``, a class that can be imported;
+- ``FILE.py:Class``, a class in a file (:mod:`eval.systems.plugin`).
+
+Any of them may carry settings, passed on as keyword arguments: ``klt-pnp+corners=400``, ``dvo-small+patches=48``.
+Nothing of a system is imported before it is built, in a process of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
 
 import dvo
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Odometry
+from dvo.registry import Registry, is_target, resolve_target
 from eval.systems import plugin
-from eval.systems.peers import colmap, orbslam3, svo
+
+DEFAULT = ("dvo-small", "klt-pnp", "null")
+LEARNED = "dvo:load"
+_OWN = ("dvo", "eval")
 
 
 @dataclass(frozen=True)
 class System:
-    """One entry of the registry.
+    """Description of a system; makes odometries of it.
 
     Attributes:
-        name: as on the command line and in the tables.
+        name: in the tables.
+        target: ``"module:Class"`` or ``"FILE.py:Class"``; called with the settings, and with ``seed`` and ``device``
+            if it accepts them.
+        settings: keyword arguments of the class.
         licence: of the code that runs.
         about: one line.
-        build: ``build(seed, device)`` gives a fresh odometry for one sequence.
-        version: gives the version of what would run.
-        missing: gives the reason why it cannot run, or None.
+        version_from, missing_from: ``"module:function"`` that returns the version, or the reason why the system cannot
+            run here (None if it can); called with those of the settings that it accepts. Empty for the default.
     """
 
     name: str
-    licence: str
-    about: str
-    build: Callable[[int, str], Odometry]
-    version: Callable[[], str]
-    missing: Callable[[], str | None]
+    target: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    licence: str = "MIT"
+    about: str = ""
+    version_from: str = ""
+    missing_from: str = ""
+
+    def build(self, seed: int, device: str) -> Odometry:
+        """Odometry for one sequence.
+
+        Args:
+            seed: of everything random in it.
+            device: where networks compute.
+
+        Raises:
+            DvoError: there is no such module or class.
+        """
+        make = plugin.load(self.target) if plugin.is_plugin(self.target) else resolve_target(self.target, "system")
+        return plugin.call(make, {"seed": seed, "device": device}, self.settings)
+
+    def version(self) -> str:
+        """Version of what would run: of its package, or a hash of the file of a plugin."""
+        if self.version_from:
+            return str(plugin.call(resolve_target(self.version_from), self.settings))
+        if plugin.is_plugin(self.target):
+            return plugin.version(self.target)
+        top = self.target.split(".")[0].split(":")[0]
+        return dvo.__version__ if top in _OWN else _package(top).get("version", "-")
+
+    def missing(self) -> str | None:
+        """Reason why the system cannot run here, or None."""
+        if self.missing_from:
+            return plugin.call(resolve_target(self.missing_from), self.settings)
+        return plugin.missing(self.target)
+
+    def identity(self) -> dict[str, Any]:
+        """Target and settings, JSON-able, for the key of a prediction; a file in the settings counts by its content."""
+        return {"target": self.target, "settings": {name: _identity(value) for name, value in self.settings.items()}}
 
 
-DEFAULT = ("dvo-small", "klt-pnp", "null")
+_BASELINES, _PEERS = "eval.systems.baselines", "eval.systems.peers"
+CATALOGUE = (
+    System("klt-pnp", f"{_BASELINES}.klt_pnp:KltPnp",
+           about="KLT tracks, five-point essential matrix, triangulation, PnP (OpenCV)"),
+    System("monoslam", f"{_BASELINES}.monoslam.slam:MonoSlam",
+           about="filter: EKF over camera and inverse-depth points, active search, one-point RANSAC"),
+    System("keyframe", f"{_BASELINES}.keyframe.system:KeyframeOdometry",
+           about="two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)"),
+    System("direct", f"{_BASELINES}.direct.system:DirectOdometry",
+           about="semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)"),
+    System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",
+           about="ORB-SLAM3 monocular (pyorbslam3), without the official vocabulary",
+           version_from=f"{_PEERS}.orbslam3:version", missing_from=f"{_PEERS}.orbslam3:missing"),
+    System("svo", f"{_PEERS}.svo:Svo", licence="GPL-3", about="SVO (svo-cpp)",
+           version_from=f"{_PEERS}.svo:version", missing_from=f"{_PEERS}.svo:missing"),
+    System("colmap", f"{_PEERS}.colmap:Colmap", licence="BSD-3",
+           about="COLMAP (pycolmap), offline, at most 60 frames of a sequence",
+           version_from=f"{_PEERS}.colmap:version", missing_from=f"{_PEERS}.colmap:missing"),
+    System("null", f"{_BASELINES}.null:NullMotion",
+           about="straight line at constant speed, no rotation, images unread"),
+)  # fmt: skip
+SYSTEMS = Registry("system", "dvo.systems", {system.name: system.target for system in CATALOGUE})
+_described = {system.name: system for system in CATALOGUE}
 
 
-def find_system(name: str, weights: str | None = None) -> System:
+def add_system(system: System) -> None:
+    """Register a system with its description, for this process.
+
+    A package that only announces ``"module:Class"`` under the entry-point group ``dvo.systems`` needs no call, and is
+    found by the worker processes too; licence and description are then those of the package.
+
+    Raises:
+        DvoError: the name is taken.
+    """
+    SYSTEMS.register(system.name, system.target)
+    _described[system.name] = system
+
+
+def remove_system(name: str) -> None:
+    """Undo :func:`add_system`."""
+    SYSTEMS.unregister(name)
+    _described.pop(name, None)
+
+
+def find_system(text: str, weights: str | None = None) -> System:
     """Look a system up.
 
     Args:
-        name: see the module.
+        text: name or target, with settings or without; see the module.
         weights: weights file for ``dvo-...`` systems in place of the package's own.
 
     Raises:
         DvoError: no such system.
+
+    Example:
+        >>> find_system("klt-pnp+corners=400").settings
+        {'corners': 400}
     """
-    if name in _CLASSICAL:
-        return _CLASSICAL[name]
-    if plugin.is_plugin(name):
-        return _own(name)
-    if name.startswith("dvo:"):
-        return _learned(name, name.removeprefix("dvo:"))
-    if name.startswith("dvo-"):
-        return _learned(name, weights or name.removeprefix("dvo-"))
-    raise DvoError(
-        f"no system '{name}'",
-        field="--systems",
-        remedy=f"choose from {', '.join(_CLASSICAL)}, dvo-NAME, dvo:FILE, FILE.py:NAME",
-    )
+    name, settings = split_settings(text)
+    found = _find(name, weights)
+    if not settings:
+        return found
+    label = found.name + text[len(name) :]
+    return replace(found, name=label, settings={**found.settings, **settings})
+
+
+def split_settings(text: str) -> tuple[str, dict[str, Any]]:
+    """``NAME+key=value+key=value`` as name and settings; values are read as YAML.
+
+    Raises:
+        DvoError: a value that is no YAML.
+    """
+    name, *pairs = re.split(r"\+(?=[A-Za-z_]\w*=)", text)
+    try:
+        return name, {key: yaml.safe_load(value) for key, value in (pair.split("=", 1) for pair in pairs)}
+    except yaml.YAMLError as error:
+        raise DvoError("a setting cannot be read", field=text, remedy="write NAME+key=value") from error
 
 
 def list_systems() -> list[System]:
-    """Everything that has a name here, the package's own weights included."""
+    """Everything that has a name: the package's own weights and the registry."""
     from dvo.models.weights import list_weights
 
-    names = dict.fromkeys(["dvo-small", *(f"dvo-{info.name}" for info in list_weights())])
-    return [find_system(name) for name in names] + list(_CLASSICAL.values())
+    names = dict.fromkeys(["dvo-small", *(f"dvo-{info.name}" for info in list_weights()), *SYSTEMS])
+    return [find_system(name) for name in names]
 
 
-def _klt_pnp(seed: int, device: str) -> Odometry:
-    from eval.systems.baselines.klt_pnp import KltPnp
-
-    return KltPnp(seed=seed)
-
-
-def _keyframe(seed: int, device: str) -> Odometry:
-    from eval.systems.baselines.keyframe.system import KeyframeOdometry
-
-    return KeyframeOdometry(seed=seed)
-
-
-def _direct(seed: int, device: str) -> Odometry:
-    from eval.systems.baselines.direct.system import DirectOdometry
-
-    return DirectOdometry(seed=seed)
-
-
-def _monoslam(seed: int, device: str) -> Odometry:
-    from eval.systems.baselines.monoslam import MonoSlam
-
-    return MonoSlam(seed=seed)
+def _find(name: str, weights: str | None) -> System:
+    if name in SYSTEMS:
+        described, target = _described.get(name), SYSTEMS.target(name)
+        return described if described is not None and described.target == target else _announced(name, target)
+    if plugin.is_plugin(name):
+        return System(Path(name).name, name, licence="the user's", about="a system of one's own")
+    if name.startswith("dvo:"):
+        return _learned(name.removeprefix("dvo:"))
+    if name.startswith("dvo-"):
+        return _learned(weights) if weights else _learned(name.removeprefix("dvo-"), name)
+    if is_target(name):
+        return _announced(name, name)
+    raise DvoError(
+        f"no system '{name}'",
+        field="--systems",
+        remedy=f"choose from {', '.join(SYSTEMS)}, dvo-NAME, dvo:FILE, package.module:Class, FILE.py:Class",
+    )
 
 
-def _orbslam3(seed: int, device: str) -> Odometry:
-    return orbslam3.OrbSlam3()
-
-
-def _svo(seed: int, device: str) -> Odometry:
-    return svo.Svo()
-
-
-def _colmap(seed: int, device: str) -> Odometry:
-    return colmap.Colmap(seed=seed)
-
-
-def _null(seed: int, device: str) -> Odometry:
-    from eval.systems.baselines.null import NullMotion
-
-    return NullMotion(seed)
-
-
-def _own(name: str) -> System:
+def _learned(weights: str, name: str | None = None) -> System:
+    """The learned odometry; weights from a file are named by it, never by weights of the package."""
     return System(
-        name,
-        "the user's",
-        "a system of one's own",
-        lambda seed, device: plugin.build(name, seed, device),
-        lambda: plugin.version(name),
-        lambda: plugin.missing(name),
+        name or f"dvo:{Path(weights).stem}",
+        LEARNED,
+        {"weights": weights},
+        about="learned patch flow and differentiable bundle adjustment",
+        version_from="eval.systems.learned:version",
+        missing_from="eval.systems.learned:missing",
     )
 
 
-def _learned(name: str, weights: str) -> System:
-    def build(seed: int, device: str) -> Odometry:
-        return dvo.load(weights, seed=seed, device=device)
-
-    def version() -> str:
-        from dvo.models.weights import weights_info
-
-        return f"{dvo.__version__}+{weights_info(weights).sha256[:8]}"
-
-    def missing() -> str | None:
-        from dvo.models.weights import find_weights
-
-        try:
-            find_weights(weights)
-        except DvoError as error:
-            return str(error)
-        return None
-
-    return System(name, "MIT", "learned patch flow and differentiable bundle adjustment", build, version, missing)
+def _announced(name: str, target: str) -> System:
+    """System of another package, described by the package's metadata."""
+    package = _package(target.split(".")[0].split(":")[0])
+    return System(name, target, licence=package.get("licence", "the user's"), about=package.get("about", target))
 
 
-_CLASSICAL = {
-    system.name: system
-    for system in (
-        System(
-            "klt-pnp",
-            "MIT",
-            "KLT tracks, five-point essential matrix, triangulation, PnP (OpenCV)",
-            _klt_pnp,
-            lambda: dvo.__version__,
-            lambda: None,
-        ),
-        System(
-            "monoslam",
-            "MIT",
-            "filter: EKF over camera and inverse-depth points, active search, one-point RANSAC",
-            _monoslam,
-            lambda: dvo.__version__,
-            lambda: None,
-        ),
-        System(
-            "keyframe",
-            "MIT",
-            "two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)",
-            _keyframe,
-            lambda: dvo.__version__,
-            lambda: None,
-        ),
-        System(
-            "direct",
-            "MIT",
-            "semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)",
-            _direct,
-            lambda: dvo.__version__,
-            lambda: None,
-        ),
-        System(
-            "orbslam3",
-            "GPL-3",
-            "ORB-SLAM3 monocular (pyorbslam3), without the official vocabulary",
-            _orbslam3,
-            orbslam3.version,
-            orbslam3.missing,
-        ),
-        System("svo", "GPL-3", "SVO (svo-cpp)", _svo, svo.version, svo.missing),
-        System(
-            "colmap",
-            "BSD-3",
-            "COLMAP (pycolmap), offline, at most 60 frames of a sequence",
-            _colmap,
-            colmap.version,
-            colmap.missing,
-        ),
-        System(
-            "null",
-            "MIT",
-            "straight line at constant speed, no rotation, images unread",
-            _null,
-            lambda: dvo.__version__,
-            lambda: None,
-        ),
-    )
-}
+def _package(top: str) -> dict[str, str]:
+    """Version, licence and summary of the distribution that holds a top-level module; empty if none does."""
+    found = metadata.packages_distributions().get(top)
+    if not found:
+        return {}
+    about = metadata.metadata(found[0])
+    facts = {
+        "version": about["Version"],
+        "licence": about["License-Expression"] or about["License"],
+        "about": about["Summary"],
+    }
+    return {name: value for name, value in facts.items() if value}
+
+
+def _identity(value: Any) -> Any:
+    if isinstance(value, str) and Path(value).is_file():
+        return f"sha256:{hashlib.sha256(Path(value).read_bytes()).hexdigest()}"
+    return value

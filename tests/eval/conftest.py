@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -15,13 +17,12 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.odometry.protocol import Odometry
-from eval.execution import predict as predict_module
 from eval.execution.plan import Plan, read_manifest
 from eval.execution.predict import Job, Prediction, predict, predict_here
 from eval.execution.runner import predict_all
 from eval.scoring.score import Row, score_all
 from eval.suites.suite import Sequence, Suite
-from eval.systems.registry import System, find_system
+from eval.systems.registry import System, add_system, find_system, remove_system
 
 CAMERA = Camera(250.0, 250.0, 159.5, 119.5, 320, 240)
 TEXELS = 120  # a metre of wall
@@ -133,29 +134,25 @@ def job(tmp_path: Path, image_folder: Path, sequence: Sequence) -> Job:
 
 
 @pytest.fixture
-def systems(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def systems(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
     """``systems(name=odometry, ...)`` puts odometries into the registry; a string is a reason to be missing."""
+    module = ModuleType("systems_of_a_test")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    module.version = lambda: "9.9"  # type: ignore[attr-defined]
+    names = []
 
     def register(**entries: Odometry | str) -> None:
-        table = {
-            name: System(
-                name,
-                "MIT",
-                "for a test",
-                lambda seed, device, thing=thing: thing,  # type: ignore[misc]
-                lambda: "9.9",
-                lambda thing=thing: thing if isinstance(thing, str) else None,  # type: ignore[misc]
-            )
-            for name, thing in entries.items()
-        }
+        for name, thing in entries.items():
+            setattr(module, name, lambda thing=thing: thing)
+            setattr(module, f"missing_{name}", lambda thing=thing: thing if isinstance(thing, str) else None)
+            place = module.__name__
+            add_system(System(name, f"{place}:{name}", about="for a test", version_from=f"{place}:version",
+                              missing_from=f"{place}:missing_{name}"))  # fmt: skip
+            names.append(name)
 
-        def find(name: str, weights: str | None = None) -> System:
-            return table[name] if name in table else find_system(name, weights)
-
-        for module in ("predict", "cache"):
-            monkeypatch.setattr(f"eval.{module}.find_system", find)
-
-    return register
+    yield register
+    for name in names:
+        remove_system(name)
 
 
 @pytest.fixture
@@ -170,7 +167,7 @@ def boom() -> Callable[[], None]:
 
 def here(job: Job) -> Prediction:
     """Run a job in this process, which is quicker and knows the systems of the test."""
-    if predict_module.find_system(job.system).missing():
+    if find_system(job.system).missing():
         return predict(job)
     return predict_here(job)
 

@@ -1,4 +1,4 @@
-"""Pictures through a lens that needs_undistortion straight lines: exact depth, surfaces and texture coordinates, resampled colours.
+"""Images through a lens with distortion: exact depth, surfaces and texture coordinates, resampled colours.
 
 A pinhole picture, the plate, covers all that the lens sees. Where the four plate pixels around the place of a lens
 pixel show one surface, that surface's linear functions are evaluated at the place itself; the other pixels, those along

@@ -7,16 +7,16 @@ new view (:meth:`_update_points`).
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from dvo.data.frame import Frame
-from dvo.geometry.poses import poses_from_matrices
 from dvo.odometry.protocol import Estimate, Result, Status
 from eval.systems.baselines import two_view
-from eval.systems.baselines.back_fill import map_of, result_of
+from eval.systems.baselines.frame_log import FrameLog, map_of
 from eval.systems.baselines.klt import Tracks, detect, follow
 
 
@@ -60,13 +60,10 @@ class KltPnp:
 
     name = "klt-pnp"
 
-    def __init__(self, config: KltPnpConfig | None = None, seed: int = 0) -> None:
-        self.config = config or KltPnpConfig()
+    def __init__(self, config: KltPnpConfig | None = None, seed: int = 0, **settings: Any) -> None:
+        self.config = replace(config or KltPnpConfig(), **settings)
         self._seed = seed
-        self._times: list[float] = []
-        self._T_cw: list[np.ndarray | None] = []
-        self._turns: list[np.ndarray | None] = []  # rotation from the frame before; None where it is not known
-        self._lost: set[int] = set()
+        self._log = FrameLog()
         self._tracks = Tracks()
         self._grey: np.ndarray | None = None  # the last image in which the tracks were seen
         self._intrinsics = np.ones(4)
@@ -81,29 +78,26 @@ class KltPnp:
         self._map: list[tuple[np.ndarray, np.ndarray]] = []
 
     def track(self, frame: Frame) -> Estimate:
-        index = len(self._times)
-        self._times.append(frame.timestamp)
-        self._T_cw.append(None)
-        self._turns.append(None)
+        index = self._log.begin(frame.timestamp)
         self._intrinsics, self._size = frame.camera.intrinsics, (frame.camera.width, frame.camera.height)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         if self._grey is None:
             self._begin(frame, grey, index)
-            return self._estimate(Status.INITIALISING)
+            return self._log.estimate(Status.INITIALISING)
         if not self._follow(grey, index):
-            self._lost.add(index)
+            self._log.mark_lost(index)
             self._blind += 1
             if self._blind >= self.config.patience or not self._started:
                 self._begin(frame, grey, index)
-            return self._estimate(Status.LOST)
+            return self._log.estimate(Status.LOST)
         self._grey, self._blind = grey, 0
         if not self._started:
             self._try_start(frame, grey, index)
-            return self._estimate(Status.TRACKING if self._started else Status.INITIALISING, 0.5)
+            return self._log.estimate(Status.TRACKING if self._started else Status.INITIALISING, 0.5)
         confidence = self._pose(index)
         self._update_points(index)
         self._refill(frame, grey, index)
-        return self._estimate(Status.TRACKING, confidence)
+        return self._log.estimate(Status.TRACKING, confidence)
 
     def finish(self) -> Result:
         self._retire(np.ones(len(self._tracks), bool))
@@ -113,7 +107,7 @@ class KltPnp:
             "maps_started": self._starts,
             "config": asdict(self.config),
         }
-        return result_of(self._times, self._T_cw, self._turns, self._lost, map_of(self._map), info)
+        return self._log.result(map_of(self._map), info)
 
     # --- tracks -------------------------------------------------------------------------------------------------------
 
@@ -125,7 +119,7 @@ class KltPnp:
         if held.sum() < max(c.pose_points, 8):
             return False
         if not self._blind:
-            self._turns[index] = two_view.rotation_between(tracks.uv[held], uv[held], self._intrinsics)
+            self._log.turns[index] = two_view.rotation_between(tracks.uv[held], uv[held], self._intrinsics)
         self._retire(~held)
         tracks.keep(held)
         tracks.last_uv, tracks.uv = tracks.uv, uv[held]
@@ -169,7 +163,7 @@ class KltPnp:
     def _start(self, pair: two_view.RelativePose, index: int) -> bool:
         """Points from the two views, poses of the frames between by PnP. False if the points are not convincing."""
         c, tracks = self.config, self._tracks
-        first = self._last_pose()
+        first = self._log.last_pose()
         second = pair.T_21 @ first
         terms = [
             two_view.ray_terms(two_view.rays(uv, self._intrinsics) @ T[:3, :3], _centre(T), np.ones(len(tracks)))
@@ -184,7 +178,8 @@ class KltPnp:
         depth = float(np.median(two_view.project(points[good], first, self._intrinsics)[1]))
         scale = 1 / depth if self._speed is None else self._speed * (index - self._reference)
         second[:3, 3] = scale * pair.T_21[:3, 3] + pair.T_21[:3, :3] @ first[:3, 3]
-        self._T_cw[self._reference], self._T_cw[index] = first, second
+        self._log.set_pose(self._reference, first)
+        self._log.set_pose(index, second)
         tracks.points[good] = _centre(first) + scale * (points[good] - _centre(first))
         tracks.keep(good | ~pair.inliers)
         self._observe(np.arange(len(tracks)), tracks.anchor_uv, first)
@@ -196,15 +191,11 @@ class KltPnp:
                 tracks.points[both], seen, self._intrinsics, c.reprojection, self._seed + frame
             )
             if pose is not None:
-                self._T_cw[frame] = pose[0]
+                self._log.set_pose(frame, pose[0])
                 self._observe(both[pose[1]], seen[pose[1]], pose[0])
         self._started, self._pending = True, []
         self._starts += 1
         return True
-
-    def _last_pose(self) -> np.ndarray:
-        """Pose of the newest frame that has one, as the place where a new map starts; identity for the first map."""
-        return next((T.copy() for T in reversed(self._T_cw) if T is not None), np.eye(4))
 
     # --- poses and points ---------------------------------------------------------------------------------------------
 
@@ -219,11 +210,11 @@ class KltPnp:
         else:
             T = self._step(index, known)
             inliers = self._seen_well(points, uv, T)
-        before = self._T_cw[index - 1]
+        before = self._log.pose(index - 1)
         if before is not None:
             step = float(np.linalg.norm(_centre(T) - _centre(before)))
             self._speed = step if self._speed is None else 0.9 * self._speed + 0.1 * step
-        self._T_cw[index] = T
+        self._log.set_pose(index, T)
         tracks.keep(np.isin(np.arange(len(tracks)), known[~inliers], invert=True))
         return float(inliers.mean()) if len(known) else 0.0
 
@@ -233,7 +224,7 @@ class KltPnp:
         Its length comes from the points that are left, or else the camera keeps its speed; without parallax it is 0.
         """
         c, tracks = self.config, self._tracks
-        last = self._last_pose()
+        last = self._log.last_pose()
         pair = two_view.relative_pose(tracks.last_uv, tracks.uv, self._intrinsics, c.epipolar, self._seed + index)
         step = np.eye(4)
         if pair is None or pair.parallax < c.step_parallax:
@@ -249,13 +240,13 @@ class KltPnp:
     def _update_points(self, index: int) -> None:
         """Add the newest view to every point, triangulate what has become possible, drop what contradicts."""
         c, tracks = self.config, self._tracks
-        T = self._T_cw[index]
+        T = self._log.pose(index)
         assert T is not None
         old = np.flatnonzero(tracks.has_point)
         self._observe(old, tracks.uv[old], T)
         new = np.flatnonzero(~tracks.has_point & (tracks.anchor != index))
         if len(new):
-            anchors = [self._T_cw[a] for a in tracks.anchor[new]]
+            anchors = [self._log.pose(a) for a in tracks.anchor[new]]
             R = np.array([a[:3, :3] for a in anchors])
             centres = np.array([_centre(a) for a in anchors])
             one = np.einsum("nji,nj->ni", R, two_view.rays(tracks.anchor_uv[new], self._intrinsics))
@@ -289,13 +280,6 @@ class KltPnp:
         pixels, depth = two_view.project(points, T_cw, self._intrinsics)
         error = np.nan_to_num(np.linalg.norm(pixels - uv, axis=1), nan=np.inf)
         return (depth > 0) & (error < self.config.reprojection)
-
-    # --- results ------------------------------------------------------------------------------------------------------
-
-    def _estimate(self, status: Status, confidence: float = 0.0) -> Estimate:
-        T = self._T_cw[-1]
-        pose = None if T is None else poses_from_matrices(np.linalg.inv(T))
-        return Estimate(self._times[-1], pose, status, confidence)
 
 
 def _centre(T_cw: np.ndarray) -> np.ndarray:

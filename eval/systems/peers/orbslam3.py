@@ -4,7 +4,7 @@ Its threads race: fed faster than the camera delivers, mapping starves. So frame
 say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). Poses are collected frame
 by frame; at the end the keyframes, which bundle adjustment has moved since, carry the frames around them along.
 
-It ships no vocabulary. ``DVO_ORB_VOCABULARY`` names the file (``python -m eval.systems.peers.vocabulary`` trains one),
+It ships no vocabulary. ``DVO_ORB_VOCABULARY`` names the file (``python -m eval vocabulary`` trains one),
 else the small one beside the test data is taken: figures with either are not those of the official vocabulary.
 """
 
@@ -33,31 +33,29 @@ version = version_of("pyorbslam3")
 
 
 def vocabulary_file() -> Path:
-    """The vocabulary that is used.
+    """Vocabulary that is used: ``$DVO_ORB_VOCABULARY``, else the small one in the data folder.
 
     Raises:
         DvoError: there is none.
     """
-    given = os.environ.get(VOCABULARY)
-    path = Path(given) if given else data_folder(None) / "orb_vocabulary" / "tiny_orb_vocabulary.txt"
+    remedy = f"run python -m eval vocabulary --out FILE, then set {VOCABULARY}=FILE"
+    try:
+        path = Path(os.environ.get(VOCABULARY) or data_folder(None) / "orb_vocabulary" / "tiny_orb_vocabulary.txt")
+    except DvoError:  # no data folder either: the vocabulary is what this system lacks
+        raise DvoError("no ORB vocabulary", field=VOCABULARY, remedy=remedy) from None
     if not path.is_file():
-        raise DvoError(
-            "no ORB vocabulary",
-            file=path,
-            remedy=f"python -m eval.systems.peers.vocabulary --out FILE, then {VOCABULARY}=FILE",
-        )
+        raise DvoError("no ORB vocabulary", file=path, remedy=remedy)
     return path
 
 
 def missing() -> str | None:
-    """Why it cannot run here, or None."""
-    reason = missing_module("pyorbslam3", "pip install pyorbslam3 (GPL-3; Linux x86-64)")
-    if reason is None:
-        try:
-            vocabulary_file()
-        except DvoError as error:
-            reason = str(error)
-    return reason
+    """Everything that keeps it from running here, the package and the vocabulary, or None."""
+    reasons = [missing_module("pyorbslam3", "pip install pyorbslam3 (GPL-3; Linux x86-64)")]
+    try:
+        vocabulary_file()
+    except DvoError as error:
+        reasons.append(str(error))
+    return "; ".join(reason for reason in reasons if reason) or None
 
 
 class OrbSlam3:

@@ -8,21 +8,21 @@ Keyframes stay where they were put: no pose graph, no joint optimisation.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from dvo.data.frame import Frame
-from dvo.geometry.poses import poses_from_matrices
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.working_image import working_image
-from eval.systems.baselines.back_fill import map_of, result_of
 from eval.systems.baselines.direct.align import Alignment, Reference, align
 from eval.systems.baselines.direct.depth import DepthConfig, DepthMap
 from eval.systems.baselines.direct.image import Level, pyramid
 from eval.systems.baselines.direct.start import TwoViewStart, spread
 from eval.systems.baselines.direct.stereo import StereoConfig, search_lines
+from eval.systems.baselines.frame_log import FrameLog, map_of
 
 
 @dataclass(frozen=True)
@@ -92,13 +92,10 @@ class DirectOdometry:
 
     name = "direct"
 
-    def __init__(self, config: DirectConfig | None = None, seed: int = 0) -> None:
-        self.config = config or DirectConfig()
+    def __init__(self, config: DirectConfig | None = None, seed: int = 0, **settings: Any) -> None:
+        self.config = replace(config or DirectConfig(), **settings)
         self._seed = seed
-        self._times: list[float] = []
-        self._T_cw: list[np.ndarray | None] = []
-        self._turns: list[np.ndarray | None] = []
-        self._lost: set[int] = set()
+        self._log = FrameLog()
         self._intrinsics, self._size = np.ones(4), (0, 0)
         self._key: Keyframe | None = None
         self._start: TwoViewStart | None = None
@@ -111,10 +108,7 @@ class DirectOdometry:
         self._counts = {"maps_started": 0, "keyframes": 0}
 
     def track(self, frame: Frame) -> Estimate:
-        index = len(self._times)
-        self._times.append(frame.timestamp)
-        self._T_cw.append(None)
-        self._turns.append(None)
+        index = self._log.begin(frame.timestamp)
         image, camera = working_image(frame, self.config.pixels)
         self._intrinsics, self._size = camera.intrinsics, (camera.width, camera.height)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -123,19 +117,19 @@ class DirectOdometry:
             return self._initialise(grey, levels, image, index)
         found = self._align(self._key, levels)
         if found is None:
-            self._lost.add(index)
+            self._log.mark_lost(index)
             self._blind += 1
             if self._blind >= self.config.patience:
                 self._retire(self._key)
                 self._key, self._start, self._blind = None, None, 0
                 self._initialise(grey, levels, image, index)
-            return self._estimate(Status.LOST)
+            return self._log.estimate(Status.LOST)
         self._moved(index, self._key, found)
         self._measure(self._key, levels[0], found)
         shift = np.linalg.norm(found.T[:3, 3]) * self._typical(self._key)
         if shift > self.config.keyframe_distance or found.overlap < self.config.keyframe_overlap:
             self._next_keyframe(levels, image, found)
-        return self._estimate(Status.TRACKING, found.agreement)
+        return self._log.estimate(Status.TRACKING, found.agreement)
 
     def finish(self) -> Result:
         if self._key is not None:
@@ -147,7 +141,7 @@ class DirectOdometry:
             **self._counts,
             "config": asdict(self.config),
         }
-        return result_of(self._times, self._T_cw, self._turns, self._lost, map_of(self._map), info)
+        return self._log.result(map_of(self._map), info)
 
     # --- every frame --------------------------------------------------------------------------------------------------
 
@@ -178,7 +172,7 @@ class DirectOdometry:
     def _moved(self, index: int, key: Keyframe, found: Alignment) -> None:
         """Take a pose and learn the motion."""
         step = found.T @ np.linalg.inv(self._last.T)
-        self._T_cw[index] = found.T @ key.T_cw
+        self._log.set_pose(index, found.T @ key.T_cw)
         if self._blind == 0:
             self._motion = step
             length = float(np.linalg.norm(step[:3, 3]))
@@ -241,19 +235,19 @@ class DirectOdometry:
         turn = None if self._start is None else self._start.follow(grey, self._intrinsics)
         if self._start is None or turn is None:
             if self._start is not None:
-                self._lost.add(index)
+                self._log.mark_lost(index)
             self._begin(grey, levels, image, index)
-            return self._estimate(Status.INITIALISING if index not in self._lost else Status.LOST)
-        self._turns[index] = turn
+            return self._log.estimate(Status.LOST if self._log.is_lost(index) else Status.INITIALISING)
+        self._log.turns[index] = turn
         self._pending.append((index, levels, image))
         waited = min((index - self._start.frame) / self.config.start_wait, 1)
         parallax = (1 - 0.5 * waited) * self.config.start_parallax * float(self._intrinsics[:2].mean())
         solved = self._start.solve(self._intrinsics, parallax, self._seed + index)
         if solved is not None and self._first_keyframe(*solved):
-            return self._estimate(Status.TRACKING, 0.5)
+            return self._log.estimate(Status.TRACKING, 0.5)
         if self._start.worn:
             self._begin(grey, levels, image, index)
-        return self._estimate(Status.INITIALISING)
+        return self._log.estimate(Status.INITIALISING)
 
     def _begin(self, grey: np.ndarray, levels: list[Level], image: np.ndarray, index: int) -> None:
         self._start, self._pending = TwoViewStart(grey, index), [(index, levels, image)]
@@ -272,7 +266,7 @@ class DirectOdometry:
         depth = DepthMap(levels[0], c.depth)
         mean, variance = spread(uv, inverse_depth / scale, levels[0].grey.shape)
         depth.begin(mean, variance)
-        before = next((pose for pose in reversed(self._T_cw[: first + 1]) if pose is not None), np.eye(4))
+        before = self._log.last_pose(first + 1)
         key = Keyframe(before, depth, levels, [], image)
         speed, self._last, self._motion = self._speed, Alignment(np.eye(4), 1.0, 0.0, 1.0, 1.0, 0.0), np.eye(4)
         self._observe(key, others[-1][1][0], T, 1.0, 0.0)
@@ -285,7 +279,7 @@ class DirectOdometry:
                 return False
             found.append((index, pyramid_[0], alignment))
             self._last = alignment
-        self._T_cw[first] = before
+        self._log.set_pose(first, before)
         self._last = Alignment(np.eye(4), 1.0, 0.0, 1.0, 1.0, 0.0)
         for index, level, alignment in found:
             self._moved(index, key, alignment)
@@ -294,10 +288,3 @@ class DirectOdometry:
         self._counts["maps_started"] += 1
         self._counts["keyframes"] += 1
         return True
-
-    # --- results ------------------------------------------------------------------------------------------------------
-
-    def _estimate(self, status: Status, confidence: float = 0.0) -> Estimate:
-        T = self._T_cw[-1]
-        pose = None if T is None else poses_from_matrices(np.linalg.inv(T))
-        return Estimate(self._times[-1], pose, status, confidence)

@@ -8,7 +8,8 @@ triangulated and adjusted, and new corners begin. No loop closing: nothing older
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,9 +17,9 @@ import numpy as np
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from eval.systems.baselines import two_view
+from eval.systems.baselines.frame_log import FrameLog
 from eval.systems.baselines.keyframe.adjust import adjust, neighbourhood
 from eval.systems.baselines.keyframe.config import KeyframeConfig
-from eval.systems.baselines.keyframe.history import History
 from eval.systems.baselines.keyframe.initialise import start_from_two_views
 from eval.systems.baselines.keyframe.map import Keyframe, Map
 from eval.systems.baselines.keyframe.pose import centre, refine_pose
@@ -31,10 +32,10 @@ class KeyframeOdometry:
 
     name = "keyframe"
 
-    def __init__(self, config: KeyframeConfig | None = None, seed: int = 0) -> None:
-        self.config = config or KeyframeConfig()
+    def __init__(self, config: KeyframeConfig | None = None, seed: int = 0, **settings: Any) -> None:
+        self.config = replace(config or KeyframeConfig(), **settings)
         self._seed = seed
-        self._history = History()
+        self._log = FrameLog()
         self._intrinsics, self._size = np.ones(4), (0, 0)
         self._map, self._old = Map(), Map()  # the map in use or being started; the one before it
         self._retired: list[tuple[np.ndarray, np.ndarray]] = []  # points of maps that were given up
@@ -52,26 +53,26 @@ class KeyframeOdometry:
         self._counts = {"maps_started": 0, "planar_starts": 0, "keyframes": 0, "culled": 0, "relocalised": 0}
 
     def track(self, frame: Frame) -> Estimate:
-        index = self._history.begin(frame.timestamp)
+        index = self._log.begin(frame.timestamp)
         self._intrinsics, self._size = frame.camera.intrinsics, (frame.camera.width, frame.camera.height)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         if self._grey is None:
             self._begin(frame, grey, index)
-            return self._history.estimate(Status.INITIALISING)
+            return self._log.estimate(Status.INITIALISING)
         followed = self._follow(grey, index)
         if not self._started:
             return self._initialise(frame, grey, index, followed)
         confidence = self._pose(index) if followed else None
         if confidence is None and not self._recover(self._map, grey, index):
-            self._history.lost.add(index)
+            self._log.mark_lost(index)
             self._blind += 1
             if self._blind >= self.config.patience:
                 self._give_up(frame, grey, index)
-            return self._history.estimate(Status.LOST)
+            return self._log.estimate(Status.LOST)
         self._grey, self._blind = grey, 0
         if self._wants_keyframe(index):
             self._insert(frame, grey, index)
-        return self._history.estimate(Status.TRACKING, confidence or 0.3)
+        return self._log.estimate(Status.TRACKING, confidence or 0.3)
 
     def finish(self) -> Result:
         points, colors = zip(*self._retired, self._old.points(), self._map.points(), strict=True)
@@ -81,7 +82,7 @@ class KeyframeOdometry:
             **self._counts,
             "config": asdict(self.config),
         }
-        return self._history.result(SparseMap(np.concatenate(points), np.concatenate(colors)), info)
+        return self._log.result(SparseMap(np.concatenate(points), np.concatenate(colors)), info)
 
     # --- every frame --------------------------------------------------------------------------------------------------
 
@@ -99,7 +100,7 @@ class KeyframeOdometry:
         if held.sum() < max(c.pose_points, 8):
             return False
         if not self._blind:
-            self._history.turns[index] = two_view.rotation_between(self._uv[held], uv[held], self._intrinsics)
+            self._log.turns[index] = two_view.rotation_between(self._uv[held], uv[held], self._intrinsics)
         self._followed = self._ids[held], uv[held]
         if not self._started:
             self._ids, self._uv = self._followed
@@ -142,7 +143,7 @@ class KeyframeOdometry:
         else:
             self._motion = np.eye(4)
         self._T = T
-        self._history.hang(index, self._map.keyframes[-1], T)
+        self._log.keyframes.place(index, self._map.keyframes[-1].frame, T)
 
     def _recover(self, world: Map, grey: np.ndarray, index: int) -> bool:
         """Find the lost camera in a map and the map's points in the image."""
@@ -164,7 +165,6 @@ class KeyframeOdometry:
         self._ids, self._uv = ids[inliers], uv[inliers]
         self._blind = max(self._blind, 1)
         self._moved(index, T)
-        self._history.lost.discard(index)
         self._counts["relocalised"] += 1
         return True
 
@@ -199,7 +199,7 @@ class KeyframeOdometry:
         newest = self._keyframe(index, self._T, grey)
         world.triangulate(newest, self._intrinsics, c.angle, c.reprojection)
         free, held = neighbourhood(world, newest, c.adjusted, c.anchors)
-        adjust(world, free, held, self._intrinsics, c.iterations, c.reprojection)
+        self._adjust(free, held, c.iterations)
         gone = world.redundant(c.redundant, spared=4)
         if gone is not None:
             self._drop(gone)
@@ -213,14 +213,21 @@ class KeyframeOdometry:
         self._ids, self._uv = self._ids[order], self._uv[order]
         keyframe = Keyframe(index, T, self._ids, self._uv, grey)
         self._map.keyframes.append(keyframe)
-        self._history.hang(index, keyframe, T)
+        self._log.keyframes.set_pose(index, T)
+        self._log.keyframes.place(index, index, T)
         self._counts["keyframes"] += 1
         return keyframe
+
+    def _adjust(self, free: list[Keyframe], held: list[Keyframe], iterations: int) -> None:
+        """Bundle adjustment of some keyframes; their frames move with them."""
+        adjust(self._map, free, held, self._intrinsics, iterations, self.config.reprojection)
+        for keyframe in free:
+            self._log.keyframes.set_pose(keyframe.frame, keyframe.T_cw)
 
     def _drop(self, gone: Keyframe) -> None:
         """Remove a keyframe; its frames hang on the one before."""
         at = next(i for i, keyframe in enumerate(self._map.keyframes) if keyframe is gone)
-        self._history.rehang(gone, self._map.keyframes[at - 1])
+        self._log.keyframes.reanchor(gone.frame, self._map.keyframes[at - 1].frame)
         del self._map.keyframes[at]
         self._counts["culled"] += 1
 
@@ -251,20 +258,20 @@ class KeyframeOdometry:
     def _initialise(self, frame: Frame, grey: np.ndarray, index: int, followed: bool) -> Estimate:
         if self._old.keyframes and self._recover(self._old, grey, index):
             self._grey, self._blind = grey, 0
-            return self._history.estimate(Status.TRACKING, 0.3)
+            return self._log.estimate(Status.TRACKING, 0.3)
         if not followed:
-            self._history.lost.add(index)
+            self._log.mark_lost(index)
             self._begin(frame, grey, index)
-            return self._history.estimate(Status.LOST)
+            return self._log.estimate(Status.LOST)
         self._grey = grey
         assert self._first is not None
         if self._try_start(self._first, index, grey):
-            return self._history.estimate(Status.TRACKING, 0.5)
+            return self._log.estimate(Status.TRACKING, 0.5)
         if len(self._ids) < max(0.4 * len(self._first.ids), self.config.start_points):
             self._begin(frame, grey, index)
         else:
             self._pending.append((index, self._ids, self._uv))
-        return self._history.estimate(Status.INITIALISING)
+        return self._log.estimate(Status.INITIALISING)
 
     def _try_start(self, first: Keyframe, index: int, grey: np.ndarray) -> bool:
         """Start the map from the first view and this one if they are far enough apart; fill in the frames between."""
@@ -298,17 +305,18 @@ class KeyframeOdometry:
         world, first_T = self._map, first.T_cw
         world.xyz[first.ids[rows[good]]] = (scale * start.points[good] - first_T[:3, 3]) @ first_T[:3, :3]
         world.keyframes.append(first)
-        self._history.hang(first.frame, first, first_T)
+        self._log.keyframes.set_pose(first.frame, first_T)
+        self._log.keyframes.place(first.frame, first.frame, first_T)
         self._counts["keyframes"] += 1
         second = self._keyframe(index, step @ first_T, grey)
-        adjust(world, [second], [first], self._intrinsics, 20, c.reprojection)
+        self._adjust([second], [first], 20)
         for frame, ids, uv in self._pending:
             known = world.known(ids)
             T, inliers = refine_pose(
                 world.xyz[ids[known]], uv[known], self._intrinsics, first_T, c.reprojection, iterations=20
             )
             if inliers.sum() >= c.pose_points:
-                self._history.hang(frame, first, T)
+                self._log.keyframes.place(frame, first.frame, T)
         if self._old.keyframes:
             self._retired.append(self._old.points())
         self._old, self._pending, self._started = Map(), [], True

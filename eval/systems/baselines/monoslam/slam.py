@@ -11,7 +11,8 @@ those in view. Accelerations are in that unit.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.working_image import working_image
-from eval.systems.baselines.back_fill import map_of
+from eval.systems.baselines.frame_log import map_of
 from eval.systems.baselines.klt import detect
 from eval.systems.baselines.monoslam.consensus import drop_inconsistent, find_consensus
 from eval.systems.baselines.monoslam.filter import Filter, Prediction
@@ -89,8 +90,8 @@ class MonoSlam:
 
     name = "monoslam"
 
-    def __init__(self, config: MonoSlamConfig | None = None, seed: int = 0) -> None:
-        self.config = config or MonoSlamConfig()
+    def __init__(self, config: MonoSlamConfig | None = None, seed: int = 0, **settings: Any) -> None:
+        self.config = replace(config or MonoSlamConfig(), **settings)
         self._rng = np.random.default_rng([seed, 7501])
         self._times: list[float] = []
         self._poses: list[np.ndarray | None] = []

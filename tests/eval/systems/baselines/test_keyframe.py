@@ -238,11 +238,11 @@ def test_relocalises_without_a_prediction(film, path):
     odometry = KeyframeOdometry(KeyframeConfig(corners=300))
     for frame in frames:
         odometry.track(frame)
-    there = odometry._history.poses()[12]
+    there = odometry._log.poses()[12]
     odometry._blind = 3
     assert odometry._recover(odometry._map, cv2.cvtColor(frames[12].image, cv2.COLOR_RGB2GRAY), 25)
     np.testing.assert_allclose(odometry._T, there, atol=0.01)
-    assert np.linalg.norm(centre(there) - centre(odometry._history.poses()[24])) > 0.1
+    assert np.linalg.norm(centre(there) - centre(odometry._log.poses()[24])) > 0.1
     assert odometry._counts["relocalised"] == 1
     assert not odometry._recover(odometry._map, np.zeros((240, 320), np.uint8), 25)
 
@@ -268,7 +268,7 @@ def test_culled_keyframes_leave_their_frames_in_place(film, path):
     odometry = KeyframeOdometry(KeyframeConfig(corners=300))
     for frame in film(path(40))[:20]:
         odometry.track(frame)
-    before = np.array(odometry._history.poses()[10:])
+    before = np.array(odometry._log.poses()[10:])
     odometry._drop(odometry._map.keyframes[1])
-    np.testing.assert_allclose(np.array(odometry._history.poses()[10:]), before, atol=1e-9)
+    np.testing.assert_allclose(np.array(odometry._log.poses()[10:]), before, atol=1e-9)
     assert np.isfinite(centre(before[0])).all()

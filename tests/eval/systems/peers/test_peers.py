@@ -20,7 +20,7 @@ from eval.systems.peers import colmap, orbslam3, svo
 from eval.systems.peers.common import Pictures, Row, longest_part
 from eval.systems.registry import find_system
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[4]
 GPL = {"svo_cpp", "pyorbslam3"}
 DRIVE = """
 import sys, cv2, numpy as np
@@ -78,10 +78,20 @@ def test_every_peer_says_how_to_install_it(monkeypatch):
         assert f"{package} (" in (peer.missing() or "") and "pip install" in (peer.missing() or "")
 
 
-def test_orbslam3_says_that_it_needs_a_vocabulary(monkeypatch, tmp_path):
-    monkeypatch.setattr("eval.systems.peers.common.find_spec", lambda name: True)
-    monkeypatch.setenv(orbslam3.VOCABULARY, str(tmp_path / "none.txt"))
-    assert "eval.systems.peers.vocabulary" in (orbslam3.missing() or "")
+def test_orbslam3_lacks_its_package_its_vocabulary_or_both(monkeypatch, tmp_path):
+    there = tmp_path / "words.txt"
+    there.write_text("10 6 0 0\n")
+    for package in (True, False):
+        monkeypatch.setattr("eval.systems.peers.common.find_spec", lambda name, package=package: package or None)
+        monkeypatch.setenv(orbslam3.VOCABULARY, str(there))
+        assert ("pyorbslam3" in (orbslam3.missing() or "")) is not package
+        assert "vocabulary" not in (orbslam3.missing() or "")
+        monkeypatch.setenv(orbslam3.VOCABULARY, str(tmp_path / "none.txt"))
+        assert "no ORB vocabulary" in orbslam3.missing() and "python -m eval vocabulary" in orbslam3.missing()
+        monkeypatch.delenv(orbslam3.VOCABULARY)
+        monkeypatch.setenv("DVO_DATA", str(tmp_path / "nowhere"))  # without a data folder it is the same that lacks
+        assert "no ORB vocabulary" in orbslam3.missing() and "data folder" not in orbslam3.missing()
+        assert ("pyorbslam3 is" in orbslam3.missing()) is not package
 
 
 def test_settings_hold_the_camera(tmp_path):

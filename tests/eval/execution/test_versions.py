@@ -1,0 +1,63 @@
+"""Code and weights on which a system depends."""
+
+from __future__ import annotations
+
+import pytest
+
+from eval.execution import versions
+from eval.execution.cache import system_facts
+from eval.execution.versions import code_digest, depends_on_threads, source_files
+from eval.suites.suite import ROOT
+from eval.systems.registry import CATALOGUE, find_system
+
+
+def test_code_of_a_system_is_what_it_imports(monkeypatch):
+    names = {str(file.relative_to(ROOT)) for file in source_files(find_system("klt-pnp"))}
+    folder = "eval/systems/baselines"
+    assert {f"{folder}/klt_pnp.py", f"{folder}/klt.py", f"{folder}/two_view.py", "dvo/graph/keyframe_log.py"} <= names
+    assert f"{folder}/null.py" not in names and not any("dvo/nets" in name for name in names)
+    learned = {str(file.relative_to(ROOT)) for file in source_files(find_system("dvo-small"))}
+    assert {"dvo/odometry/tracker.py", "dvo/models/patch_vo.py", "dvo/ba/layer.py"} <= learned
+    assert depends_on_threads(find_system("dvo-small")) and not depends_on_threads(find_system("klt-pnp"))
+
+    before = {name: code_digest(find_system(name)) for name in ("klt-pnp", "null")}
+    read = versions._content
+    monkeypatch.setattr(versions, "_content", lambda file: read(file) + b"#" * (file.name == "two_view.py"))
+    assert code_digest(find_system("klt-pnp")) != before["klt-pnp"]
+    assert code_digest(find_system("null")) == before["null"]
+
+
+def test_weights_are_part_of_the_version(tmp_path):
+    torch = pytest.importorskip("torch")
+    from dvo.models.weights import find_weights, weights_info
+
+    first = tmp_path / "first.safetensors"
+    first.write_bytes(find_weights("small").read_bytes())
+    before = system_facts("dvo-small", str(first)).version
+    assert before.endswith(weights_info(first).sha256[:8]) and torch
+    content = bytearray(first.read_bytes())
+    content[-1] ^= 1
+    first.write_bytes(bytes(content))
+    assert system_facts("dvo-small", str(first)).version != before
+
+
+def test_every_system_of_the_catalogue_has_code():
+    for system in CATALOGUE:
+        files = source_files(system)
+        assert any(file.stem == system.target.rpartition(":")[0].rpartition(".")[2] for file in files), system.name
+
+
+def test_code_of_a_file_and_of_a_package(tmp_path, monkeypatch):
+    (tmp_path / "own.py").write_text("import torch\nfrom eval.systems.baselines.klt import detect\n")
+    files = source_files(find_system(f"{tmp_path / 'own.py'}:Own"))
+    assert {tmp_path / "own.py", ROOT / "eval/systems/baselines/klt.py"} <= set(files)
+    assert depends_on_threads(find_system(f"{tmp_path / 'own.py'}:Own"))
+    package = tmp_path / "own_slam"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "system.py").write_text("from own_slam import parts\nfrom dvo.data.frame import Frame\n")
+    (package / "parts.py").write_text("import numpy\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    system = find_system("own_slam.system:Own")
+    assert {package / "system.py", package / "parts.py", ROOT / "dvo/data/frame.py"} <= set(source_files(system))
+    assert not depends_on_threads(system)

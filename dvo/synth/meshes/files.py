@@ -221,7 +221,7 @@ def _picture(image: Any, warnings: list[str]) -> Array:
 
 
 def _light(mesh: Any, vertices: Array, faces: Array, rotate: bool) -> Array:
-    """Light on each corner ``(T, 3)``: ambient, a distant lamp, smooth over needs_undistortion and hard at creases."""
+    """Light on each corner ``(T, 3)``: ambient, a distant lamp, smooth over bends and hard at creases."""
     corners = vertices[faces]
     flat: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)

@@ -44,7 +44,8 @@ class GroupedReprojection(Factor):
         return self.rays, self.target, self.weight
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> GroupedReprojection:
-        return GroupedReprojection(*tensors, self.plan, self.gate)
+        rays, target, weight = tensors
+        return GroupedReprojection(rays, target, weight, self.plan, self.gate)
 
     def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
         plan, b, everything = self.plan, len(self.rays), slice(0, self.plan.groups)

@@ -42,7 +42,7 @@ def inverse_depth_block(
     """Inverse depths ``(B, K)``, kept within ``limits`` after each step; the eliminated block."""
 
     def retract(value: Tensor, step: Tensor) -> Tensor:
-        return (value + step[..., 0]).clamp(*limits)
+        return (value + step).clamp(*limits)
 
     return StateBlock(inverse_depths, 1, retract, None, inverse_depths.shape[1], held, eliminated=True)
 

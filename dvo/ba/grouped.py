@@ -16,8 +16,18 @@ from torch import Tensor
 from dvo.ba.blocks import INVERSE_DEPTHS, POSES
 from dvo.ba.edges import EdgePlan
 from dvo.ba.kernels import Kernel
-from dvo.ba.normal_equations import Counted, Gate, accumulate, counts, pose_jacobian, relative_motion, view
-from dvo.ba.problem import AdjointConstants, Factor, Linearisation, NormalEquations, State
+from dvo.ba.normal_equations import (
+    Counted,
+    Gate,
+    SumIndex,
+    accumulate,
+    counts,
+    pose_jacobian,
+    relative_motion,
+    sum_index,
+    view,
+)
+from dvo.ba.problem import AdjointConstants, Factor, Linearisation, NormalEquations, State, StateBlock
 from dvo.ba.reprojection import MARGIN
 from dvo.geometry import so3
 from dvo.geometry.projection import gather
@@ -32,6 +42,7 @@ class GroupedReprojection(Factor):
         target, weight: ``(B, G, 2, M)`` normalised; a weight is zero where a place is empty.
         plan: layout of the edges.
         gate: conditions on which edges count.
+        index: destinations of the sums for the free frames of a state.
     """
 
     rays: Tensor
@@ -39,13 +50,14 @@ class GroupedReprojection(Factor):
     weight: Tensor
     plan: EdgePlan
     gate: Gate
+    index: SumIndex
 
     def tensors(self) -> tuple[Tensor, ...]:
         return self.rays, self.target, self.weight
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> GroupedReprojection:
         rays, target, weight = tensors
-        return GroupedReprojection(rays, target, weight, self.plan, self.gate)
+        return GroupedReprojection(rays, target, weight, self.plan, self.gate, self.index)
 
     def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
         plan, b, everything = self.plan, len(self.rays), slice(0, self.plan.groups)
@@ -70,10 +82,13 @@ class GroupedReprojection(Factor):
 
     def normal_equations(self, state: State) -> tuple[NormalEquations, list[Counted]]:
         poses, depths = state[POSES], state[INVERSE_DEPTHS]
-        assert poses.slot is not None
+        index = self.index
+        if index.slot is not poses.slot:
+            assert poses.slot is not None
+            index = sum_index(self.plan, poses.slot, poses.free, len(self.rays))
         equations, used = accumulate(
-            poses.value, depths.value, self.rays, self.target, self.weight, self.plan, self.gate, poses.slot,
-            poses.free, not poses.held, not depths.held,
+            poses.value, depths.value, self.rays, self.target, self.weight, self.plan, self.gate, index,
+            not poses.held, not depths.held,
         )  # fmt: skip
         before, width = state.offsets[POSES], 6 * poses.unknowns
         after = state.size - before - width
@@ -182,6 +197,7 @@ def group_measurements(
     targets: Tensor,
     weights: Tensor,
     plan: EdgePlan,
+    poses: StateBlock,
     *,
     max_residual: float,
     bounds: tuple[float, float] | None,
@@ -194,6 +210,7 @@ def group_measurements(
         intrinsics: ``(B, N, 4)``.
         targets, weights: ``(B, E, 2)`` pixels and pixels^-2.
         plan: layout of the edges.
+        poses: state block of the poses, for the frames that are free.
         max_residual: pixels; a longer residual does not count.
         bounds: ``(width, height)`` of the feature map, or None.
         kernel: robust kernel.
@@ -212,4 +229,6 @@ def group_measurements(
     if bounds is not None:
         middle = centres.new_tensor(bounds) / 2
         gate = replace(gate, offset=(c_j.detach() - middle).mT, reach=middle[:, None] + MARGIN)
-    return GroupedReprojection(rays, target.mT.contiguous(), weight.mT.contiguous(), plan, gate)
+    assert poses.slot is not None
+    index = sum_index(plan, poses.slot, poses.free, len(centres))
+    return GroupedReprojection(rays, target.mT.contiguous(), weight.mT.contiguous(), plan, gate, index)

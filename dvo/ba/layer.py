@@ -144,8 +144,8 @@ def make_problem(
         if plan is None:
             plan = plan_edges(ii, jj, kk, frames, count)
         reprojection = group_measurements(
-            centres, intrinsics, targets, weights, plan, max_residual=options.max_residual, bounds=options.bounds,
-            kernel=options.kernel,
+            centres, intrinsics, targets, weights, plan, poses, max_residual=options.max_residual,
+            bounds=options.bounds, kernel=options.kernel,
         )  # fmt: skip
     else:
         blocks = {INTRINSICS: intrinsics_block(intrinsics, refine, shared=sensors is None), **blocks}
@@ -215,5 +215,7 @@ def _check_values(
     if sensors is not None:
         check_index(sensors.source, cameras, "sensors.source")
         check_index(sensors.target, cameras, "sensors.target")
-    if bool((weights < 0).any()):
+    # The smallest weight is NaN if any is; only then look at each.
+    least = float(weights.detach().amin()) if weights.numel() else 0.0
+    if least < 0 or (least != least and bool((weights < 0).any())):
         raise DvoError("negative", field="weights", remedy="give inverse variances, zero for an edge to leave out")

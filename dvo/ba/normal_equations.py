@@ -86,6 +86,42 @@ def pose_jacobian(v: View) -> tuple[Tensor, ...]:
     return v.h, o, o, v.h, -v.h * v.xy, -xy, -square[..., 1:, :], square[..., :1, :], xy, -y, x
 
 
+@dataclass(frozen=True)
+class SumIndex:
+    """Destinations of the sums of :func:`accumulate`, the same in every iteration.
+
+    Attributes:
+        slot, free: of the frames, see :func:`dvo.ba.edges.free_slots`.
+        pairs: by chunk ``(B G,)``, cell of each group among batch and pairs.
+        ends: by chunk ``(2 B G M,)``, cells of both frames of each place among batch, slots and patches.
+        blocks: ``(4 B P,)`` cells of the 6x6 blocks of the pairs among batch, slots and slots.
+        gradients: ``(2 P,)`` slots of the gradients of the pairs.
+    """
+
+    slot: Tensor
+    free: int
+    pairs: tuple[Tensor, ...]
+    ends: tuple[Tensor, ...]
+    blocks: Tensor
+    gradients: Tensor
+
+
+def sum_index(plan: EdgePlan, slot: Tensor, free: int, batch: int) -> SumIndex:
+    """Destinations for a batch of the given size."""
+    element, n, k = torch.arange(batch, device=slot.device)[:, None], free, plan.patches
+    slot_i, slot_j = slot[plan.pair_i], slot[plan.pair_j]
+    by_pair, by_both = [], []
+    for part in plan.chunks():
+        group = plan.group_pair[part]
+        kk = plan.kk[part.start * plan.size : part.stop * plan.size]
+        ends = torch.stack((slot_j[group], slot_i[group]), -1)[:, None] * k
+        by_pair.append((element * len(plan.pair_i) + group).flatten())
+        by_both.append((element * (n + 1) * k + (ends + kk.view(-1, plan.size, 1)).flatten()).flatten())
+    row, column = torch.cat((slot_j, slot_j, slot_i, slot_i)), torch.cat((slot_j, slot_i, slot_j, slot_i))
+    blocks = (element * (n + 1) ** 2 + row * (n + 1) + column).flatten()
+    return SumIndex(slot, free, tuple(by_pair), tuple(by_both), blocks, torch.cat((slot_j, slot_i)))
+
+
 def accumulate(
     poses_cw: Tensor,
     inverse_depth: Tensor,
@@ -94,8 +130,7 @@ def accumulate(
     weight: Tensor,
     plan: EdgePlan,
     gate: Gate,
-    slot: Tensor,
-    free: int,
+    index: SumIndex,
     pose_part: bool,
     depth_part: bool,
 ) -> tuple[NormalEquations, list[Counted]]:
@@ -103,14 +138,14 @@ def accumulate(
 
     Args:
         rays: ``(B, G, 3, M)``. target, weight: ``(B, G, 2, M)``, normalised.
-        slot, free: see :func:`dvo.ba.edges.free_slots`.
+        index: destinations of the sums.
         pose_part, depth_part: poses, depths are unknowns. What is not needed stays zero or empty.
 
     Returns:
         The equations of the ``6 n`` pose unknowns and ``K`` inverse depths, and for each chunk of the plan the places
         that count.
     """
-    b, k, n, pairs = len(poses_cw), plan.patches, free, len(plan.pair_i)
+    b, k, n, pairs = len(poses_cw), plan.patches, index.free, len(plan.pair_i)
     zeros = poses_cw.new_zeros
     rotation, t = relative_motion(poses_cw, plan)
     tr = so3.hat(t[..., 0]) @ rotation
@@ -123,9 +158,8 @@ def accumulate(
     both_ends = both_ends.view(b, pairs, 8, 16)
 
     by_pair, by_both = zeros(b * pairs, 6, 7), zeros(b * (n + 1) * k, 8)
-    batch = torch.arange(b, device=slot.device)[:, None]
     used: list[Counted] = []
-    for part in plan.chunks():
+    for chunk, part in enumerate(plan.chunks()):
         group = plan.group_pair[part]
         places = slice(part.start * plan.size, part.stop * plan.size)
         kk = plan.kk[places]
@@ -146,14 +180,11 @@ def accumulate(
         if pose_part:
             flat = f.view(*f.shape[:2], 8, 2 * plan.size)
             products = (flat[..., :6, :] * w.flatten(-2)[..., None, :]) @ flat[..., :7, :].mT
-            index = (batch * pairs + group).flatten()
-            by_pair.index_add_(0, index, products.flatten(0, 1))
+            by_pair.index_add_(0, index.pairs[chunk], products.flatten(0, 1))
         if depth_part:
             wd = w * j_d
             products = (f.unflatten(-2, (8, 2)) * wd[..., None, :, :]).sum(-2).mT @ both_ends.index_select(1, group)
-            ends = torch.stack((slot[plan.pair_j[group]], slot[plan.pair_i[group]]), -1)[:, None] * k
-            index = (batch * (n + 1) * k + (ends + kk.view(-1, plan.size, 1)).flatten()).flatten()
-            by_both.index_add_(0, index, products.reshape(-1, 8))
+            by_both.index_add_(0, index.ends[chunk], products.reshape(-1, 8))
 
     by_both = by_both.view(b, n + 1, k, 8)
     landmark = by_both[..., 6:].sum(1)
@@ -167,11 +198,9 @@ def accumulate(
     ji = hessian @ minus_adjoint
     ii_gradient = minus_adjoint.mT @ torch.cat((ji, gradient), -1)
     blocks = torch.cat((hessian, ji, ji.mT, ii_gradient[..., :6]), 1)
-    slot_i, slot_j = slot[plan.pair_i], slot[plan.pair_j]
-    row, column = torch.cat((slot_j, slot_j, slot_i, slot_i)), torch.cat((slot_j, slot_i, slot_j, slot_i))
-    index = (batch * (n + 1) ** 2 + row * (n + 1) + column).flatten()
-    grid = zeros(b * (n + 1) ** 2, 6, 6).index_add_(0, index, blocks.flatten(0, 1)).view(b, n + 1, n + 1, 6, 6)
+    grid = zeros(b * (n + 1) ** 2, 6, 6).index_add_(0, index.blocks, blocks.flatten(0, 1))
+    grid = grid.view(b, n + 1, n + 1, 6, 6)
     h_pp = grid[:, :n, :n].transpose(2, 3).reshape(b, 6 * n, 6 * n)
     gradients = torch.cat((gradient, ii_gradient[..., 6:]), 1)[..., 0]
-    g_p = zeros(b, n + 1, 6).index_add_(1, torch.cat((slot_j, slot_i)), gradients)[:, :n].reshape(b, 6 * n)
+    g_p = zeros(b, n + 1, 6).index_add_(1, index.gradients, gradients)[:, :n].reshape(b, 6 * n)
     return NormalEquations(h_pp, h_pl, h_ll, g_p, g_l), used

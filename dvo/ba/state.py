@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ class StateBlock:
     Attributes:
         value: ``(B, N, ...)``.
         dim: size of the tangent of one element.
-        retract: ``(value (B, N, ...), tangent (B, N, dim)) -> value``.
+        retract: ``(value (B, N, ...), tangent (B, N, dim)) -> value``; of an eliminated block the tangent is ``(B, N)``.
         slot: ``(N,)`` unknown of each element; fixed elements have the value ``free``, elements with the same unknown
             move by the same tangent. None: each element is an unknown of its own.
         free: number of unknowns among the elements.
@@ -37,6 +38,19 @@ class StateBlock:
         """Number of unknowns in this call."""
         return 0 if self.held else self.free
 
+    @cached_property
+    def _stays(self) -> Tensor | None:
+        """Mask of the fixed elements, to be broadcast over values; None if all are unknowns of their own."""
+        if self.slot is None:
+            return None
+        return (self.slot == self.free).view(-1, *(1,) * (self.value.dim() - 2))
+
+    def with_value(self, value: Tensor) -> StateBlock:
+        """The same block with another value. Done in every step, hence without the cost of dataclasses.replace."""
+        block = object.__new__(StateBlock)
+        block.__dict__.update(self.__dict__, value=value)
+        return block
+
     def spread(self, steps: Tensor) -> Tensor:
         """Tangents of the unknowns ``(B, free, dim)`` to tangents of all elements ``(B, N, dim)``, zero if fixed."""
         if self.slot is None:
@@ -48,10 +62,9 @@ class StateBlock:
         if self.unknowns == 0:
             return self
         value = self.retract(self.value, self.spread(steps))
-        if self.slot is not None:
-            stays = (self.slot == self.free).view(-1, *(1,) * (value.dim() - 2))
-            value = torch.where(stays, self.value, value)
-        return replace(self, value=value)
+        if self._stays is not None:
+            value = torch.where(self._stays, self.value, value)
+        return self.with_value(value)
 
 
 @dataclass(frozen=True)
@@ -91,8 +104,12 @@ class State:
 
     def with_values(self, values: Mapping[str, Tensor]) -> State:
         """The same blocks with other values."""
-        changed = {name: replace(block, value=values[name]) for name, block in self.blocks.items()}
-        return State(changed)
+        return self._with({name: block.with_value(values[name]) for name, block in self.blocks.items()})
+
+    def _with(self, blocks: Mapping[str, StateBlock]) -> State:
+        state = object.__new__(State)
+        state.__dict__.update(self.__dict__, blocks=blocks)
+        return state
 
     def rows(self, name: str, index: Tensor) -> Tensor:
         """Rows ``(F, dim)`` of the reduced system for the elements ``index (F,)`` of a block that is not eliminated.
@@ -114,7 +131,7 @@ class State:
     def moved(self, reduced: Tensor, landmarks: Tensor) -> State:
         """The state after a step ``(B, size)`` of the reduced system and ``(B, K)`` of the eliminated block."""
         changed = {
-            name: block.moved(landmarks[..., None] if block.eliminated else self.part(name, reduced))
+            name: block.moved(landmarks if block.eliminated else self.part(name, reduced))
             for name, block in self.blocks.items()
         }
-        return State(changed)
+        return self._with(changed)

@@ -6,7 +6,7 @@ and the derivative of one scalar; see :mod:`dvo.ba.adjoint`.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
 from typing import Any
 
 import torch
@@ -31,12 +31,17 @@ def normal_equations(problem: Problem, depth_damping: float) -> tuple[NormalEqua
     for factor in problem.factors:
         equations, memo = factor.normal_equations(problem.state)
         memos.append(memo)
-        total = replace(equations, h_ll=equations.h_ll + depth_damping) if total is None else total + equations
+        if total is None:
+            h_ll = equations.h_ll + depth_damping
+            total = NormalEquations(equations.h_pp, equations.h_pl, h_ll, equations.g_p, equations.g_l)
+        else:
+            total = total + equations
     if total is None:
         raise DvoError("a problem without factors", remedy="give at least one factor")
     landmarks = problem.state.landmarks
     if landmarks is not None and problem.state[landmarks].held:
-        total = replace(total, h_ll=torch.zeros_like(total.h_ll))  # as if nothing observed them: they get no step
+        # As if nothing observed them: they get no step.
+        total = dataclasses.replace(total, h_ll=torch.zeros_like(total.h_ll))
     return total, memos
 
 
@@ -52,7 +57,7 @@ class GaussNewtonStep(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, problem: Problem, damping: BADamping, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        problem = problem.with_tensors(tensors)
+        # The tensors are those of the problem; they are arguments for autograd to see them.
         equations, memos = normal_equations(problem, damping.depth)
         solver = reduced_system(equations, damping)
         dp, dl = solver.solve(equations.g_p, equations.g_l[..., None])
@@ -93,5 +98,5 @@ def solve(problem: Problem, iterations: int, damping: BADamping) -> Problem:
         return problem
     for _ in range(iterations):
         dp, dl = GaussNewtonStep.apply(problem, damping, *problem.tensors())
-        problem = replace(problem, state=problem.state.moved(dp, dl))
+        problem = Problem(problem.state.moved(dp, dl), problem.factors)
     return problem

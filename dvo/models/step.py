@@ -14,7 +14,7 @@ from typing import Literal, Protocol
 from torch import Tensor
 
 from dvo.ba.layer import bundle_adjust
-from dvo.ba.step import BADamping
+from dvo.ba.options import BADamping, BAOptions
 from dvo.geometry.projection import reproject
 from dvo.graph.edges import PatchGraph
 from dvo.nets.correlation import CorrelationLookup
@@ -73,6 +73,7 @@ class StepOptions:
         iterations: Gauss-Newton iterations.
         damping: of bundle adjustment.
         bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.bundle_adjust`.
+        check: indices and weights, see :class:`dvo.ba.options.BAOptions`.
     """
 
     mode: Mode = "joint"
@@ -80,6 +81,7 @@ class StepOptions:
     iterations: int = 2
     damping: BADamping = BADamping()
     bounds: tuple[float, float] | None = None
+    check: bool | None = False
 
 
 @dataclass(frozen=True)
@@ -157,22 +159,22 @@ def step(
     state = replace(state, hidden=revision.hidden, targets=targets, weights=revision.weights, coords=None)
     if options.mode == "flow":
         return replace(state, coords=revision.coords + revision.delta[:, :, None, None])
-    poses_cw, patches = bundle_adjust(
+    measured = targets, revision.weights, graph.ii, graph.jj, graph.kk
+    solved = bundle_adjust(
         state.poses_cw,
         state.patches,
         state.intrinsics,
-        targets,
-        revision.weights,
-        graph.ii,
-        graph.jj,
-        graph.kk,
-        fixed=options.fixed,
-        iterations=options.iterations,
-        damping=options.damping,
-        structure_only=options.mode == "structure",
-        bounds=options.bounds,
+        *measured,
+        BAOptions(
+            fixed=options.fixed,
+            iterations=options.iterations,
+            damping=options.damping,
+            structure_only=options.mode == "structure",
+            bounds=options.bounds,
+            check=options.check,
+        ),
     )
-    return replace(state, poses_cw=poses_cw, patches=patches)
+    return replace(state, poses_cw=solved.poses_cw, patches=solved.patches)
 
 
 def recent_depth(patches: Tensor, per_frame: int, frames: int) -> Tensor:

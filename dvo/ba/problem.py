@@ -1,0 +1,104 @@
+"""Least-squares problems: state blocks and the factors that measure them.
+
+Each Gauss-Newton step solves ``H delta = g`` with ``H = sum J^T W J`` and ``g = sum J^T W r`` over the rows of all
+factors. Unknowns are ordered globals (intrinsics, velocities, biases) | poses | inverse depths. The last block may be
+``eliminated``: no factor couples two of its elements, hence its part of ``H`` is diagonal and a Schur complement
+removes it. Everything else is the *reduced system*, with :attr:`State.size` unknowns.
+
+A new measurement is a subclass of :class:`Factor` that names the blocks it touches and linearises itself; nothing else
+changes.
+
+Shapes: ``B`` batch, ``N`` elements of a block, ``F`` rows of a factor (edges, priors), ``D`` residuals per row.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from dvo.ba.linearisation import AdjointConstants, Linearisation, NormalEquations, adjoint_term, assemble
+from dvo.ba.state import State, StateBlock
+
+__all__ = ["AdjointConstants", "Factor", "Linearisation", "NormalEquations", "Problem", "State", "StateBlock"]
+
+
+class Factor(ABC):
+    """A batch of measurements of the same kind.
+
+    A subclass is a frozen dataclass whose floating-point tensor fields are its parameters (they receive gradients), and
+    implements :meth:`linearise`. The other methods are generic; a fast path may override :meth:`normal_equations` and
+    :meth:`phi`.
+
+    Example:
+        >>> @dataclass(frozen=True)
+        ... class SpeedLimit(Factor):
+        ...     weight: Tensor  # (B, N, 6)
+        ...     def linearise(self, values): ...
+    """
+
+    @abstractmethod
+    def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
+        """Residuals, weights and Jacobians at the values ``(B, N, ...)`` of the state blocks, differentiably."""
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Parameters that may need a gradient: the floating-point tensors among the fields."""
+        return tuple(getattr(self, name) for name in self._parameters())
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> Factor:
+        """The same factor with other :meth:`tensors`."""
+        return replace(self, **dict(zip(self._parameters(), tensors, strict=True)))  # type: ignore[type-var]
+
+    def _parameters(self) -> list[str]:
+        values = ((f.name, getattr(self, f.name)) for f in fields(self))  # type: ignore[arg-type]
+        return [name for name, value in values if isinstance(value, Tensor) and value.is_floating_point()]
+
+    def normal_equations(self, state: State) -> tuple[NormalEquations, Any]:
+        """Contribution to the normal equations, and anything that :meth:`phi` needs of this pass."""
+        return assemble(self.linearise(state.values()), state), None
+
+    def phi(self, state: State, constants: AdjointConstants, memo: Any) -> Iterator[Tensor]:
+        """Terms of the adjoint scalar, ``sum w (J lambda) . (r - J delta)`` and those of relative damping.
+
+        Args:
+            state: values are leaves of autograd, as are the parameters of this factor.
+            constants: see :class:`AdjointConstants`.
+            memo: second result of :meth:`normal_equations` at the same state.
+
+        Yields:
+            Scalars whose sum is phi; each is differentiated before the next one is made, which bounds memory.
+        """
+        yield adjoint_term(self.linearise(state.values()), state, constants)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A state and the factors that measure it."""
+
+    state: State
+    factors: tuple[Factor, ...]
+
+    def tensors(self) -> list[Tensor]:
+        """Everything that a step depends on: values of the blocks, then parameters of the factors."""
+        return [*self.state.values().values(), *(x for factor in self.factors for x in factor.tensors())]
+
+    def with_tensors(self, tensors: Sequence[Tensor]) -> Problem:
+        """The same problem with other :meth:`tensors`."""
+        count = len(self.state.blocks)
+        state = self.state.with_values(dict(zip(self.state.blocks, tensors[:count], strict=True)))
+        factors, at = [], count
+        for factor in self.factors:
+            size = len(factor.tensors())
+            factors.append(factor.with_tensors(tensors[at : at + size]))
+            at += size
+        return Problem(state, tuple(factors))
+
+    def cost(self) -> Tensor:
+        """``(B,)`` sum of weighted squared residuals of all factors."""
+        values = self.state.values()
+        costs = [factor.linearise(values).cost() for factor in self.factors]
+        return torch.stack(costs).sum(0)

@@ -1,6 +1,5 @@
-"""Every system on every sequence of some suites: ``python -m eval run``, ``score``, ``report``, ``list``.
-
-Without a verb it is ``run``.
+"""Evaluation of systems on suites of sequences: ``python -m eval run``, ``score``, ``report``, ``list``, ``prepare``,
+``vocabulary``. Without a command it is ``run``.
 """
 
 from __future__ import annotations
@@ -12,7 +11,14 @@ from eval.commands import VERBS, parser
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Returns the exit code: 0, 2 for an input that the user can mend (one line says what), 130 after Ctrl-C."""
+    """Run the program.
+
+    Args:
+        arguments: of the command line; None takes those of the process.
+
+    Returns:
+        Exit code: 0; 2 for an input that the user can fix, told in one line; 130 after Ctrl-C.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if "--list" in given:
         given = ["list"]

@@ -1,4 +1,4 @@
-"""What may be typed after ``python -m eval``, and what it does."""
+"""Commands of ``python -m eval``: their arguments and what they run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from eval.execution.runner import predict_all
 from eval.reporting.report import AXES, PAGE, RESULTS, TABLE, write_report, write_tables
 from eval.scoring.score import score_all
 from eval.suites.selection import config_names, folder_of_data, is_rendered, load_suites, settle
-from eval.suites.suite import data_folder
+from eval.suites.suite import data_folder, read_suites
 from eval.systems.registry import DEFAULT, list_systems
 
 
@@ -32,7 +32,9 @@ def parser() -> argparse.ArgumentParser:
     run = verbs.add_parser("run", help="run systems on suites, score them, write tables and report")
     run.add_argument("--suite", default="validation", metavar="NAME[,NAME]",
                      help="names in configs/eval, YAML files, or folders of sequences (validation)")  # fmt: skip
-    run.add_argument("--systems", default=",".join(DEFAULT), help=f"names with commas between ({','.join(DEFAULT)})")
+    run.add_argument(
+        "--systems", default=",".join(DEFAULT), help=f"names with commas between, see: list ({','.join(DEFAULT)})"
+    )
     run.add_argument("--sequences", help="names with commas between (all of the suites)")
     run.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds 0 to N-1 (1)")
     run.add_argument("--stride", type=int, metavar="N", help="feed every N-th image (as the suite says)")
@@ -55,6 +57,20 @@ def parser() -> argparse.ArgumentParser:
         verb.add_argument("out", type=Path, metavar="DIR", help="folder of an evaluation")
     listing = verbs.add_parser("list", help="systems with licence and state; suites with their sequences")
     listing.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings")
+    ahead = verbs.add_parser("prepare", help="render suites ahead of an evaluation")
+    ahead.add_argument("suites", nargs="+", metavar="SUITE", help="axes, axes/test, fast, fast/test/large, ...")
+    ahead.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet too")
+    words = verbs.add_parser("vocabulary", help="train a vocabulary for ORB-SLAM3 on rendered pictures")
+    words.add_argument("--out", type=Path, required=True, metavar="FILE", help="text file that ORB-SLAM3 reads")
+    for name, default, about in (
+        ("sequences", 60, "rendered sequences"),
+        ("frames", 5, "pictures of each"),
+        ("features", 1000, "descriptors of each picture"),
+        ("branching", 10, "children of a node"),
+        ("depth", 4, "levels of the tree"),
+        ("seed", 0, "of renderings and clusters"),
+    ):
+        words.add_argument(f"--{name}", type=int, default=default, metavar="N", help=f"{about} ({default})")
     return line
 
 
@@ -129,6 +145,23 @@ def show_list(given: argparse.Namespace) -> None:
                 print(f"      data: {suite.download}")
 
 
+def prepare(given: argparse.Namespace) -> None:
+    """``prepare``: rendered sequences in the cache before an evaluation needs them."""
+    from eval.suites import prepare as ahead
+
+    folders = ahead.prepare([suite for name in given.suites for suite in read_suites(name)])
+    if given.sheet and folders:
+        ahead.write_sheet(given.sheet, folders)
+
+
+def vocabulary(given: argparse.Namespace) -> None:
+    """``vocabulary``: a vocabulary for ORB-SLAM3."""
+    from eval.systems.peers.vocabulary import train_on_renderings
+
+    options = {name: value for name, value in vars(given).items() if name not in ("verb", "out")}
+    print(train_on_renderings(given.out, **options))
+
+
 def tell(text: str) -> None:
     """Progress goes to the error stream, so that the table can be piped."""
     print(text, file=sys.stderr, flush=True)
@@ -169,4 +202,6 @@ VERBS: dict[str, Callable[[argparse.Namespace], None]] = {
     "score": score,
     "report": report,
     "list": show_list,
+    "prepare": prepare,
+    "vocabulary": vocabulary,
 }

@@ -1,4 +1,4 @@
-"""One odometry over one source, from the first frame to the result, whatever happens on the way."""
+"""Session: one odometry over one source, from the first frame to the result. The one loop that feeds frames."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ FrameCallback = Callable[[Frame, Estimate | None], None]
 
 @dataclass(frozen=True)
 class Run:
-    """What a session leaves behind.
+    """Record of a session.
 
     Attributes:
         result: the odometry's result, with rows for strided frames, counted in frames of the source.
         frames_fed: frames given to the odometry (fewer than read under a stride).
         interrupted: stopped by the user.
-        warnings: what went wrong without ending the run, a sentence each.
+        warnings: problems that did not end the run, a sentence each.
         seconds: wall time spent ``reading``, ``tracking`` and ``finishing``.
+        frame_seconds: wall time inside ``track`` of each frame fed.
     """
 
     result: Result
@@ -33,6 +34,7 @@ class Run:
     interrupted: bool
     warnings: tuple[str, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+    frame_seconds: tuple[float, ...] = ()
 
     @property
     def frames_per_second(self) -> float:
@@ -47,19 +49,32 @@ def run(
     stride: int = 1,
     on_frame: FrameCallback | None = None,
     should_stop: Callable[[], bool] | None = None,
+    strict: bool = False,
 ) -> Run:
     """Feed every ``stride``-th frame, and the last one, then finish.
 
     An interruption or a frame that cannot be read ends the feeding, not the run: what was tracked so far is finished
-    and returned, and ``warnings`` says so.
+    and returned with a warning.
 
     Args:
-        on_frame: called after each frame; the estimate is None for a frame passed over.
-        should_stop: asked before each frame; True ends the feeding. A caller that gives it handles Ctrl-C; without
+        odometry: a fresh one.
+        source: frames in order of time.
+        stride: every how many-th frame is fed.
+        on_frame: called after each frame, outside the clock; the estimate is None for a frame passed over.
+        should_stop: called before each frame; True ends the feeding. A caller that gives it handles Ctrl-C; without
             it, a KeyboardInterrupt ends the feeding too.
+        strict: an error, or an interruption, is raised instead.
+
+    Returns:
+        The result with its timings.
 
     Raises:
-        DvoError: a stride below 1, or no frame at all.
+        DvoError: a stride below 1, or no frame at all; with ``strict`` any error of the source or the odometry.
+
+    Example:
+        >>> done = run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt"))  # doctest: +SKIP
+        >>> len(done.result.trajectory)  # doctest: +SKIP
+        1200
     """
     if stride < 1:
         raise DvoError(f"must be 1 or more, got {stride}", field="stride", remedy="give a whole number of frames")
@@ -77,11 +92,11 @@ def run(
             feeding.take(frame)
         feeding.flush()
     except KeyboardInterrupt:
-        if should_stop is not None:  # the caller handles the first one, so this is an impatient second
+        if strict or should_stop is not None:  # the caller handles the first one, so this is an impatient second
             raise
         interrupted = True
     except (DvoError, OSError) as error:
-        if not feeding.fed:
+        if strict or not feeding.fed:
             raise
         warnings.append(f"stopped at frame {feeding.frames_read}: {error}")
     if interrupted:
@@ -92,7 +107,9 @@ def run(
     started = time.perf_counter()
     result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
-    trajectory = fill_skipped(result.trajectory, np.array(feeding.fed), np.array(feeding.skipped))
+    trajectory = result.trajectory
+    if feeding.skipped:
+        trajectory = fill_skipped(trajectory, np.array(feeding.fed), np.array(feeding.skipped))
     read = feeding.frames_read
     return Run(
         result=replace(result, trajectory=trajectory, frames_read=read, frames_lost=read - len(trajectory)),
@@ -100,6 +117,7 @@ def run(
         interrupted=interrupted,
         warnings=(*getattr(source, "warnings", ()), *warnings),
         seconds=feeding.seconds,
+        frame_seconds=tuple(feeding.frame_seconds),
     )
 
 
@@ -127,13 +145,14 @@ def fill_skipped(trajectory: Trajectory, fed: np.ndarray, skipped: np.ndarray) -
 
 
 class _Feeding:
-    """Applies the stride and keeps the books."""
+    """Stride, clock and stamps of the frames fed."""
 
     def __init__(self, odometry: Odometry, stride: int, on_frame: FrameCallback | None) -> None:
         self.odometry, self.stride, self.on_frame = odometry, stride, on_frame
         self.fed: list[float] = []
         self.skipped: list[float] = []
         self.seconds = {"reading": 0.0, "tracking": 0.0, "finishing": 0.0}
+        self.frame_seconds: list[float] = []
         self.pending: Frame | None = None  # the last frame passed over: fed after all if the source ends with it
 
     @property
@@ -159,7 +178,8 @@ class _Feeding:
     def _track(self, frame: Frame) -> Estimate:
         started = time.perf_counter()
         estimate = self.odometry.track(frame)
-        self.seconds["tracking"] += time.perf_counter() - started
+        self.frame_seconds.append(time.perf_counter() - started)
+        self.seconds["tracking"] += self.frame_seconds[-1]
         self.fed.append(frame.timestamp)
         return estimate
 

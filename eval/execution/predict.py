@@ -10,17 +10,19 @@ import json
 import os
 import shutil
 import sys
-import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dvo.data.frame import Frame
+from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory, read_tum, write_tum
 from dvo.errors import DvoError
-from dvo.odometry.protocol import Odometry
+from dvo.odometry.protocol import Estimate, Odometry
 from dvo.odometry.results import jsonable, peak_memory_mb
+from dvo.odometry.session import run
 from eval.execution.process import run_limited
 from eval.scoring.blackout import dark_spans, is_dark
 from eval.suites.suite import ROOT, Sequence, open_sequence
@@ -133,19 +135,29 @@ def predict_here(job: Job) -> Prediction:
     return write_prediction(job, prediction)
 
 
-def drive(odometry: Odometry, source: Any) -> tuple[Prediction, Trajectory]:
-    """Feed every frame of a source to an odometry, with a clock."""
-    stamps, seconds, dark, resolution = [], [], [], ""
-    for frame in source:
-        begin = time.perf_counter()
-        odometry.track(frame)
-        seconds.append(time.perf_counter() - begin)
+def drive(odometry: Odometry, source: Source) -> tuple[Prediction, Trajectory]:
+    """Feed every frame of a source to an odometry, with a clock.
+
+    Args:
+        odometry: a fresh one; whatever it raises is passed on.
+        source: of the sequence.
+
+    Returns:
+        The record, and the trajectory, camera to world.
+    """
+    stamps: list[float] = []
+    dark: list[bool] = []
+    resolution = ""
+
+    def look(frame: Frame, _: Estimate | None) -> None:
+        nonlocal resolution
         stamps.append(frame.timestamp)
         dark.append(is_dark(frame.image))
         resolution = f"{frame.camera.width}x{frame.camera.height}"
-    begin = time.perf_counter()
-    result = odometry.finish()
-    total = sum(seconds) + time.perf_counter() - begin
+
+    done = run(odometry, source, on_frame=look, strict=True)
+    result, seconds = done.result, done.frame_seconds
+    total = done.seconds["tracking"] + done.seconds["finishing"]
     worked = result.info.get("working_size")
     prediction = Prediction(
         status="ok",

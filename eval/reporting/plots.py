@@ -18,6 +18,7 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import align_trajectory, associate, relative_rotation_errors
 from dvo.viz.plot import INK, PAPER, plan_axes, with_gaps
+from eval.scoring.summary import quartiles
 from eval.suites.suite import Suite
 
 OURS = "#d55e00"
@@ -133,8 +134,9 @@ def plot_axis(title: str, unit: str, values: Mapping[str, Sequence[float]], null
     for row, name in enumerate(names):
         group = np.array(list(values[name]), dtype=float)
         known = group[np.isfinite(group)]
-        if len(known):
-            left, middle, right = np.quantile(known, [0.25, 0.5, 0.75])
+        box = quartiles(values[name])
+        if box is not None:
+            left, middle, right = box
             plot.plot([left, right], [row, row], color=look[name].color, lw=7, alpha=0.3, solid_capstyle="butt")
             plot.plot(known, np.full(len(known), row), look[name].marker, color=look[name].color, ms=4.5, alpha=0.75)
             plot.plot([middle, middle], [row - 0.33, row + 0.33], color=look[name].color, lw=2.4)

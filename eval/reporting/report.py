@@ -17,9 +17,12 @@ from eval.execution.cache import slug
 from eval.execution.plan import Manifest, groundtruth_file
 from eval.execution.predict import RECORD, read_prediction, read_trajectory
 from eval.reporting.plots import plot_axis, plot_sequence, plot_speed, styles
-from eval.reporting.tables import (
-    DIGITS,
+from eval.reporting.tables import axis_table, markdown, one_line, speed_note, write_csv
+from eval.reporting.verdict import verdicts
+from eval.scoring.score import Row
+from eval.scoring.summary import (
     FIGURES,
+    NOTHING,
     NULL,
     RESOURCES,
     UNITS,
@@ -27,18 +30,15 @@ from eval.reporting.tables import (
     Axis,
     Cell,
     axes_of,
-    axis_table,
-    best_of,
-    cell,
+    axis_cell,
+    axis_cells,
+    axis_rows,
+    error_cell,
     errors_of,
-    markdown,
-    one_line,
-    speed_note,
-    summary,
-    write_csv,
+    judged_cells,
+    resource_cell,
+    summarise,
 )
-from eval.reporting.verdict import verdicts
-from eval.scoring.score import Row
 from eval.suites.suite import Sequence, Suite
 
 RESULTS, TABLE, AXES, PAGE, FIGURE_FOLDER = "results.csv", "table.md", "axes.md", "report.html", "figures"
@@ -153,20 +153,16 @@ class Figures:
 
 def shown_cells(axis: Axis, manifest: Manifest, rows: list[Row]) -> list[Shown]:
     """A line of the table of systems by axis."""
-    cells = {name: cell(axis, name, rows) for name in manifest.systems}
-    digits = DIGITS.get(axis.judged_by, 2)
-    best = best_of(cells, digits)
+    cells = axis_cells(axis, manifest.systems, rows)
     zero = cells[NULL].median if NULL in cells else math.nan
     shown = []
     for name, found in cells.items():
         if found.note:
             shown.append(Shown(found.note, "", "", False, "void"))
             continue
-        text = f"{found.median:.{digits}f}" if math.isfinite(found.median) else "–"
-        low, high = (f"{value:.{digits}f}" if math.isfinite(value) else "∞" for value in (found.low, found.high))
-        spread = f"{low} – {high}" if low != high else ""
         failed = f"{found.failed} of {found.runs} failed" if found.failed else ""
-        shown.append(Shown(text, spread, failed, name in best, "zero" if name == NULL else shade(found, zero)))
+        kind = "zero" if name == NULL else shade(found, zero)
+        shown.append(Shown(found.middle(axis.digits), found.span(axis.digits, " – "), failed, found.best, kind))
     return shown
 
 
@@ -183,13 +179,11 @@ def shade(found: Cell, zero: float) -> str:
 
 def axis_figure(axis: Axis, manifest: Manifest, rows: list[Row], figures: Figures) -> tuple[str, str]:
     """Alternative text and source of the figure of an axis."""
-    names = {sequence.name for sequence in axis.sequences}
     values: dict[str, list[float]] = {}
     for system in manifest.systems:
-        mine = [row for row in rows if row.system == system and row.suite == axis.suite.name and row.sequence in names]
-        known = errors_of([row for row in mine if row.status not in VOID], axis.judged_by)
-        values[system] = [value for value in known if not math.isnan(value)]
-    zero = cell(axis, NULL, rows).median if NULL in manifest.systems else math.nan
+        made = [row for row in axis_rows(axis, system, rows) if row.status not in VOID]
+        values[system] = [value for value in errors_of(made, axis.judged_by) if not math.isnan(value)]
+    zero = axis_cell(axis, NULL, rows).median if NULL in manifest.systems else math.nan
     svg = plot_axis(axis.title, axis.unit, values, zero)
     return f"{axis.title}: {axis.unit} of every run, by system", figures(f"axis_{axis.title}_{axis.judged_by}", svg)
 
@@ -210,7 +204,7 @@ def speed_figures(axes: list[Axis], manifest: Manifest, rows: list[Row], figures
                     r for r in rows if r.system == system and (r.suite, r.sequence) == place and r.status not in VOID
                 ]
                 if mine:
-                    pair = (_median([row.fps for row in mine]), _median(errors_of(mine, judge)))
+                    pair = (resource_cell(mine, "fps").median, error_cell(mine, judge).median)
                     points.setdefault(system, []).append(pair)
         if any(math.isfinite(error) and error > 0 for pairs in points.values() for _, error in pairs):
             unit = UNITS.get(judge, judge)
@@ -225,15 +219,18 @@ def overall(system: str, rows: list[Row]) -> list[str]:
     cells = []
     for _, field, digits in OVERALL:
         values = [float(getattr(row, field)) for row in mine]
-        known = [value for value in values if not math.isnan(value)]
         if field == "completeness":
-            known = [100 * value for value in known]
-        found = (np.mean(known) if field in AREAS else np.median(known)) if known else math.nan
-        cells.append(f"{found:.{digits}f}" if math.isfinite(found) else "–")
-    for _, field, digits in RESOURCES:
-        found = _median([getattr(row, field) for row in mine])
-        cells.append(f"{found:.{digits}f}" if math.isfinite(found) else "–")
-    return cells
+            values = [100 * value for value in values]
+        cells.append(f"{found:.{digits}f}" if math.isfinite(found := _overall(field, values)) else NOTHING)
+    return cells + [resource_cell(mine, field).middle(digits) for _, field, digits in RESOURCES]
+
+
+def _overall(field: str, values: list[float]) -> float:
+    """Mean of an area, median of everything else; values without a meaning are left out."""
+    if field not in AREAS:
+        return summarise(values).median
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
 
 
 def sequence_section(
@@ -244,16 +241,15 @@ def sequence_section(
     groups = {name: [row for row in mine if row.system == name] for name in manifest.systems}
     dark = any(row.blackouts for row in mine)
     columns = [*FIGURES, *(BLACKOUT if dark else ()), *RESOURCES]
-    judged = {name: _median(errors_of(group, sequence.judged_by)) for name, group in groups.items()}
-    best = min((value for value in judged.values() if math.isfinite(value)), default=math.nan)
+    judged = judged_cells(sequence, groups)
     lines = []
     for name, group in groups.items():
         texts = []
         for _, field, digits in columns:
             resource = any(field == other for _, other, _ in RESOURCES)
-            values = [getattr(row, field) for row in group] if resource else errors_of(group, field)
-            texts.append((summary(values, digits), field == sequence.judged_by and judged[name] == best))
-        complete = summary([100 * row.completeness for row in group], 0)
+            found = resource_cell(group, field) if resource else error_cell(group, field)
+            texts.append((found.text(digits), field == sequence.judged_by and judged[name].best))
+        complete = summarise([100 * row.completeness for row in group]).text(0)
         failed = sum(row.failed for row in group)
         states = ", ".join(dict.fromkeys(row.status for row in group if row.failed))
         lines.append((name, f"{failed}/{len(group)}" + (f" {states}" if states else ""), complete, texts))
@@ -292,8 +288,3 @@ def _tracks(
         if (folder / RECORD).is_file():
             dark = dark or read_prediction(folder).dark
     return tracks, dark
-
-
-def _median(values: list[float]) -> float:
-    known = [value for value in values if not math.isnan(value)]
-    return float(np.median(known)) if known else math.nan

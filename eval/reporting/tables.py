@@ -5,124 +5,32 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-
-import numpy as np
 
 from eval.execution.plan import Manifest
 from eval.scoring.score import COLUMNS, Row
-from eval.suites.suite import Sequence, Suite
-
-# Column of the table, field of the row, digits.
-FIGURES = (
-    ("ATE %", "ate_percent", 2),
-    ("ATE m", "ate_rmse", 3),
-    ("RPE m", "rpe_trans", 4),
-    ("RPE °", "rpe_rot_deg", 3),
-    ("rot. error / rot.", "rotation_error_ratio", 2),
-    ("scale drift", "scale_drift", 2),
+from eval.scoring.summary import (
+    FIGURES,
+    RESOURCES,
+    axes_of,
+    axis_cells,
+    error_cell,
+    judged_cells,
+    resource_cell,
+    summarise,
 )
-RESOURCES = (("frames/s", "fps", 1), ("p95 ms", "latency_p95_ms", 0), ("MB", "peak_memory_mb", 0))
-UNITS = {"ate_percent": "ATE %", "rpe_rot_deg": "RPE °", "segment_ate_percent": "segment ATE %", "recovery_s": "s"}
-DIGITS = {field: digits for _, field, digits in FIGURES}
-NULL = "null"
-VOID = ("no data", "not run", "unavailable")  # states that say nothing about how well a system does
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One line of the table of systems by axis: the sequences of a suite that are judged by the same error."""
-
-    suite: Suite
-    judged_by: str
-    sequences: tuple[Sequence, ...]
-    shared: bool = False
-
-    @property
-    def title(self) -> str:
-        """Name of the suite, and what sets this part of it apart."""
-        name = self.suite.name.replace("_", " ")
-        if not self.shared:
-            return name
-        return f"{name}: {', '.join(one.name for one in self.sequences)}" if len(self.sequences) == 1 else name
-
-    @property
-    def unit(self) -> str:
-        """Of the figures."""
-        return UNITS.get(self.judged_by, self.judged_by)
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A system on an axis.
-
-    Attributes:
-        median, low, high: over sequences and seeds, failed runs counting as infinite; nan without runs.
-        failed, runs: counts.
-        note: in place of figures, where there is nothing to compute.
-    """
-
-    median: float
-    low: float
-    high: float
-    failed: int
-    runs: int
-    note: str = ""
-
-
-def axes_of(manifest: Manifest) -> list[Axis]:
-    """The lines of the table of systems by axis."""
-    axes = []
-    for suite in manifest.suites:
-        judges = list(dict.fromkeys(str(sequence.judged_by) for sequence in suite.sequences))
-        for judge in judges:
-            part = tuple(sequence for sequence in suite.sequences if sequence.judged_by == judge)
-            axes.append(Axis(suite, judge, part, len(judges) > 1))
-    return axes
-
-
-def cell(axis: Axis, system: str, rows: list[Row]) -> Cell:
-    """The figures of one system on one axis."""
-    names = {sequence.name for sequence in axis.sequences}
-    mine = [row for row in rows if row.system == system and row.suite == axis.suite.name and row.sequence in names]
-    told = [row for row in mine if row.status not in VOID]
-    if not told:
-        return Cell(math.nan, math.nan, math.nan, 0, 0, mine[0].status if mine else "not run")
-    values = errors_of(told, axis.judged_by)
-    known = [value for value in values if not math.isnan(value)]
-    failed = sum(row.failed for row in told)
-    if not known:
-        return Cell(math.nan, math.nan, math.nan, failed, len(told), "–")
-    return Cell(float(np.median(known)), min(known), max(known), failed, len(told))
-
-
-def best_of(cells: dict[str, Cell], digits: int) -> set[str]:
-    """The systems with the smallest median, to the digits shown."""
-    finite = {name: round(cell.median, digits) for name, cell in cells.items() if math.isfinite(cell.median)}
-    return {name for name, value in finite.items() if value == min(finite.values())}
+from eval.suites.suite import Suite
 
 
 def axis_table(manifest: Manifest, rows: list[Row]) -> str:
-    """The table of systems by axis for the README: medians, bold the best of a line, failed runs in brackets."""
+    """Table of systems by axis for the README: medians, bold the best of a line, failed runs in brackets."""
     systems = list(manifest.systems)
     lines = [_line(["axis", "median", *systems]), _line(["---", "---", *["--:"] * len(systems)])]
     for axis in axes_of(manifest):
-        cells = {name: cell(axis, name, rows) for name in systems}
-        digits = DIGITS.get(axis.judged_by, 2)
-        best = best_of(cells, digits)
-        texts = [cell_text(found, digits, bold=name in best) for name, found in cells.items()]
-        lines.append(_line([axis.title, axis.unit, *texts]))
+        cells = axis_cells(axis, systems, rows)
+        lines.append(_line([axis.title, axis.unit, *(cell.short(axis.digits) for cell in cells.values())]))
     return "\n".join(lines) + "\n"
-
-
-def cell_text(found: Cell, digits: int, bold: bool = False) -> str:
-    """``1.23 (2/6 failed)``."""
-    if found.note:
-        return found.note
-    text = f"{found.median:.{digits}f}" if math.isfinite(found.median) else "–"
-    text = f"**{text}**" if bold else text
-    return f"{text} ({found.failed}/{found.runs} failed)" if found.failed else text
 
 
 def write_csv(path: Path, rows: Iterable[Row]) -> None:
@@ -149,16 +57,14 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     for sequence in suite.sequences:
         groups = {name: [r for r in rows if r.sequence == sequence.name and r.system == name] for name in systems}
         groups = {name: group for name, group in groups.items() if group}
-        judged = {name: _median(errors_of(group, sequence.judged_by)) for name, group in groups.items()}
-        best = min(judged.values(), default=math.inf)
+        judged = judged_cells(sequence, groups)
         for position, (name, group) in enumerate(groups.items()):
             cells = []
             for _, field, digits in FIGURES:
-                text = summary(errors_of(group, field), digits)
-                won = field == sequence.judged_by and math.isfinite(best) and judged[name] == best
-                cells.append(f"**{text}**" if won else text)
-            cells.append(summary([100 * row.completeness for row in group], 0))
-            cells += [summary([getattr(row, field) for row in group], digits) for _, field, digits in RESOURCES]
+                text = error_cell(group, field).text(digits)
+                cells.append(f"**{text}**" if field == sequence.judged_by and judged[name].best else text)
+            cells.append(summarise([100 * row.completeness for row in group]).text(0))
+            cells += [resource_cell(group, field).text(digits) for _, field, digits in RESOURCES]
             failed = sum(row.failed for row in group)
             title = f"{sequence.name} ({sequence.about})" if sequence.about else sequence.name
             lines.append(_line([title if position == 0 else "", name, f"{failed}/{len(group)}", *cells]))
@@ -210,28 +116,9 @@ def speed_note(manifest: Manifest, rows: list[Row]) -> str:
     return f"Speed without reading images, {counts} on {manifest.device} ({manifest.machine}){shared}."
 
 
-def errors_of(rows: list[Row], field: str) -> list[float]:
-    """A field of every row, infinite where the run failed."""
-    return [math.inf if row.failed else float(getattr(row, field)) for row in rows]
-
-
-def summary(values: list[float], digits: int) -> str:
-    """``median [min–max]``."""
-    known = [value for value in values if not math.isnan(value)]
-    if not known or not math.isfinite(np.median(known)):
-        return "–"
-    figures = (float(function(known)) for function in (np.median, np.min, np.max))
-    middle, low, high = (f"{value:.{digits}f}" if math.isfinite(value) else "∞" for value in figures)
-    return middle if low == high else f"{middle} [{low}–{high}]"
-
-
 def one_line(text: str) -> str:
     """Without line breaks."""
     return " ".join(text.split())
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values)) if values and not np.isnan(values).any() else math.inf
 
 
 def _csv(value: object) -> str:

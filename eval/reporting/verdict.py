@@ -1,4 +1,4 @@
-"""Where each of our systems wins and where it loses, in words, from the same cells as the table."""
+"""Verdicts on our systems: axes on which each wins and loses, in words, from the same cells as the table."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from eval.execution.plan import Manifest
-from eval.reporting.tables import DIGITS, NULL, VOID, axes_of, cell
 from eval.scoring.score import Row
+from eval.scoring.summary import NULL, VOID, axes_of, axis_cells
 
 LEVEL = 1.1  # medians within ten percent of each other count as level
 
@@ -41,7 +41,7 @@ def _verdict(name: str, manifest: Manifest, rows: list[Row]) -> Verdict | None:
         return None
     wins, level, losses, below = [], [], [], []
     for axis in axes_of(manifest):
-        cells = {system: cell(axis, system, rows) for system in manifest.systems}
+        cells = axis_cells(axis, manifest.systems, rows)
         ours = cells.pop(name)
         if not ours.runs:
             continue
@@ -51,7 +51,7 @@ def _verdict(name: str, manifest: Manifest, rows: list[Row]) -> Verdict | None:
             for system, found in cells.items()
             if not system.startswith("dvo") and system != NULL and math.isfinite(found.median)
         }
-        digits = DIGITS.get(axis.judged_by, 2)
+        digits = axis.digits
         own = f"{ours.median:.{digits}f}" if math.isfinite(ours.median) else "fails"
         if not ours.median < zero and math.isfinite(zero):
             below.append(f"{axis.title}: {own} against {zero:.{digits}f}")

@@ -1,8 +1,7 @@
-"""Render suites ahead of an evaluation: ``python -m eval.suites.prepare axes axes/test``."""
+"""Rendering of suites ahead of an evaluation, for ``python -m eval prepare axes axes/test``."""
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -12,11 +11,18 @@ import numpy as np
 
 from dvo.errors import DvoError
 from eval.suites.rendered import RECORD, place_of, rendered_folder
-from eval.suites.suite import Suite, read_suites
+from eval.suites.suite import Suite
 
 
 def prepare(suites: list[Suite]) -> list[Path]:
-    """See to it that every rendered sequence is in the cache; prints what it did. Returns the folders."""
+    """Render every sequence that is not in the cache yet, with a line of output for each.
+
+    Args:
+        suites: rendered ones; recordings in them are passed over.
+
+    Returns:
+        Folders of the rendered sequences.
+    """
     folders = []
     begin, made = time.perf_counter(), 0
     for suite in suites:
@@ -59,24 +65,17 @@ def contact_sheet(folders: list[Path], columns: int = 6, width: int = 200) -> np
     return np.concatenate(rows)[..., ::-1]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Returns the exit code: 0, or 2 for an input that the user can mend."""
-    line = argparse.ArgumentParser(prog="python -m eval.suites.prepare", description=__doc__)
-    line.add_argument("suites", nargs="+", help="axes, axes/test, fast, fast/test/large, ...")
-    line.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet too")
-    given = line.parse_args(arguments)
+def write_sheet(path: Path, folders: list[Path]) -> None:
+    """Write a contact sheet as a picture.
+
+    Raises:
+        DvoError: the file cannot be written, or its suffix names no format.
+    """
+    import cv2
+
     try:
-        folders = prepare([suite for name in given.suites for suite in read_suites(name)])
-        if given.sheet and folders:
-            import cv2
-
-            if not cv2.imwrite(str(given.sheet), contact_sheet(folders)[..., ::-1]):
-                raise DvoError("cannot write the picture", file=given.sheet, remedy="give a path that ends in .png")
-    except DvoError as error:
-        print(f"eval: error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        written = cv2.imwrite(str(path), contact_sheet(folders)[..., ::-1])
+    except cv2.error:
+        written = False
+    if not written:
+        raise DvoError("cannot write the picture", file=path, remedy="give a path that ends in .png")

@@ -137,3 +137,20 @@ def test_interpolation_does_not_reach_out_of_the_trajectory():
     trajectory = Trajectory(np.array([1.0, 2.0]), np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1)))
     filled = session.fill_skipped(trajectory, np.array([1.0, 2.0]), np.array([0.5, 1.5, 2.5]))
     assert filled.timestamps.tolist() == [1.0, 1.5, 2.0]
+
+
+def test_strict_raises_instead_of_warning(fake_odometry):
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    assert session.run(fake_odometry(), frames(12, broken=5)).warnings
+    with pytest.raises(DvoError, match="does not decode"):
+        session.run(fake_odometry(), frames(12, broken=5), strict=True)
+    with pytest.raises(KeyboardInterrupt):
+        session.run(fake_odometry(at_frame={3: stop}), frames(12), strict=True)
+
+
+def test_every_frame_fed_has_its_time(fake_odometry):
+    done = session.run(fake_odometry(), frames(12), stride=4)
+    assert len(done.frame_seconds) == done.frames_fed == 4 and min(done.frame_seconds) >= 0
+    assert sum(done.frame_seconds) == pytest.approx(done.seconds["tracking"])

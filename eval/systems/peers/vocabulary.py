@@ -1,5 +1,4 @@
-"""Train a vocabulary of ORB descriptors on rendered pictures, for ORB-SLAM3:
-``python -m eval.systems.peers.vocabulary``.
+"""Vocabulary of ORB descriptors, trained on rendered pictures, for ORB-SLAM3: ``python -m eval vocabulary``.
 
 A tree of k-majority clusters (k-means for binary strings: a centre is the majority of each bit, Grana et al. 2013), in
 the text format of DBoW2 (Galvez-Lopez, Tardos 2012) that ORB-SLAM reads: ``branching depth scoring weighting``, then a
@@ -8,8 +7,6 @@ line for every node but the root, ``parent is_word byte x 32 weight``, numbered 
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +20,7 @@ FIRST_SEED = 4000  # of the sequences; those of the suites lie elsewhere
 # ORB-SLAM groups features by the node 4 levels above the depth that the file states, and matches within groups. A
 # stated depth of 4 would put all into one group; 6 gives branching^2 groups, as with its own vocabulary.
 STATED_DEPTH = 6
+LEAST = {"sequences": 1, "frames": 1, "features": 10, "branching": 2, "depth": 1}  # smallest values that work
 _ONES = np.unpackbits(np.arange(1 << 16, dtype=np.uint16).view(np.uint8).reshape(-1, 2), axis=1).sum(1, dtype=np.uint8)
 
 
@@ -180,35 +178,28 @@ def rendered_descriptors(sequences: int, frames: int, features: int, seed: int) 
                 yield descriptors
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Returns the exit code: 0, or 2 for an input that the user can mend."""
-    about = (__doc__ or "").split("\n\n")[0]
-    line = argparse.ArgumentParser(prog="python -m eval.systems.peers.vocabulary", description=about)
-    line.add_argument("--out", type=Path, required=True, metavar="FILE", help="text file that ORB-SLAM3 reads")
-    for name, default, text in (
-        ("sequences", 60, "rendered sequences"),
-        ("frames", 5, "pictures of each"),
-        ("features", 1000, "descriptors of each picture"),
-        ("branching", 10, "children of a node"),
-        ("depth", 4, "levels of the tree"),
-        ("seed", 0, "of renderings and clusters"),
-    ):
-        line.add_argument(f"--{name}", type=int, default=default, metavar="N", help=f"{text} ({default})")
-    given = line.parse_args(arguments)
-    try:
-        for name, least in (("sequences", 1), ("frames", 1), ("features", 10), ("branching", 2), ("depth", 1)):
-            if getattr(given, name) < least:
-                raise DvoError(f"must be {least} or more", field=f"--{name}", remedy="give a larger number")
-        images = list(rendered_descriptors(given.sequences, given.frames, given.features, given.seed))
-        vocabulary = train(images, given.branching, given.depth, given.seed)
-        write_vocabulary(given.out, vocabulary)
-    except DvoError as error:
-        print(f"eval.systems.peers.vocabulary: error: {error}", file=sys.stderr)
-        return 2
+def train_on_renderings(out: Path, *, sequences: int = 60, frames: int = 5, features: int = 1000, branching: int = 10,
+                        depth: int = 4, seed: int = 0) -> str:  # fmt: skip
+    """Train a vocabulary on rendered pictures and write it.
+
+    Args:
+        out: text file.
+        sequences, frames, features: rendered sequences, pictures of each, descriptors of each picture.
+        branching, depth: see :func:`train`.
+        seed: of renderings and clusters.
+
+    Returns:
+        A sentence on what was written.
+
+    Raises:
+        DvoError: a number that is too small, too few descriptors, or a file that cannot be written.
+    """
+    given = {"sequences": sequences, "frames": frames, "features": features, "branching": branching, "depth": depth}
+    for name, least in LEAST.items():
+        if given[name] < least:
+            raise DvoError(f"must be {least} or more", field=f"--{name}", remedy="give a larger number")
+    images = list(rendered_descriptors(sequences, frames, features, seed))
+    vocabulary = train(images, branching, depth, seed)
+    write_vocabulary(out, vocabulary)
     used = sum(len(image) for image in images)
-    print(f"{given.out}: {int(vocabulary.is_word.sum())} words from {used} descriptors of {len(images)} pictures")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return f"{out}: {int(vocabulary.is_word.sum())} words from {used} descriptors of {len(images)} pictures"

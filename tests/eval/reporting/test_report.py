@@ -18,8 +18,8 @@ from eval.__main__ import main
 from eval.execution.plan import read_manifest
 from eval.reporting.plots import OURS, plot_axis, plot_sequence, plot_speed, styles
 from eval.reporting.report import overall, shade, write_report, write_tables
-from eval.reporting.tables import Cell, axes_of, best_of, cell, cell_text
 from eval.reporting.verdict import verdicts
+from eval.scoring.summary import Cell
 from eval.suites.suite import Suite
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
@@ -95,23 +95,6 @@ def test_report_from_the_folder_alone(plan, rows, page, tmp_path, capsys):
     crashed = next(row for row in written if row["system"] == "bad")
     assert crashed["ate_rmse"] == "" and crashed["reason"] == "RuntimeError: boom | with a bar and two lines"
     assert capsys.readouterr().out.startswith("**made for a test**")
-
-
-def test_cells(plan, rows):
-    manifest = read_manifest(plan.out)
-    (axis,) = axes_of(manifest)
-    assert cell(axis, "absent", rows).note == "unavailable" and cell(axis, "nobody", rows).note == "not run"
-    lossy = cell(axis, "lossy", rows)
-    assert (lossy.median, lossy.failed, lossy.runs) == (math.inf, 2, 2)
-    null = next(row for row in rows if row.system == "null")
-    values = [replace(null, ate_percent=value) for value in (1.0, 2.0, 30.0)]
-    mixed = cell(axis, "null", [*values, replace(null, status="timeout")])
-    assert mixed == Cell(16.0, 1.0, math.inf, 1, 4)  # between the second and the third of four
-    assert cell_text(mixed, 1, bold=True) == "**16.0** (1/4 failed)"
-    missing = cell(axis, "null", [*values, replace(null, status="no data")])
-    assert (missing.median, missing.runs, missing.failed) == (2.0, 3, 0)  # says nothing about the system
-    pair = {"a": Cell(1.001, 1, 1, 0, 1), "b": Cell(1.004, 1, 1, 0, 1), "c": Cell(math.inf, 1, 1, 1, 1)}
-    assert best_of(pair, 2) == {"a", "b"} and best_of(pair, 3) == {"a"}
 
 
 def test_shades_against_null():

@@ -14,7 +14,9 @@ import pytest
 
 from dvo.errors import DvoError
 from dvo.synth import HELD_OUT, LONG_KINDS, make_sequence
-from eval.suites import prepare, rendered
+from eval import commands
+from eval.__main__ import main
+from eval.suites import rendered
 from eval.suites.rendered import RECORD, place_of, rendered_folder
 from eval.suites.suite import Sequence, open_sequence, read_suites
 
@@ -161,13 +163,14 @@ def test_prepare_renders_and_says_so(
                   for q in suites[0].sequences[:1])  # fmt: skip
     from dataclasses import replace
 
-    monkeypatch.setattr(prepare, "read_suites", lambda _: [replace(suites[0], sequences=short)])
-    assert prepare.main(["plain", "--sheet", str(tmp_path / "sheet.png")]) == 0
+    monkeypatch.setattr(commands, "read_suites", lambda _: [replace(suites[0], sequences=short)])
+    assert main(["prepare", "plain", "--sheet", str(tmp_path / "sheet.png")]) == 0
     assert "1 rendered now" in capsys.readouterr().out and (tmp_path / "sheet.png").is_file()
-    assert prepare.main(["plain"]) == 0
-    assert "in the cache" in capsys.readouterr().out
+    assert main(["prepare", "plain", "--sheet", str(tmp_path / "sheet.nonsense")]) == 2
+    captured = capsys.readouterr()
+    assert "in the cache" in captured.out and "ends in .png" in captured.err
     monkeypatch.undo()
-    assert prepare.main(["nonsense"]) == 2
+    assert main(["prepare", "nonsense"]) == 2
     assert "nonsense" in capsys.readouterr().err
 
 

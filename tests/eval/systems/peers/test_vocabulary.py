@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from dvo.errors import DvoError
+from eval.__main__ import main
 from eval.systems.peers.orbslam3 import count_words
 from eval.systems.peers.vocabulary import (
     STATED_DEPTH,
     Vocabulary,
     hamming,
-    main,
     majority_clusters,
     train,
     write_vocabulary,
@@ -97,7 +97,10 @@ def test_too_little_to_learn_from():
 def test_command_is_deterministic(tmp_path: Path, capsys):
     small = ["--sequences", "2", "--frames", "1", "--features", "120", "--branching", "4", "--depth", "2"]
     for name in ("a", "b"):
-        assert main(["--out", str(tmp_path / name), *small]) == 0
+        assert main(["vocabulary", "--out", str(tmp_path / name), *small]) == 0
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     assert "words from" in capsys.readouterr().out
-    assert main(["--out", str(tmp_path / "c"), "--branching", "1"]) == 2 and "--branching" in capsys.readouterr().err
+    assert (
+        main(["vocabulary", "--out", str(tmp_path / "c"), "--branching", "1"]) == 2
+        and "--branching" in capsys.readouterr().err
+    )

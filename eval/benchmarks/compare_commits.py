@@ -1,0 +1,203 @@
+"""Speed and results of this checkout against an earlier commit.
+
+``python -m eval.benchmarks.compare_commits --base REV [--pairs 5] [--what tracking,ba,training]``
+
+REV is checked out into a temporary git worktree. Each measurement then runs in fresh processes of one thread, base and
+current by turns, so that a change of the machine's load meets both; printed are all pairs and the median of their
+ratios (current over base; below 1 the current tree is faster). Seconds are processor time. For tracking, each tree also
+runs ``dvo run`` on the real clips once, and their ``trajectory.txt`` are compared byte by byte.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from dvo.errors import DvoError
+from eval.suites.suite import ROOT, data_folder
+
+CLIPS = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr1_rpy_60")
+WHAT = ("tracking", "ba", "training")
+_THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+_STEP = re.compile(r"^step\s+([0-9.]+) s$", re.MULTILINE)  # of the table of `python -m train profile`
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Sizes of the measurements.
+
+    Attributes:
+        data: folder of the real clips.
+        clip, frames: clip whose tracking is timed, and how many of its frames; None for all.
+        steps: training steps of one measurement.
+        clips: whose trajectories are compared.
+    """
+
+    data: Path
+    clip: str = "tartanair_v1_60"
+    frames: int | None = None
+    steps: int = 5
+    clips: tuple[str, ...] = CLIPS
+
+
+@contextmanager
+def worktree(revision: str, repository: Path = ROOT) -> Iterator[Path]:
+    """A temporary checkout of a commit, removed at the end.
+
+    Args:
+        revision: commit, branch or tag.
+        repository: checkout whose history has it.
+
+    Raises:
+        DvoError: git is not there, or does not find the commit.
+    """
+    with tempfile.TemporaryDirectory(prefix="dvo-base-") as folder:
+        place = Path(folder) / "tree"
+        _git(repository, "worktree", "add", "--detach", str(place), revision)
+        try:
+            yield place
+        finally:
+            _git(repository, "worktree", "remove", "--force", str(place))
+
+
+def seconds(what: str, tree: Path, settings: Settings) -> float:
+    """One measurement in a fresh process.
+
+    Args:
+        what: ``tracking``, ``ba`` (one call with backward) or ``training`` (one step).
+        tree: checkout that is measured.
+        settings: sizes.
+
+    Raises:
+        DvoError: the process failed, or printed no time.
+    """
+    if what == "training":
+        told = _run([sys.executable, "-m", "train", "profile", "--steps", str(settings.steps), "--cpu-time"], tree)
+        found = _STEP.search(told)
+    else:
+        script = str(Path(__file__).with_name("measurements.py"))
+        clip = [str(settings.data / settings.clip)] if what == "tracking" else []
+        frames = ["--frames", str(settings.frames)] if settings.frames else []
+        told = _run([sys.executable, script, what, *clip, *frames], tree)
+        found = re.search(r"SECONDS ([0-9.]+)", told)
+    if found is None:
+        raise DvoError("printed no time", file=tree, field=what, remedy="run the measurement by hand")
+    return float(found[1])
+
+
+def paired(measure: Callable[[Path], float], base: Path, current: Path, pairs: int) -> list[tuple[float, float]]:
+    """Measure two trees by turns: base, current, base, current, ...
+
+    Args:
+        measure: gives the seconds of a tree.
+        base, current: the trees.
+        pairs: number of pairs.
+
+    Returns:
+        Seconds of base and current, for each pair.
+    """
+    return [(measure(base), measure(current)) for _ in range(pairs)]
+
+
+def median_ratio(pairs: list[tuple[float, float]]) -> float:
+    """Median over the pairs of current over base."""
+    return statistics.median(current / base for base, current in pairs)
+
+
+def trajectory(tree: Path, clip: Path, out: Path) -> bytes:
+    """Content of ``trajectory.txt`` of ``dvo run`` on a clip, seed 0, on the CPU."""
+    command = [sys.executable, "-m", "dvo", "run", str(clip), "--out", str(out), "--seed", "0", "--device", "cpu"]
+    _run(command, tree)
+    return (out / "trajectory.txt").read_bytes()
+
+
+def same_trajectories(base: Path, current: Path, settings: Settings) -> dict[str, bool]:
+    """Whether both trees give the same bytes, by clip."""
+    found = {}
+    with tempfile.TemporaryDirectory(prefix="dvo-tracks-") as folder:
+        for name in settings.clips:
+            clip = settings.data / name
+            one, two = (trajectory(tree, clip, Path(folder) / f"{name}-{k}") for k, tree in enumerate((base, current)))
+            found[name] = one == two
+    return found
+
+
+def _run(command: list[str], tree: Path) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_WAIT_POLICY": "PASSIVE"} | dict.fromkeys(_THREADS, "1")
+    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
+        raise DvoError(f"{' '.join(command[1:4])} failed: {last}", file=tree, remedy="run it there by hand")
+    return done.stdout
+
+
+def _git(repository: Path, *arguments: str) -> None:
+    try:
+        subprocess.run(["git", "-C", str(repository), *arguments], check=True, capture_output=True, text=True)
+    except FileNotFoundError:
+        raise DvoError("git is not installed", remedy="install it") from None
+    except subprocess.CalledProcessError as error:
+        last = (error.stderr.strip().splitlines() or ["failed"])[-1]
+        raise DvoError(
+            f"git {arguments[0]}: {last}", field="--base", remedy="give a commit of this repository"
+        ) from None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the comparison.
+
+    Returns:
+        Exit code: 0, or 2 for an input that the user can fix.
+    """
+    line = argparse.ArgumentParser(prog="python -m eval.benchmarks.compare_commits", description=__doc__,
+                                   formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
+    line.add_argument("--base", required=True, metavar="REV", help="commit to compare with")
+    line.add_argument("--pairs", type=int, default=5, metavar="N", help="pairs of each measurement (5)")
+    line.add_argument("--what", default=",".join(WHAT), help=f"names with commas between ({','.join(WHAT)})")
+    line.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings ($DVO_DATA, ../shared/data)")
+    line.add_argument("--clip", default=Settings.clip, help=f"clip whose tracking is timed ({Settings.clip})")
+    line.add_argument("--frames", type=int, metavar="N", help="of it (all)")
+    line.add_argument("--steps", type=int, default=Settings.steps, help="training steps of a measurement (5)")
+    line.add_argument("--clips", default=",".join(CLIPS), help="clips whose trajectories are compared; '' for none")
+    given = line.parse_args(arguments)
+    try:
+        names = [name for name in given.what.split(",") if name]
+        if unknown := [name for name in names if name not in WHAT]:
+            raise DvoError(f"no measurement '{unknown[0]}'", field="--what", remedy=f"choose from {', '.join(WHAT)}")
+        if given.pairs < 1:
+            raise DvoError(f"must be 1 or more, got {given.pairs}", field="--pairs", remedy="give a whole number")
+        data = data_folder(given.data).resolve() if "tracking" in names else Path()
+        clips = tuple(name for name in given.clips.split(",") if name)
+        settings = Settings(data, given.clip, given.frames, given.steps, clips)
+        with worktree(given.base) as base:
+            for name in names:
+                _compare(name, base, settings, given.pairs)
+    except DvoError as error:
+        print(f"compare_commits: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _compare(name: str, base: Path, settings: Settings, pairs: int) -> None:
+    measured = []
+    for number in range(pairs):
+        measured += paired(lambda tree: seconds(name, tree, settings), base, ROOT, 1)
+        one, two = measured[-1]
+        print(f"{name:9} pair {number + 1}: base {one:.4f} s, current {two:.4f} s, ratio {two / one:.3f}", flush=True)
+    print(f"{name:9} median ratio current / base of {pairs} pairs: {median_ratio(measured):.3f}", flush=True)
+    if name == "tracking":
+        for clip, same in same_trajectories(base, ROOT, settings).items():
+            print(f"{clip:24} trajectory.txt {'same bytes' if same else 'DIFFERENT'}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,98 @@
+"""Single measurements for :mod:`eval.benchmarks.compare_commits`: ``python measurements.py tracking CLIP``.
+
+Run as a file, with the tree to be measured on PYTHONPATH. Only names that every version of dvo has are used, so that
+one file measures them all. Seconds are those of the processor in this process, which other work on the machine hardly
+changes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from itertools import islice
+from typing import Any
+
+import cv2
+import torch
+
+import dvo
+
+
+def tracking(clip: str, frames: int | None) -> float:
+    """Seconds to track and finish a clip with the weights ``small``; reading is not counted."""
+    images = list(islice(dvo.open(clip), frames))
+    odometry = dvo.load("small", seed=0)
+    start = time.process_time()
+    for frame in images:
+        odometry.track(frame)
+    odometry.finish()
+    return time.process_time() - start
+
+
+def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: int = 24) -> float:
+    """Seconds of one bundle adjustment with its backward pass, the fastest of some.
+
+    The problem is that of a training clip: every patch is seen in every other frame.
+
+    Args:
+        repeats: runs.
+        batch, frames, per_frame: clips, frames of each and patches of a frame.
+    """
+    generator = torch.Generator().manual_seed(0)
+    count = frames * per_frame
+    centres = torch.rand(batch, count, 2, generator=generator) * torch.tensor([40.0, 30.0])
+    depth = 0.3 + torch.rand(batch, count, 1, generator=generator)
+    patches = torch.cat((centres, depth), -1)[..., None, None].repeat(1, 1, 1, 3, 3)
+    quaternion = torch.tensor([0.0, 0, 0, 1]).expand(batch, frames, 4)
+    shifts = 0.05 * torch.randn(batch, frames, 3, generator=generator)
+    poses = torch.cat((shifts, quaternion), -1)
+    intrinsics = torch.tensor([35.0, 35, 20, 15]).repeat(batch, frames, 1)
+    kk = torch.arange(count).repeat_interleave(frames)
+    ii, jj = kk // per_frame, torch.arange(frames).repeat(count)
+    ii, jj, kk = (x[ii != jj] for x in (ii, jj, kk))
+    targets = centres[:, kk] + torch.randn(batch, len(kk), 2, generator=generator)
+    weights = torch.rand(targets.shape, generator=generator)
+    plan = edge_plan(ii, jj, kk, frames, count)
+    best = float("inf")
+    for _ in range(repeats):
+        leaves = [x.clone().requires_grad_() for x in (poses, patches, intrinsics, targets, weights)]
+        start = time.process_time()
+        found: Any = dvo.bundle_adjust(*leaves, ii, jj, kk, plan=plan)
+        moved, refined = (found.poses_cw, found.patches) if hasattr(found, "poses_cw") else found
+        (moved.sum() + refined.sum()).backward()
+        best = min(best, time.process_time() - start)
+    return best
+
+
+def edge_plan(ii: torch.Tensor, jj: torch.Tensor, kk: torch.Tensor, frames: int, count: int) -> Any:
+    """Plan of the edges, as training makes one for a graph that stays; None in a version that has no such function."""
+    try:
+        from dvo.ba.edges import plan_edges
+
+        return plan_edges(ii, jj, kk, frames, count)
+    except (ImportError, TypeError):
+        return None
+
+
+def main() -> None:
+    """Print the seconds."""
+    line = argparse.ArgumentParser(description=__doc__)
+    line.add_argument("what", choices=("tracking", "ba"))
+    line.add_argument("clip", nargs="?")
+    line.add_argument("--frames", type=int)
+    line.add_argument("--repeats", type=int, default=30)
+    given = line.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    try:
+        from dvo.allocator import reuse_freed_memory  # as `dvo run` and training do
+
+        reuse_freed_memory()
+    except ImportError:
+        pass
+    seconds = tracking(given.clip, given.frames) if given.what == "tracking" else bundle_adjustment(given.repeats)
+    print(f"SECONDS {seconds:.9f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -22,14 +22,14 @@ from dvo.synth.render.renderer import Rendering, render
 from dvo.synth.render.shot import Shot
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.families import random_scene
-from dvo.synth.scenes.repaint import plainer
+from dvo.synth.scenes.repaint import reduce_texture
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.sensors.imu import Imu, ImuNoise, measure_imu
 from dvo.synth.sensors.sensor import (
     Sensor,
     expose,
     exposure_changes,
-    in_the_dark,
+    low_light,
     random_intrinsics,
     random_sensor,
 )
@@ -226,7 +226,7 @@ def make_sequence(
     camera = random_lens(np.random.default_rng([seed, salts.LENS]), pinhole, spec.camera.lens)
     sensor = _apply_effects(random_sensor(rng), spec.camera, seed, duration)
     if spec.scene.texture < 1:
-        scene = plainer(scene, spec.scene.texture, seed)
+        scene = reduce_texture(scene, spec.scene.texture, seed)
     movers = spec.scene.movers
     stage = Stage(scene, random_bodies(scene, path, duration, seed, movers)) if movers else scene
     return film(
@@ -242,7 +242,7 @@ def _apply_effects(sensor: Sensor, spec: CameraSpec, seed: int, duration: float)
         rng = np.random.default_rng([seed, salts.LIGHTING])
         sensor = replace(sensor, stops=exposure_changes(rng, duration, spec.lighting))
     if spec.light < 1:
-        sensor = in_the_dark(sensor, spec.light)
+        sensor = low_light(sensor, spec.light)
     if spec.blackout > 0:
         sensor = replace(sensor, blackout=(((duration - spec.blackout) / 2, (duration + spec.blackout) / 2),))
     return sensor

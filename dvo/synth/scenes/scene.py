@@ -47,8 +47,7 @@ class Scene:
         solids: ``(K, 15)`` centre, half sizes, rotation (row-major, box to world) of boxes that cameras must not enter.
         scale: typical viewing distance, metres.
         hints: information for path planning: ``heading`` (3,) along a street or None, ``focus`` (low, high) box of
-            points
-            to look at, ``height`` (low, high) of cameras.
+            points to look at, ``height`` (low, high) of cameras.
     """
 
     origin: Array
@@ -87,8 +86,7 @@ class Scene:
 
         Returns:
             ``surface (13, P)``: linear part of the texture map (4), gain (3), offset (3), left and top of the texture's
-            cell,
-            left edge of the light map's cell; ``light (1, 3, CELL, P CELL)``.
+            cell, left edge of the light map's cell; ``light (1, 3, CELL, P CELL)``.
         """
         key = str(device)
         if key not in self._cache:
@@ -201,7 +199,7 @@ class SceneBuilder:
         texture = int(rng.choice(self.pool.tagged(*tags))) if tags else int(rng.integers(self.pool.count))
         mean = self.pool.use(texture)
         strength = rng.uniform(*contrast)
-        # Pull dark and bright textures towards the middle: a scene of black walls teaches nothing.
+        # Pull dark and bright textures towards medium grey, or black walls would have no gradients.
         level = bright * np.exp(rng.normal(0, 0.22)) * (0.45 / max(mean.mean(), 0.08)) ** 0.5
         tint = level * np.exp(rng.normal(0, 0.06, 3))
         repeat = float(np.exp(rng.uniform(*np.log(metres))))

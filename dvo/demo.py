@@ -49,6 +49,9 @@ def render_clip(frames: int) -> RenderedClip:
 
     Args:
         frames: number of frames.
+
+    Returns:
+        The frames, in memory.
     """
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=frames)

@@ -153,6 +153,9 @@ def sequence_spec(base: SequenceSpec | None = None, **options: Any) -> SequenceS
         base: specification that supplies the options not given; the defaults if None.
         options: fields of :class:`SequenceFormat`, :class:`SceneSpec`, :class:`MotionSpec` and :class:`CameraSpec`.
 
+    Returns:
+        The specification.
+
     Raises:
         DvoError: an unknown name, or a number out of range.
 

@@ -172,6 +172,9 @@ def free_space(corners: Array, view: View = "auto") -> FreeSpace:
     Args:
         corners: ``(T, 3, 3)``, z up.
         view: "auto", "inside" or "outside".
+
+    Returns:
+        Cells in which cameras may be.
     """
     low, high = corners.min((0, 1)), corners.max((0, 1))
     extent = high - low

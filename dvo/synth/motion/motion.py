@@ -48,6 +48,9 @@ class Path:
 
         Args:
             gain: factor; -1 reverses the motion.
+
+        Returns:
+            The scaled path.
         """
         return replace(self, gain=self.gain * gain)
 

@@ -10,9 +10,10 @@ from dvo.synth.motion.motion import Sway
 from dvo.synth.protocols import Motion
 from dvo.synth.render.renderer import render_depth
 from dvo.synth.scenes.bodies import Body
+from dvo.synth.scenes.builder import SceneBuilder
 from dvo.synth.scenes.furnishing import UP, paint_object, yaw
 from dvo.synth.scenes.lighting import bake
-from dvo.synth.scenes.scene import Scene, SceneBuilder
+from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
 

@@ -38,6 +38,9 @@ def find_start(scene: Scene, rng: np.random.Generator, tries: int = 4) -> Start:
         scene: to start in.
         rng: draws poses.
         tries: rounds of up to three poses.
+
+    Returns:
+        The best of the poses.
     """
     best: tuple[float, Start] | None = None
     k = np.array([16.0, 16.0, 11.5, 8.5])

@@ -90,6 +90,9 @@ def plate_of(camera: Camera, parts: int) -> Plate:
         camera: with its distortion.
         parts: samples m per pixel edge.
 
+    Returns:
+        The plate, kept for the next call.
+
     Raises:
         DvoError: the lens model has no ray for a pixel, or the plate would be huge.
     """
@@ -124,6 +127,9 @@ def random_lens(rng: np.random.Generator, camera: Camera, model: DistortionModel
         rng: draws them.
         camera: pinhole.
         model: "none" returns the camera as it is.
+
+    Returns:
+        The camera with its distortion.
     """
     if model == "none":
         return camera

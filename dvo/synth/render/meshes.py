@@ -133,6 +133,9 @@ def render_mesh(
         quality: sampling of the colours.
         device: where to render.
         coordinates: fill the weights too.
+
+    Returns:
+        Images ``(N, 3, H, W)``, depth and triangle ``(N, H, W)``, weights ``(N, H, W, 2)``.
     """
     covers = _covers(scene, poses_wc, intrinsics, height, width, device)
     depth = torch.stack([torch.where(c.triangle >= 0, 1 / c.inverse_depth, 0.0).float() for c in covers])

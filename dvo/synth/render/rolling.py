@@ -13,7 +13,8 @@ from torch import Tensor
 from dvo.errors import DvoError
 from dvo.synth.render.antialias import smooth_outlines
 from dvo.synth.render.quality import STANDARD, Quality
-from dvo.synth.render.renderer import PIECE, Rendering, cast, coordinates_of, functions_of, named, shade, view_scene
+from dvo.synth.render.renderer import PIECE, Rendering, cast, named, view_scene
+from dvo.synth.render.shading import coordinates_of, functions_of, shade
 from dvo.synth.render.view import SLACK, View
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import Scene

@@ -42,7 +42,14 @@ class Offset:
     mount: Array
 
     def poses_wc(self, times: Array) -> Array:
-        """Poses ``(T, 7)`` at ``times (T,)`` seconds."""
+        """Poses ``(T, 7)`` at ``times (T,)`` seconds.
+
+        Args:
+            times: ``(T,)`` seconds.
+
+        Returns:
+            ``(T, 7)``.
+        """
         poses = self.motion.poses_wc(times)
         return compose_rodrigues(poses, np.broadcast_to(self.mount, poses.shape))
 
@@ -58,7 +65,14 @@ class Rest:
     pose_wc: Array
 
     def poses_wc(self, times: Array) -> Array:
-        """Poses ``(T, 7)`` at ``times (T,)`` seconds."""
+        """Poses ``(T, 7)`` at ``times (T,)`` seconds.
+
+        Args:
+            times: ``(T,)`` seconds.
+
+        Returns:
+            ``(T, 7)``.
+        """
         return np.tile(np.asarray(self.pose_wc, float), (len(np.asarray(times)), 1))
 
 
@@ -104,6 +118,9 @@ class Shot:
 
         Args:
             baseline: distance to the right, world units.
+
+        Returns:
+            The shot of the right camera.
         """
         return replace(self, path=Offset(self.path, np.array([baseline, 0, 0, 0, 0, 0, 1.0])))
 
@@ -179,6 +196,9 @@ class Shot:
         Args:
             middle: sharp image at mid-exposure.
             time: seconds.
+
+        Returns:
+            Number of images.
         """
         step = 10
         depth = middle.depth[0, ::step, ::step].cpu().numpy().astype(float)

@@ -58,6 +58,9 @@ def look(scene: Scene, poses_wc: Array, intrinsics: Array, size: tuple[int, int]
         poses_wc: ``(N, 7)`` camera to world.
         intrinsics: ``(N, 4)`` pixels.
         size: height and width of the image, which culls; None keeps all surfaces that face a camera.
+
+    Returns:
+        The view.
     """
     rotation, centre = split(poses_wc)  # (N, 3, 3) camera to world, (N, 3)
     seen = _in_sight(scene, rotation, centre, intrinsics, size)
@@ -100,6 +103,9 @@ def look_at_stage(stage: Stage, poses_wc: Array, intrinsics: Array, size: tuple[
         stage: scene and bodies.
         poses_wc, intrinsics, size: as for :func:`look`.
         times: ``(N,)`` seconds of the cameras, for the poses of the bodies.
+
+    Returns:
+        The view; surfaces are numbered as in :class:`dvo.synth.Stage`.
     """
     views = [look(stage.scene, poses_wc, intrinsics, size)]
     for body, start in zip(stage.bodies, stage.starts[1:-1], strict=True):

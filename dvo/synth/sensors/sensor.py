@@ -91,6 +91,9 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
 
     Args:
         rng: draws it.
+
+    Returns:
+        The sensor.
     """
     poor = rng.random() < 0.25
     return Sensor(
@@ -115,6 +118,9 @@ def random_degradation(rng: np.random.Generator, sensor: Sensor, duration: float
         rng: draws it.
         sensor: without wear.
         duration: of the clip, seconds.
+
+    Returns:
+        The sensor, in most cases unchanged.
     """
     draw = rng.random()
     if draw < 0.05:
@@ -134,6 +140,9 @@ def exposure_changes(rng: np.random.Generator, duration: float, strength: float)
         rng: draws them.
         duration: seconds.
         strength: stops.
+
+    Returns:
+        Pairs of second and exposure value (stops).
     """
     count = max(3, int(duration / 1.3))
     times = np.linspace(0, duration, count)
@@ -161,6 +170,9 @@ def low_light(sensor: Sensor, light: float) -> Sensor:
     Args:
         sensor: in usual light.
         light: share of the usual light that arrives, in (0, 1].
+
+    Returns:
+        The sensor in low light.
     """
     amplified = float(np.clip(0.8 / light, 1.0, 14.0))
     red, green, blue = (value * light * amplified for value in sensor.balance)

@@ -94,7 +94,14 @@ class TexturePool:
         self.tags = [self._photos[s][1] if isinstance(s, int) else self._patterns[s][1] for s in self._sources]
 
     def cell(self, index: int) -> tuple[int, int]:
-        """Top and left of a texture's cell in the atlas, texels."""
+        """Top and left of a texture's cell in the atlas, texels.
+
+        Args:
+            index: of the texture.
+
+        Returns:
+            Row and column.
+        """
         return index // self.columns * self.size * 3 // 2, index % self.columns * self.size
 
     def use(self, index: int) -> np.ndarray:
@@ -161,6 +168,9 @@ def texture_pool(seed: int, count: int = 224, size: int = 256, *, folder: Path |
 
     Args:
         seed, count, size, folder: see :class:`TexturePool`.
+
+    Returns:
+        The pool.
     """
     return TexturePool(seed, count, size, folder)
 

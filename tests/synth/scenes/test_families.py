@@ -14,8 +14,8 @@ from dvo.registry import Registry
 from dvo.synth import FAMILIES, HELD_OUT, Scene, make_sequence, random_scene, render
 from dvo.synth.motion.paths import find_start
 from dvo.synth.motion.walks import long_path
+from dvo.synth.scenes.builder import SceneBuilder
 from dvo.synth.scenes.families import SHARES
-from dvo.synth.scenes.scene import SceneBuilder
 from dvo.synth.textures.texture import TexturePool, texture_pool
 
 RECORDED = "tabletop planes corridor clutter street planes room planes tabletop street street street"

@@ -1,4 +1,7 @@
-"""Patterns with drawn shapes: cloth, dead leaves, facades, posters, shelves, doors, wallpaper, paintings."""
+"""Patterns with drawn shapes: cloth, dead leaves, facades, posters, shelves, doors, wallpaper, paintings.
+
+Each function takes a generator and the edge length S in texels, and returns ``(S, S, 3)`` float32 RGB in [0, 1].
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Patterns of materials: stone, plaster, bricks, tiles, wood, bark, grass, asphalt, roofs, sky."""
+"""Patterns of materials: stone, plaster, bricks, tiles, wood, bark, grass, asphalt, roofs, sky.
+
+Each function takes a generator and the edge length S in texels, and returns ``(S, S, 3)`` float32 RGB in [0, 1].
+"""
 
 from __future__ import annotations
 

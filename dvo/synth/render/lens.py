@@ -1,4 +1,4 @@
-"""Rendering through a lens with distortion: exact depth, surfaces and texture coordinates, resampled colours.
+"""Images through a lens with distortion: exact depth, surfaces and texture coordinates, resampled colours.
 
 A pinhole image, the plate, covers the whole field of view of the lens. If the four plate pixels around the position of
 a lens pixel show one surface, that surface's linear functions are evaluated at the position itself; the other pixels,

@@ -297,7 +297,7 @@ class Shot:
         k = self.camera.intrinsics
         if self.readout <= 0:
             when, size = np.array([time]), self._size
-            if bends(self.camera):  # through the plate of the lens
+            if bends(self.camera):  # through the pinhole picture that covers what the lens sees
                 plate = plate_of(self.camera, 2)
                 pixels = undistorted_pixels(pixels, self.camera) + (plate.intrinsics - k)[2:]
                 k, size = plate.intrinsics, plate.size

@@ -1,4 +1,4 @@
-"""``dvo demo``: render a clip on the spot, track it, and compare with the exact ground truth."""
+"""``dvo demo``: render a clip, track it, and compare with the exact ground truth."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ SCENE, FAMILY, FPS = 0, "room", 30.0
 
 @dataclass
 class RenderedClip:
-    """A clip in memory, so that the speed in run.json is the tracker's and not the renderer's.
+    """Clip in memory, so that the speed in run.json is that of the tracker and not of the renderer.
 
     Attributes:
+        name: of the clip.
         frames: rendered before.
         groundtruth: camera-to-world poses of these frames, metres.
+        warnings: always empty; part of the interface of a source.
     """
 
     name: str
@@ -42,7 +44,14 @@ class RenderedClip:
 
 
 def render_clip(frames: int) -> RenderedClip:
-    """``frames`` frames of 320x240 at 30 Hz: a hand-held walk through a furnished room."""
+    """Render a hand-held walk through a furnished room, 320x240 at 30 Hz.
+
+    Args:
+        frames: number of frames.
+
+    Returns:
+        The frames, in memory.
+    """
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=frames)
         sequence = make_sequence(SCENE, frames=frames, family=FAMILY, kind="handheld", fps=FPS)
@@ -54,7 +63,17 @@ def render_clip(frames: int) -> RenderedClip:
 
 
 def demo(arguments: argparse.Namespace) -> int:
-    """Entry point of ``dvo demo``; returns the exit code."""
+    """Entry point of ``dvo demo``.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
+
+    Raises:
+        DvoError: weights that cannot be loaded, or a folder that cannot be written.
+    """
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
     odometry = load_odometry(arguments, device)  # before the rendering: fail early

@@ -1,4 +1,4 @@
-"""``dvo synth preview | export``: look at scenes and meshes, and write sequences of them."""
+"""``dvo synth preview | export``: contact sheets of scenes and meshes, and sequences written to disk."""
 
 from __future__ import annotations
 
@@ -21,7 +21,17 @@ from dvo.synth.specs import CameraSpec, MotionSpec, SceneSpec, SequenceFormat, S
 
 
 def preview(arguments: argparse.Namespace) -> int:
-    """A contact sheet of a family, of a mesh, of training clips or of all families."""
+    """Write a contact sheet of a family, of a mesh, of training clips or of all families.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
+
+    Raises:
+        DvoError: a file that cannot be written, an unknown family or mesh, options that do not combine.
+    """
     out = Path(arguments.out)
     if not out.parent.is_dir() or out.suffix.lower() not in (".png", ".jpg"):
         raise DvoError("cannot be written", file=out, field="--out", remedy="name a .png in a folder that exists")
@@ -49,7 +59,17 @@ def preview(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> int:
-    """A sequence in the layout of TUM RGB-D or TartanAir."""
+    """Write a sequence in the layout of TUM RGB-D or TartanAir.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
+
+    Raises:
+        DvoError: a folder that cannot be written, an unknown family or mesh, options that do not combine.
+    """
     width, height = arguments.size
     device = device_of(arguments.device)
     form = SequenceFormat(arguments.frames, height, width, arguments.fps)

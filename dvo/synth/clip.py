@@ -21,7 +21,7 @@ from dvo.synth.render.quality import Quality
 from dvo.synth.render.renderer import render, render_depth
 from dvo.synth.scenes.families import random_scene
 from dvo.synth.scenes.scene import Scene
-from dvo.synth.sensors.sensor import Sensor, expose, random_intrinsics, random_sensor, random_wear
+from dvo.synth.sensors.sensor import Sensor, expose, random_degradation, random_intrinsics, random_sensor
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.synth.specs import check_names
 from dvo.synth.textures.texture import texture_pool
@@ -126,13 +126,13 @@ class _Plan:
     times: Array
 
 
-def _meet(path: Path, rhythm: Array, target: float, speed: float, depth: Array, low: Array) -> float:
+def _match_flow(path: Path, rhythm: Array, target: float, speed: float, depth: Array, low: Array) -> float:
     """Speed at which the mean flow over given depth maps meets the target (fixed-point steps on the ratio)."""
     for _ in range(5):
         times, moved = _timing(path, rhythm, speed)
         flow, overlap = induced_flow(depth, moved.poses_wc(times), low)
         mean = float(flow.mean()) * LOW
-        if overlap.mean() < 0.2:  # out of sight: the mean says little
+        if overlap.mean() < 0.2:  # little overlap: the mean is not reliable
             speed *= 0.4
             continue
         ratio = target / max(mean, 1e-3)
@@ -161,7 +161,7 @@ def _plan(
     height, width = size[0] // LOW, size[1] // LOW
     low = (intrinsics + [0, 0, 0.5, 0.5]) / LOW - [0, 0, 0.5, 0.5]
     depth = np.full((len(rhythm), height, width), path.depth)  # a first guess without rendering
-    speed = _meet(path, rhythm, target, 0.05, depth, low)
+    speed = _match_flow(path, rhythm, target, 0.05, depth, low)
     for _ in range(3):  # ahead, backwards, slower
         times, moved = _timing(path, rhythm, speed)
         if scene.is_free(_between(moved, times)[:, :3]).all():
@@ -188,7 +188,7 @@ def _plan(
             return _Plan(moved, times) if roomy and overlap.min() > 0.5 else None
         if overlap.min() < 0.25:
             return None
-        speed = _meet(path, rhythm, target, speed, depth, low)
+        speed = _match_flow(path, rhythm, target, speed, depth, low)
     return None
 
 
@@ -240,8 +240,10 @@ def make_clip(
             field = np.clip(np.concatenate([field, field[-1:]]), -spec.width / 3, spec.width / 3)
             flow = torch.from_numpy(field.astype(np.float32))
         times = plan.times - plan.times[0]
-        # From a stream of its own, so that the draws above do not depend on wear.
-        camera = random_wear(np.random.default_rng([seed, salts.CLIP_WEAR, index]), camera, float(times[-1]))
+        # From a stream of its own, so that the draws above do not depend on degradation.
+        camera = random_degradation(
+            np.random.default_rng([seed, salts.CLIP_DEGRADATION, index]), camera, float(times[-1])
+        )
         images = expose(images, camera, rng, flow, times)
     scale = float(rendering.depth.median())
     relative = compose_rodrigues(invert_rodrigues(poses_wc), poses_wc[:1])  # world := first camera

@@ -11,16 +11,20 @@ from dvo.synth.clip import make_clip
 
 
 class ClipDataset(Dataset[dict[str, Tensor]]):
-    """``length`` clips of stream ``seed``; the same bytes for any number of workers.
+    """Data set of ``length`` clips of stream ``seed``; the same bytes for any number of workers.
+
+    Items are ``images (N, 3, H, W)`` uint8, ``depth (N, H, W)``, ``poses_cw (N, 7)``, ``intrinsics (N, 4)``, see
+    :class:`dvo.synth.clip.Clip`. Neighbouring indices share a scene (``clips_per_scene``), so reading in order is
+    faster than reading shuffled.
 
     Args:
-        seed: names the stream.
+        seed: of the stream.
         length: number of clips.
         start: index of the first clip (to resume).
-        options: passed to :func:`dvo.synth.clip.make_clip`.
+        options: of :func:`dvo.synth.clip.make_clip`.
 
-    Items are ``images (N, 3, H, W)`` uint8, ``depth (N, H, W)``, ``poses_cw (N, 7)``, ``intrinsics (N, 4)``.
-    Neighbouring indices share a scene (``clips_per_scene``), so reading in order is faster than shuffled.
+    Example:
+        >>> loader = DataLoader(ClipDataset(seed=0, length=1000, frames=8), batch_size=4, num_workers=2)
     """
 
     def __init__(self, seed: int, length: int, *, start: int = 0, **options: Any) -> None:

@@ -1,4 +1,4 @@
-"""Sequences as files in the layouts of TUM RGB-D and TartanAir, and scenes as triangles for other renderers."""
+"""Export of sequences in the layouts of TUM RGB-D and TartanAir, and of scenes as triangles for other renderers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,14 @@ OCCLUDED, OUT_OF_VIEW = 1, 100
 
 
 def scene_triangles(scene: Scene) -> tuple[Array, Array, Array]:
-    """Vertices ``(V, 3)``, faces ``(F, 3)`` counter-clockwise from the front, the surface of each face ``(F,)``."""
+    """Triangles of a scene.
+
+    Args:
+        scene: flat surfaces.
+
+    Returns:
+        Vertices ``(V, 3)``, faces ``(F, 3)`` counter-clockwise from the front, the surface of each face ``(F,)``.
+    """
     count = len(scene)
     faces = np.arange(count)[:, None] * 4 + np.array([[0, 1, 2, 0, 2, 3]])
     is_triangle = (scene.corners[:, 2] == scene.corners[:, 3]).all(1)
@@ -76,7 +83,7 @@ def mesh_sequence(
 def export_sequence(
     sequence: SyntheticSequence, out: Path | str, layout: Layout, *, on_frame: Callable[[int], None] | None = None
 ) -> list[str]:
-    """Write a sequence; returns notes on what the layout cannot hold.
+    """Write a sequence.
 
     ``tum``: ``rgb/``, ``depth/`` (16 bit, 5000 to a metre, 0 for none or beyond 13.1 m), ``rgb.txt``, ``depth.txt``,
     ``groundtruth.txt``. ``tartanair``: ``image_left/``, ``depth_left/*.npy`` (metres, float32, 0 for none), ``flow/``
@@ -85,11 +92,16 @@ def export_sequence(
     distortion (``tum`` only) also its coefficients, of a fisheye ``calib.yaml`` instead.
 
     Args:
+        sequence: rendered frame by frame while it is written.
         out: folder, new or empty.
+        layout: ``tum`` or ``tartanair``.
         on_frame: called with the number of frames written so far.
 
+    Returns:
+        Notes on content that the layout cannot hold.
+
     Raises:
-        DvoError: no such layout, or the folder holds something or cannot be written.
+        DvoError: an unknown layout, or a folder that is not empty or cannot be written.
     """
     if layout not in ("tum", "tartanair"):
         raise DvoError(f"no layout {layout!r}", field="layout", remedy="choose tum or tartanair")
@@ -109,7 +121,7 @@ def export_sequence(
 
 
 def _write_calibration(camera: Camera, out: Path) -> None:
-    """``calib.txt``, which has no place for a fisheye's model, or ``calib.yaml``."""
+    """Write ``calib.txt``, or ``calib.yaml`` for a fisheye model."""
     if camera.model == "fisheye":
         rows = {name: f"{value:.9f}" for name, value in zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True)}
         rows |= {"width": str(camera.width), "height": str(camera.height), "model": "fisheye"}
@@ -145,7 +157,7 @@ def _write_picture(path: Path, picture: Array) -> None:
 def _write_tum(frames: Iterator[tuple[int, Array, Array]], sequence: SyntheticSequence, out: Path) -> list[str]:
     (out / "rgb").mkdir()
     (out / "depth").mkdir()
-    times = sequence.groundtruth.timestamps.round(6)  # as the names state them
+    times = sequence.groundtruth.timestamps.round(6)  # as in the file names
     lists: dict[str, list[str]] = {"rgb": ["# timestamp filename"], "depth": ["# timestamp filename"]}
     beyond = total = 0
     for index, image, depth in frames:
@@ -186,11 +198,12 @@ def _write_tartanair(frames: Iterator[tuple[int, Array, Array]], sequence: Synth
 
 
 def static_flow(first: Array, second: Array, poses_wc: Array, intrinsics: Any) -> tuple[Array, Array]:
-    """Flow of a static scene from one frame to another, by depth and pose.
+    """Flow of a static scene from one frame to another, from depth and poses.
 
     Args:
         first, second: ``(H, W)`` depth, 0 for none (a background at infinity).
-        poses_wc: ``(2, 7)``; intrinsics: fx fy cx cy.
+        poses_wc: ``(2, 7)``, in units of the depth.
+        intrinsics: fx fy cx cy, pixels.
 
     Returns:
         ``(H, W, 2)`` float32 pixels; ``(H, W)`` uint8 mask: 0 valid, 1 occluded, 100 out of view.
@@ -209,7 +222,7 @@ def static_flow(first: Array, second: Array, poses_wc: Array, intrinsics: Any) -
     there = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5)
     column, row = (np.where(there, at, 0).round().astype(int) for at in (u, v))
     column, row = column.clip(0, width - 1), row.clip(0, height - 1)
-    # Hidden where all that is seen around the spot is nearer (around: the spot lies between pixels).
+    # Occluded where everything visible around the point is nearer (it lies between pixels).
     seen = np.where(second > 0, second, np.inf)
     around = cv2.dilate(np.where(np.isfinite(seen), seen, 1e9).astype(np.float32), np.ones((3, 3)))[row, column]
     hidden = there & (around < 0.99 * np.where(near[..., 0], z, 1e8))

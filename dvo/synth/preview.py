@@ -1,4 +1,4 @@
-"""Contact sheets of clips: frames, depth, flow, plan of the path (``dvo synth preview``)."""
+"""Contact sheets of clips: frames, depth, flow, plan view of the path (``dvo synth preview``)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ Array = np.ndarray
 
 
 def depth_colours(depth: Array) -> Array:
-    """``(H, W)`` depth (unit: median 1) -> ``(H, W, 3)`` uint8 RGB; near is bright, by inverse depth."""
+    """Colours of a depth map, by inverse depth; near is bright.
+
+    Args:
+        depth: ``(H, W)`` in units of its median, 0 for none.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB.
+    """
     level = np.clip(1 / np.maximum(depth, 1e-3) / 2.5, 0, 1)
     table = cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
     table[depth <= 0] = 0  # nothing there
@@ -24,7 +31,15 @@ def depth_colours(depth: Array) -> Array:
 
 
 def flow_between(clip: Clip, i: int, j: int) -> Array:
-    """Flow ``(H, W, 2)`` in pixels from frame i to frame j by depth and pose (whether or not it stays in view)."""
+    """Flow from one frame of a clip to another, from depth and poses, whether or not it stays in view.
+
+    Args:
+        clip: with depth and poses.
+        i, j: frames.
+
+    Returns:
+        ``(H, W, 2)`` pixels.
+    """
     depth = clip.depth[i].cpu().numpy()
     fx, fy, cx, cy = clip.intrinsics[i].cpu().numpy().astype(float)
     poses = clip.poses_cw.cpu().numpy().astype(float)
@@ -37,7 +52,15 @@ def flow_between(clip: Clip, i: int, j: int) -> Array:
 
 
 def flow_colours(flow: Array, largest: float) -> Array:
-    """``(H, W, 2)`` -> ``(H, W, 3)`` uint8 RGB: hue is direction, saturation is length."""
+    """Colours of a flow field: hue is direction, saturation is length.
+
+    Args:
+        flow: ``(H, W, 2)`` pixels.
+        largest: length of full saturation, pixels.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB.
+    """
     hue = (np.arctan2(flow[..., 1], flow[..., 0]) / (2 * np.pi) % 1) * 179
     length = np.clip(np.hypot(flow[..., 0], flow[..., 1]) / largest, 0, 1)
     hsv = np.stack([hue, 255 * length, np.full_like(hue, 255)], -1).astype(np.uint8)
@@ -45,7 +68,15 @@ def flow_colours(flow: Array, largest: float) -> Array:
 
 
 def plan_view(poses_cw: Array, size: tuple[int, int]) -> Array:
-    """Camera centres and viewing directions from above (x right, z up the picture) -> ``(H, W, 3)`` uint8 RGB."""
+    """Camera centres and viewing directions from above (x right, z up the image).
+
+    Args:
+        poses_cw: ``(N, 7)`` world to camera.
+        size: height and width of the image, pixels.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB.
+    """
     height, width = size
     poses_wc = invert_rodrigues(poses_cw)
     centre, forward = poses_wc[:, [0, 2]], split(poses_wc)[0][:, [0, 2], 2]
@@ -66,7 +97,15 @@ def plan_view(poses_cw: Array, size: tuple[int, int]) -> Array:
 
 
 def clip_row(clip: Clip, columns: int = 4) -> Array:
-    """One row ``(H, (columns + 3) W, 3)``: evenly chosen frames, depth and flow of the first, plan view."""
+    """Row of images of a clip: evenly chosen frames, depth and flow of the first, plan view.
+
+    Args:
+        clip: to show.
+        columns: number of frames.
+
+    Returns:
+        ``(H, (columns + 3) W, 3)`` uint8 RGB.
+    """
     images = clip.images.cpu().numpy().transpose(0, 2, 3, 1)
     chosen = np.linspace(0, len(images) - 1, columns).round().astype(int)
     flow = flow_between(clip, 0, 1) * (clip.depth[0] > 0).cpu().numpy()[..., None]
@@ -80,13 +119,31 @@ def clip_row(clip: Clip, columns: int = 4) -> Array:
 
 
 def contact_sheet(seed: int = 0, count: int = 12, *, start: int = 0, **options: object) -> Array:
-    """Sheet ``(H, W, 3)`` uint8 RGB of ``count`` clips; ``options`` go to :func:`dvo.synth.clip.make_clip`."""
+    """Rows of training clips.
+
+    Args:
+        seed: of the stream.
+        count: number of clips.
+        start: index of the first.
+        options: of :func:`dvo.synth.clip.make_clip`.
+
+    Returns:
+        ``(count H, 7 W, 3)`` uint8 RGB.
+    """
     rows = [clip_row(make_clip(seed, start + i, **options)) for i in range(count)]  # type: ignore[arg-type]
     return np.concatenate(rows, 0)
 
 
 def sequence_rows(sequence: SyntheticSequence, columns: int = 4) -> Array:
-    """One row of a sequence, as :func:`clip_row` has it; the flow is that over a tenth of a second."""
+    """Row of images of a sequence, as :func:`clip_row`; the flow is that over a tenth of a second.
+
+    Args:
+        sequence: to show.
+        columns: number of frames.
+
+    Returns:
+        ``(H, (columns + 3) W, 3)`` uint8 RGB.
+    """
     poses_wc, times = sequence.groundtruth.poses_wc, sequence.groundtruth.timestamps
     chosen = np.linspace(0, len(sequence) - 1, columns).round().astype(int)
     pictures = [sequence.rendering(int(index)) for index in chosen]
@@ -109,7 +166,17 @@ def sequence_rows(sequence: SyntheticSequence, columns: int = 4) -> Array:
 def family_sheet(
     names: Sequence[str], seeds: Sequence[int], height: int, width: int, *, textures: str | None = None
 ) -> Array:
-    """Sheet of clean sequences of six seconds, a row for each family and seed, with its name on it."""
+    """Rows of clean sequences of six seconds, one per family and seed, each labelled with the family.
+
+    Args:
+        names: families.
+        seeds: of the sequences, as many.
+        height, width: of one image, pixels.
+        textures: folder of photographs to use as textures.
+
+    Returns:
+        ``(rows H, 7 W, 3)`` uint8 RGB.
+    """
     rows = []
     for name, seed in zip(names, seeds, strict=True):
         sequence = make_sequence(

@@ -18,7 +18,7 @@ PATH = 7201  # short path of a training clip
 LONG_PATH = 7202  # long path of a sequence
 # Training clips
 CLIP = 7301  # path, intrinsics, sensor
-CLIP_WEAR = 7302  # compression and exposure changes
+CLIP_DEGRADATION = 7302  # compression and exposure changes
 # Sequences
 SEQUENCE = 7401  # scene, path, intrinsics, sensor
 NOISE = 7402  # noise of one frame

@@ -22,14 +22,14 @@ from dvo.synth.render.renderer import Rendering, render
 from dvo.synth.render.shot import Shot
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.families import random_scene
-from dvo.synth.scenes.repaint import plainer
+from dvo.synth.scenes.repaint import reduce_texture
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.sensors.imu import Imu, ImuNoise, measure_imu
 from dvo.synth.sensors.sensor import (
     Sensor,
     expose,
     exposure_changes,
-    in_the_dark,
+    low_light,
     random_intrinsics,
     random_sensor,
 )
@@ -94,15 +94,36 @@ class SyntheticSequence:
         )  # fmt: skip
 
     def time(self, index: int) -> float:
-        """Timestamp of a frame, seconds."""
+        """Timestamp of a frame, seconds.
+
+        Args:
+            index: of the frame.
+
+        Returns:
+            Seconds.
+        """
         return float(self.groundtruth.timestamps[index])
 
     def rendering(self, index: int) -> Rendering:
-        """Clean image, depth, surfaces and texture coordinates of one frame (batch of 1)."""
+        """Clean image, depth, surfaces and texture coordinates of one frame (batch of 1).
+
+        Args:
+            index: of the frame.
+
+        Returns:
+            Batch of one.
+        """
         return self.shot.rendering(self.time(index), self.groundtruth.poses_wc[index : index + 1])
 
     def frame(self, index: int) -> Frame:
-        """One frame as the camera delivers it, with the sensor's noise."""
+        """One frame as the camera delivers it, with the sensor's noise.
+
+        Args:
+            index: of the frame.
+
+        Returns:
+            Image ``(H, W, 3)`` uint8 RGB, timestamp and camera.
+        """
         images = self.rendering(index).images
         if self.sensor is not None:
             rng = np.random.default_rng([self.seed, salts.NOISE, index])
@@ -114,15 +135,37 @@ class SyntheticSequence:
         return (self.frame(index) for index in range(len(self)))
 
     def flow(self, start: int, end: int) -> Flow:
-        """Optical flow and visibility from frame ``start`` to frame ``end``, see :func:`dvo.synth.optical_flow`."""
+        """Optical flow and visibility from frame ``start`` to frame ``end``, see :func:`dvo.synth.optical_flow`.
+
+        Args:
+            start, end: indices of the frames.
+
+        Returns:
+            Flow of every pixel of the first frame.
+        """
         return optical_flow(self.shot, self.time(start), self.time(end))
 
     def dynamic_mask(self, index: int) -> np.ndarray:
-        """``(H, W)`` bool: pixels that show a moving body."""
+        """``(H, W)`` bool: pixels that show a moving body.
+
+        Args:
+            index: of the frame.
+
+        Returns:
+            ``(H, W)`` bool.
+        """
         return dynamic_mask(self.shot, self.time(index))
 
     def tracks(self, count: int = 200, *, seed: int = 0) -> Tracks:
-        """``count`` surface points followed through all frames, see :func:`dvo.synth.tracks`."""
+        """``count`` surface points followed through all frames, see :func:`dvo.synth.tracks`.
+
+        Args:
+            count: number of points.
+            seed: same seed, same points.
+
+        Returns:
+            The tracks.
+        """
         return tracks(self.shot, self.groundtruth.timestamps, count, seed=seed)
 
     def imu(self, rate: float = 200.0, *, noise: ImuNoise | None = None, seed: int | None = None) -> Imu:
@@ -132,13 +175,23 @@ class SyntheticSequence:
             rate: samples per second.
             noise: None for exact measurements.
             seed: of the noise; that of the sequence if None.
+
+        Returns:
+            The samples.
         """
         first, last = self.time(0), self.time(-1)
         times = first + np.arange(int(np.floor((last - first) * rate + 1e-9)) + 1) / rate
         return measure_imu(self.path, times, noise=noise, seed=self.seed if seed is None else seed)
 
     def stereo(self, baseline: float) -> SyntheticSequence:
-        """Second camera of a rectified stereo pair, ``baseline`` metres to the right, with noise of its own."""
+        """Second camera of a rectified stereo pair, ``baseline`` metres to the right, with noise of its own.
+
+        Args:
+            baseline: distance to the right, metres.
+
+        Returns:
+            Sequence of the right camera.
+        """
         second = self.shot.beside(baseline).path
         truth = Trajectory(self.groundtruth.timestamps, second.poses_wc(self.groundtruth.timestamps))
         return replace(
@@ -226,7 +279,7 @@ def make_sequence(
     camera = random_lens(np.random.default_rng([seed, salts.LENS]), pinhole, spec.camera.lens)
     sensor = _apply_effects(random_sensor(rng), spec.camera, seed, duration)
     if spec.scene.texture < 1:
-        scene = plainer(scene, spec.scene.texture, seed)
+        scene = reduce_texture(scene, spec.scene.texture, seed)
     movers = spec.scene.movers
     stage = Stage(scene, random_bodies(scene, path, duration, seed, movers)) if movers else scene
     return film(
@@ -242,7 +295,7 @@ def _apply_effects(sensor: Sensor, spec: CameraSpec, seed: int, duration: float)
         rng = np.random.default_rng([seed, salts.LIGHTING])
         sensor = replace(sensor, stops=exposure_changes(rng, duration, spec.lighting))
     if spec.light < 1:
-        sensor = in_the_dark(sensor, spec.light)
+        sensor = low_light(sensor, spec.light)
     if spec.blackout > 0:
         sensor = replace(sensor, blackout=(((duration - spec.blackout) / 2, (duration + spec.blackout) / 2),))
     return sensor

@@ -6,6 +6,7 @@ Configuration files and keyword arguments name the settings flat (``frames``, ``
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -152,6 +153,9 @@ def sequence_spec(base: SequenceSpec | None = None, **options: Any) -> SequenceS
         base: specification that supplies the options not given; the defaults if None.
         options: fields of :class:`SequenceFormat`, :class:`SceneSpec`, :class:`MotionSpec` and :class:`CameraSpec`.
 
+    Returns:
+        The specification.
+
     Raises:
         DvoError: an unknown name, or a number out of range.
 
@@ -170,20 +174,21 @@ def sequence_spec(base: SequenceSpec | None = None, **options: Any) -> SequenceS
     return SequenceSpec(**changed)
 
 
-def check_names(options: dict[str, Any], known: Any) -> None:
+def check_names(options: dict[str, Any], known: Iterable[str]) -> None:
     """Reject options of unknown name.
 
     Args:
         options: by name.
-        known: iterable of the names that exist.
+        known: names that exist.
 
     Raises:
         DvoError: an unknown name.
     """
-    unknown = sorted(set(options) - set(known))
+    names = sorted(known)
+    unknown = sorted(set(options) - set(names))
     if unknown:
-        names = ", ".join(sorted(known))
-        raise DvoError(f"no rendering option '{unknown[0]}'", field=unknown[0], remedy=f"use one of {names}")
+        remedy = f"use one of {', '.join(names)}"
+        raise DvoError(f"no rendering option '{unknown[0]}'", field=unknown[0], remedy=remedy)
 
 
 def _check_share(name: str, value: float) -> None:

@@ -1,6 +1,6 @@
 """Ground truth beyond pose and depth: optical flow with occlusions, moving pixels, tracks of points.
 
-Everything follows from depth, poses and surface identity of the frames in the middle of their exposure (see
+All of it follows from depth, poses and surface identity of the frames in the middle of their exposure (see
 :mod:`dvo.synth.render.shot`): exact for sharp frames, for blurred ones that of mid-exposure, row by row with a
 rolling shutter.
 """
@@ -22,12 +22,12 @@ CLOSE = 1e-4  # relative difference of depth below which two hits are the same p
 
 @dataclass(frozen=True)
 class Flow:
-    """Where the pixels of one frame are in another.
+    """Positions of the pixels of one frame in another.
 
     Attributes:
         flow: ``(H, W, 2)`` float64 pixels to the right and down; 0 where nothing is hit.
-        inside: ``(H, W)`` bool: lands in the picture, in front of the camera.
-        visible: ``(H, W)`` bool: lands in the picture and nothing hides it there; ``inside & ~visible`` is occluded.
+        inside: ``(H, W)`` bool: lands in the image, in front of the camera.
+        visible: ``(H, W)`` bool: lands in the image and is not occluded there; ``inside & ~visible`` is occluded.
     """
 
     flow: Array
@@ -40,11 +40,11 @@ class Tracks:
     """Surface points followed through frames.
 
     Attributes:
-        pixels: ``(F, M, 2)`` float64 x, y, wherever they are (also outside the picture or hidden).
+        pixels: ``(F, M, 2)`` float64 x, y, also outside the image or occluded.
         depth: ``(F, M)`` along the optical axis; not positive behind the camera.
-        visible: ``(F, M)`` bool: in the picture and not hidden.
-        surface: ``(M,)`` what they lie on.
-        dynamic: ``(M,)`` bool: on a body that moves.
+        visible: ``(F, M)`` bool: in the image and not occluded.
+        surface: ``(M,)`` surface of each point.
+        dynamic: ``(M,)`` bool: on a moving body.
         points: ``(M, 3)`` in the world, or in the frame of their body.
     """
 
@@ -57,9 +57,17 @@ class Tracks:
 
 
 def optical_flow(shot: Shot, start: float, end: float) -> Flow:
-    """Flow and visibility from the frame at time ``start`` to the frame at time ``end``, in seconds."""
+    """Flow and visibility from one frame to another.
+
+    Args:
+        shot: scene, path and camera.
+        start, end: times of the two frames, seconds.
+
+    Returns:
+        The flow of every pixel of the first frame.
+    """
     first, last = shot.sharp(start), shot.sharp(end)
-    pixels, depth, surface = hits(first)
+    pixels, depth, surface = hit_pixels(first)
     points = shot.lift(start, pixels, depth, surface)
     there, z = shot.place(end, points, surface)
     height, width = shot.camera.height, shot.camera.width
@@ -68,24 +76,41 @@ def optical_flow(shot: Shot, start: float, end: float) -> Flow:
     inside, visible = np.zeros((2, height, width), bool)
     in_view = shot.inside(there, z)
     flow[at], inside[at] = np.where(z[:, None] > 0, there - pixels, 0.0), in_view
-    visible[at] = in_view & shows(shot, end, there, z, surface, last)
+    visible[at] = in_view & visible_points(shot, end, there, z, surface, last)
     return Flow(flow, inside, visible)
 
 
-def hits(rendering: Rendering) -> tuple[Array, Array, Array]:
-    """Pixels ``(M, 2)``, depth ``(M,)`` float64 and surface ``(M,)`` of what one frame hits, row by row."""
+def hit_pixels(rendering: Rendering) -> tuple[Array, Array, Array]:
+    """Pixels of one frame that hit a surface, row by row.
+
+    Args:
+        rendering: batch of one.
+
+    Returns:
+        Pixels ``(M, 2)``, depth ``(M,)`` float64 and surface ``(M,)``.
+    """
     depth = rendering.depth[0].cpu().numpy().astype(np.float64)
     y, x = np.nonzero(depth > 0)
     return np.stack([x, y], -1).astype(np.float64), depth[y, x], rendering.surface[0].cpu().numpy()[y, x]
 
 
-def shows(
+def visible_points(
     shot: Shot, time: float, pixels: Array, depth: Array, surface: Array, frame: Rendering | None = None
 ) -> Array:
-    """``(M,)`` bool: does the frame at ``time`` show these surfaces at these places ``(M, 2)``, or something nearer?
+    """Visibility of surface points in a frame.
 
-    A place whose four neighbouring pixels all show the surface does (surfaces are convex and a thing in front of them
-    that is thinner than a pixel is not in any picture); the others are asked by tracing a ray.
+    A point is visible if its four neighbouring pixels all show its surface (surfaces are convex, and objects in front
+    of them thinner than a pixel are in no image); the others are decided by tracing a ray.
+
+    Args:
+        shot: scene, path and camera.
+        time: of the frame, seconds.
+        pixels: ``(M, 2)`` projections of the points.
+        depth, surface: ``(M,)`` of the points.
+        frame: sharp rendering at that time; rendered if None.
+
+    Returns:
+        ``(M,)`` bool.
     """
     frame = frame or shot.sharp(time)
     names = frame.surface[0].cpu().numpy()
@@ -107,33 +132,45 @@ def shows(
 
 
 def dynamic_mask(shot: Shot, time: float, frame: Rendering | None = None) -> Array:
-    """``(H, W)`` bool: pixels of the frame at ``time`` that show a moving body."""
+    """Pixels that show a moving body.
+
+    Args:
+        shot: scene, path and camera.
+        time: of the frame, seconds.
+        frame: sharp rendering at that time; rendered if None.
+
+    Returns:
+        ``(H, W)`` bool.
+    """
     surface = (frame or shot.sharp(time)).surface[0].cpu().numpy()
     return surface >= shot.scene.static if isinstance(shot.scene, Stage) else np.zeros(surface.shape, bool)
 
 
 def tracks(shot: Shot, times: Array, count: int = 200, *, seed: int = 0, sources: int = 4) -> Tracks:
-    """Follow points through the frames at ``times (F,)``.
+    """Follow surface points through frames.
 
     Args:
-        shot: what is filmed.
-        times: seconds.
+        shot: scene, path and camera.
+        times: ``(F,)`` seconds.
         count: number of points M (fewer where frames hit too little).
         seed: same seed, same points.
-        sources: the points are drawn evenly in as many of the frames, spread over the time.
+        sources: number of frames, spread evenly over the time, in which the points are drawn.
+
+    Returns:
+        The tracks.
     """
     rng = np.random.default_rng([seed, salts.TRACKS])
     times = np.asarray(times, float)
     frames = np.unique(np.linspace(0, len(times) - 1, min(sources, len(times))).round().astype(int))
     drawn = []
     for number, share in zip(frames, np.array_split(np.arange(count), len(frames)), strict=True):
-        pixels, depth, surface = hits(shot.sharp(float(times[number])))
+        pixels, depth, surface = hit_pixels(shot.sharp(float(times[number])))
         chosen = np.sort(rng.choice(len(pixels), min(len(share), len(pixels)), replace=False))
         points = shot.lift(float(times[number]), pixels[chosen], depth[chosen], surface[chosen])
         drawn.append((points, surface[chosen]))
     points, surface = (np.concatenate(part) for part in zip(*drawn, strict=True))
     places = [shot.place(float(time), points, surface) for time in times]
-    visible = [shows(shot, float(time), *place, surface) for time, place in zip(times, places, strict=True)]
+    visible = [visible_points(shot, float(time), *place, surface) for time, place in zip(times, places, strict=True)]
     dynamic = surface >= shot.scene.static if isinstance(shot.scene, Stage) else np.zeros(len(surface), bool)
     pixels, depth = (np.stack(part) for part in zip(*places, strict=True))
     return Tracks(pixels, depth, np.stack(visible), surface, dynamic, points)

@@ -81,7 +81,7 @@ def test_sequence_is_a_source_of_frames() -> None:
 
 
 def test_sequences_without_effects_keep_their_bytes(plain: SyntheticSequence) -> None:
-    """What the options do when off: nothing, down to the drawing of everything else."""
+    """Options at their neutral values change nothing, not even the draws of everything else."""
     off = {"shutter": 0.0, "rolling_shutter": 0.0, "movers": 0, "texture": 1.0, "lighting": 0.0, "light": 1.0,
            "blackout": 0.0, "drop": 0.0, "jpeg": 0, "shake": 1.0}  # fmt: skip
     assert bytes_of(make_sequence(SEED, **SMALL, **off)) == bytes_of(plain)

@@ -17,9 +17,7 @@ AXES = Path(__file__).parents[2] / "configs" / "eval" / "axes.yaml"
 
 
 def test_flat_names_are_sorted_into_their_specifications() -> None:
-    spec = sequence_spec(
-        frames=20, fps=10.0, family="street", movers=2, kind="forward", shake=2.0, shutter=0.5, jpeg=50
-    )
+    spec = sequence_spec(frames=20, fps=10.0, family="street", movers=2, kind="forward", shake=2.0, shutter=0.5, jpeg=9)
     assert spec == SequenceSpec(
         SequenceFormat(20, fps=10.0), SceneSpec("street", movers=2), MotionSpec("forward", shake=2.0),
         CameraSpec(shutter=0.5, jpeg=9),

@@ -21,7 +21,7 @@ from dvo.synth import (
 )
 from dvo.synth.motion.movers import random_bodies
 from dvo.synth.textures.texture import texture_pool
-from dvo.synth.truth import hits, shows
+from dvo.synth.truth import hit_pixels, visible_points
 
 CAMERA = Camera(82.0, 81.5, 47.7, 35.2, 96, 72)
 TIMES = (0.4, 0.55)
@@ -86,7 +86,7 @@ def test_flow_there_and_back_agree(scene: Scene, case: str) -> None:
     home, z = shot.place(TIMES[0], points, surface)
     close = np.linalg.norm(home - np.stack([x, y], -1)[::7], axis=-1)
     assert np.quantile(close, 0.99) < 1e-2
-    assert shows(shot, TIMES[0], home, z, surface)[close < 1e-2].mean() > 0.99
+    assert visible_points(shot, TIMES[0], home, z, surface)[close < 1e-2].mean() > 0.99
     # On the grid of whole pixels: the flow back at the nearest pixel is minus the flow there, but for its own change.
     near = np.clip(target.round().astype(int), 0, [CAMERA.width - 1, CAMERA.height - 1])
     returned = back.flow[near[:, 1], near[:, 0]]
@@ -120,7 +120,7 @@ def test_without_bodies_moving_pixels_the_static_flow_is_wrong(scene: Scene) -> 
     mask = dynamic_mask(shot, TIMES[0])
     assert 0.01 < mask.mean() < 0.7
     assert isinstance(shot.scene, Stage)
-    pixels, depth, surface = hits(shot.sharp(TIMES[0]))
+    pixels, depth, surface = hit_pixels(shot.sharp(TIMES[0]))
     assert np.array_equal(surface >= shot.scene.static, mask[depth.reshape(mask.shape) > 0])
     true, _ = shot.place(TIMES[1], shot.lift(TIMES[0], pixels, depth, surface), surface)
     nothing = np.zeros_like(surface)  # as if all belonged to the static scene
@@ -137,7 +137,7 @@ def test_occluded_pixels_are_hidden_by_something_nearer(scene: Scene) -> None:
     result = optical_flow(shot, 0.2, 0.8)
     hidden = result.inside & ~result.visible
     assert hidden.sum() > 20
-    pixels, depth, surface = hits(shot.sharp(0.2))
+    pixels, depth, surface = hit_pixels(shot.sharp(0.2))
     there, z = shot.place(0.8, shot.lift(0.2, pixels, depth, surface), surface)
     chosen = hidden[tuple(pixels[:, ::-1].astype(int).T)]
     seen, _, _ = shot.trace(0.8, there[chosen])

@@ -1,4 +1,4 @@
-"""Reading meshes through trimesh: glTF, GLB, OBJ, PLY (and STL, OFF), with their textures, colours and defects."""
+"""Mesh files through trimesh: glTF, GLB, OBJ, PLY, STL and OFF, with their textures, colours and defects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = np.ndarray
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
 MAX_TRIANGLES, MAX_BYTES, MAX_EDGE = 4_000_000, 2 * 1024**3, 4096
 DECIMATE = "decimate it first, for instance by trimesh's simplify_quadric_decimation or in Blender"
-SUN = np.array([0.45, -0.35, 0.82])  # where the light of meshes comes from (they bring none)
+SUN = np.array([0.45, -0.35, 0.82])  # direction of the light on meshes, whose files have none
 CREASE = np.cos(np.radians(50))  # corners bent more than this are shaded flat
 
 
@@ -32,15 +32,18 @@ def load_mesh(
     light: bool = True,
     seed: int = 0,
 ) -> MeshScene:
-    """Read a mesh file as something to render and to fly through.
+    """Read a mesh file as a scene.
 
     Args:
-        path: glTF, GLB, OBJ, PLY, STL or OFF; textures are looked for where the file says.
-        up: which axis of the file points up; None: z for PLY, STL and OFF, y for the others.
-        view: whether cameras live within ("inside") or around the mesh ("outside"); "auto" finds out.
-        ground: stand a mesh that is seen from outside on a textured plane.
-        light: shade by one distant light; False where light is painted into the textures (scans).
+        path: glTF, GLB, OBJ, PLY, STL or OFF; textures are read from the files that it names.
+        up: axis of the file that points up; None: z for PLY, STL and OFF, y for the others.
+        view: cameras within ("inside") or around the mesh ("outside"); "auto" decides by its shape.
+        ground: put a mesh that is seen from outside on a textured plane.
+        light: shade by one distant light; False if light is part of the textures (scans).
         seed: of the replacement for missing textures.
+
+    Returns:
+        The mesh, z up.
 
     Raises:
         DvoError: trimesh is not installed; no such file, or not a mesh; empty, broken or huge.
@@ -58,7 +61,7 @@ def load_mesh(
         raise DvoError("meshes need trimesh", field="mesh", remedy="pip install 'dvo[synth]'") from None
     try:
         loaded = trimesh.load_scene(path, process=False)  # processing would hide defects
-    except Exception as error:  # whatever trimesh's readers stumble over
+    except Exception as error:  # trimesh's readers raise errors of many types
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DvoError(
             f"cannot be read as a mesh ({reason})",
@@ -73,12 +76,16 @@ def mesh_scene(
     loaded: Any, *, rotate: bool = False, view: View = "auto", ground: bool = True, light: bool = True, seed: int = 0,
     file: Path | None = None,
 ) -> MeshScene:  # fmt: skip
-    """A ``trimesh.Trimesh`` or ``trimesh.Scene`` as a :class:`MeshScene`.
+    """Scene from a ``trimesh.Trimesh`` or ``trimesh.Scene``.
 
     Args:
+        loaded: the mesh.
         rotate: the y axis points up, and is turned onto z.
         view, ground, light, seed: see :func:`load_mesh`.
         file: for messages.
+
+    Returns:
+        The mesh, z up.
 
     Raises:
         DvoError: empty, broken or huge.
@@ -126,7 +133,7 @@ def mesh_scene(
         (space.bounds[0], space.bounds[1]) if space.inside else (low + 0.35 * (high - low), low + 0.65 * (high - low))
     )
     hints: dict[str, Any] = {"heading": None, "focus": focus, "inside": space.inside}
-    # Pictures that nothing uses would only cost memory.
+    # Unused textures would only cost memory.
     used = np.unique(texture[texture >= 0])
     renumbered = np.searchsorted(used, texture)
     texture = np.where(texture >= 0, renumbered, -1)
@@ -135,15 +142,15 @@ def mesh_scene(
 
 
 def _fallback(seed: int, kind: int) -> Array:
-    """A procedural picture without a seam: stains for meshes, a rough one for the ground."""
+    """Tileable procedural texture: stains for meshes, a rough one for the ground."""
     rng = np.random.default_rng([seed, salts.MESH_TEXTURE, kind])
     picture = PATTERNS["stains" if kind == 0 else "fractal"][0](rng, 512)
-    picture = 0.4 * picture + 0.6 * picture.mean(2, keepdims=True)  # muted: a stand-in, and a ground to stand on
+    picture = 0.4 * picture + 0.6 * picture.mean(2, keepdims=True)  # muted colours
     return np.clip(picture * (0.55 / max(float(picture.mean()), 0.1)), 0, 1).astype(np.float32)
 
 
 def _projected(corners: Array, metres: float) -> Array:
-    """Coordinates of a picture ``metres`` wide laid along the axis that each triangle faces most, ``(T, 3, 2)``."""
+    """Texture coordinates ``(T, 3, 2)`` of a projection along the axis that each triangle faces most, in ``metres``."""
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     axes = np.array([[1, 2], [0, 2], [0, 1]])[normal.argmax(1)]
     return np.take_along_axis(corners, axes[:, None].repeat(3, 1), 2) * [1, -1] / metres
@@ -152,14 +159,16 @@ def _projected(corners: Array, metres: float) -> Array:
 def _gather(
     mesh: Any, pictures: list[Array], light: bool, rotate: bool, file: Path | None, warnings: list[str]
 ) -> tuple[Array, Array, Array, Array]:
-    """Corners, tint, texture, texture coordinates of one part; coordinates are NaN where it has neither picture nor
-    colours (texture 0 is then the replacement)."""
+    """Corners, tint, texture and texture coordinates of one part.
+
+    Coordinates are NaN where it has neither texture nor colours (texture 0 is then the replacement).
+    """
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise DvoError("broken: a face names a vertex that is not there", file=file, remedy="export it again")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise DvoError("broken: a vertex is not finite", file=file, remedy="export it again")
-    if mesh.visual.kind is None:  # smooth shading needs to know which triangles share a corner
+    if mesh.visual.kind is None:  # smooth shading needs corners that are shared
         mesh = mesh.copy()
         mesh.merge_vertices()
         vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
@@ -184,7 +193,7 @@ def _gather(
         else:
             colours = np.asarray(mesh.visual.face_colors)[:, None, :3].astype(np.float32).repeat(3, 1) / 255
         tint = tint * colours
-        if np.ptp(colours, axis=(0, 1)).max() > 0.02:  # colours that say something
+        if np.ptp(colours, axis=(0, 1)).max() > 0.02:  # colours that vary
             texture[:], uv = -1, np.zeros((len(faces), 3, 2))
     tint = tint * _factor(material)
     if light:
@@ -195,13 +204,13 @@ def _gather(
 
 
 def _image(material: Any) -> Any:
-    """The picture of a material, a PIL image, or None."""
+    """Image of a material (PIL), or None."""
     found = getattr(material, "baseColorTexture", None)
     return found if found is not None else getattr(material, "image", None)
 
 
 def _factor(material: Any) -> Array:
-    """Colour that a material multiplies on, as sRGB in [0, 1]; glTF states it in linear light."""
+    """Colour factor of a material, as sRGB in [0, 1]; glTF states it in linear light."""
     factor = getattr(material, "baseColorFactor", None)
     if factor is not None:
         linear = np.asarray(factor, float)[:3] / (255 if np.max(factor) > 1 else 1)
@@ -221,7 +230,7 @@ def _picture(image: Any, warnings: list[str]) -> Array:
 
 
 def _light(mesh: Any, vertices: Array, faces: Array, rotate: bool) -> Array:
-    """Light on each corner ``(T, 3)``: ambient, a distant lamp, smooth over bends and hard at creases."""
+    """Light on each corner ``(T, 3)``: ambient and one distant lamp, smooth over bends and flat at creases."""
     corners = vertices[faces]
     flat: Array = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)

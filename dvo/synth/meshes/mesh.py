@@ -1,4 +1,4 @@
-"""Meshes as scenes: triangles with their own textures, rendered and flown through like :class:`dvo.synth.Scene`."""
+"""Meshes as scenes: triangles with their own textures, rendered and explored like :class:`dvo.synth.Scene`."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Array = np.ndarray
 
 @dataclass
 class MeshScene:
-    """T triangles; world frame: z up, units of the file.
+    """T triangles. World frame: z up, units of the file.
 
     Attributes:
         corners: ``(T, 3, 3)`` float64 (triangle, corner, coordinate).
         tint: ``(T, 3, 3)`` float32 colour of each corner, light included; multiplied onto the texture.
         texture: ``(T,)`` int64 index into ``textures``, -1 for none.
         texture_uv: ``(T, 3, 2)`` float64 column and row of each corner in units of the texture's edges; repeats.
-        textures: the pictures.
-        space: where a camera may be.
+        textures: the images.
+        space: free space for cameras.
         scale: typical viewing distance.
-        hints: what path planning goes by, as in :class:`dvo.synth.Scene`.
-        family: name, for sequences.
-        warnings: what was done to the file, in sentences.
+        hints: information for path planning, as in :class:`dvo.synth.Scene`.
+        family: name for sequences.
+        warnings: changes made to the file's content, one sentence each.
     """
 
     corners: Array
@@ -50,24 +50,45 @@ class MeshScene:
 
     @property
     def bounds(self) -> Array:
-        """``(2, 3)`` box in which cameras live."""
+        """``(2, 3)`` box of camera positions."""
         return self.space.bounds
 
     @cached_property
     def solids(self) -> Array:
-        """None: free space is a grid here; ``(0, 15)``."""
+        """Empty ``(0, 15)``: the free space of a mesh is a grid."""
         return np.zeros((0, 15))
 
     def is_free(self, points: Array) -> Array:
-        """``(T,)`` bool: in the free space around or within the mesh."""
+        """Membership in the free space around or within the mesh.
+
+        Args:
+            points: ``(T, 3)``.
+
+        Returns:
+            ``(T,)`` bool.
+        """
         return self.space.is_free(points)
 
     def clearance(self, points: Array) -> Array:
-        """Distance ``(T,)`` from points ``(T, 3)`` to the nearest triangle; -1 where the space is not free."""
+        """Distance from points to the nearest triangle.
+
+        Args:
+            points: ``(T, 3)``.
+
+        Returns:
+            ``(T,)`` in units of the file; -1 outside the free space.
+        """
         return self.space.clearance(points)
 
     def tensors(self, device: torch.device | str) -> dict[str, Tensor]:
-        """The triangles on a device (kept after the first call)."""
+        """Triangles on a device, kept after the first call.
+
+        Args:
+            device: where.
+
+        Returns:
+            ``corners``, ``tint``, ``texture`` and ``uv`` as tensors.
+        """
         key = str(device)
         if key not in self._cache:
             arrays = {"corners": self.corners, "tint": self.tint, "texture": self.texture, "uv": self.texture_uv}

@@ -1,4 +1,4 @@
-"""Where a camera may be around or within a mesh: a grid of free cells and exact distances to the triangles."""
+"""Free space around or within a mesh: a grid of free cells and exact distances to the triangles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,15 @@ ENCLOSED = 0.7  # share of them that must end at a wall
 
 
 def triangle_distance(points: Array, corners: Array) -> Array:
-    """Distance ``(M,)`` from points ``(M, 3)`` to triangles ``(M, 3, 3)``, pair by pair (Ericson 2005, 5.1.5)."""
+    """Distance from points to triangles, pair by pair (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
+
+    Args:
+        points: ``(M, 3)``.
+        corners: ``(M, 3, 3)``.
+
+    Returns:
+        ``(M,)``.
+    """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     best = np.full(len(points), np.inf)
     for p, q in ((a, b), (b, c), (c, a)):
@@ -37,10 +45,10 @@ class FreeSpace:
 
     Attributes:
         corners: ``(T, 3, 3)``.
-        bounds: ``(2, 3)`` box in which cameras live.
+        bounds: ``(2, 3)`` box of camera positions.
         low, cell: corner of the grid, edge of its cells.
-        free: ``(X, Y, Z)`` bool; outside of the grid, but inside the bounds, all is free.
-        inside: whether cameras live within the mesh.
+        free: ``(X, Y, Z)`` bool; inside the bounds and outside the grid all is free if cameras are outside the mesh.
+        inside: cameras are within the mesh.
     """
 
     corners: Array
@@ -56,7 +64,14 @@ class FreeSpace:
         self._near = torch.from_numpy(self._centre.astype(np.float32))
 
     def is_free(self, points: Array) -> Array:
-        """``(T,)`` bool."""
+        """Membership in the free space.
+
+        Args:
+            points: ``(T, 3)``.
+
+        Returns:
+            ``(T,)`` bool.
+        """
         points = np.asarray(points, float)
         cell = np.floor((points - self.low) / self.cell).astype(int)
         within = ((cell >= 0) & (cell < self.free.shape)).all(1)
@@ -65,7 +80,14 @@ class FreeSpace:
         return free & np.where(within, self.free[tuple(spot.T)], not self.inside)
 
     def clearance(self, points: Array) -> Array:
-        """Distance ``(T,)`` to the nearest triangle; -1 where the space is not free."""
+        """Distance from points to the nearest triangle.
+
+        Args:
+            points: ``(T, 3)``.
+
+        Returns:
+            ``(T,)``; -1 where the space is not free.
+        """
         points = np.asarray(points, float)
         distance = np.full(len(points), -1.0)
         where = np.flatnonzero(self.is_free(points))
@@ -84,7 +106,7 @@ class FreeSpace:
 
 
 def _samples(corners: Array, spacing: float) -> tuple[Array, Array]:
-    """Points on the triangles at most ``spacing`` apart ``(S, 3)`` and the area vector that each stands for."""
+    """Points on the triangles at most ``spacing`` apart ``(S, 3)`` and the area vector of each ``(S, 3)``."""
     edge = np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1).max(1)
     steps = np.ceil(edge / spacing).astype(int).clip(1, 400)
     normal = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -100,7 +122,7 @@ def _samples(corners: Array, spacing: float) -> tuple[Array, Array]:
 
 
 def _reach(seed: Array, blocked: Array) -> Array:
-    """Cells that are connected with the seed cells without crossing blocked ones (six neighbours)."""
+    """Cells connected with the seed cells without crossing blocked ones (six neighbours)."""
     found = seed & ~blocked
     count = -1
     while count != (count := int(found.sum())):
@@ -109,13 +131,13 @@ def _reach(seed: Array, blocked: Array) -> Array:
                 source = [slice(None)] * 3
                 target = [slice(None)] * 3
                 source[axis], target[axis] = cut, paste
-                # Masked at once: a blocked cell must not hand on what it is reached from.
+                # Masked at once: the flood must not pass through a blocked cell.
                 found[tuple(target)] |= found[tuple(source)] & ~blocked[tuple(target)]
     return found
 
 
 def _enclosed(occupied: Array, normal: Array, cells: Array) -> Array:
-    """Share ``(M,)`` of horizontal rays from cells ``(M, 3)`` that end at a surface which faces them; 0 without floor.
+    """Share ``(M,)`` of horizontal rays from cells ``(M, 3)`` that end at a surface facing them; 0 without a floor.
 
     Within a solid, rays meet the backs of surfaces, which do not count.
     """
@@ -142,14 +164,17 @@ def _enclosed(occupied: Array, normal: Array, cells: Array) -> Array:
 
 
 def free_space(corners: Array, view: View = "auto") -> FreeSpace:
-    """Find out where cameras may be.
+    """Free space for cameras.
 
-    A mesh is looked at from within (a room, a street) where walls face its middle all around, and from outside (an
-    object) otherwise; ``view`` overrides.
+    A mesh is explored from within (a room, a street) if walls face its middle all around, and from outside (an object)
+    otherwise; ``view`` overrides this.
 
     Args:
         corners: ``(T, 3, 3)``, z up.
         view: "auto", "inside" or "outside".
+
+    Returns:
+        Cells in which cameras may be.
     """
     low, high = corners.min((0, 1)), corners.max((0, 1))
     extent = high - low
@@ -185,7 +210,7 @@ def free_space(corners: Array, view: View = "auto") -> FreeSpace:
 
 
 def _largest(cells: Array) -> Array:
-    """The largest connected part of a set of cells."""
+    """Largest connected part of a set of cells."""
     best, left = np.zeros_like(cells), cells.copy()
     while left.sum() > best.sum():
         seed = np.zeros_like(cells)

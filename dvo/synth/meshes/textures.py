@@ -1,4 +1,4 @@
-"""Pictures of any size as mip pyramids in one flat table, and their antialiased sampling with repeat."""
+"""Images of any size as mip pyramids in one flat table, and their antialiased sampling with repeat."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEVELS = 13  # 4096 texels down to 1
 
 
 def _pyramid(picture: np.ndarray) -> list[np.ndarray]:
-    """``LEVELS`` pictures, each half of the one before; the last ones repeat."""
+    """``LEVELS`` images, each half the size of the one before; the last ones repeat."""
     levels = [picture]
     while len(levels) < LEVELS:
         height, width = levels[-1].shape[:2]
@@ -24,7 +24,7 @@ def _pyramid(picture: np.ndarray) -> list[np.ndarray]:
 
 @dataclass
 class TextureSet:
-    """The pictures of a mesh.
+    """Images of a mesh.
 
     Attributes:
         pictures: ``(H, W, 3)`` float32 RGB in [0, 1] each, at most 4096 pixels along an edge.
@@ -34,7 +34,7 @@ class TextureSet:
     _cache: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict, repr=False)
 
     def _on(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Texels ``(N, 3)`` of all levels and, per picture and level, offset, width, height ``(P, LEVELS, 3)``."""
+        """Texels ``(N, 3)`` of all levels and, per image and level, offset, width, height ``(P, LEVELS, 3)``."""
         key = str(device)
         if key not in self._cache:
             flat, table, offset = [], [], 0
@@ -50,13 +50,16 @@ class TextureSet:
         return self._cache[key]
 
     def sample(self, picture: Tensor, place: Tensor, jacobian: Tensor, taps: int) -> Tensor:
-        """Trilinear samples averaged along the longer axis of the pixel's footprint, ``(M, 3)`` float32.
+        """Trilinear samples averaged along the longer axis of the pixel's footprint.
 
         Args:
-            picture: ``(M,)`` which picture.
-            place: ``(M, 2)`` column and row in units of the picture's edges.
+            picture: ``(M,)`` index of the image.
+            place: ``(M, 2)`` column and row in units of the image's edges.
             jacobian: ``(M, 2, 2)`` of the place by the pixel's x and y.
             taps: samples along the longer axis.
+
+        Returns:
+            ``(M, 3)`` float32 colour in [0, 1].
         """
         texels, table = self._on(place.device)
         about = table[picture]
@@ -81,7 +84,7 @@ class TextureSet:
 
 
 def _bilinear(texels: Tensor, about: Tensor, place: Tensor) -> Tensor:
-    """``(M, 3)`` from pictures that repeat; ``about (M, 3)`` offset, width, height."""
+    """``(M, 3)`` from images that repeat; ``about (M, 3)`` offset, width, height."""
     offset, width, height = about.unbind(1)
     x, y = ((place[:, i] - place[:, i].floor()) * about[:, i + 1] - 0.5 for i in (0, 1))
     left, top = x.floor(), y.floor()

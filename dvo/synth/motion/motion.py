@@ -1,4 +1,10 @@
-"""Motions in continuous time: camera paths and the sway of bodies, as poses at any time."""
+"""Motions in continuous time: camera paths and the motion of bodies, with a pose at any time.
+
+A :class:`Path` is ``T_wc(t) = T_0 Exp(g w(t) xi) Exp(g shake(w(t)))``: a constant body twist (straight, arc, orbit,
+turn)
+plus smooth shake, with gain g and a time warp w for stop-and-go. Any frame rate, motion blur and rolling shutter can be
+read from the same path.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +20,17 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Path:
-    """One smooth path.
+    """Smooth path of constant twist plus shake.
 
     Attributes:
-        kind: which of ``KINDS``.
+        kind: one of ``dvo.synth.KINDS``.
         rotation, position: ``(3, 3)``, ``(3,)`` camera to world at rest.
         twist: ``(6,)`` body velocity ``[v, omega]``, world units and rad per second.
         frequency: ``(F,)`` of the shake, rad/s.
         shake: ``(F, 2, 6)`` sine and cosine amplitudes ``[position (body axes), rotation vector]``.
         depth: median depth in view at the start.
         warp: amplitude, rad/s and phase of the time warp; an amplitude near 1 nearly stops.
-        gain: scales the whole motion.
+        gain: factor on the whole motion.
     """
 
     kind: str
@@ -38,11 +44,25 @@ class Path:
     gain: float = 1.0
 
     def scaled(self, gain: float) -> Path:
-        """The same path with its motion scaled by ``gain`` (-1: the other way)."""
+        """Same path with its motion scaled.
+
+        Args:
+            gain: factor; -1 reverses the motion.
+
+        Returns:
+            The scaled path.
+        """
         return replace(self, gain=self.gain * gain)
 
     def poses_wc(self, times: Array) -> Array:
-        """Camera-to-world poses ``(T, 7)`` float64 at ``times (T,)`` seconds."""
+        """Camera-to-world poses.
+
+        Args:
+            times: ``(T,)`` seconds.
+
+        Returns:
+            ``(T, 7)`` float64.
+        """
         times = np.asarray(times, float)
         amplitude, rate, phase = self.warp
         warped = times + amplitude / rate * (np.sin(rate * times + phase) - np.sin(phase))
@@ -57,10 +77,10 @@ class Path:
 
 @dataclass(frozen=True)
 class SplinePath:
-    """A long path: uniform cubic B-spline through position, yaw, pitch and roll, plus shake.
+    """Long path: uniform cubic B-spline through position, yaw, pitch and roll, plus shake.
 
     Attributes:
-        kind: which of ``LONG_KINDS``.
+        kind: one of ``dvo.synth.LONG_KINDS``.
         control: ``(K, 6)`` x, y, z, yaw, pitch, roll (rad; yaw 0 looks along y, pitch up is positive).
         interval: seconds between control points.
         frequency, shake: as in :class:`Path`; added in body axes.
@@ -74,13 +94,20 @@ class SplinePath:
 
     @property
     def duration(self) -> float:
-        """Seconds that the control points cover."""
+        """Time covered by the control points, seconds."""
         return (len(self.control) - 3) * self.interval
 
     def poses_wc(self, times: Array) -> Array:
-        """Camera-to-world poses ``(T, 7)`` float64 at ``times (T,)`` seconds in [0, duration]."""
+        """Camera-to-world poses.
+
+        Args:
+            times: ``(T,)`` seconds in [0, duration].
+
+        Returns:
+            ``(T, 7)`` float64.
+        """
         times = np.asarray(times, float)
-        # A little before 0 the first piece goes on: a shutter opens before the time of its frame.
+        # Just before 0 the first segment is extrapolated: a shutter opens before the time of its frame.
         place = np.clip(times / self.interval, -0.2, len(self.control) - 3 - 1e-9)
         index = np.maximum(np.floor(place), 0).astype(int)
         s = place - index
@@ -97,15 +124,15 @@ class SplinePath:
 
 @dataclass(frozen=True)
 class Sway:
-    """A smooth motion: steady drift, a swing to and fro, a turn about the vertical and a wobble.
+    """Smooth motion of a body: steady drift, oscillation, turn about the vertical and a wobble.
 
     Attributes:
-        centre: ``(3,)`` position at time 0 without the swing.
+        centre: ``(3,)`` position at time 0 without the oscillation.
         drift: ``(3,)`` velocity, world units per second.
         reach: ``(2, 3)`` amplitudes of the sine and cosine of ``rate t + phase``.
         rate, phase: rad/s and rad.
         heading, spin: yaw at time 0 (rad) and its rate (rad/s).
-        wobble: ``(3,)`` rotation vector that swings at 1.7 times the rate.
+        wobble: ``(3,)`` rotation vector that oscillates at 1.7 times the rate.
     """
 
     centre: Array
@@ -118,7 +145,14 @@ class Sway:
     wobble: Array
 
     def poses_wc(self, times: Array) -> Array:
-        """Body-to-world poses ``(T, 7)`` float64."""
+        """Body-to-world poses.
+
+        Args:
+            times: ``(T,)`` seconds.
+
+        Returns:
+            ``(T, 7)`` float64.
+        """
         times = np.asarray(times, float)
         angle = self.rate * times + self.phase
         swing = np.stack([np.sin(angle), np.cos(angle)], -1) @ self.reach

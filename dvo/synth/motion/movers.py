@@ -1,4 +1,4 @@
-"""Draws bodies for a scene: boxes and figures that sway, turn and drive through the view of a camera."""
+"""Planning of moving bodies: boxes and figures that sway, turn and drive through the view of a camera."""
 
 from __future__ import annotations
 
@@ -10,22 +10,26 @@ from dvo.synth.motion.motion import Sway
 from dvo.synth.protocols import Motion
 from dvo.synth.render.renderer import render_depth
 from dvo.synth.scenes.bodies import Body
+from dvo.synth.scenes.builder import SceneBuilder
 from dvo.synth.scenes.furnishing import UP, paint_object, yaw
 from dvo.synth.scenes.lighting import bake
-from dvo.synth.scenes.scene import Scene, SceneBuilder
+from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
 
 
 def random_bodies(scene: Scene, camera_path: Motion, duration: float, seed: int, count: int) -> tuple[Body, ...]:
-    """Draw bodies that come into view of a camera path, never touch the camera and keep off solid things if they can.
+    """Draw bodies that come into view of a camera path, never touch the camera and avoid solid objects if possible.
 
     Args:
-        scene: where they move; also gives the textures.
+        scene: to move in; also supplies the textures.
         camera_path: camera to world.
-        duration: seconds during which they are to be seen.
+        duration: seconds during which the bodies are to be visible.
         seed: same seed, same bodies.
-        count: how many.
+        count: number of bodies.
+
+    Returns:
+        The bodies; fewer than ``count`` if there is no room.
     """
     rng = np.random.default_rng([seed, salts.MOVERS])
     times = np.linspace(0, duration, max(16, int(8 * duration)))
@@ -35,7 +39,7 @@ def random_bodies(scene: Scene, camera_path: Motion, duration: float, seed: int,
     for number in range(count):
         best: tuple[float, Body] | None = None
         for _ in range(24):
-            # Each has a share of the time of its own, so that some body is in view at most times.
+            # Each body is placed in its own part of the time, so that some body is in view at most times.
             at = int(np.clip((number + rng.random()) / count * len(times), 0, len(times) - 1))
             depth, _ = render_depth(scene, eyes[at : at + 1], k, 18, 24)
             x, y = rng.uniform(3, 20), rng.uniform(5, 13)
@@ -60,7 +64,7 @@ def random_bodies(scene: Scene, camera_path: Motion, duration: float, seed: int,
 
 
 def _motion(rng: np.random.Generator, camera: Array, spot: Array, away: float, when: float, scene: Scene) -> Sway:
-    """To and fro across the view, or along a street; at ``spot`` at the time ``when``."""
+    """Oscillation across the view, or a drive along a street; at ``spot`` at the time ``when``."""
     drift = np.zeros(3)
     heading = scene.hints.get("heading")
     across = camera[:, 0] * rng.choice([-1, 1]) + camera[:, 2] * rng.normal(0, 0.5)
@@ -78,7 +82,7 @@ def _motion(rng: np.random.Generator, camera: Array, spot: Array, away: float, w
 
 
 def _figure(rng: np.random.Generator, scene: Scene, size: float) -> Scene:
-    """A box, a stack of boxes, a box with a board: something that is not mistaken for a plane; half height ``size``."""
+    """Box, stack of boxes, or box with a board, of half height ``size``: not mistaken for a plane."""
     b = SceneBuilder(rng, scene.pool)
     paints = [paint_object(b, (0.7 * size, 3 * size), 0.1) for _ in range(3)]
     kind = rng.random()

@@ -1,8 +1,4 @@
-"""Camera paths in continuous time: a constant body twist (straight, arc, orbit, turn) plus smooth shake.
-
-``T_wc(t) = T_0 Exp(g w(t) xi) Exp(g shake(w(t)))`` with gain g and a time warp w for stop-and-go. Any frame rate,
-motion blur and rolling shutter can be read off the same path.
-"""
+"""Planning of short camera paths, for training clips: a start pose in free space and a random motion."""
 
 from __future__ import annotations
 
@@ -23,7 +19,12 @@ KINDS = ("handheld", "forward", "sideways", "orbit", "rotation", "drone", "stop_
 
 @dataclass(frozen=True)
 class Start:
-    """A pose with free space around it and something to see: ``rotation (3, 3)``, ``position (3,)``, median depth."""
+    """Pose with free space around it and several surfaces in view.
+
+    Attributes:
+        rotation, position: ``(3, 3)``, ``(3,)`` camera to world.
+        depth: median depth in view.
+    """
 
     rotation: Array
     position: Array
@@ -31,7 +32,16 @@ class Start:
 
 
 def find_start(scene: Scene, rng: np.random.Generator, tries: int = 4) -> Start:
-    """Draw a start pose: of some random ones, the first that sees several surfaces and none of them too near."""
+    """Draw a start pose: of some random ones, the first that sees several surfaces and none of them too close.
+
+    Args:
+        scene: to start in.
+        rng: draws poses.
+        tries: rounds of up to three poses.
+
+    Returns:
+        The best of the poses.
+    """
     best: tuple[float, Start] | None = None
     k = np.array([16.0, 16.0, 11.5, 8.5])
     heading, focus = scene.hints.get("heading"), scene.hints.get("focus")
@@ -66,7 +76,7 @@ def find_start(scene: Scene, rng: np.random.Generator, tries: int = 4) -> Start:
             break
     if best is not None:
         return best[1]
-    # Cluttered beyond use: the freest of many points.
+    # Too cluttered: the point of largest clearance of many.
     spots = rng.uniform(scene.bounds[0], scene.bounds[1], (200, 3))
     spot = spots[int(scene.clearance(spots).argmax())]
     return Start(look_rotation(rng.normal(size=3) * [1, 1, 0.2], UP), spot, scene.scale)
@@ -75,17 +85,20 @@ def find_start(scene: Scene, rng: np.random.Generator, tries: int = 4) -> Start:
 def random_path(
     scene: Scene, seed: int, kind: str | None = None, *, shake: float = 1.0, start: Start | None = None
 ) -> Path:
-    """Draw a path that starts in free space. Motion is scaled to the depth in view; the far end is not checked.
+    """Draw a path that starts in free space. Motion is scaled to the depth in view; the end is not checked.
 
     Args:
-        scene: where to fly.
+        scene: to move in.
         seed: same seed, same path.
         kind: one of ``KINDS``; drawn to suit the scene if None.
-        shake: multiplies the amplitude of the shake.
-        start: where to begin; drawn if None.
+        shake: factor on the amplitude of the shake.
+        start: start pose; drawn if None.
+
+    Returns:
+        The path.
 
     Raises:
-        DvoError: no such kind.
+        DvoError: an unknown kind.
     """
     rng = np.random.default_rng([seed, salts.PATH])
     vehicle = scene.hints.get("heading") is not None

@@ -1,4 +1,4 @@
-"""Long camera paths: walks, drives, orbits that stay in free space for as long as wanted."""
+"""Planning of long camera paths: walks, drives and orbits of any length in free space."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from dvo.synth.render.renderer import render_depth
 from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
-# What long sequences add to the kinds of clips: a circuit that comes back, a way that never turns, a hasty hand.
+# Long paths add to the kinds of short ones: a closed circuit, a way without turns, a hasty hand.
 LONG_KINDS = tuple(dict.fromkeys((*KINDS, "loop", "straight", "fast")))
-TURNS = 1.4  # how often a loop is walked round
+TURNS = 1.4  # rounds of a loop
 
 
 def _yaw_towards(direction: Array) -> float:
@@ -28,18 +28,21 @@ def _nearest_turn(angle: float, previous: float) -> float:
 def long_path(
     scene: Scene, seed: int, kind: str, duration: float, *, speed: float = 1.0, shake: float = 1.0
 ) -> SplinePath:
-    """A path of ``duration`` seconds that stays in free space all along: a walk, a drive, an orbit...
+    """Draw a path that stays in free space all along.
 
     Args:
-        scene: where to move.
+        scene: to move in.
         seed: same seed, same path.
         kind: one of ``LONG_KINDS``.
         duration: seconds.
-        speed: 1 is a relaxed pace: a tenth of the scene's scale in a second, six times that for a vehicle in a street.
-        shake: multiplies the amplitude of the hand's shake.
+        speed: 1 is a relaxed pace: a tenth of the scene's scale per second, six times that for a vehicle in a street.
+        shake: factor on the amplitude of the hand's shake.
+
+    Returns:
+        The path.
 
     Raises:
-        DvoError: no such kind, or no room for such a path.
+        DvoError: an unknown kind, or no room for such a path.
     """
     if kind not in LONG_KINDS:
         raise DvoError(f"no path kind {kind!r}", field="kind", remedy=f"choose one of {', '.join(LONG_KINDS)}")
@@ -71,6 +74,7 @@ def long_path(
 def _draw_long(
     scene: Scene, rng: np.random.Generator, kind: str, duration: float, speed: float, shake: float
 ) -> SplinePath:
+    """Draw a path of any kind except ``loop``."""
     interval = 0.8
     count = int(np.ceil(duration / interval)) + 4
     start = find_start(scene, rng, 2)
@@ -148,7 +152,7 @@ def _draw_long(
 
 
 def _shake(scene: Scene, rng: np.random.Generator, shake: float, vehicle: bool) -> tuple[Array, Array]:
-    """Frequencies and amplitudes of a hand, or of a car."""
+    """Frequencies and amplitudes of a hand, or of a vehicle."""
     hertz = np.exp(rng.uniform(np.log(0.4), np.log(3.0), 6))
     amplitude = rng.normal(size=(6, 2, 6)) / hertz[:, None, None] / np.sqrt(6) * shake
     amplitude[..., :3] *= 0.003 * scene.scale * (0.3 if vehicle else 1)
@@ -157,7 +161,7 @@ def _shake(scene: Scene, rng: np.random.Generator, shake: float, vehicle: bool) 
 
 
 def _longest_way(scene: Scene, rng: np.random.Generator, position: Array) -> tuple[Array, float]:
-    """The level direction in which most free space lies ahead, of sixteen, and how far it goes."""
+    """Level direction with the longest free way ahead, of sixteen, and its length."""
     reach = np.linspace(0, 6 * scene.scale, 60)[1:]
     best = (np.array([0.0, 1.0, 0.0]), 0.0)
     for angle in rng.uniform(0, 2 * np.pi) + np.arange(16) * np.pi / 8:
@@ -170,10 +174,10 @@ def _longest_way(scene: Scene, rng: np.random.Generator, position: Array) -> tup
 
 
 def _draw_loop(scene: Scene, rng: np.random.Generator, duration: float, speed: float, shake: float) -> SplinePath:
-    """A rounded circuit that is walked ``TURNS`` times: the second round repeats the first but for the shake.
+    """Draw a rounded circuit of ``TURNS`` rounds: the second round repeats the first except for the shake.
 
-    Where there is time for it the camera turns all the way round, else it looks about and comes back to where it
-    looked.
+    If the duration allows it the camera turns all the way round, else it looks about and returns to its first
+    direction.
     """
     once = duration / TURNS
     steps = max(8, int(np.ceil(once / 0.8)))

@@ -1,4 +1,4 @@
-"""Smooth outlines without shading more: a pixel beside an outline is a mix of its neighbours' colours by coverage."""
+"""Antialiasing of outlines by coverage: a pixel at an outline is a mix of its neighbours' colours."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ OFFSETS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))  
 def smooth_outlines(images: Tensor, surface: Tensor, functions: Tensor, slack: float, *, by_row: bool = False) -> None:
     """Blend the pixels at outlines, in place.
 
-    At four places of each such pixel the nearest surface is looked for among those of the pixel and of its neighbours;
-    the place takes the colour that this surface has there, at the neighbour's centre. Depth and surfaces stay those of
-    pixel centres.
+    At four samples of each such pixel the nearest surface is determined among those of the pixel and of its neighbours;
+    the sample takes the colour of this surface at the neighbour's centre. Depth and surfaces stay those of pixel
+    centres.
 
     Args:
         images: ``(N, 3, H, W)``.
-        surface: ``(N, H, W)`` int32 row of the functions of what each pixel shows, -1 for nothing.
+        surface: ``(N, H, W)`` int32 row of the functions of the visible surface, -1 for none.
         functions: ``(N, Q, 5, 3)`` inverse depth and four edge functions, linear in (x, y, 1).
         slack: edge functions above ``-slack`` are inside.
-        by_row: functions are ``(N, H, Q, 5, 3)``, others for every row, in which they take the row as y = 0.
+        by_row: functions are ``(N, H, Q, 5, 3)``, one set per row, in which the row is y = 0.
     """
     for frame in range(len(images)):  # one at a time: small enough for the processor's cache
         _smooth_frame(images[frame], surface[frame], functions[frame], slack, by_row)
@@ -53,7 +53,7 @@ def _smooth_frame(image: Tensor, surface: Tensor, functions: Tensor, slack: floa
     for dx, dy in OFFSETS:
         value = centre + dx * rows[:, 0] + dy * rows[:, 1]
         inside = (value[1:].amin(0) >= -slack) & (names >= 0)
-        # What a surface hides counts for nothing; where no candidate covers the place, the pixel's own colour stays.
+        # Hidden surfaces do not count; if no candidate covers the sample, the pixel's own colour stays.
         score = torch.where(inside, value[0], -1.0)
         score[0].clamp_min_(-0.5)
         best, chosen = score[0], places[0]

@@ -1,9 +1,9 @@
 """Images through a lens with distortion: exact depth, surfaces and texture coordinates, resampled colours.
 
-A pinhole picture, the plate, covers all that the lens sees. Where the four plate pixels around the place of a lens
-pixel show one surface, that surface's linear functions are evaluated at the place itself; the other pixels, those along
-outlines, are traced as rays. Colours are read from a plate of finer grid, several places to a pixel. The models of
-distortion are those of :mod:`dvo.geometry.undistort`.
+A pinhole image, the plate, covers the whole field of view of the lens. If the four plate pixels around the position of
+a lens pixel show one surface, that surface's linear functions are evaluated at the position itself; the other pixels,
+those along outlines, are traced as rays. Colours are read from a plate of finer grid, several samples to a pixel. The
+distortion models are those of :mod:`dvo.geometry.undistort`.
 """
 
 from __future__ import annotations
@@ -20,27 +20,42 @@ from dvo.geometry.camera import Camera, DistortionModel
 from dvo.geometry.undistort import distort, in_range, needs_undistortion, undistort
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.quality import STANDARD, Quality
-from dvo.synth.render.renderer import Rendering, cast, render, sight, trace
+from dvo.synth.render.renderer import Rendering, cast, render, trace, view_scene
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
-WIDEST = 4.0  # times the picture's edge; a plate beyond that is of a lens that a plane cannot hold
+WIDEST = 4.0  # times the image's edge; a larger plate would be of a lens that looks nearly sideways
 FAR_OFF = -1e4  # pixels
 MARGIN = 2  # pixels of plate around what is needed
 
 
-def straight(pixels: Array, camera: Camera) -> Array:
-    """Pixels ``(..., 2)`` of the lens camera to those ``(..., 2)`` of the pinhole camera with the same intrinsics, NaN
-    where the lens model has no ray."""
+def undistorted_pixels(pixels: Array, camera: Camera) -> Array:
+    """Undistorted pixels.
+
+    Args:
+        pixels: ``(..., 2)`` of the camera with distortion.
+        camera: with its distortion.
+
+    Returns:
+        ``(..., 2)`` pixels of the pinhole camera with the same intrinsics; NaN outside the range of the lens model.
+    """
     if not needs_undistortion(camera):
         return pixels
     focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
     return undistort((pixels - centre) / focal, camera) * focal + centre
 
 
-def bent(pixels: Array, camera: Camera) -> Array:
-    """Inverse of :func:`straight`; what lies beyond the range of the lens model goes to a place far off the picture."""
+def distorted_pixels(pixels: Array, camera: Camera) -> Array:
+    """Distorted pixels, the inverse of :func:`undistorted_pixels`.
+
+    Args:
+        pixels: ``(..., 2)`` of the pinhole camera with the same intrinsics.
+        camera: with its distortion.
+
+    Returns:
+        ``(..., 2)`` pixels of the camera with distortion; far outside the image beyond the range of the lens model.
+    """
     if not needs_undistortion(camera):
         return pixels
     focal, centre = camera.intrinsics[:2], camera.intrinsics[2:]
@@ -51,14 +66,14 @@ def bent(pixels: Array, camera: Camera) -> Array:
 
 @dataclass(frozen=True)
 class Plate:
-    """The pinhole picture that covers a lens picture.
+    """Pinhole image that covers a lens image.
 
     Attributes:
         intrinsics: ``(4,)`` fx fy cx cy of the plate.
         size: its height and width, pixels.
-        places: ``(H, W, 2)`` float64 where in the plate the pixel centres of the lens picture lie.
-        fine: ``(1, H m, W m, 2)`` float32 where m x m parts of each lie in the plate of m times finer grid, as
-            ``grid_sample`` has it.
+        places: ``(H, W, 2)`` float64 positions in the plate of the pixel centres of the lens image.
+        fine: ``(1, H m, W m, 2)`` float32 positions of m x m samples of each pixel in the plate of m times finer grid,
+            as ``grid_sample`` takes them.
     """
 
     intrinsics: Array
@@ -69,16 +84,23 @@ class Plate:
 
 @lru_cache(maxsize=4)
 def plate_of(camera: Camera, parts: int) -> Plate:
-    """The plate of a camera.
+    """Plate of a camera.
+
+    Args:
+        camera: with its distortion.
+        parts: samples m per pixel edge.
+
+    Returns:
+        The plate, kept for the next call.
 
     Raises:
         DvoError: the lens model has no ray for a pixel, or the plate would be huge.
     """
     y, x = np.mgrid[: camera.height, : camera.width].astype(float)
-    places = straight(np.stack([x, y], -1), camera)
+    places = undistorted_pixels(np.stack([x, y], -1), camera)
     steps = (np.arange(parts * max(camera.height, camera.width)) + 0.5) / parts - 0.5
     fine_y, fine_x = np.meshgrid(steps[: parts * camera.height], steps[: parts * camera.width], indexing="ij")
-    fine = straight(np.stack([fine_x, fine_y], -1), camera)
+    fine = undistorted_pixels(np.stack([fine_x, fine_y], -1), camera)
     reach = np.ptp(fine.reshape(-1, 2), axis=0)
     if not np.isfinite(fine).all() or (reach > WIDEST * np.array([camera.width, camera.height])).any():
         raise DvoError(
@@ -96,10 +118,18 @@ def plate_of(camera: Camera, parts: int) -> Plate:
 
 
 def random_lens(rng: np.random.Generator, camera: Camera, model: DistortionModel) -> Camera:
-    """The camera with a lens of that model; coefficients are drawn so that the whole picture stays in its range.
+    """Draw distortion coefficients such that the whole image stays in the range of the model.
 
-    ``radtan``: barrel or cushion, at the corners up to 13 % of their distance from the middle, hardly decentred.
-    ``fisheye``: nearly equidistant; its corners look up to 65 degrees aside, for which the focal length may grow.
+    ``radtan``: barrel or pincushion, at the corners up to 13 % of their distance from the centre, hardly decentred.
+    ``fisheye``: nearly equidistant; its corners are up to 65 degrees off axis, for which the focal length may grow.
+
+    Args:
+        rng: draws them.
+        camera: pinhole.
+        model: "none" returns the camera as it is.
+
+    Returns:
+        The camera with its distortion.
     """
     if model == "none":
         return camera
@@ -123,18 +153,21 @@ def render_lens(
     """Render N frames of a camera with distortion.
 
     Args:
-        scene: what to render.
+        scene: static, or with moving bodies.
         poses_wc: ``(N, 7)`` camera to world.
         camera: with its distortion.
-        times, quality, device, coordinates: as for :func:`dvo.synth.render.renderer.render`; at least 2 x 2 samples
-            are taken of each pixel for the colours.
+        times, quality, device, coordinates: as for :func:`dvo.synth.render.renderer.render`; at least 2 x 2 samples are
+            taken of each pixel for the colours.
+
+    Returns:
+        As :func:`dvo.synth.render.renderer.render`.
 
     Raises:
-        DvoError: a mesh (its triangles are too small for this), or a lens that no plane can hold.
+        DvoError: a mesh (its triangles are too small for this), or a lens whose field of view no plane can hold.
     """
     if isinstance(scene, MeshScene):
         raise DvoError("meshes are not rendered through a lens", field="camera", remedy="give a camera without model")
-    parts = max(2, quality.supersample)  # one place a pixel would let fine textures shimmer where the lens compresses
+    parts = max(2, quality.supersample)  # one sample per pixel would alias where the lens compresses
     plate = plate_of(camera, parts)
     height, width = plate.size
     scale = np.array([parts, parts, parts, parts])
@@ -162,8 +195,8 @@ def render_lens(
 def _exact(
     scene: Scene | Stage, pose: Array, plate: Plate, time: Array | None, device: torch.device | str
 ) -> tuple[Array, Array, Array]:
-    """Depth ``(H, W)``, surface ``(H, W)`` and uv ``(H, W, 2)`` at the places of one frame, float64."""
-    _, view = sight(scene, pose, plate.intrinsics[None], plate.size, time)
+    """Depth ``(H, W)``, surface ``(H, W)`` and uv ``(H, W, 2)`` at the positions of one frame, float64."""
+    _, view = view_scene(scene, pose, plate.intrinsics[None], plate.size, time)
     _, local, _ = cast(view, *plate.size, device)
     rows = local[0].cpu().numpy()
     shape = plate.places.shape[:2]

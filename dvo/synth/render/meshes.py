@@ -1,4 +1,4 @@
-"""Depth, colours and single rays of meshes, from the cover of each pixel (:mod:`dvo.synth.render.raster`)."""
+"""Rendering of meshes: depth, colours and single rays, from the visible triangle of each pixel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dvo.synth.render.raster import NEAR, Cover, rasterise
 Array = np.ndarray
 PIECE = 20_000  # pixels shaded at once on a CPU
 SKY = ((0.86, 0.9, 0.94), (0.42, 0.6, 0.86), (0.45, 0.44, 0.42))  # horizon, zenith, below
-FAR = 20.0  # scales; how far the background counts as being when paths are planned
+FAR = 20.0  # scales; depth of the background for path planning
 
 
 def _covers(
@@ -30,7 +30,18 @@ def _covers(
 def mesh_depth(
     scene: MeshScene, poses_wc: Array, intrinsics: Array, height: int, width: int, device: torch.device | str
 ) -> tuple[Tensor, Tensor]:
-    """Depth ``(N, H, W)`` float32 and triangle ``(N, H, W)``; where there is nothing, depth is ``FAR`` scales."""
+    """Depth and triangles; the background counts as ``FAR`` scales away.
+
+    Args:
+        scene: the mesh.
+        poses_wc: ``(N, 7)`` float64.
+        intrinsics: ``(N, 4)`` float64 pixels.
+        height, width: image size, pixels.
+        device: where to render.
+
+    Returns:
+        Depth ``(N, H, W)`` float32 and triangle ``(N, H, W)``, -1 for none.
+    """
     covers = _covers(scene, poses_wc, intrinsics, height, width, device)
     depth = [torch.where(c.triangle >= 0, 1 / c.inverse_depth, FAR * scene.scale).float() for c in covers]
     return torch.stack(depth), torch.stack([_named(c) for c in covers])
@@ -42,7 +53,7 @@ def _named(cover: Cover) -> Tensor:
 
 
 def _weights(cover: Cover, at: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of pixels that show triangles ``at (M,)``: functions ``(M, 3, 3)``, 1/Z ``(M,)``, barycentric ``(M, 3)``."""
+    """Functions ``(M, 3, 3)``, 1/Z ``(M,)`` and barycentric weights ``(M, 3)`` of pixels with triangles ``at (M,)``."""
     functions = cover.functions[at]
     share = functions[..., 0] * x[:, None] + functions[..., 1] * y[:, None] + functions[..., 2]
     inverse = share.sum(1)
@@ -50,7 +61,7 @@ def _weights(cover: Cover, at: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, Te
 
 
 def _colours(scene: MeshScene, cover: Cover, rotation: Tensor, k: Tensor, taps: int) -> Tensor:
-    """Image ``(3, H, W)`` of a cast grid: texture times tint, and a pale sky where there is nothing."""
+    """Image ``(3, H, W)`` of a cast grid: texture times tint, and a pale sky as background."""
     height, width = cover.triangle.shape
     device = cover.triangle.device
     image = torch.empty(height * width, 3, device=device)
@@ -70,7 +81,7 @@ def _colours(scene: MeshScene, cover: Cover, rotation: Tensor, k: Tensor, taps: 
 
 
 def _shade(scene: MeshScene, cover: Cover, at: Tensor, x: Tensor, y: Tensor, taps: int) -> Tensor:
-    """Colour ``(M, 3)`` of pixels (x, y) that show triangles ``at (M,)``."""
+    """Colour ``(M, 3)`` of pixels (x, y) with triangles ``at (M,)``."""
     tables = scene.tensors(at.device)
     functions, inverse, share = _weights(cover, at, x, y)
     triangle = cover.index[at]
@@ -98,7 +109,7 @@ def _shade(scene: MeshScene, cover: Cover, at: Tensor, x: Tensor, y: Tensor, tap
 
 
 def _sky(rotation: Tensor, k: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """``(M, 3)`` a gradient by the elevation of the ray alone, so that it turns with the camera as a sky does."""
+    """``(M, 3)`` gradient by the elevation of the ray alone, fixed in the world."""
     across, down = (x - k[2]) / k[0], (y - k[3]) / k[1]
     rise = rotation[2, 0] * across + rotation[2, 1] * down + rotation[2, 2]
     rise = (rise / (across**2 + down**2 + 1).sqrt()).float()[:, None]
@@ -112,11 +123,19 @@ def render_mesh(
     scene: MeshScene, poses_wc: Array, intrinsics: Array, height: int, width: int, *, quality: Quality,
     device: torch.device | str, coordinates: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Images, depth, triangle, barycentric weights of corners 1 and 2: the fields of a ``Rendering``.
+    """Fields of a ``Rendering``: images, depth, triangle, barycentric weights of corners 1 and 2.
 
     Args:
-        poses_wc: ``(N, 7)`` float64; intrinsics: ``(N, 4)`` float64.
-        supersample: rays per pixel edge for the colours.
+        scene: the mesh.
+        poses_wc: ``(N, 7)`` float64.
+        intrinsics: ``(N, 4)`` float64 pixels.
+        height, width: image size, pixels.
+        quality: sampling of the colours.
+        device: where to render.
+        coordinates: fill the weights too.
+
+    Returns:
+        Images ``(N, 3, H, W)``, depth and triangle ``(N, H, W)``, weights ``(N, H, W, 2)``.
     """
     covers = _covers(scene, poses_wc, intrinsics, height, width, device)
     depth = torch.stack([torch.where(c.triangle >= 0, 1 / c.inverse_depth, 0.0).float() for c in covers])
@@ -139,7 +158,17 @@ def render_mesh(
 
 
 def trace_mesh(scene: MeshScene, poses_wc: Array, intrinsics: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """What single rays hit, in float64; arguments and results as those of :func:`dvo.synth.trace`."""
+    """Triangles hit by single rays, in float64.
+
+    Args:
+        scene: the mesh.
+        poses_wc: ``(N, 7)``.
+        intrinsics: ``(N, 4)`` pixels.
+        pixels: ``(N, M, 2)`` x, y.
+
+    Returns:
+        depth ``(N, M)``, triangle ``(N, M)`` (-1 for none), barycentric weights of corners 1 and 2 ``(N, M, 2)``.
+    """
     n, m = pixels.shape[:2]
     depth, surface, uv = np.zeros((n, m)), np.full((n, m), -1), np.zeros((n, m, 2))
     rotation, centre = split(poses_wc)

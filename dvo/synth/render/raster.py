@@ -1,4 +1,4 @@
-"""Triangles to pixels: exact coverage and depth at pixel centres, for meshes of a hundred thousand triangles and more.
+"""Rasterisation of triangles: exact coverage and depth at pixel centres, for meshes of 100,000 triangles and more.
 
 With corners ``v0 v1 v2`` in the camera, the ray ``r = (x', y', 1)`` through a pixel meets the triangle's plane at
 ``Z r = sum_i b_i v_i``. By Cramer's rule ``b_i / Z = (v_j x v_k) . r / det``, with ``det = v0 . (v1 x v2)``: linear in
@@ -23,12 +23,12 @@ WIDEN = 1e-6  # pixels by which spans are widened before the exact test
 
 @dataclass
 class Cover:
-    """What one camera sees.
+    """Visible triangle of each pixel of one camera.
 
     Attributes:
         triangle: ``(H, W)`` int64 row of ``index`` and ``functions``, -1 for none.
         inverse_depth: ``(H, W)`` float64, 0 for none.
-        index: ``(S,)`` triangles that may show.
+        index: ``(S,)`` triangles that may be visible.
         functions: ``(S, 3, 3)`` float64: b_i / Z from (x, y, 1).
     """
 
@@ -39,7 +39,7 @@ class Cover:
 
 
 def _windows(local: Tensor, k: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixel bounds ``low (T, 2)``, ``high (T, 2)`` and whether any part lies in front ``(T,)``."""
+    """Pixel bounds ``low (T, 2)``, ``high (T, 2)``, and ``(T,)`` bool: any part lies in front."""
     z = local[..., 2]
     front = z > near
     scale = 1 / torch.where(front, z, 1.0)[..., None]
@@ -59,7 +59,7 @@ def _windows(local: Tensor, k: Tensor, near: float) -> tuple[Tensor, Tensor, Ten
 
 
 def _spread(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For ``counts (M,)``: the owner and the rank within it of each of ``counts.sum()`` items."""
+    """Owner and rank within it of each of ``counts.sum()`` items, for ``counts (M,)``."""
     owner = torch.repeat_interleave(counts)
     rank = torch.arange(len(owner), device=counts.device) - (counts.cumsum(0) - counts)[owner]
     return owner, rank
@@ -89,14 +89,17 @@ def _setup(
 def rasterise(
     corners: Tensor, rotation: Tensor, centre: Tensor, intrinsics: Tensor, height: int, width: int, *, near: float
 ) -> Cover:
-    """Find the nearest triangle at every pixel centre; both sides of a triangle are seen.
+    """Nearest triangle at every pixel centre; triangles are two-sided.
 
     Args:
         corners: ``(T, 3, 3)`` float64 corners in the world (triangle, corner, coordinate).
         rotation, centre: ``(3, 3)``, ``(3,)`` float64 camera to world.
         intrinsics: ``(4,)`` float64 fx fy cx cy, pixels.
-        height, width: of the image.
-        near: smallest depth seen, world units.
+        height, width: of the image, pixels.
+        near: smallest visible depth, world units.
+
+    Returns:
+        The visible triangles.
     """
     device = corners.device
     index, edges, det, window = _setup(corners, rotation, centre, intrinsics, height, width, near)
@@ -140,7 +143,7 @@ def _linear(functions: Tensor, triangle: Tensor, x: Tensor, y: Tensor) -> Tensor
 
 
 def _resolve(nearest: Tensor, chosen: Tensor, pixel: Tensor, inverse: Tensor, triangle: Tensor) -> None:
-    """Depth test in place; of equally near triangles the first wins, whatever the order of work."""
+    """Depth test in place; of equally near triangles the first wins, independent of the order of work."""
     before = nearest[pixel]
     nearest.scatter_reduce_(0, pixel, inverse, "amax")
     wins = inverse == nearest[pixel]

@@ -1,4 +1,4 @@
-"""The renderer: flat surfaces rasterised exactly, textured and lit, in plain torch.
+"""Renderer of flat surfaces, rasterised exactly, textured and lit, in plain torch.
 
 In the camera of frame n a plane has an inverse depth that is linear in the pixel, and so are u / Z and v / Z of its
 surface coordinates and Z-scaled distances to its edges. So per frame and surface there are a few 3-vectors (computed in
@@ -19,10 +19,10 @@ from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.antialias import smooth_outlines
 from dvo.synth.render.meshes import mesh_depth, render_mesh, trace_mesh
 from dvo.synth.render.quality import STANDARD, Quality
+from dvo.synth.render.shading import coordinates_of, functions_of, shade
 from dvo.synth.render.view import SLACK, View, look, look_at_stage
 from dvo.synth.scenes.bodies import Stage
-from dvo.synth.scenes.scene import CELL, Scene
-from dvo.synth.textures.texture import sample
+from dvo.synth.scenes.scene import Scene
 
 PIECE = 9600  # pixels shaded at once on a CPU
 Array = np.ndarray
@@ -30,13 +30,13 @@ Array = np.ndarray
 
 @dataclass
 class Rendering:
-    """What N cameras see.
+    """Images of N cameras with ground truth.
 
     Attributes:
         images: ``(N, 3, H, W)`` float32 RGB in [0, 1].
         depth: ``(N, H, W)`` float32 Z along the optical axis, world units; 0 where no surface is hit.
         surface: ``(N, H, W)`` int64 index of the surface, -1 where none is hit.
-        uv: ``(N, H, W, 2)`` float32 coordinates in the surface, world units (see :class:`Scene`).
+        uv: ``(N, H, W, 2)`` float32 coordinates in the surface, world units (see :class:`dvo.synth.Scene`).
     """
 
     images: Tensor
@@ -46,8 +46,16 @@ class Rendering:
 
 
 def cast(view: View, height: int, width: int, device: torch.device | str) -> tuple[Tensor, Tensor, Tensor]:
-    """Largest inverse depth ``(N, H, W)``, the position in ``view.index`` of its surface (int32, -1 for none), and the
-    functions ``(N, Q, 5, 3)`` that decided it: inverse depth and edges.
+    """Visible surface at every pixel centre.
+
+    Args:
+        view: the surfaces as N cameras see them.
+        height, width: image size, pixels.
+        device: where to compute.
+
+    Returns:
+        Largest inverse depth ``(N, H, W)``; the position in ``view.index`` of its surface, int32, -1 for none; the
+        functions ``(N, Q, 5, 3)`` that decided it: inverse depth and edges.
     """
     n = len(view.seen)
     slack = 0.02  # pixels; the windows are exact but for rounding and SLACK
@@ -81,47 +89,6 @@ def cast(view: View, height: int, width: int, device: torch.device | str) -> tup
     return nearest, surface, table
 
 
-def _linear(rows: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Evaluate functions ``(3, M)`` at pixels ``(M,)``."""
-    return torch.addcmul(torch.addcmul(rows[2], rows[0], x), rows[1], y)
-
-
-def functions_of(scene: Scene, view: View, device: torch.device | str) -> Tensor:
-    """Coefficients ``(N Q, 15)`` of 1/Z, s/Z, t/Z and of the light-map coordinates over Z."""
-    texture = scene.texture_map[view.index] @ view.basis
-    light = scene.light_map[view.index] @ view.basis
-    packed = np.concatenate([view.basis[:, :, 2:], texture, light], 2).astype(np.float32)
-    return torch.from_numpy(packed.reshape(-1, 15)).to(device)
-
-
-def shade(scene: Scene, functions: Tensor, row: Tensor, surface: Tensor, x: Tensor, y: Tensor, taps: int) -> Tensor:
-    """Colour ``(3, M)`` in [0, 1] of M pixels (x, y) that show ``surface (M,)``, with functions in ``row (M,)``."""
-    tables = scene.tensors(surface.device)
-    f = functions.index_select(0, row).t().contiguous().view(5, 3, -1)
-    about = tables["surface"].index_select(1, surface)
-    z = 1 / _linear(f[0], x, y)
-    s, t = _linear(f[1], x, y) * z, _linear(f[2], x, y) * z
-    # Jacobian of texel coordinates by pixel, from the quotient rule.
-    sx, sy = torch.addcmul(f[1, 0], s, f[0, 0], value=-1) * z, torch.addcmul(f[1, 1], s, f[0, 1], value=-1) * z
-    tx, ty = torch.addcmul(f[2, 0], t, f[0, 0], value=-1) * z, torch.addcmul(f[2, 1], t, f[0, 1], value=-1) * z
-    along_x, along_y = torch.hypot(sx, tx), torch.hypot(sy, ty)
-    major = torch.maximum(along_x, along_y)
-    minor = (sx * ty - sy * tx).abs_() / major.clamp_min(1e-9)
-    footprint = torch.maximum(minor, major / taps)
-    wide = along_x >= along_y
-    shift = ((torch.arange(taps, device=x.device) + 0.5) / taps - 0.5)[:, None]
-    places_s, places_t = s + shift * torch.where(wide, sx, sy), t + shift * torch.where(wide, tx, ty)
-    colour = sample(scene.pool, about[10], about[11], places_s, places_t, footprint)
-    colour = torch.addcmul(about[7:10], colour, about[4:7])
-    light = tables["light"]
-    across, down = light.shape[3], light.shape[2]
-    lx = (_linear(f[3], x, y) * z).clamp_(0, CELL - 1).add_(about[12]).mul_(2 / (across - 1)).sub_(1)
-    ly = (_linear(f[4], x, y) * z).clamp_(0, CELL - 1).mul_(2 / (down - 1)).sub_(1)
-    grid = torch.stack([lx, ly], -1).view(1, 1, -1, 2)
-    shine = torch.nn.functional.grid_sample(light, grid, padding_mode="border", align_corners=True)
-    return colour.mul_(shine.view(3, -1)).clamp_(0, 1)
-
-
 def _cameras(poses_wc: object, intrinsics: object) -> tuple[Array, Array]:
     def to_numpy(value: object) -> Array:
         if isinstance(value, Tensor):
@@ -138,10 +105,20 @@ def _cameras(poses_wc: object, intrinsics: object) -> tuple[Array, Array]:
     return poses, np.broadcast_to(k, (len(poses), 4))
 
 
-def sight(
+def view_scene(
     scene: Scene | Stage, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None, times: object = None
 ) -> tuple[Scene, View]:
-    """What cameras ``(N, 7)`` see at ``times (N,)``, and the scene whose paint and light goes with it.
+    """Surfaces in view of cameras, and the scene whose textures and light belong to them.
+
+    Args:
+        scene: static, or with moving bodies.
+        poses_wc: ``(N, 7)`` camera to world.
+        intrinsics: ``(N, 4)`` pixels.
+        size: height and width of the image, which culls; None culls only what faces away.
+        times: ``(N,)`` seconds, for the poses of moving bodies.
+
+    Returns:
+        The scene of all surfaces, and the view.
 
     Raises:
         DvoError: moving bodies and no time for every camera.
@@ -158,17 +135,35 @@ def render_depth(
     scene: Scene | Stage | MeshScene, poses_wc: object, intrinsics: object, height: int, width: int, *,
     device: torch.device | str = "cpu", times: object = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Depth ``(N, H, W)`` and surface ``(N, H, W)`` alone: what planning of paths needs, at a fraction of the cost."""
+    """Depth and surfaces alone, as path planning needs them, at a fraction of the cost.
+
+    Args:
+        scene, poses_wc, intrinsics, height, width, device, times: as for :func:`render`.
+
+    Returns:
+        Depth ``(N, H, W)`` and surface ``(N, H, W)``.
+
+    Raises:
+        DvoError: as :func:`render`.
+    """
     poses, k = _cameras(poses_wc, intrinsics)
     if isinstance(scene, MeshScene):
         return mesh_depth(scene, poses, k, height, width, device)
-    _, view = sight(scene, poses, k, (height, width), times)
+    _, view = view_scene(scene, poses, k, (height, width), times)
     nearest, local, _ = cast(view, height, width, device)
     return torch.where(local >= 0, 1 / nearest, 0.0), named(view, local)
 
 
 def named(view: View, local: Tensor) -> Tensor:
-    """Positions in ``view.index`` -> surfaces of the scene, int64; -1 stays."""
+    """Surfaces of the scene from positions in ``view.index``.
+
+    Args:
+        view: of the cameras.
+        local: any shape, int; -1 stays.
+
+    Returns:
+        int64, same shape.
+    """
     names = torch.from_numpy(np.append(view.index, -1).astype(np.int64)).to(local.device)
     return names[local.long()]
 
@@ -232,7 +227,7 @@ def render(
         fine = replace(quality, supersample=rays)
         parts = render_mesh(scene, poses, k, height, width, quality=fine, device=device, coordinates=coordinates)
         return Rendering(*parts)
-    painted, view = sight(scene, poses, k, (height, width), times)
+    painted, view = view_scene(scene, poses, k, (height, width), times)
     nearest, local, functions = cast(view, height, width, device)
     depth = torch.where(local >= 0, 1 / nearest, 0.0)
     if quality.supersample == 1:
@@ -242,45 +237,37 @@ def render(
     else:
         m = quality.supersample
         fine_k = k * [m, m, m, m] + [0, 0, 0.5 * m - 0.5, 0.5 * m - 0.5]
-        _, fine_view = sight(scene, poses, fine_k, (height * m, width * m), times)
+        _, fine_view = view_scene(scene, poses, fine_k, (height * m, width * m), times)
         _, fine_local, _ = cast(fine_view, height * m, width * m, device)
         images = torch.nn.functional.avg_pool2d(_colours(painted, fine_view, fine_local, quality.taps), m)
     uv = coordinates_of(view, local, depth) if coordinates else torch.zeros(len(poses), 0, 0, 2, device=device)
     return Rendering(images, depth, named(view, local), uv)
 
 
-def coordinates_of(view: View, local: Tensor, depth: Tensor) -> Tensor:
-    """Surface coordinates ``(N, H, W, 2)`` of a cast grid."""
-    n, height, width = local.shape
-    device = local.device
-    uv = torch.from_numpy(view.basis[:, :, :2].astype(np.float32).reshape(-1, 6)).to(device)
-    frame = torch.arange(n, device=device)[:, None, None] * len(view.index)
-    chosen = uv[(frame + local.clamp_min(0)).reshape(-1)].view(n, height, width, 2, 3)
-    xs = torch.arange(width, dtype=torch.float32, device=device)[:, None]
-    ys = torch.arange(height, dtype=torch.float32, device=device)[:, None, None]
-    return (chosen[..., 0] * xs + chosen[..., 1] * ys + chosen[..., 2]) * depth[..., None]
-
-
 def trace(
     scene: Scene | Stage | MeshScene, poses_wc: object, intrinsics: object, pixels: Array, times: object = None,
     size: tuple[int, int] | None = None,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """What single rays hit, in float64: the reference for tests and for tracks.
+    """Surfaces hit by single rays, in float64: the reference for tests and for tracks.
 
     Args:
-        scene: what to look at.
-        poses_wc: ``(N, 7)``; intrinsics: ``(N, 4)`` or ``(4,)``.
+        scene: static, with moving bodies, or a mesh.
+        poses_wc: ``(N, 7)`` camera to world.
+        intrinsics: ``(N, 4)`` or ``(4,)``.
         pixels: ``(N, M, 2)`` x, y (need not be integers nor inside an image).
-        times: ``(N,)`` seconds, for the places of moving bodies.
-        size: height and width of pictures in which all pixels lie: spares work on what cannot show there.
+        times: ``(N,)`` seconds, for the poses of moving bodies.
+        size: height and width of images in which all pixels lie; saves work on surfaces out of view.
 
     Returns:
-        depth ``(N, M)``, surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
+        depth ``(N, M)`` (0 for none), surface ``(N, M)`` (-1 for none), uv ``(N, M, 2)``.
+
+    Raises:
+        DvoError: as :func:`render`.
     """
     poses, k = _cameras(poses_wc, intrinsics)
     if isinstance(scene, MeshScene):
         return trace_mesh(scene, poses, k, pixels)
-    _, view = sight(scene, poses, k, size, times)
+    _, view = view_scene(scene, poses, k, size, times)
     homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], -1).swapaxes(1, 2)  # (N, 3, M)
     if not len(view.index):
         nothing = np.zeros(pixels.shape[:2])

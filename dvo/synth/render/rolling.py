@@ -1,4 +1,4 @@
-"""Rolling shutter: every row of the picture has a camera of its own, at its own time; exact, as for a still camera.
+"""Rolling shutter: every row of the image has a camera of its own, at its own time; exact, as for a still camera.
 
 A camera of one row sees the same linear functions of the pixel as any other (see :mod:`dvo.synth.render.renderer`), so
 a frame is cast as H cameras of height 1 and shaded at once.
@@ -13,7 +13,8 @@ from torch import Tensor
 from dvo.errors import DvoError
 from dvo.synth.render.antialias import smooth_outlines
 from dvo.synth.render.quality import STANDARD, Quality
-from dvo.synth.render.renderer import PIECE, Rendering, cast, coordinates_of, functions_of, named, shade, sight
+from dvo.synth.render.renderer import PIECE, Rendering, cast, named, view_scene
+from dvo.synth.render.shading import coordinates_of, functions_of, shade
 from dvo.synth.render.view import SLACK, View
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import Scene
@@ -22,10 +23,18 @@ Array = np.ndarray
 
 
 def row_offsets(rows: Array, height: int, readout: float) -> Array:
-    """Seconds from the middle of the frame to the middle of exposure of ``rows`` (0 is the top; need not be integers).
+    """Times of exposure of rows, relative to the frame.
 
     The sensor reads ``height`` rows in ``readout`` seconds, one after the other from top to bottom; the middle row
     ``(height - 1) / 2`` has offset 0, so that a frame's timestamp and pose are those of its middle row.
+
+    Args:
+        rows: of any shape, 0 is the top; need not be integers.
+        height: number of rows.
+        readout: seconds.
+
+    Returns:
+        Seconds from the middle of the frame to the middle of exposure of each row.
     """
     return (np.asarray(rows, float) - (height - 1) / 2) * (readout / height)
 
@@ -37,7 +46,7 @@ def render_rows(
     """Render one frame whose rows have poses of their own.
 
     Args:
-        scene: what to render.
+        scene: static, or with moving bodies.
         poses_wc: ``(H, 7)`` camera to world while each row is exposed.
         intrinsics: ``(4,)`` fx fy cx cy in pixels of the ``H`` x ``width`` image.
         width: pixels.
@@ -45,7 +54,7 @@ def render_rows(
         quality, device, coordinates: as for :func:`dvo.synth.render.renderer.render`.
 
     Returns:
-        A batch of one frame. Depth is measured along the optical axis that the row's camera had.
+        A batch of one frame. Depth is measured along the optical axis of the row's camera.
 
     Raises:
         DvoError: arguments of the wrong shape.
@@ -77,10 +86,10 @@ def render_rows(
 def _look_rows(
     scene: Scene | Stage, poses_wc: Array, intrinsics: Array, width: int, times: Array | None
 ) -> tuple[Scene, View]:
-    """One camera per row: row y of the frame is row 0 of a camera whose principal point lies y higher."""
+    """View of one camera per row: row y of the frame is row 0 of a camera with its principal point y higher."""
     k = np.tile(intrinsics, (len(poses_wc), 1))
     k[:, 3] -= np.arange(len(poses_wc))
-    return sight(scene, poses_wc, k, (1, width), times)
+    return view_scene(scene, poses_wc, k, (1, width), times)
 
 
 def _colours(scene: Scene, view: View, local: Tensor, taps: int) -> Tensor:

@@ -1,9 +1,9 @@
-"""One camera on one path through one scene: what it sees at any time, through its shutter.
+"""Shot: one camera on one path through one scene, rendered at any time through its shutter.
 
-Time and place of a frame at time t: its timestamp, pose, depth, surfaces and all other ground truth are those of the
-middle of the exposure. With a rolling shutter each row has a middle of its own (:func:`row_offsets`); the frame's pose
-is that of the middle row, depth and surfaces are those that each row sees. Motion blur is the mean of sharp pictures
-taken along the path of the camera and of the bodies; ground truth stays that of mid-exposure.
+Timestamp, pose, depth, surfaces and all other ground truth of a frame are those of the middle of the exposure. With a
+rolling shutter each row has a middle of its own (:func:`row_offsets`); the frame's pose is that of the middle row,
+depth and surfaces are those of each row's camera. Motion blur is the mean of sharp images taken along the path of the
+camera and of the bodies; ground truth stays that of mid-exposure.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dvo.geometry.camera import Camera
 from dvo.geometry.poses import compose_rodrigues, pose_from, quaternion_to_matrix, split
 from dvo.geometry.undistort import needs_undistortion
 from dvo.synth.protocols import Motion
-from dvo.synth.render.lens import bent, plate_of, render_lens, straight
+from dvo.synth.render.lens import distorted_pixels, plate_of, render_lens, undistorted_pixels
 from dvo.synth.render.quality import Quality
 from dvo.synth.render.renderer import Rendering, render, trace
 from dvo.synth.render.rolling import render_rows, row_offsets
@@ -31,31 +31,54 @@ BLUR_STEP, MOST = 1.5, 15  # pixels between sub-exposures, and how many there ar
 
 @dataclass(frozen=True)
 class Offset:
-    """A motion seen from a frame that is fixed to it: ``T_wc(t) T_cd`` with ``mount (7,)`` T_cd."""
+    """Motion of a frame fixed to a moving one: ``T_wc(t) T_cd``.
+
+    Attributes:
+        motion: T_wc.
+        mount: ``(7,)`` T_cd.
+    """
 
     motion: Motion
     mount: Array
 
     def poses_wc(self, times: Array) -> Array:
-        """Poses ``(T, 7)`` at ``times (T,)``."""
+        """Poses ``(T, 7)`` at ``times (T,)`` seconds.
+
+        Args:
+            times: ``(T,)`` seconds.
+
+        Returns:
+            ``(T, 7)``.
+        """
         poses = self.motion.poses_wc(times)
         return compose_rodrigues(poses, np.broadcast_to(self.mount, poses.shape))
 
 
 @dataclass(frozen=True)
 class Rest:
-    """A motion that stays at ``pose_wc (7,)``."""
+    """Motion that stays at one pose.
+
+    Attributes:
+        pose_wc: ``(7,)``.
+    """
 
     pose_wc: Array
 
     def poses_wc(self, times: Array) -> Array:
-        """Poses ``(T, 7)`` at ``times (T,)``."""
+        """Poses ``(T, 7)`` at ``times (T,)`` seconds.
+
+        Args:
+            times: ``(T,)`` seconds.
+
+        Returns:
+            ``(T, 7)``.
+        """
         return np.tile(np.asarray(self.pose_wc, float), (len(np.asarray(times)), 1))
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What is filmed and how the sensor is read.
+    """Scene, path and read-out of the sensor.
 
     Attributes:
         scene: static, or a :class:`Stage` with moving bodies.
@@ -67,7 +90,7 @@ class Shot:
         device: where to render.
 
     Raises:
-        DvoError: a rolling shutter behind a lens with distortion, which is not rendered.
+        DvoError: a rolling shutter with a lens with distortion, which is not supported.
     """
 
     scene: Scene | Stage
@@ -91,11 +114,26 @@ class Shot:
         return self.camera.height, self.camera.width
 
     def beside(self, baseline: float) -> Shot:
-        """The same shot by the second camera of a rectified stereo pair, ``baseline`` world units to the right."""
+        """Shot of the second camera of a rectified stereo pair.
+
+        Args:
+            baseline: distance to the right, world units.
+
+        Returns:
+            The shot of the right camera.
+        """
         return replace(self, path=Offset(self.path, np.array([baseline, 0, 0, 0, 0, 0, 1.0])))
 
     def sharp(self, time: float, pose_wc: Array | None = None) -> Rendering:
-        """Frozen in the middle of the exposure: batch of one. ``pose_wc (1, 7)`` spares evaluating the path."""
+        """Image frozen in the middle of the exposure.
+
+        Args:
+            time: seconds.
+            pose_wc: ``(1, 7)`` saves evaluating the path.
+
+        Returns:
+            Batch of one.
+        """
         if self.readout > 0:
             when = self._row_times(time)
             poses = self.path.poses_wc(when)
@@ -120,7 +158,15 @@ class Shot:
         )  # fmt: skip
 
     def rendering(self, time: float, pose_wc: Array | None = None) -> Rendering:
-        """The clean frame at a time, blurred if the exposure lasts."""
+        """Clean image, with motion blur if the exposure lasts.
+
+        Args:
+            time: seconds.
+            pose_wc: ``(1, 7)`` saves evaluating the path.
+
+        Returns:
+            Batch of one.
+        """
         middle = self.sharp(time, pose_wc)
         if self.exposure <= 0:
             return middle
@@ -142,8 +188,18 @@ class Shot:
         return replace(middle, images=total / count)
 
     def sub_exposures(self, middle: Rendering, time: float) -> int:
-        """How many sharp pictures make up a blurred one: odd, so that no step is longer than ``BLUR_STEP`` pixels for
-        95 % of the picture (but at most ``MOST``)."""
+        """Number of sharp images that make up a blurred one.
+
+        It is odd, and large enough for steps of at most ``BLUR_STEP`` pixels in 95 % of the image (but at most
+        ``MOST``).
+
+        Args:
+            middle: sharp image at mid-exposure.
+            time: seconds.
+
+        Returns:
+            Number of images.
+        """
         step = 10
         depth = middle.depth[0, ::step, ::step].cpu().numpy().astype(float)
         surface = middle.surface[0, ::step, ::step].cpu().numpy().ravel()
@@ -161,10 +217,18 @@ class Shot:
         return int(np.clip(2 * np.ceil((longest / BLUR_STEP - 1) / 2) + 1, 1, MOST))
 
     def lift(self, time: float, pixels: Array, depth: Array, surface: Array) -> Array:
-        """Points ``(M, 3)`` that pixels ``(M, 2)`` with depth and surface ``(M,)`` show in the frame at ``time``, each
-        in the frame of what it belongs to: the world, or a body."""
+        """Points shown by pixels, each in the frame of its owner: the world, or a body.
+
+        Args:
+            time: of the frame, seconds.
+            pixels: ``(M, 2)``.
+            depth, surface: ``(M,)``.
+
+        Returns:
+            ``(M, 3)``.
+        """
         fx, fy, cx, cy = self.camera.intrinsics
-        ideal = straight(pixels, self.camera)
+        ideal = undistorted_pixels(pixels, self.camera)
         ray = np.stack([(ideal[:, 0] - cx) / fx, (ideal[:, 1] - cy) / fy, np.ones(len(pixels))], -1)
         rotation, centre = self._read(self.path, time, pixels[:, 1])
         points = (rotation @ (ray * depth[:, None])[..., None])[..., 0] + centre
@@ -174,10 +238,17 @@ class Shot:
         return points
 
     def place(self, time: float, points: Array, surface: Array) -> tuple[Array, Array]:
-        """Pixels ``(M, 2)`` and depth ``(M,)`` at which the frame at ``time`` has points from :meth:`lift`.
+        """Projection of points from :meth:`lift` into a frame.
 
-        With a rolling shutter the row decides on the pose and the pose on the row: solved by fixed-point steps. Points
-        behind the camera have depth <= 0 and pixels without meaning.
+        With a rolling shutter the row determines the pose and the pose the row: solved by fixed-point steps.
+
+        Args:
+            time: of the frame, seconds.
+            points: ``(M, 3)``.
+            surface: ``(M,)``.
+
+        Returns:
+            Pixels ``(M, 2)`` and depth ``(M,)``; points behind the camera have depth <= 0 and pixels without meaning.
         """
         fx, fy, cx, cy = self.camera.intrinsics
         moving = self._moving(surface)
@@ -191,7 +262,9 @@ class Shot:
             local = (np.swapaxes(rotation, -1, -2) @ (world - centre)[..., None])[..., 0]
             z = local[:, 2]
             ahead = np.where(z > 1e-9, z, 1e-9)
-            pixels = bent(np.stack([fx * local[:, 0] / ahead + cx, fy * local[:, 1] / ahead + cy], -1), self.camera)
+            pixels = distorted_pixels(
+                np.stack([fx * local[:, 0] / ahead + cx, fy * local[:, 1] / ahead + cy], -1), self.camera
+            )
             change = float(np.abs(pixels[:, 1] - rows).max(initial=0))
             rows = np.clip(pixels[:, 1], -1.0, self.camera.height)
             if change < 1e-7:
@@ -199,26 +272,41 @@ class Shot:
         return pixels, z
 
     def inside(self, pixels: Array, depth: Array) -> Array:
-        """``(M,)`` bool: in front of the camera and in the picture."""
+        """Points in front of the camera and in the image.
+
+        Args:
+            pixels: ``(M, 2)``.
+            depth: ``(M,)``.
+
+        Returns:
+            ``(M,)`` bool.
+        """
         edge = np.array([self.camera.width, self.camera.height]) - 0.5
         return (depth > 0) & (pixels >= -0.5).all(-1) & (pixels <= edge).all(-1)
 
     def trace(self, time: float, pixels: Array) -> tuple[Array, Array, Array]:
-        """What the frame at ``time`` shows at places ``(M, 2)`` in it (not only at pixel centres), in float64: depth
-        ``(M,)``, surface ``(M,)``, uv ``(M, 2)``."""
+        """Surfaces at places of a frame (not only at pixel centres), in float64.
+
+        Args:
+            time: of the frame, seconds.
+            pixels: ``(M, 2)``.
+
+        Returns:
+            depth ``(M,)``, surface ``(M,)``, uv ``(M, 2)``.
+        """
         k = self.camera.intrinsics
         if self.readout <= 0:
             when, size = np.array([time]), self._size
             if needs_undistortion(self.camera):  # through the pinhole picture that covers what the lens sees
                 plate = plate_of(self.camera, 2)
-                pixels = straight(pixels, self.camera) + (plate.intrinsics - k)[2:]
+                pixels = undistorted_pixels(pixels, self.camera) + (plate.intrinsics - k)[2:]
                 k, size = plate.intrinsics, plate.size
             depth, surface, uv = trace(self.scene, self.path.poses_wc(when), k, pixels[None], when, size)
             return depth[0], surface[0], uv[0]
         when = time + row_offsets(pixels[:, 1], self.camera.height, self.readout)
         poses = pose_from(*self._read(self.path, time, pixels[:, 1]))
         k = np.tile(k, (len(pixels), 1))
-        k[:, 2:] -= pixels  # each pixel is the only one, the origin, of a camera of its own
+        k[:, 2:] -= pixels  # each pixel is the origin of a camera of its own
         depth, surface, uv = trace(self.scene, poses, k, np.zeros((len(pixels), 1, 2)), when, (1, 1))
         return depth[:, 0], surface[:, 0], uv[:, 0]
 
@@ -226,7 +314,7 @@ class Shot:
         return time + row_offsets(np.arange(self.camera.height), self.camera.height, self.readout)
 
     def _moving(self, surface: Array) -> list[tuple[Array, Motion]]:
-        """Which points ride on which body."""
+        """Points on each moving body: indices and the body's motion."""
         if not isinstance(self.scene, Stage) or not self.scene.bodies:
             return []
         owner = self.scene.owner(surface)
@@ -236,7 +324,7 @@ class Shot:
     def _read(self, motion: Motion, time: float, rows: Array) -> tuple[Array, Array]:
         """Rotation ``(M, 3, 3)`` or ``(1, 3, 3)`` and translation of a motion while ``rows (M,)`` are exposed.
 
-        Between neighbouring whole rows poses are interpolated: they lie some 1e-4 s apart, the error is below 1e-8.
+        Between neighbouring whole rows poses are interpolated: they are about 1e-4 s apart, the error is below 1e-8.
         """
         if self.readout <= 0:
             return split(motion.poses_wc(np.array([time])))

@@ -1,4 +1,4 @@
-"""A scene as cameras see it: per frame and surface a few linear functions of the pixel, and what can show at all."""
+"""Views of a scene: per frame and surface a few linear functions of the pixel, and culling."""
 
 from __future__ import annotations
 
@@ -17,10 +17,14 @@ Array = np.ndarray
 
 @dataclass
 class View:
-    """Linear functions of the pixel (x, y, 1) for N frames and the Q surfaces in sight of any of them, float64.
+    """Linear functions of the pixel (x, y, 1) for N frames and the Q surfaces in view of any of them, float64.
 
-    ``index (Q,)`` surfaces, ``basis (N, Q, 3, 3)`` rows u/Z, v/Z, 1/Z, ``edges (N, Q, 4, 3)``, ``seen (N, Q)`` bool and
-    ``window (N, Q, 4)`` x0 y0 x1 y1 pixel bounds.
+    Attributes:
+        index: ``(Q,)`` surfaces.
+        basis: ``(N, Q, 3, 3)`` rows u/Z, v/Z, 1/Z.
+        edges: ``(N, Q, 4, 3)`` positive inside.
+        seen: ``(N, Q)`` bool.
+        window: ``(N, Q, 4)`` x0 y0 x1 y1 pixel bounds.
     """
 
     index: Array
@@ -31,7 +35,7 @@ class View:
 
 
 def _in_sight(scene: Scene, rotation: Array, centre: Array, intrinsics: Array, size: tuple[int, int] | None) -> Array:
-    """Surfaces that may show in any frame: facing it and with a bounding sphere that meets the viewing cone."""
+    """Surfaces that may be visible in any frame: facing it, with a bounding sphere that meets the viewing cone."""
     height = -((scene.origin - centre[:, None]) * scene.normal).sum(-1)
     seen = (np.abs(height) > 1e-9) & (scene.two_sided | (height > 0))
     middle, radius = scene.spheres
@@ -47,7 +51,17 @@ def _in_sight(scene: Scene, rotation: Array, centre: Array, intrinsics: Array, s
 
 
 def look(scene: Scene, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None) -> View:
-    """Build the functions; ``size`` (height, width) culls what cannot show, None keeps all that faces a camera."""
+    """View of a static scene.
+
+    Args:
+        scene: the surfaces.
+        poses_wc: ``(N, 7)`` camera to world.
+        intrinsics: ``(N, 4)`` pixels.
+        size: height and width of the image, which culls; None keeps all surfaces that face a camera.
+
+    Returns:
+        The view.
+    """
     rotation, centre = split(poses_wc)  # (N, 3, 3) camera to world, (N, 3)
     seen = _in_sight(scene, rotation, centre, intrinsics, size)
     index = np.flatnonzero(seen.any(0))
@@ -83,7 +97,16 @@ def look(scene: Scene, poses_wc: Array, intrinsics: Array, size: tuple[int, int]
 
 
 def look_at_stage(stage: Stage, poses_wc: Array, intrinsics: Array, size: tuple[int, int] | None, times: Array) -> View:
-    """As :func:`look`; ``times (N,)`` of the cameras say where the bodies are."""
+    """View of a scene with moving bodies.
+
+    Args:
+        stage: scene and bodies.
+        poses_wc, intrinsics, size: as for :func:`look`.
+        times: ``(N,)`` seconds of the cameras, for the poses of the bodies.
+
+    Returns:
+        The view; surfaces are numbered as in :class:`dvo.synth.Stage`.
+    """
     views = [look(stage.scene, poses_wc, intrinsics, size)]
     for body, start in zip(stage.bodies, stage.starts[1:-1], strict=True):
         seen_from = compose_rodrigues(invert_rodrigues(body.motion.poses_wc(times)), poses_wc)

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from dvo.errors import DvoError
 from dvo.synth.protocols import Motion
 from dvo.synth.scenes.scene import Scene
 
@@ -69,7 +70,7 @@ class Stage:
         """
         parts = [self.scene, *(body.scene for body in self.bodies)]
         if any(part.pool is not self.scene.pool for part in parts):
-            raise ValueError("bodies must take their textures from the pool of their scene")
+            raise DvoError("bodies must take their textures from the pool of their scene", field="bodies")
         joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_SURFACE}
         others = {f.name: getattr(self.scene, f.name) for f in fields(Scene) if f.name not in PER_SURFACE}
         return Scene(**{**others, **joined, "_cache": {}})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dvo.geometry.poses import so3_exp
-from dvo.synth.scenes.scene import Material, SceneBuilder
+from dvo.synth.scenes.builder import Material, SceneBuilder
 
 Array = np.ndarray
 UP = np.array([0.0, 0.0, 1.0])
@@ -44,6 +44,9 @@ def paint_object(b: SceneBuilder, metres: tuple[float, float], bland: float) -> 
         b: supplies textures and random numbers.
         metres: range of the width of one texture repeat.
         bland: probability of a nearly textureless material.
+
+    Returns:
+        The material.
     """
     if b.rng.random() < bland:
         return b.material("plain", metres=metres, contrast=(0.5, 1.5))

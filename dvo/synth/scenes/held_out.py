@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dvo.synth.scenes.builder import Material, SceneBuilder
 from dvo.synth.scenes.furnishing import UP, furnish, yaw
 from dvo.synth.scenes.lighting import bake
-from dvo.synth.scenes.scene import Material, Scene, SceneBuilder
+from dvo.synth.scenes.scene import Scene
 from dvo.synth.scenes.vegetation import bush, frustum, sky, tree
 from dvo.synth.textures.texture import TexturePool
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dvo.synth.scenes.builder import Material, SceneBuilder
 from dvo.synth.scenes.furnishing import UP, WALLS, any_rotation, paint_object, scatter, yaw
 from dvo.synth.scenes.lighting import bake
-from dvo.synth.scenes.scene import Material, Scene, SceneBuilder
+from dvo.synth.scenes.scene import Scene
 from dvo.synth.scenes.vegetation import bush, conifer, frustum, rock, sky, tree
 from dvo.synth.textures.texture import TexturePool
 

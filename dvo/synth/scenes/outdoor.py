@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dvo.synth.scenes.builder import SceneBuilder
 from dvo.synth.scenes.furnishing import UP, WALLS, paint_object, scatter, yaw
 from dvo.synth.scenes.lighting import bake
-from dvo.synth.scenes.scene import Scene, SceneBuilder
+from dvo.synth.scenes.scene import Scene
 from dvo.synth.scenes.vegetation import sky as sky_box
 from dvo.synth.scenes.vegetation import tree
 from dvo.synth.textures.texture import TexturePool

@@ -10,7 +10,7 @@ from dvo.synth import salts
 from dvo.synth.scenes.scene import Scene
 
 
-def plainer(scene: Scene, share: float, seed: int) -> Scene:
+def reduce_texture(scene: Scene, share: float, seed: int) -> Scene:
     """Scene with part of its textures' contrast removed: most surfaces take their own mean colour, the rest keep some.
 
     Args:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from dvo.synth.scenes.builder import Material, SceneBuilder
 from dvo.synth.scenes.furnishing import UP, any_rotation
-from dvo.synth.scenes.scene import Material, SceneBuilder
 
 Array = np.ndarray
 

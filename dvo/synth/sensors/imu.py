@@ -1,10 +1,10 @@
-"""What an inertial sensor on the camera measures, from the continuous path.
+"""Inertial measurements of a sensor at the camera, from the continuous path.
 
-Model (Kalibr's, and of Forster et al., "On-manifold preintegration", 2017, eq. 27-28): in the frame of the camera,
+Model (that of Kalibr, and of Forster et al., "On-manifold preintegration", 2017, eq. 27-28), in the camera frame:
 
     gyro  = omega + bias_g + noise,    accel = R_wc^T (a_w - g_w) + bias_a + noise,
 
-with white noise of density n (deviation ``n sqrt(rate)`` of a sample) and biases that walk randomly.
+with white noise of density n (deviation ``n sqrt(rate)`` of a sample) and biases that follow random walks.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ STEP = 2e-4  # seconds on either side of a sample over which motion is different
 
 @dataclass(frozen=True)
 class ImuNoise:
-    """Of the sensor; the defaults are those of the ADIS16448 that EuRoC's calibration gives (Burri et al., 2016).
+    """Noise densities; the defaults are those of the ADIS16448 in EuRoC's calibration (Burri et al., 2016).
 
     Attributes:
         gyro: rad/s/sqrt(Hz).
         gyro_walk: rad/s^2/sqrt(Hz).
         accel: m/s^2/sqrt(Hz).
         accel_walk: m/s^3/sqrt(Hz).
-        gyro_bias, accel_bias: deviation of the bias at the start, rad/s and m/s^2.
+        gyro_bias, accel_bias: standard deviation of the initial bias, rad/s and m/s^2.
     """
 
     gyro: float = 1.6968e-4
@@ -45,13 +45,14 @@ class ImuNoise:
 
 @dataclass(frozen=True)
 class Imu:
-    """Samples in the frame of the camera (x right, y down, z forward).
+    """Samples in the camera frame (x right, y down, z forward).
 
     Attributes:
         timestamps: ``(T,)`` seconds.
-        gyro: ``(T, 3)`` rad/s. accel: ``(T, 3)`` m/s^2, gravity's reaction included (at rest: -R^T g).
-        gyro_bias, accel_bias: ``(T, 3)`` that are part of them.
-        gravity: ``(3,)`` in the world.
+        gyro: ``(T, 3)`` rad/s.
+        accel: ``(T, 3)`` m/s^2, specific force (at rest: -R^T g).
+        gyro_bias, accel_bias: ``(T, 3)`` biases contained in them.
+        gravity: ``(3,)`` in the world, m/s^2.
     """
 
     timestamps: Array
@@ -65,17 +66,20 @@ class Imu:
 def measure_imu(
     path: Motion, times: Array, *, noise: ImuNoise | None = None, seed: int = 0, gravity: Array = GRAVITY
 ) -> Imu:
-    """IMU samples at ``times (T,)``, evenly spaced seconds.
+    """IMU samples along a path.
 
-    Rates of turn and accelerations are central differences over ``STEP`` of the path in float64 (rounding: some
-    1e-6 m/s^2 and 1e-11 rad/s).
+    Rates and accelerations are central differences over ``STEP`` of the path in float64 (rounding: about 1e-6 m/s^2 and
+    1e-11 rad/s).
 
     Args:
         path: camera to world, in metres.
-        times: when to measure.
-        noise: of the sensor; None measures without any noise or bias.
+        times: ``(T,)`` evenly spaced, seconds.
+        noise: None measures without noise and bias.
         seed: of the noise.
-        gravity: in the world, m/s^2.
+        gravity: ``(3,)`` in the world, m/s^2.
+
+    Returns:
+        The samples.
 
     Raises:
         DvoError: times that are not evenly spaced.
@@ -104,7 +108,14 @@ def measure_imu(
 
 
 def rotation_vector(rotation: Array) -> Array:
-    """Matrices ``(..., 3, 3)`` of turns well below pi -> rotation vectors ``(..., 3)``, accurate for tiny ones."""
+    """Logarithm of rotations of angles well below pi, accurate for tiny ones.
+
+    Args:
+        rotation: ``(..., 3, 3)``.
+
+    Returns:
+        ``(..., 3)`` rad.
+    """
     twist = 0.5 * np.stack(
         [
             rotation[..., 2, 1] - rotation[..., 1, 2],

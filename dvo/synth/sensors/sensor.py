@@ -1,7 +1,6 @@
-"""What a camera does to a clean rendering: exposure, colour, vignetting, blur, noise, compression, failures.
+"""Camera response to a clean rendering: exposure, colour, vignetting, blur, noise, compression, failures.
 
-Everything is drawn from a seed; the drawing and the noise are made on the CPU, so that a clip does not depend on the
-device.
+All parameters and noise are drawn on the CPU from a seed, so that a clip does not depend on the device.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class Sensor:
-    """Parameters of one clip.
+    """Parameters of one clip or sequence.
 
     Attributes:
         exposure: mean brightness to which the clip is exposed, in [0, 1]; None leaves the light as it is.
@@ -26,16 +25,17 @@ class Sensor:
         flicker: standard deviation of the frame-to-frame drift of log gain.
         vignette: darkening in the corners, 0 to 1.
         blur: Gaussian radius in pixels, 0 for none.
-        shutter: share of the time between frames during which light is gathered, 0 for no motion blur. In films the
-            blur is integrated along the path; in training clips it follows the flow between frames (an approximation).
-            Poses and depth are those of mid-exposure.
-        shot, read: noise deviation at full brightness (grows with the root of brightness) and in the dark.
-        readout: share of the time between frames during which a rolling shutter reads its rows, 0 for a global one.
+        shutter: share of the frame interval during which light is gathered, 0 for no motion blur. In sequences the blur
+            is integrated along the path; in training clips it follows the flow between frames (an approximation). Poses
+            and depth are those of mid-exposure.
+        shot, read: standard deviation of the noise at full brightness (grows with the root of brightness) and in the
+            dark.
+        readout: share of the frame interval during which a rolling shutter reads its rows, 0 for a global one.
         stops: knots ``(second, exposure value)`` of the exposure over time, linear between them and constant outside;
             one more stop is twice as bright. Empty: constant.
-        blackout: spans ``(from, to)`` in seconds without light: what is left is noise.
+        blackout: spans ``(from, to)`` in seconds without light, of which only noise is recorded.
         jpeg: quality of compression, 1 to 100; 0 for none.
-        drop: chance that a frame is lost (films only).
+        drop: probability that a frame is lost (sequences only).
     """
 
     exposure: float | None = 0.45
@@ -56,13 +56,28 @@ class Sensor:
     drop: float = 0.0
 
     def dark(self, times: np.ndarray) -> np.ndarray:
-        """``(T,)`` bool: does a blackout hold at ``times (T,)``?"""
+        """Blackout at given times.
+
+        Args:
+            times: ``(T,)`` seconds.
+
+        Returns:
+            ``(T,)`` bool.
+        """
         times = np.asarray(times, float)
         return np.any([(times >= a) & (times < b) for a, b in self.blackout], 0) & np.ones(len(times), bool)
 
 
 def random_intrinsics(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
-    """``(4,)`` fx fy cx cy: horizontal field of view 40-110 degrees, slightly off centre, slightly anisotropic."""
+    """Draw intrinsics: horizontal field of view 40-110 degrees, slightly off centre, slightly anisotropic.
+
+    Args:
+        rng: draws them.
+        height, width: image size, pixels.
+
+    Returns:
+        ``(4,)`` fx fy cx cy, pixels.
+    """
     view = np.deg2rad(rng.uniform(40, 110))
     fx = 0.5 * width / np.tan(view / 2)
     fy = fx * np.exp(rng.normal(0, 0.01))
@@ -72,7 +87,14 @@ def random_intrinsics(rng: np.random.Generator, height: int, width: int) -> np.n
 
 
 def random_sensor(rng: np.random.Generator) -> Sensor:
-    """Draw a camera: mostly decent, now and then poor."""
+    """Draw a sensor: of good quality in three of four cases, else poor.
+
+    Args:
+        rng: draws it.
+
+    Returns:
+        The sensor.
+    """
     poor = rng.random() < 0.25
     return Sensor(
         exposure=float(np.clip(rng.normal(0.43, 0.09), 0.15, 0.7)),
@@ -89,8 +111,17 @@ def random_sensor(rng: np.random.Generator) -> Sensor:
     )
 
 
-def random_wear(rng: np.random.Generator, sensor: Sensor, duration: float) -> Sensor:
-    """Now and then (one clip in ten) compression or a change of exposure, on top of :func:`random_sensor`."""
+def random_degradation(rng: np.random.Generator, sensor: Sensor, duration: float) -> Sensor:
+    """Add compression or a change of exposure to one clip in ten, in addition to :func:`random_sensor`.
+
+    Args:
+        rng: draws it.
+        sensor: without wear.
+        duration: of the clip, seconds.
+
+    Returns:
+        The sensor, in most cases unchanged.
+    """
     draw = rng.random()
     if draw < 0.05:
         return replace(sensor, jpeg=int(rng.integers(30, 95)))
@@ -100,8 +131,18 @@ def random_wear(rng: np.random.Generator, sensor: Sensor, duration: float) -> Se
 
 
 def exposure_changes(rng: np.random.Generator, duration: float, strength: float) -> tuple[tuple[float, float], ...]:
-    """Knots for :attr:`Sensor.stops`: slow drifts of up to half of ``strength`` stops, and one or two sudden changes of
-    ``strength`` stops, from which an automatic exposure recovers most of the way within a second or two.
+    """Draw knots for :attr:`Sensor.stops`.
+
+    There are slow drifts of up to half of ``strength``, and one or two sudden changes of ``strength``, from which an
+    automatic exposure recovers most of the way within one or two seconds.
+
+    Args:
+        rng: draws them.
+        duration: seconds.
+        strength: stops.
+
+    Returns:
+        Pairs of second and exposure value (stops).
     """
     count = max(3, int(duration / 1.3))
     times = np.linspace(0, duration, count)
@@ -121,9 +162,17 @@ def exposure_changes(rng: np.random.Generator, duration: float, strength: float)
     return tuple((float(t), float(v)) for t, v in zip(grid, level, strict=True))
 
 
-def in_the_dark(sensor: Sensor, light: float) -> Sensor:
-    """The sensor where only the share ``light`` of the usual light arrives: it amplifies up to 14 times, and with the
-    signal the noise. Noise is that of photons (variance grows with the amplified signal) and of reading out.
+def low_light(sensor: Sensor, light: float) -> Sensor:
+    """Sensor in low light, which amplifies the signal up to 14 times together with the noise.
+
+    The noise is that of photons (variance grows with the amplified signal) and of read-out.
+
+    Args:
+        sensor: in usual light.
+        light: share of the usual light that arrives, in (0, 1].
+
+    Returns:
+        The sensor in low light.
     """
     amplified = float(np.clip(0.8 / light, 1.0, 14.0))
     red, green, blue = (value * light * amplified for value in sensor.balance)
@@ -137,7 +186,15 @@ def in_the_dark(sensor: Sensor, light: float) -> Sensor:
 
 
 def compressed(images: Tensor, quality: int) -> Tensor:
-    """``(N, 3, H, W)`` float RGB in [0, 1] through JPEG and back."""
+    """Images after JPEG compression.
+
+    Args:
+        images: ``(N, 3, H, W)`` float RGB in [0, 1].
+        quality: 1 to 100.
+
+    Returns:
+        Same shape, device and type.
+    """
     frames = (images * 255).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
     out = []
     for frame in frames:
@@ -185,8 +242,8 @@ def expose(
         images: ``(N, 3, H, W)`` float RGB in [0, 1].
         sensor: the camera.
         rng: draws flicker and noise.
-        flow: ``(N, H, W, 2)`` pixels from each frame to the next, wanted by motion blur.
-        times: ``(N,)`` seconds, wanted by changes of exposure and blackouts.
+        flow: ``(N, H, W, 2)`` pixels from each frame to the next, needed for motion blur.
+        times: ``(N,)`` seconds, needed for changes of exposure and blackouts.
 
     Returns:
         ``(N, 3, H, W)`` float RGB in [0, 1].
@@ -215,7 +272,7 @@ def expose(
     if times is not None and sensor.blackout:
         images = images * torch.from_numpy(~sensor.dark(times)).to(device)[:, None, None, None]
     images = images.clamp_(0, 4)
-    # A soft shoulder instead of hard white.
+    # Smooth saturation instead of clipping.
     images = torch.where(images > 0.75, 0.75 + 0.25 * torch.tanh((images - 0.75) / 0.25), images)
     if sensor.gamma != 1:
         images = images.pow(sensor.gamma)

@@ -23,7 +23,11 @@ PHOTOGRAPHS = {
 
 
 def photographs() -> list[tuple[np.ndarray, str]]:
-    """The RGB photographs in [0, 1] that an installed scikit-image carries, with tags; empty without the package."""
+    """Photographs that an installed scikit-image ships.
+
+    Returns:
+        ``(H, W, 3)`` float32 RGB in [0, 1] with their tags; empty without the package.
+    """
     spec = importlib.util.find_spec("skimage")
     if spec is None or spec.origin is None:
         return []
@@ -41,12 +45,19 @@ TAGS = {tag for _, tag in (*PATTERNS.values(), *SPECIAL.values())} | {"photo"}
 
 
 def folder_photographs(folder: Path | str, seed: int) -> list[tuple[np.ndarray, str]]:
-    """RGB photographs in [0, 1] from a folder and its subfolders, with tags: up to ``MOST_PHOTOGRAPHS``, drawn by seed.
+    """Photographs of a folder and its subfolders, up to ``MOST_PHOTOGRAPHS``.
 
-    A subfolder named after a tag ("wall", "floor", "ground", ...) says what its pictures suit; others suit "photo".
+    A subfolder named after a tag ("wall", "floor", "ground", ...) gives its images that tag; others have "photo".
+
+    Args:
+        folder: with image files.
+        seed: draws the images of a larger folder.
+
+    Returns:
+        ``(H, W, 3)`` float32 RGB in [0, 1] with their tags; the longer edge is ``EDGE`` at most.
 
     Raises:
-        DvoError: no such folder, no pictures in it, or one that cannot be read.
+        DvoError: no such folder, no images in it, or one that cannot be read.
     """
     folder = Path(folder)
     remedy = f"give a folder with pictures ({', '.join(SUFFIXES[:3])}, ...)"
@@ -62,7 +73,9 @@ def folder_photographs(folder: Path | str, seed: int) -> list[tuple[np.ndarray, 
     for file in files:
         image = cv2.imread(str(file), cv2.IMREAD_COLOR)
         if image is None:
-            raise DvoError("cannot be read as a picture", file=file, field="textures", remedy="mend or remove the file")
+            raise DvoError(
+                "cannot be read as a picture", file=file, field="textures", remedy="replace or remove the file"
+            )
         if min(image.shape[:2]) < 16:
             raise DvoError("smaller than 16 pixels", file=file, field="textures", remedy="remove the file")
         shrink = EDGE / max(image.shape[:2])

@@ -1,6 +1,6 @@
-"""The texture pool: procedural patterns and photographs as one mip-mapped atlas, and its antialiased sampling.
+"""Texture pool: procedural patterns and photographs as one mip-mapped atlas, and its antialiased sampling.
 
-A pool belongs to (seed, count, size) and is shared by all scenes of a process; a surface picks a texture, a random
+A pool is determined by (seed, count, size) and shared by all scenes of a process; a surface takes a texture, a random
 window of it, a tint and a contrast. Textures are drawn when they are first used.
 """
 
@@ -24,7 +24,7 @@ WEIGHTS = {"plain": 2.0, "leaves": 2.0, "fractal": 2.0, "facade": 2.0, "asphalt"
 
 
 def _window(rng: Rng, photo: np.ndarray, size: int) -> np.ndarray:
-    """A random square window of a photograph, resized, perhaps mirrored, recoloured."""
+    """Random square window of a photograph, resized; mirrored or with permuted channels at times."""
     edge = int(min(photo.shape[:2]) * rng.uniform(0.45, 1.0))
     top, left = (int(rng.integers(0, n - edge + 1)) for n in photo.shape[:2])
     crop = photo[top : top + edge, left : left + edge]
@@ -50,7 +50,7 @@ def _fill_cell(cell: np.ndarray, image: np.ndarray, levels: int) -> None:
 
 
 class TexturePool:
-    """Mip-mapped textures laid out in one picture; about a third are photographs where scikit-image is installed.
+    """Mip-mapped textures in one atlas; about a third are photographs if scikit-image is installed.
 
     Every texture has a cell of ``size`` x ``1.5 size`` texels: level 0 on top, the smaller levels in a row below it.
 
@@ -61,18 +61,18 @@ class TexturePool:
         folder: photographs to use in place of scikit-image's.
 
     Raises:
-        DvoError: no pictures in the folder, or one that cannot be read.
+        DvoError: no images in the folder, or one that cannot be read.
 
     Attributes:
         atlas: ``(3, H, W)`` float32 in [0, 1]; cells of textures that were never used are black.
         levels: mip levels, down to 2 texels.
-        tags: what each texture suits ("wall", "floor", "photo", ...).
+        tags: use that each texture suits ("wall", "floor", "photo", ...).
     """
 
     def __init__(self, seed: int, count: int, size: int, folder: Path | str | None = None) -> None:
         self.seed, self.count, self.size, self.levels = seed, count, size, size.bit_length() - 1
         self.columns = int(np.ceil(np.sqrt(1.5 * count)))
-        # Special patterns follow the others, so that scenes which ask for none of them look as they do without.
+        # Special patterns follow the others, so that they do not change scenes that use none of them.
         special = [name for name in SPECIAL for _ in range(max(1, count // 56))]
         total = count + len(special)
         rows = -(-total // self.columns)
@@ -94,11 +94,25 @@ class TexturePool:
         self.tags = [self._photos[s][1] if isinstance(s, int) else self._patterns[s][1] for s in self._sources]
 
     def cell(self, index: int) -> tuple[int, int]:
-        """Top and left of a texture's cell in the atlas."""
+        """Top and left of a texture's cell in the atlas, texels.
+
+        Args:
+            index: of the texture.
+
+        Returns:
+            Row and column.
+        """
         return index // self.columns * self.size * 3 // 2, index % self.columns * self.size
 
     def use(self, index: int) -> np.ndarray:
-        """See to it that a texture is drawn; returns its mean colour ``(3,)``."""
+        """Draw a texture unless it is there already.
+
+        Args:
+            index: of the texture.
+
+        Returns:
+            Mean colour ``(3,)``.
+        """
         if not self._ready[index]:
             rng = np.random.default_rng([self.seed, salts.TEXTURE, index])
             source = self._sources[index]
@@ -114,7 +128,14 @@ class TexturePool:
         return self._mean[index]
 
     def on(self, device: torch.device | str) -> Tensor:
-        """The atlas ``(1, 3, H, W)`` on a device; only cells that are new there are copied."""
+        """Atlas on a device; only cells that are new there are copied.
+
+        Args:
+            device: where.
+
+        Returns:
+            ``(1, 3, H, W)`` float32.
+        """
         if torch.device(device).type == "cpu":
             return self.atlas[None]
         key = str(device)
@@ -129,14 +150,28 @@ class TexturePool:
         return copy[None]
 
     def tagged(self, *tags: str) -> np.ndarray:
-        """Indices of the textures with any of the tags; all of them if there is none."""
+        """Indices of the textures with any of the tags.
+
+        Args:
+            tags: "wall", "floor"...
+
+        Returns:
+            ``(K,)`` indices; all textures if none has such a tag.
+        """
         found = np.flatnonzero([tag in tags for tag in self.tags])
         return found if len(found) else np.arange(self.count)
 
 
 @lru_cache(maxsize=4)
 def texture_pool(seed: int, count: int = 224, size: int = 256, *, folder: Path | str | None = None) -> TexturePool:
-    """The pool of a seed (and of a folder of photographs), one object per process."""
+    """Pool of a seed (and of a folder of photographs), one object per process.
+
+    Args:
+        seed, count, size, folder: see :class:`TexturePool`.
+
+    Returns:
+        The pool.
+    """
     return TexturePool(seed, count, size, folder)
 
 
@@ -147,8 +182,8 @@ def sample(
 
     Args:
         pool: the textures.
-        left, top: ``(M,)`` float32 corner of the texture's cell in the atlas.
-        s, t: ``(K, M)`` coordinates in texels of level 0 (column, row), K places to average.
+        left, top: ``(M,)`` float32 corner of the texture's cell in the atlas, texels.
+        s, t: ``(K, M)`` coordinates in texels of level 0 (column, row); the K samples are averaged.
         footprint: ``(M,)`` edge of a pixel in texels of level 0.
         bias: added to the mip level; negative is sharper.
 

@@ -44,6 +44,6 @@ def test_bodies_move_rigidly_and_keep_off_the_camera(scene: Scene) -> None:
     assert not film(scene, path, camera, times=times[::8]).dynamic_mask(0).any()
     with pytest.raises(DvoError, match="times"):
         render(Stage(scene, bodies), path.poses_wc(np.zeros(1)), camera.intrinsics, 60, 80)
-    with pytest.raises(ValueError, match="pool"):
+    with pytest.raises(DvoError, match="pool"):
         stranger = Body(random_scene(2, "room", pool=texture_pool(12, count=24, size=64)), bodies[0].motion)
         _ = Stage(scene, (stranger,)).surfaces

@@ -16,7 +16,7 @@ from dvo.geometry.undistort import Undistorter
 from dvo.odometry.working_image import working_image
 from dvo.synth import Shot, make_sequence, mesh_scene, random_path, random_scene, render, trace
 from dvo.synth.export import export_sequence
-from dvo.synth.render.lens import bent, plate_of, random_lens, render_lens, straight
+from dvo.synth.render.lens import distorted_pixels, plate_of, random_lens, render_lens, undistorted_pixels
 from dvo.synth.render.quality import Quality
 from dvo.synth.sensors.sensor import random_intrinsics
 from dvo.synth.textures.texture import texture_pool
@@ -43,8 +43,8 @@ def test_every_drawn_lens_has_a_ray_for_every_pixel(seed, model, size):
     edge = np.array([[-0.5, -0.5], [size[1] - 0.5, -0.5], [-0.5, size[0] - 0.5], [size[1] - 0.5, size[0] - 0.5]])
     inner = rng.uniform(0, 1, (50, 2)) * [size[1], size[0]] - 0.5
     pixels = np.concatenate([edge, inner])
-    ideal = straight(pixels, camera)
-    assert np.isfinite(ideal).all() and np.abs(bent(ideal, camera) - pixels).max() < 1e-6
+    ideal = undistorted_pixels(pixels, camera)
+    assert np.isfinite(ideal).all() and np.abs(distorted_pixels(ideal, camera) - pixels).max() < 1e-6
     assert camera.is_distorted
 
 
@@ -54,7 +54,7 @@ def test_depth_and_surfaces_are_those_of_the_bent_rays(lens):
     camera, (scene, pose) = LENSES[lens], scene_and_pose()
     got = render_lens(scene, pose, camera)
     y, x = np.mgrid[: camera.height : 3, : camera.width : 3]
-    rays = straight(np.stack([x.ravel(), y.ravel()], -1).astype(float), camera)
+    rays = undistorted_pixels(np.stack([x.ravel(), y.ravel()], -1).astype(float), camera)
     depth, surface, uv = trace(scene, pose, CAMERA.intrinsics, rays[None])
     same = got.surface[0].numpy()[y.ravel(), x.ravel()] == surface[0]
     assert same.mean() > 0.999
@@ -107,7 +107,7 @@ def test_behind_the_lens_range_nothing_is_in_the_picture():
     camera, (scene, _) = LENSES["radtan"], scene_and_pose()
     shot = Shot(scene, random_path(scene, 1, "handheld"), camera)
     folded = camera.fx * np.array([[2.2, 0.0]]) + [camera.cx, camera.cy]
-    assert not shot.inside(bent(folded, camera), np.array([1.0])).any()
+    assert not shot.inside(distorted_pixels(folded, camera), np.array([1.0])).any()
 
 
 @pytest.mark.parametrize("model", ["radtan", "fisheye"])

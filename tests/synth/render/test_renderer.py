@@ -11,8 +11,9 @@ from dvo.geometry.poses import invert_rodrigues, look_rotation, pose_from, split
 from dvo.synth import random_path, random_scene, render, trace
 from dvo.synth.render.quality import Quality
 from dvo.synth.render.renderer import render_depth
+from dvo.synth.scenes.builder import SceneBuilder
 from dvo.synth.scenes.families import SHARES
-from dvo.synth.scenes.scene import Scene, SceneBuilder
+from dvo.synth.scenes.scene import Scene
 from dvo.synth.textures.texture import TexturePool, texture_pool
 
 H, W = 48, 64

@@ -19,7 +19,7 @@ from dvo.synth import (
 from dvo.synth.motion.movers import random_bodies
 from dvo.synth.render.shot import Rest
 from dvo.synth.textures.texture import texture_pool
-from dvo.synth.truth import hits, shows
+from dvo.synth.truth import hit_pixels, visible_points
 
 CAMERA = Camera(82.0, 81.5, 47.7, 35.2, 96, 72)
 
@@ -76,10 +76,10 @@ def test_second_camera_of_a_pair(scene: Scene) -> None:
     """Rectified stereo: what both see lies on one row, shifted by fx b / Z."""
     shot = Shot(scene, random_path(scene, 2, "handheld"), CAMERA)
     right = shot.beside(0.1)
-    pixels, depth, surface = hits(shot.sharp(0.2))
+    pixels, depth, surface = hit_pixels(shot.sharp(0.2))
     there, z = right.place(0.2, shot.lift(0.2, pixels, depth, surface), surface)
     assert np.allclose(there[:, 1], pixels[:, 1], atol=1e-6) and np.allclose(z, depth, rtol=1e-9)
     assert np.allclose(pixels[:, 0] - there[:, 0], CAMERA.fx * 0.1 / depth)
-    assert shows(right, 0.2, there, z, surface).mean() > 0.5
+    assert visible_points(right, 0.2, there, z, surface).mean() > 0.5
     relative = compose_rodrigues(invert_rodrigues(shot.path.poses_wc(np.zeros(1))), right.path.poses_wc(np.zeros(1)))[0]
     assert np.allclose(relative, [0.1, 0, 0, 0, 0, 0, 1], atol=1e-9)

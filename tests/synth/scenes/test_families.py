@@ -14,8 +14,8 @@ from dvo.registry import Registry
 from dvo.synth import FAMILIES, HELD_OUT, Scene, make_sequence, random_scene, render
 from dvo.synth.motion.paths import find_start
 from dvo.synth.motion.walks import long_path
+from dvo.synth.scenes.builder import SceneBuilder
 from dvo.synth.scenes.families import SHARES
-from dvo.synth.scenes.scene import SceneBuilder
 from dvo.synth.textures.texture import TexturePool, texture_pool
 
 RECORDED = "tabletop planes corridor clutter street planes room planes tabletop street street street"
@@ -62,26 +62,26 @@ def test_the_draw_of_a_family_keeps_its_bytes(monkeypatch: pytest.MonkeyPatch) -
     assert " ".join(str(random_scene(seed)) for seed in range(12)) == RECORDED
 
 
-def slab(rng: np.random.Generator, pool: TexturePool) -> Scene:
-    """A family of this module: one wall."""
+def empty(rng: np.random.Generator, pool: TexturePool) -> Scene:
+    """A family of this module: an empty room."""
     builder = SceneBuilder(rng, pool)
-    builder.rectangle([0, 3, 0], [0, -1, 0], [0, 0, 1], 8, 8, builder.material("wall"))
-    return builder.build("slab", np.array([[-1.0, -1, -1], [1, 1, 1]]), 2.0)
+    builder.box([0, 0, 0], [3, 3, 3], np.eye(3), [builder.material("wall")], inside=True)
+    return builder.build("empty", np.array([[-1.0, -1, -1], [1, 1, 1]]), 2.0)
 
 
 def test_a_module_outside_the_package_adds_a_family(monkeypatch: pytest.MonkeyPatch) -> None:
     outside = ModuleType("stranger")
-    outside.slab = slab  # type: ignore[attr-defined]
+    outside.empty = empty  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "stranger", outside)
-    FAMILIES.register("slab", "stranger:slab")
+    FAMILIES.register("empty", "stranger:empty")
     try:
-        sequence = make_sequence(1, frames=2, height=32, width=48, fps=10, family="slab", sensor=False)
-        assert sequence.name.startswith("slab-") and float(sequence.rendering(0).depth.max()) > 1
+        sequence = make_sequence(1, frames=2, height=32, width=48, fps=10, family="empty", sensor=False)
+        assert sequence.name.startswith("empty-") and float(sequence.rendering(0).depth.max()) > 1
         names_instead_of_scenes(monkeypatch)
         drawn = " ".join(str(random_scene(seed)) for seed in range(12))
         assert drawn == RECORDED, "a family that is added is drawn only when it is named"
     finally:
-        FAMILIES.unregister("slab")
+        FAMILIES.unregister("empty")
 
 
 def test_terrain_has_one_texture_across_its_triangles() -> None:

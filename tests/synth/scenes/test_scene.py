@@ -20,7 +20,7 @@ from dvo.synth import (
 from dvo.synth.render.shot import Rest
 from dvo.synth.scenes.bodies import PER_SURFACE, Body
 from dvo.synth.scenes.families import SHARES
-from dvo.synth.scenes.repaint import plainer
+from dvo.synth.scenes.repaint import reduce_texture
 from dvo.synth.textures.texture import texture_pool
 
 
@@ -47,7 +47,7 @@ def test_clearance_knows_surfaces_and_solids(scenes: dict[str, Scene]) -> None:
 def test_bare_scenes_have_less_texture_and_the_same_geometry(scene: Scene) -> None:
     path = long_path(scene, 1, "handheld", 2.0)
     camera, times = Camera(70, 70, 39.5, 29.5, 80, 60), np.array([0.3, 1.5])
-    full, bare = (film(s, path, camera, times=times).rendering(0) for s in (scene, plainer(scene, 0.1, 0)))
+    full, bare = (film(s, path, camera, times=times).rendering(0) for s in (scene, reduce_texture(scene, 0.1, 0)))
     assert torch.equal(full.surface, bare.surface) and torch.equal(full.depth, bare.depth)
 
     def detail(images: torch.Tensor) -> float:

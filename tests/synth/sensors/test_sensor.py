@@ -15,7 +15,7 @@ from dvo.synth import (
     salts,
 )
 from dvo.synth.clip import make_clip
-from dvo.synth.sensors.sensor import compressed, expose, exposure_changes, in_the_dark, random_sensor, random_wear
+from dvo.synth.sensors.sensor import compressed, expose, exposure_changes, low_light, random_degradation, random_sensor
 
 SMALL: dict[str, Any] = {"frames": 12, "height": 60, "width": 80, "fps": 10.0, "family": "room"}
 SEED = 4
@@ -42,7 +42,7 @@ def test_low_light_is_noisy_where_it_should_be() -> None:
     grey = torch.full((1, 3, 200, 200), 0.5)
     sensor = Sensor(exposure=None, shot=0.01, read=0.003)
     good = expose(grey, sensor, np.random.default_rng(0))
-    poor = expose(grey, in_the_dark(sensor, 0.05), np.random.default_rng(0))
+    poor = expose(grey, low_light(sensor, 0.05), np.random.default_rng(0))
     gain = 0.05 * 14
     assert float(poor.mean()) == pytest.approx(0.5 * gain, rel=0.02)
     expected = np.sqrt(14 * 0.01**2 * 0.5 * gain + (14 * 0.003) ** 2)
@@ -57,7 +57,9 @@ def test_jpeg_loses_detail_by_quality(plain: SyntheticSequence) -> None:
 
 
 def test_sensor_wear_of_clips_is_rare_and_has_its_own_draws() -> None:
-    worn = [random_wear(np.random.default_rng([0, salts.CLIP_WEAR, i]), Sensor(), 1.0) for i in range(400)]
+    worn = [
+        random_degradation(np.random.default_rng([0, salts.CLIP_DEGRADATION, i]), Sensor(), 1.0) for i in range(400)
+    ]
     assert 0.05 < np.mean([sensor != Sensor() for sensor in worn]) < 0.15
     assert all(30 <= sensor.jpeg < 95 or sensor.jpeg == 0 for sensor in worn)
     assert random_sensor(np.random.default_rng(0)).stops == ()

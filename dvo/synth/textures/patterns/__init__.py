@@ -1,7 +1,7 @@
-"""Procedural textures: each function draws one ``(S, S, 3)`` float32 RGB image in [0, 1] from a numpy Generator.
+"""Procedural patterns: functions ``(rng, size)`` that draw one ``(S, S, 3)`` float32 RGB image in [0, 1].
 
-``PATTERNS`` maps a name to (function, tag); scenes ask for tags ("facade", "floor"...), so that walls look like walls.
-``SPECIAL`` holds patterns that only scenes which ask for their tags get.
+``PATTERNS`` maps a name to (function, tag); scenes select by tag ("facade", "floor"...), so that walls look like walls.
+``SPECIAL`` holds patterns that only scenes which name their tags get.
 """
 
 from __future__ import annotations

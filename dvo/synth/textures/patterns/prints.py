@@ -1,4 +1,7 @@
-"""Patterns with drawn shapes: cloth, dead leaves, facades, posters, shelves, doors, wallpaper, paintings."""
+"""Patterns with drawn shapes: cloth, dead leaves, facades, posters, shelves, doors, wallpaper, paintings.
+
+Each function takes a generator and the edge length S in texels, and returns ``(S, S, 3)`` float32 RGB in [0, 1].
+"""
 
 from __future__ import annotations
 
@@ -51,12 +54,13 @@ def leaves(rng: Rng, size: int, palette: Callable[[], np.ndarray] | None = None)
 
 
 def foliage(rng: Rng, size: int) -> np.ndarray:
+    """Leaves of a plant."""
     base = np.array([rng.uniform(0.15, 0.45), rng.uniform(0.3, 0.6), rng.uniform(0.08, 0.25)])
     return leaves(rng, size, lambda: np.clip(base * np.exp(rng.normal(0, 0.45)) + rng.normal(0, 0.03, 3), 0, 1))
 
 
 def facade(rng: Rng, size: int) -> np.ndarray:
-    """A grid of windows in a wall; tiles without a seam."""
+    """Grid of windows in a wall; tileable."""
     kind = rng.random()
     wall = bricks(rng, size) if kind < 0.35 else stains(rng, size) if kind < 0.5 else plain(rng, size)
     image = (0.75 * wall + 0.25 * wall.mean((0, 1))).astype(np.float32)
@@ -84,7 +88,7 @@ def facade(rng: Rng, size: int) -> np.ndarray:
 
 
 def text(rng: Rng, size: int) -> np.ndarray:
-    """A poster: headline, lines of letters, a picture block."""
+    """Poster: headline, lines of letters, a picture."""
     image: np.ndarray = np.broadcast_to(colour(rng, 0.4, 0.5, 1), (size, size, 3)).astype(np.float32).copy()
     for _ in range(int(rng.integers(0, 4))):
         x, y, w, h = rng.uniform(0.05, 0.6, 4) * size
@@ -138,7 +142,7 @@ def panel(rng: Rng, size: int) -> np.ndarray:
 
 
 def wallpaper(rng: Rng, size: int) -> np.ndarray:
-    """One motif on a lattice, exactly repeated: what misleads matching."""
+    """One motif on a lattice, exactly repeated, which is ambiguous for matching."""
     count = 2 * int(rng.integers(2, 6))
     cell = size // count
     motif = np.broadcast_to(colour(rng, 0.3, 0.4, 0.9), (cell, cell, 3)).astype(np.float32).copy()
@@ -157,7 +161,7 @@ def wallpaper(rng: Rng, size: int) -> np.ndarray:
 
 
 def painting(rng: Rng, size: int) -> np.ndarray:
-    """A picture in a frame: sky, hills, shapes, brush strokes."""
+    """Painting in a frame: sky, hills, shapes, brush strokes."""
     y = np.linspace(0, 1, size, dtype=np.float32)[:, None, None]
     top, low = colour(rng, 0.4, 0.4, 0.95), colour(rng, 0.4, 0.3, 0.95)
     image = np.ascontiguousarray(np.broadcast_to(top + y * (low - top), (size, size, 3)), np.float32)

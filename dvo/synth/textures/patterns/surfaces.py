@@ -1,4 +1,7 @@
-"""Patterns of materials: stone, plaster, bricks, tiles, wood, bark, grass, asphalt, roofs, sky."""
+"""Patterns of materials: stone, plaster, bricks, tiles, wood, bark, grass, asphalt, roofs, sky.
+
+Each function takes a generator and the edge length S in texels, and returns ``(S, S, 3)`` float32 RGB in [0, 1].
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from dvo.synth.textures.patterns.base import Rng, colour, grain, noise, shade
 
 
 def fractal(rng: Rng, size: int) -> np.ndarray:
+    """Fractal noise of a few colours: stone."""
     field = noise(rng, size, rng.uniform(0.7, 2.4), np.exp(rng.normal(0, 0.3)))
     ranked = np.clip(0.5 + field * rng.uniform(0.15, 0.4), 0, 1)
     base = colour(rng)
@@ -61,6 +65,7 @@ def cells(rng: Rng, size: int) -> np.ndarray:
 
 
 def bricks(rng: Rng, size: int) -> np.ndarray:
+    """Rows of bricks with mortar."""
     rows = int(rng.integers(5, 16))
     per_row = max(2, int(rows / rng.uniform(1.5, 3.5)))
     base, mortar = colour(rng, 0.5, 0.25, 0.75), colour(rng, 0.1, 0.3, 0.85)
@@ -107,6 +112,7 @@ def wood(rng: Rng, size: int) -> np.ndarray:
 
 
 def grass(rng: Rng, size: int) -> np.ndarray:
+    """Blades of grass."""
     field = noise(rng, size, rng.uniform(0.6, 1.1), rng.uniform(0.6, 1)) * 0.25 + noise(rng, size, 2) * 0.12 + 0.5
     base = np.array([rng.uniform(0.25, 0.5), rng.uniform(0.35, 0.6), rng.uniform(0.1, 0.25)])
     return shade(np.clip(field, 0, 1), [base * 0.35, base, np.clip(base * 1.6, 0, 1)])
@@ -129,6 +135,7 @@ def asphalt(rng: Rng, size: int) -> np.ndarray:
 
 
 def clouds(rng: Rng, size: int) -> np.ndarray:
+    """Sky with clouds."""
     field = np.clip(0.5 + noise(rng, size, rng.uniform(1.6, 2.4), 1.3) * rng.uniform(0.1, 0.35), 0, 1)
     sky = np.array([rng.uniform(0.4, 0.75), rng.uniform(0.6, 0.8), rng.uniform(0.8, 0.98)])
     grey = rng.uniform(0.0, 1.0)
@@ -137,7 +144,7 @@ def clouds(rng: Rng, size: int) -> np.ndarray:
 
 
 def bark(rng: Rng, size: int) -> np.ndarray:
-    """Furrows that run up a trunk."""
+    """Furrows along a trunk."""
     furrows = noise(rng, size, rng.uniform(1.0, 1.5), rng.uniform(2.2, 4.0))
     depth = np.clip(np.abs(furrows) * rng.uniform(0.6, 1.1), 0, 1)
     base = colour(rng, 0.2, 0.3, 0.65) * np.array([1.1, 0.95, 0.8])
@@ -149,7 +156,7 @@ def bark(rng: Rng, size: int) -> np.ndarray:
 
 
 def marble(rng: Rng, size: int) -> np.ndarray:
-    """Veins where a warped field crosses zero."""
+    """Veins along the zero crossings of a warped field."""
     field = noise(rng, size, rng.uniform(1.5, 2.0)) + 0.35 * noise(rng, size, 1.1)
     veins = np.exp(-np.abs(field) * rng.uniform(3, 9))
     ground = 0.5 + 0.2 * noise(rng, size, 1.9)

@@ -76,14 +76,14 @@ def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
 
 
 class VideoRecording:
-    """A video file.
+    """Video file as a recording.
 
     Times are the container's; where it has none that increase, the frame's number over the frame rate. A rate or
     a list of times that the user gives overrides both.
 
     Args:
         path: the file.
-        request: the user's times or rate.
+        request: options of the user.
 
     Raises:
         DvoError: it does not open, holds no frame, or ``times`` has another number of rows than it has frames.
@@ -160,7 +160,15 @@ class VideoRecording:
 
 
 def open_video(path: Path, request: Request) -> Recording:
-    """Open a video file; see :class:`VideoRecording`."""
+    """Open a video file.
+
+    Args:
+        path: the file.
+        request: options of the user.
+
+    Raises:
+        DvoError: see :class:`VideoRecording`.
+    """
     return VideoRecording(path, request)
 
 

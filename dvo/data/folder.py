@@ -15,7 +15,11 @@ _STEREO_NAME = re.compile(r"\d{16,}_[01]")
 
 
 def matches(path: Path) -> bool:
-    """Any folder: the last reader to which a path is offered."""
+    """True for any folder: the last reader to which a path is offered.
+
+    Args:
+        path: existing file or folder.
+    """
     return path.is_dir()
 
 

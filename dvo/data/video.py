@@ -28,7 +28,11 @@ _GIVE_UP_AFTER = 900
 
 
 def matches(path: Path) -> bool:
-    """Any file (folders are for the other readers)."""
+    """True for any file; folders are for the other readers.
+
+    Args:
+        path: existing file or folder.
+    """
     return path.is_file()
 
 

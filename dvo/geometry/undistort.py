@@ -24,6 +24,9 @@ def needs_undistortion(camera: Camera) -> bool:
     """True if images of the camera differ from those of a pinhole camera.
 
     A fisheye with zero coefficients needs undistortion too: its model maps the angle, not its tangent.
+
+    Args:
+        camera: with its model and coefficients.
     """
     return camera.model == "fisheye" or camera.is_distorted
 

@@ -1,20 +1,35 @@
-"""What goes in: frames, cameras' calibrations, trajectories, and readers for videos, image folders and datasets."""
+"""Frames, calibrations and trajectories, and the readers of videos, image folders, data sets and streams."""
 
 from dvo.data.calibration import Calibration, read_calibration
-from dvo.data.frame import Frame
+from dvo.data.frame import Frame, InertialSamples, StereoView
+from dvo.data.recording import ImageRecording, Reader, Recording, Request
+from dvo.data.registry import READERS
+from dvo.data.sensors import Sensors, StereoRig
 from dvo.data.source import Source, open_source
+from dvo.data.streams import FrameStream, stream
 from dvo.data.trajectory import Trajectory, interpolate, read_kitti_poses, read_tum, write_kitti_poses, write_tum
 
 __all__ = [
+    "READERS",
     "Calibration",
     "Frame",
+    "FrameStream",
+    "ImageRecording",
+    "InertialSamples",
+    "Reader",
+    "Recording",
+    "Request",
+    "Sensors",
     "Source",
+    "StereoRig",
+    "StereoView",
     "Trajectory",
     "interpolate",
     "open_source",
     "read_calibration",
     "read_kitti_poses",
     "read_tum",
+    "stream",
     "write_kitti_poses",
     "write_tum",
 ]

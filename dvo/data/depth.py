@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -38,11 +40,14 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray | None:
 
 def _read_array(path: Path) -> np.ndarray | None:
     try:
-        loaded = np.load(path)
-        depth = loaded["depth"] if isinstance(loaded, np.lib.npyio.NpzFile) else loaded
+        if path.suffix == ".npz":
+            with np.load(path) as archive:
+                depth = archive["depth"]
+        else:
+            depth = np.load(path)
     except KeyError:
         raise DvoError("no array 'depth' in it", file=path, field="depth", remedy="name the array depth") from None
-    except (OSError, ValueError, EOFError):
+    except (OSError, ValueError, EOFError, BadZipFile, zlib.error):
         return None
     if not np.issubdtype(depth.dtype, np.floating):
         raise DvoError(f"depth of type {depth.dtype}", file=path, field="depth", remedy="store metres as float32")

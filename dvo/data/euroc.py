@@ -28,7 +28,11 @@ def _mav(path: Path) -> Path | None:
 
 
 def matches(path: Path) -> bool:
-    """A folder with ``mav0/cam0/data``, or ``mav0`` itself."""
+    """True for a folder with ``mav0/cam0/data``, or ``mav0`` itself.
+
+    Args:
+        path: existing file or folder.
+    """
     return _mav(path) is not None
 
 

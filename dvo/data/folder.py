@@ -1,4 +1,4 @@
-"""A plain folder of images."""
+"""Plain folder of images."""
 
 from __future__ import annotations
 
@@ -15,14 +15,25 @@ _STEREO_NAME = re.compile(r"\d{16,}_[01]")
 
 
 def matches(path: Path) -> bool:
-    """Any folder (the last reader asked)."""
+    """True for any folder: the last reader to which a path is offered.
+
+    Args:
+        path: existing file or folder.
+    """
     return path.is_dir()
 
 
 def camera_images(folder: Path, warnings: list[str]) -> list[Path]:
-    """The images of one camera, in order: natural order, by time if the names are stamps.
+    """List the images of one camera: in natural order, or by time if the names are stamps.
 
     A folder of stereo pairs named ``<nanoseconds>_0`` and ``<nanoseconds>_1`` gives the left ones.
+
+    Args:
+        folder: of the images.
+        warnings: receives a sentence if images were left out.
+
+    Returns:
+        Files; empty if there are none.
     """
     images = list_images(folder)
     if images and all(_STEREO_NAME.fullmatch(image.stem) for image in images):
@@ -38,6 +49,10 @@ def camera_images(folder: Path, warnings: list[str]) -> list[Path]:
 
 def open_folder(path: Path, request: Request) -> Recording:
     """Read a folder of images; no calibration of its own.
+
+    Args:
+        path: the folder.
+        request: options of the user.
 
     Raises:
         DvoError: no images, or times that do not fit them.

@@ -70,7 +70,11 @@ class InertialSamples:
         return len(self.timestamps)
 
     def between(self, after: float, until: float) -> InertialSamples:
-        """Samples with ``after < time <= until`` (seconds)."""
+        """Samples with ``after < time <= until``.
+
+        Args:
+            after, until: seconds.
+        """
         first, last = np.searchsorted(self.timestamps, [after, until], side="right")
         part = slice(int(first), int(last))
         return InertialSamples(self.timestamps[part], self.gyro[part], self.accel[part], self.T_camera_imu)

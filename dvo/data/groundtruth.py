@@ -1,4 +1,4 @@
-"""Ground-truth files that a user names for images without their own: one table of formats, told apart by their rows."""
+"""Ground-truth files that a user names: one table of formats, recognised by their rows."""
 
 from __future__ import annotations
 

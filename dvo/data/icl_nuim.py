@@ -45,7 +45,11 @@ def _images(path: Path) -> Path | None:
 
 
 def matches(path: Path) -> bool:
-    """A folder of images named after one of the eight trajectories, with the poses at one of the usual places."""
+    """True for a folder of images named after one of the eight trajectories, with the poses at one of the usual places.
+
+    Args:
+        path: existing file or folder.
+    """
     return path.is_dir() and _truth(path) is not None and _images(path) is not None
 
 

@@ -1,4 +1,4 @@
-"""Image files: which there are, in which order, and what is in them."""
+"""Image files: listing in natural order, and decoding to 8-bit RGB."""
 
 from __future__ import annotations
 
@@ -13,13 +13,21 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp",
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that puts ``img_2`` before ``img_10``."""
+    """Sort key that puts ``img_2`` before ``img_10``.
+
+    Args:
+        name: of a file.
+    """
     parts = re.split(r"([0-9]+)", name)
     return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in parts if part]
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files directly in a folder, in natural order; hidden ones left out."""
+    """List the image files directly in a folder, in natural order; hidden ones left out.
+
+    Args:
+        folder: need not exist.
+    """
     if not folder.is_dir():
         return []
     found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
@@ -27,16 +35,26 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def has_images(folder: Path) -> bool:
-    """Whether there is at least one image file directly in the folder (does not list a large folder to its end)."""
+    """True if at least one image file lies directly in the folder; does not list a large folder to its end.
+
+    Args:
+        folder: need not exist.
+    """
     return folder.is_dir() and any(
         path.suffix.lower() in SUFFIXES and not path.name.startswith(".") for path in folder.iterdir()
     )
 
 
 def to_rgb8(image: np.ndarray) -> np.ndarray:
-    """What OpenCV decoded, ``(H, W[, 1|3|4])`` in BGR order, to ``(H, W, 3)`` uint8 RGB.
+    """Convert an image as OpenCV decodes it.
 
     Grey is repeated, alpha dropped, 16 bit divided by 257 (a fixed factor: brightness stays comparable over frames).
+
+    Args:
+        image: ``(H, W)`` or ``(H, W, 1|3|4)`` uint8 or uint16, BGR order.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB.
 
     Raises:
         DvoError: another type of pixel (a depth map in float, say).
@@ -51,7 +69,13 @@ def to_rgb8(image: np.ndarray) -> np.ndarray:
 
 
 def read_image(path: Path) -> np.ndarray | None:
-    """``(H, W, 3)`` uint8 RGB, or None if the file is corrupt or cut short. EXIF orientation is not applied.
+    """Decode an image file. EXIF orientation is not applied.
+
+    Args:
+        path: the file.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB, or None if the file is missing, corrupt or cut short.
 
     Raises:
         DvoError: a readable image with pixels that are no colours (float).
@@ -77,7 +101,13 @@ def read_image(path: Path) -> np.ndarray | None:
 
 
 def is_complete(data: bytes) -> bool:
-    """Whether the end mark is there: the decoders return a cut file with its lower part grey, and no error."""
+    """True if the end mark of a PNG or JPEG file is there.
+
+    The decoders return a cut file with its lower part grey, and no error.
+
+    Args:
+        data: the bytes of an image file; of other formats any byte will do.
+    """
     if data.startswith(b"\x89PNG"):
         return b"IEND" in data[-4096:]
     if data.startswith(b"\xff\xd8"):  # the first half may hold a thumbnail with its own end mark

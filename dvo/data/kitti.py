@@ -60,7 +60,11 @@ def _split(path: Path) -> tuple[Path, Path] | None:
 
 
 def matches(path: Path) -> bool:
-    """A folder with ``image_N`` and a ``calib.txt`` of rows ``P0:`` to ``P3:``, or its ``image_N``."""
+    """True for a folder with ``image_N`` and a ``calib.txt`` of rows ``P0:`` to ``P3:``, or its ``image_N``.
+
+    Args:
+        path: existing file or folder.
+    """
     return path.is_dir() and _split(path) is not None
 
 

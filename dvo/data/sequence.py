@@ -77,7 +77,11 @@ def find_groundtruth(path: Path) -> Trajectory | None:
 
 
 def matches(path: Path) -> bool:
-    """A folder without images of its own and with one (or several) folders of images in it."""
+    """True for a folder without images of its own and with one (or several) folders of images in it.
+
+    Args:
+        path: existing file or folder.
+    """
     if not path.is_dir() or has_images(path):
         return False
     return any(has_images(path / name) for name in IMAGE_FOLDERS) or any(

@@ -16,9 +16,13 @@ _SECONDS = re.compile(r"\d+\.\d+")
 
 
 def parse_stamp(text: str) -> float | None:
-    """Seconds of a stamp: a decimal number, or an integer of at least 16 digits (nanoseconds); None for anything else.
+    """Parse a time stamp: a decimal number of seconds, or an integer of at least 16 digits (nanoseconds).
 
-    A frame number (``000123``) is none, so that it is never passed off as seconds.
+    Args:
+        text: stem of a file name.
+
+    Returns:
+        Seconds; None for anything else. A frame number (``000123``) is no stamp, so that it never passes for seconds.
     """
     if _NANOSECONDS.fullmatch(text):
         return int(text) / 1e9
@@ -26,9 +30,16 @@ def parse_stamp(text: str) -> float | None:
 
 
 def read_times(path: Path, count: int | None) -> np.ndarray:
-    """First column of a text or CSV file: one row per image, in seconds (integers of 16 digits and more: nanoseconds).
+    """Read the first column of a text or CSV file: seconds, one row per image (integers of 16 digits: nanoseconds).
 
     ``#`` starts a comment; a first row of words is a header.
+
+    Args:
+        path: the file.
+        count: number of rows that there must be; None for any.
+
+    Returns:
+        ``(N,)`` float64 seconds, strictly increasing.
 
     Args:
         path: the file.
@@ -79,7 +90,15 @@ def read_times(path: Path, count: int | None) -> np.ndarray:
 
 
 def times_from_names(paths: list[Path]) -> np.ndarray | None:
-    """``(N,)`` seconds if every stem is a stamp (``1305031102.175304``, ``1403636579763555584[_0]``), else None."""
+    """Read times from file names.
+
+    Args:
+        paths: ``N`` files.
+
+    Returns:
+        ``(N,)`` float64 seconds if every stem is a stamp (``1305031102.175304``, ``1403636579763555584[_0]``), else
+        None.
+    """
     times = [parse_stamp(re.sub(r"(?<=\d{16})_0$", "", path.stem)) for path in paths]
     if not paths or any(time is None for time in times):
         return None
@@ -95,16 +114,18 @@ def choose_times(
     warnings: list[str],
     fallback: Callable[[], np.ndarray | None] = lambda: None,
 ) -> np.ndarray:
-    """Times of the images of a folder by the rule: ``times``, ``times.txt`` beside them or one level up, names that are
-    stamps, ``fallback()``, ``fps``, and last a guessed rate that is said aloud.
+    """Choose the times of the images of a folder.
+
+    The first of these that there is: ``times``, ``times.txt`` beside the images or one level up, names that are stamps,
+    ``fallback()``, ``fps``, and last an assumed rate, with a warning.
 
     Args:
         paths: the images, in order.
         folder: where ``times.txt`` is looked for, and in its parent.
         times: file that the user named.
         fps: rate that the user named.
-        warnings: receives what the user should know.
-        fallback: times that the dataset offers, e.g. those of its ground truth.
+        warnings: receives guesses and options that were not used, a sentence each.
+        fallback: times that the data set offers, e.g. those of its ground truth.
 
     Returns:
         ``(len(paths),)`` float64 seconds; may hold duplicates when they come from names.

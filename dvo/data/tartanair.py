@@ -64,7 +64,11 @@ def _layout(path: Path) -> _Layout | None:
 
 
 def matches(path: Path) -> bool:
-    """A folder with ``image_lcam_front``, with ``image_left`` and ``pose_left.txt``, or one of the test set."""
+    """True for a folder with ``image_lcam_front``, with ``image_left`` and ``pose_left.txt``, or one of the test set.
+
+    Args:
+        path: existing file or folder.
+    """
     return path.is_dir() and _layout(path) is not None
 
 

@@ -18,6 +18,16 @@ class Trajectory:
     Attributes:
         timestamps: ``(N,)`` float64 seconds.
         poses_wc: ``(N, 7)`` float64 ``tx ty tz qx qy qz qw``, camera to world.
+
+    Raises:
+        ValueError: shapes that do not match.
+
+    Example:
+        >>> import numpy as np
+        >>> poses = np.array([[0, 0, 0, 0, 0, 0, 1.0], [0, 0, 2, 0, 0, 0, 1]])
+        >>> trajectory = Trajectory(np.array([0.0, 0.5]), poses)
+        >>> len(trajectory), trajectory.path_length
+        (2, 2.0)
     """
 
     timestamps: np.ndarray
@@ -37,12 +47,17 @@ class Trajectory:
 
     @property
     def path_length(self) -> float:
-        """Sum of the distances between consecutive camera centres."""
+        """Sum of the distances between consecutive camera centres, in the unit of the positions."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
 
 def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write ``timestamp tx ty tz qx qy qz qw`` rows."""
+    """Write a trajectory in TUM's format: rows ``timestamp tx ty tz qx qy qz qw``, nine decimals.
+
+    Args:
+        path: file to write.
+        trajectory: camera-to-world poses.
+    """
     rows = np.column_stack([trajectory.timestamps, trajectory.poses_wc])
     with open(path, "w", encoding="utf-8") as file:
         file.write("# timestamp tx ty tz qx qy qz qw (camera to world)\n")
@@ -51,10 +66,22 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def read_tum(path: Path | str) -> Trajectory:
-    """Read a TUM trajectory.
+    """Read a trajectory in TUM's format: rows ``timestamp tx ty tz qx qy qz qw``, ``#`` comments.
+
+    Args:
+        path: the file; blanks or commas between the numbers.
+
+    Returns:
+        Camera-to-world poses in the order of the rows, quaternions normalised.
 
     Raises:
-        DvoError: missing file, a row without 8 numbers, or a quaternion of zero length.
+        DvoError: missing file, no rows, a row without 8 finite numbers, or a quaternion of zero length.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\\n0.5 1 2 3 0 0 0 1\\n")
+        >>> read_tum("groundtruth.txt").poses_wc
+        array([[1., 2., 3., 0., 0., 0., 1.]])
     """
     path = Path(path)
     if not path.is_file():
@@ -78,13 +105,13 @@ def read_tum(path: Path | str) -> Trajectory:
     table = np.array(rows, dtype=np.float64)
     norms = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
     if (norms < 1e-6).any():
-        raise DvoError("a quaternion has no length", file=path, field="qx qy qz qw", remedy="mend the row")
+        raise DvoError("a quaternion has no length", file=path, field="qx qy qz qw", remedy="correct the row")
     table[:, 4:] /= norms
     return Trajectory(table[:, 0].copy(), table[:, 1:].copy())
 
 
 def interpolate(trajectory: Trajectory, timestamps: np.ndarray, max_gap: float = 0.1) -> Trajectory:
-    """The trajectory at other times: positions linearly, rotations by slerp between the two neighbouring poses.
+    """Interpolate a trajectory at other times: positions linearly, rotations by slerp between the neighbouring poses.
 
     Args:
         trajectory: poses in increasing order of time.
@@ -116,6 +143,9 @@ def interpolate(trajectory: Trajectory, timestamps: np.ndarray, max_gap: float =
 def read_kitti_poses(path: Path | str) -> np.ndarray:
     """Read a KITTI pose file: a row-major 3x4 camera-to-world matrix a line.
 
+    Args:
+        path: the file.
+
     Returns:
         ``(N, 7)`` float64 poses, camera to world. The file holds no times.
 
@@ -143,7 +173,12 @@ def read_kitti_poses(path: Path | str) -> np.ndarray:
 
 
 def write_kitti_poses(path: Path | str, poses_wc: np.ndarray) -> None:
-    """Write ``(N, 7)`` camera-to-world poses as rows of a 3x4 matrix; times are not kept by this format."""
+    """Write poses in KITTI's format: a row-major 3x4 matrix a line; the format holds no times.
+
+    Args:
+        path: file to write.
+        poses_wc: ``(N, 7)`` camera to world.
+    """
     rows = pose_matrices(poses_wc)[:, :3].reshape(len(poses_wc), 12)
     with open(path, "w", encoding="utf-8") as file:
         for row in rows:

@@ -28,7 +28,11 @@ CALIBRATIONS = {
 
 
 def matches(path: Path) -> bool:
-    """A folder with ``rgb.txt``, or with ``rgb/`` and ``groundtruth.txt``."""
+    """True for a folder with ``rgb.txt``, or with ``rgb/`` and ``groundtruth.txt``.
+
+    Args:
+        path: existing file or folder.
+    """
     return (path / "rgb.txt").is_file() or ((path / "groundtruth.txt").is_file() and has_images(path / "rgb"))
 
 

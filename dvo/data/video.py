@@ -28,7 +28,11 @@ _GIVE_UP_AFTER = 900
 
 
 def matches(path: Path) -> bool:
-    """Any file (folders are for the other readers)."""
+    """True for any file; folders are for the other readers.
+
+    Args:
+        path: existing file or folder.
+    """
     return path.is_file()
 
 
@@ -76,14 +80,14 @@ def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
 
 
 class VideoRecording:
-    """A video file.
+    """Video file as a recording.
 
     Times are the container's; where it has none that increase, the frame's number over the frame rate. A rate or
     a list of times that the user gives overrides both.
 
     Args:
         path: the file.
-        request: the user's times or rate.
+        request: options of the user.
 
     Raises:
         DvoError: it does not open, holds no frame, or ``times`` has another number of rows than it has frames.
@@ -160,7 +164,15 @@ class VideoRecording:
 
 
 def open_video(path: Path, request: Request) -> Recording:
-    """Open a video file; see :class:`VideoRecording`."""
+    """Open a video file.
+
+    Args:
+        path: the file.
+        request: options of the user.
+
+    Raises:
+        DvoError: see :class:`VideoRecording`.
+    """
     return VideoRecording(path, request)
 
 

@@ -1,6 +1,7 @@
-"""Poses as numpy arrays: the little that files need (the optimiser's SE(3) on tensors lives in ``dvo.geometry``).
+"""Poses as numpy arrays, for files, ground truth and rendering (:mod:`dvo.geometry.se3` has those of the optimiser).
 
-A pose is ``tx ty tz qx qy qz qw``; all functions take any leading shape and work in float64.
+A pose is ``tx ty tz qx qy qz qw``; all functions take any leading shape and work in float64. A pose ``T_ab`` takes
+points from frame ``b`` to frame ``a``: ``x_a = R x_b + t``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,14 @@ NED_FROM_CAMERA = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 
 
 def pose_matrices(poses: np.ndarray) -> np.ndarray:
-    """``(..., 7)`` poses with quaternions of any positive length to ``(..., 4, 4)`` matrices."""
+    """Convert poses to homogeneous matrices.
+
+    Args:
+        poses: ``(..., 7)``, quaternions of any positive length.
+
+    Returns:
+        ``(..., 4, 4)`` float64.
+    """
     poses = np.asarray(poses, dtype=np.float64)
     q = poses[..., 3:] / np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
     x, y, z, w = np.moveaxis(q, -1, 0)
@@ -33,22 +41,42 @@ def pose_matrices(poses: np.ndarray) -> np.ndarray:
 
 
 def poses_from_matrices(matrices: np.ndarray) -> np.ndarray:
-    """``(..., 4, 4)`` or ``(..., 3, 4)`` rigid matrices to ``(..., 7)`` poses, ``qw >= 0``.
+    """Convert rigid matrices to poses.
 
     The quaternion is the column of largest norm of ``4 q q^T``, which never divides by something small
-    (Shepperd 1978), and which forgives rotations that are orthonormal only to the digits of a text file.
+    (Shepperd 1978), and which tolerates rotations that are orthonormal only to the digits of a text file.
+
+    Args:
+        matrices: ``(..., 4, 4)`` or ``(..., 3, 4)``.
+
+    Returns:
+        ``(..., 7)`` float64, unit quaternions with ``qw >= 0``.
     """
     m = np.asarray(matrices, dtype=np.float64)
     return np.concatenate([m[..., :3, 3], matrix_to_quaternion(m[..., :3, :3])], axis=-1)
 
 
 def compose_poses(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """``a b``: ``(..., 7)`` and ``(..., 7)``, broadcast."""
+    """Compose poses: ``T_ac = T_ab T_bc``.
+
+    Args:
+        a, b: ``(..., 7)``, broadcast against each other.
+
+    Returns:
+        ``(..., 7)`` float64, ``qw >= 0``.
+    """
     return poses_from_matrices(pose_matrices(a) @ pose_matrices(b))
 
 
 def invert_poses(poses: np.ndarray) -> np.ndarray:
-    """Inverse of ``(..., 7)`` poses."""
+    """Invert poses: ``T_ba`` of ``T_ab``.
+
+    Args:
+        poses: ``(..., 7)``.
+
+    Returns:
+        ``(..., 7)`` float64, ``qw >= 0``.
+    """
     matrices = pose_matrices(poses)
     rotation = np.swapaxes(matrices[..., :3, :3], -1, -2).copy()
     position = rotation @ matrices[..., :3, 3:]
@@ -58,7 +86,7 @@ def invert_poses(poses: np.ndarray) -> np.ndarray:
 
 
 def ned_to_camera(poses: np.ndarray) -> np.ndarray:
-    """TartanAir's NED camera-to-world poses to poses of a camera with x right, y down, z forward.
+    """Convert TartanAir's NED camera-to-world poses to those of a camera with x right, y down, z forward.
 
     Only the camera's axes are renamed; the world stays TartanAir's (z down), so that positions do not change.
 
@@ -74,7 +102,15 @@ def ned_to_camera(poses: np.ndarray) -> np.ndarray:
 
 
 def slerp(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Spherical interpolation of unit quaternions ``(N, 4)`` with ``weight`` ``(N,)`` of ``b``, along the short way."""
+    """Interpolate rotations spherically, along the shorter arc (Shoemake 1985).
+
+    Args:
+        a, b: ``(..., 4)`` unit quaternions ``qx qy qz qw``.
+        weight: ``(...)`` of ``b``, 0 to 1.
+
+    Returns:
+        ``(..., 4)`` float64 unit quaternions.
+    """
     cosine = np.sum(a * b, axis=-1, keepdims=True)
     b = np.where(cosine < 0, -b, b)
     angle = np.arccos(np.clip(np.abs(cosine), 0, 1))

@@ -262,3 +262,80 @@ def test_sequence_folder_with_an_unusual_name_for_its_images(make):
     cv2.imwrite(str(make.images("clip/more", []) / "b.png"), make.image(0))
     with pytest.raises(DvoError, match="several folders of images: more, shots"):
         open_source(make.root / "clip")
+
+
+# --- public benchmarks with ground truth of their own
+
+
+def tartanair_test(make, deeper=False):
+    make.images("mono/ME001", [f"{i:06d}.png" for i in range(3)], 640, 480)
+    make.text(
+        "mono_gt/ME001.txt" if deeper else "mono/mono_gt/ME001.txt", f"1 2 3 0 0 0 1\n1 3 3 0 0 {S} {S}\n1 4 3 0 0 0 1"
+    )
+    return make.root / "mono/ME001"
+
+
+@pytest.mark.parametrize("deeper", [True, False])
+def test_tartanair_test_set(make, deeper):
+    source = open_source(tartanair_test(make, deeper))
+    assert (source.kind, source.name, source.camera.intrinsics.tolist()) == ("tartanair", "ME001", [320, 320, 320, 240])
+    assert source.groundtruth.timestamps == pytest.approx([0, 0.1, 0.2])
+    assert source.groundtruth.positions.tolist() == [[1, 2, 3], [1, 3, 3], [1, 4, 3]]
+    forward = pose_matrices(source.groundtruth.poses_wc)[:, :3, 2]
+    assert forward[0] == pytest.approx([1, 0, 0]) and forward[1] == pytest.approx([0, 1, 0], abs=1e-9)
+    frame = next(iter(source))
+    assert frame.depth is None and frame.right is None
+
+
+def test_groundtruth_of_tartanair_that_is_named(make):
+    folder = tartanair_test(make)
+    named = open_source(folder, groundtruth="../mono_gt/ME001.txt").groundtruth
+    found = open_source(folder).groundtruth
+    assert np.array_equal(named.poses_wc, found.poses_wc) and np.array_equal(named.timestamps, found.timestamps)
+    make.text("mono/mono_gt/short.txt", "1 2 3 0 0 0 1\n")
+    with pytest.raises(DvoError, match="1 rows without times for 3 images"):
+        open_source(folder, groundtruth="../mono_gt/short.txt")
+
+
+def icl_nuim(make, name="living_room_traj2_loop", truth="TrajectoryGT/livingRoom2.gt.freiburg"):
+    make.images(name, [f"{i}.png" for i in range(12)], 640, 480)
+    make.text(truth, "".join(f"{i} {i} 0 0 0 0 0 1\n" for i in range(1, 12)))  # one row less than images
+    return make.root / name
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("living_room_traj2_loop", "TrajectoryGT/livingRoom2.gt.freiburg"),
+        ("office_room_traj0_loop", "TrajectoryGT/traj0.gt.freiburg"),
+        ("traj3_frei_png", "traj3_frei_png/traj3.gt.freiburg"),
+    ],
+)
+def test_icl_nuim(make, name, truth):
+    source = open_source(icl_nuim(make, name, truth))
+    assert (source.kind, source.camera.intrinsics.tolist()) == ("icl_nuim", [481.2, 480, 319.5, 239.5])
+    assert [frame.timestamp for frame in source] == pytest.approx(np.arange(12) / 30) and source.warnings == []
+    # the first image is number 1
+    assert source.groundtruth.timestamps == pytest.approx(np.arange(11) / 30)
+    assert source.groundtruth.positions[:, 0].tolist() == list(range(1, 12))
+    named = open_source(make.root / name, groundtruth=make.root / truth, fps=15).groundtruth
+    assert named.timestamps == pytest.approx(np.arange(11) / 15)
+
+
+def test_icl_nuim_needs_counted_stamps_and_its_names(make):
+    folder = icl_nuim(make)
+    make.text("TrajectoryGT/livingRoom2.gt.freiburg", "0.5 1 0 0 0 0 0 1\n1.5 2 0 0 0 0 0 1\n")
+    with pytest.raises(DvoError, match="count images"):
+        open_source(folder)
+    other = make.images("somewhere", ["0.png"])
+    assert open_source(other, calib=make.calib()).kind == "folder"
+
+
+def test_icl_nuim_in_tums_layout_has_depth(make):
+    folder = make.root / "living_room_traj1_frei_png"
+    make.images(f"{folder.name}/rgb", ["0.png", "1.png"], 640, 480)
+    make.text(f"{folder.name}/livingRoom1.gt.freiburg", "1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    (folder / "depth").mkdir()
+    cv2.imwrite(str(folder / "depth/1.png"), np.full((480, 640), 7500, np.uint16))
+    first, second = open_source(folder)
+    assert first.depth is None and float(second.depth[0, 0]) == 1.5

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.geometry.undistort import Undistorter, distort, undistort, undistorted_camera
+from dvo.geometry.undistort import Undistorter, distort, needs_undistortion, undistort, undistorted_camera
 
 # real lenses: TUM RGB-D freiburg1, EuRoC cam0, TUM-VI cam0
 FR1 = Camera(517.3, 516.5, 318.6, 255.3, 640, 480, "radtan", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
@@ -67,8 +67,9 @@ def test_points_that_no_ray_reaches_are_nan():
     assert np.isnan(undistort(np.array([1.7, 0.0]), Camera(190, 190, 255, 255, 512, 512, "fisheye"))).all()
 
 
-def test_fisheye_without_coefficients_still_bends():
+def test_fisheye_without_coefficients_needs_undistortion():
     camera = Camera(190, 190, 255, 255, 512, 512, "fisheye")
+    assert needs_undistortion(camera)
     assert distort(np.array([1.0, 0.0]), camera) == pytest.approx([np.pi / 4, 0])
     assert Undistorter(camera).camera.model == "none"
 
@@ -122,3 +123,39 @@ def test_no_distortion_leaves_the_image_alone():
 def test_coefficients_that_fold_the_image_are_an_error():
     with pytest.raises(DvoError, match="fold"):
         undistorted_camera(Camera(200, 200, 320, 240, 640, 480, "radtan", (-5.0, 0.0, 0.0, 0.0)))
+
+
+@LENSES
+def test_depth_is_that_of_the_nearest_ray_and_never_in_between(camera):
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    seen = (np.stack([u, v], -1) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    ideal = undistort(seen, camera)
+    # an inclined plane Z = 2 + 0.5 x, with a wall at 10 on the right, as the lens sees them
+    depth = np.where(ideal[..., 0] > 0.3, 10.0, 2 + 0.5 * ideal[..., 0]).astype(np.float32)
+    depth[np.isnan(ideal[..., 0])] = np.nan
+    undistorter = Undistorter(camera)
+    new = undistorter.camera
+    found = undistorter.depth(depth)
+    x = (np.arange(new.width) - new.cx) / new.fx
+    plane, wall = x < 0.28, x > 0.32
+    assert found.dtype == np.float32 and found.shape == depth.shape
+    assert np.isin(found[np.isfinite(found)], depth[np.isfinite(depth)]).all()  # no value that was not measured
+    seen_share = np.isfinite(found).mean()
+    assert seen_share > 0.999 if camera.model == "radtan" else seen_share > 0.9
+    # half a pixel of the lens in both directions, times the plane's slope
+    pixel = sum(np.nanmax(np.abs(part)) for part in np.gradient(ideal[..., 0]))
+    tolerance = 0.5 * 0.501 * pixel if camera.model == "radtan" else 0.02  # a fisheye's edge is stretched
+    assert np.nanmax(np.abs(found - (2 + 0.5 * x))[:, plane]) < tolerance
+    assert (np.nan_to_num(found[:, wall], nan=10) == 10).all()
+
+
+def test_unknown_depth_stays_unknown_and_a_pinhole_keeps_its_depth():
+    depth = np.full((EUROC.height, EUROC.width), np.nan, np.float32)
+    depth[200:280, 300:450] = 3
+    found = Undistorter(EUROC).depth(depth)
+    assert set(np.unique(found[np.isfinite(found)])) == {3} and 0.02 < np.isfinite(found).mean() < 0.08
+    pinhole = Camera(50, 50, 31, 23, 64, 48)
+    own = np.ones((48, 64), np.float32)
+    assert Undistorter(pinhole).depth(own) is own
+    with pytest.raises(ValueError, match="48x64"):
+        Undistorter(pinhole).depth(np.ones((24, 32), np.float32))

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Any
 
 from dvo.errors import DvoError
@@ -91,6 +90,8 @@ class Registry:
 
     def _all(self) -> dict[str, str]:
         if self._announced is None:
+            from importlib.metadata import entry_points  # slow to import
+
             found = entry_points(group=self.group) if self.group else ()
             self._announced = {entry.name: entry.value for entry in found if is_target(entry.value)}
         return {**self._announced, **self._targets}

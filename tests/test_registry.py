@@ -56,7 +56,7 @@ def test_entry_points_of_other_packages(monkeypatch):
     from importlib.metadata import EntryPoint
 
     announced = [EntryPoint("theirs", "math:tau", "dvo.parts"), EntryPoint("module", "math", "dvo.parts")]
-    monkeypatch.setattr("dvo.registry.entry_points", lambda group: announced if group == "dvo.parts" else [])
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: announced if group == "dvo.parts" else [])
     registry = Registry("part", "dvo.parts", {"ours": "math:pi"})
     assert list(registry) == ["theirs", "ours"]
     assert registry.resolve("theirs") == pytest.approx(6.283185307)

@@ -1,0 +1,132 @@
+"""A package outside ``dvo``, ``train`` and ``eval`` (``tests/outside``) brings a network, an odometry, a training task,
+a factor, a reader, a system and a scene family. It is announced by entry points, as an installed package is, and each
+part is run by the ordinary commands without editing a file."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from dvo.ba.layer import BADamping, BAOptions, bundle_adjust
+from dvo.data.trajectory import Trajectory, write_tum
+from dvo.geometry import se3
+from dvo.geometry.projection import reproject
+from dvo.nets.patchifier import patch_coordinates
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTSIDE = ROOT / "tests" / "outside"
+NAME = "distance_vo"
+
+
+def command(*arguments, cwd=ROOT):
+    """Run ``python ARGUMENTS`` with the package on the path; returns what it printed."""
+    path = os.pathsep.join([str(OUTSIDE), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)], cwd=cwd, env={**os.environ, "PYTHONPATH": path}, capture_output=True,
+        text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A recording in a layout that only the reader of the package knows."""
+    folder = tmp_path_factory.mktemp("outside") / "walk"
+    folder.mkdir()
+    images = np.random.default_rng(0).integers(0, 255, (6, 48, 64, 3), dtype=np.uint8)
+    np.save(folder / "frames.npy", images)
+    (folder / "calib.txt").write_text("50 50 31.5 23.5\n")
+    times = np.arange(6) / 10
+    write_tum(folder / "groundtruth.txt", Trajectory(times, np.column_stack([times, np.zeros((6, 5)), np.ones(6)])))
+    return folder
+
+
+def test_parts_are_announced_without_a_call():
+    listed = command("-c", (
+        "from dvo.models.registry import ARCHITECTURES; from dvo.odometry.registry import ODOMETRIES\n"
+        "from dvo.data.registry import READERS; from dvo.synth.scenes.families import FAMILIES\n"
+        "from train.tasks.registry import TASKS; from eval.systems.registry import SYSTEMS\n"
+        "print([n in r for n, r in (('distance_vo', ARCHITECTURES), ('distance_vo', ODOMETRIES), ('array', READERS),\n"
+        "    ('shed', FAMILIES), ('distance_vo', TASKS), ('standing-still', SYSTEMS))])"
+    ))  # fmt: skip
+    assert listed.strip() == str([True] * 6)
+
+
+def test_train_export_and_run(recording, tmp_path):
+    """Task, network, odometry and reader: trained, exported and tracked by the ordinary commands."""
+    saver = {"dirpath": str(tmp_path), "save_last": True, "every_n_train_steps": 1, "enable_version_counter": False}
+    settings = {
+        "task": NAME,
+        "trainer": {
+            "accelerator": "cpu", "devices": 1, "max_epochs": -1, "max_steps": 2, "log_every_n_steps": 1,
+            "enable_progress_bar": False, "enable_model_summary": False, "use_distributed_sampler": False,
+            "default_root_dir": str(tmp_path), "logger": False,
+            "callbacks": [{"class_path": "lightning.pytorch.callbacks.ModelCheckpoint", "init_args": saver}],
+        },
+        "model": {"channels": 3},
+        "data": {"frames": 2, "sizes": [[48, 64]], "workers": 0},
+    }  # fmt: skip
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(settings))
+    command("-m", "train", "fit", "--config", tmp_path / "settings.yaml", cwd=ROOT)
+    command("-m", "train", "export", tmp_path / "last.ckpt", tmp_path / "distance.safetensors")
+    assert NAME in command("-m", "dvo", "weights", "info", tmp_path / "distance.safetensors")
+    out = tmp_path / "out"
+    command("-m", "dvo", "run", recording, "--weights", tmp_path / "distance.safetensors", "--out", out, "--device",
+            "cpu", "--set", "gain=2.0")  # fmt: skip
+    facts = json.loads((out / "run.json").read_text())
+    assert facts["kind"] == "array" and facts["odometry"] == "dvo-distance" and facts["frames"]["tracked"] == 6
+
+
+def test_the_system_is_evaluated_beside_the_others(recording, tmp_path):
+    sequence = {"name": "walk", "path": "walk", "groundtruth": "groundtruth.txt"}
+    suite = {"name": "walks", "label": "a walk", "sequences": [sequence]}
+    (tmp_path / "walks.yaml").write_text(yaml.safe_dump(suite))
+    command("-m", "eval", "run", "--suite", tmp_path / "walks.yaml", "--systems", "standing-still+height=1.5,null",
+            "--data", recording.parent, "--seeds", "1", "--out", tmp_path / "runs", "--threads", "1")  # fmt: skip
+    rows = (tmp_path / "runs" / "results.csv").read_text()
+    assert "standing-still" in rows and "null" in rows
+
+
+def test_the_scene_family_is_rendered(tmp_path):
+    command("-m", "dvo", "synth", "preview", "shed", "--rows", "1", "--size", "48x32", "--out", tmp_path / "shed.png")
+    assert (tmp_path / "shed.png").stat().st_size > 1000
+
+
+def test_the_factor_fixes_the_scale(monkeypatch):
+    """A scene that is 15 % too small is brought to the known distance of two cameras, and gradients reach the distance."""
+    monkeypatch.syspath_prepend(OUTSIDE)
+    from distance_vo.factor import KnownDistance
+
+    g = torch.Generator().manual_seed(0)
+    n, m = 4, 12
+    poses = se3.exp(0.1 * torch.randn(1, n, 6, generator=g, dtype=torch.float64))
+    poses[:, 0] = se3.identity(dtype=torch.float64)
+    centres = torch.randint(4, 36, (1, n, m, 2), generator=g)
+    depth = 0.5 + torch.rand(1, n * m, generator=g, dtype=torch.float64)
+    patches = patch_coordinates(centres, depth, 3)
+    intrinsics = torch.tensor([40.0, 40, 20, 20], dtype=torch.float64).expand(1, n, 4)
+    kk = torch.arange(n * m).repeat_interleave(n)
+    jj = torch.arange(n).repeat(n * m)
+    ii = kk // m
+    targets = reproject(poses, patches, intrinsics, ii, jj, kk).coords[:, :, 1, 1]
+    start, small = poses.clone(), patches.clone()
+    start[..., :3] *= 0.85
+    small[:, :, 2] /= 0.85
+    apart = (se3.inverse(poses)[:, 0, :3] - se3.inverse(poses)[:, 3, :3]).norm(dim=-1, keepdim=True)
+    apart.requires_grad_()
+    factor = KnownDistance(apart, torch.full_like(apart, 1e4).detach(), torch.tensor([0]), torch.tensor([3]))
+    options = BAOptions(iterations=12, damping=BADamping(1e-6, 1e-6, 1e-6), bounds=(40, 40))
+    arguments = (start, small, intrinsics, targets, torch.ones_like(targets), ii, jj, kk, options)
+    found = bundle_adjust(*arguments, factors=[factor])
+    torch.testing.assert_close(found.poses_cw, poses, atol=1e-4, rtol=1e-4)
+    assert (bundle_adjust(*arguments).poses_cw - poses).abs().max() > 0.02  # without it the scale stays
+    (gradient,) = torch.autograd.grad(found.poses_cw[0, 3, :3].norm(), apart)
+    expected = poses[0, 3, :3].norm() / apart.detach()  # the whole scene grows with the distance
+    torch.testing.assert_close(gradient, expected, rtol=1e-2, atol=1e-3)

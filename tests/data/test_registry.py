@@ -88,3 +88,13 @@ def test_what_is_no_file_and_no_folder(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(DvoError, match="neither a file nor a folder"):
         open_source(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("file", ["tum.py", "depth.py", "source.py"])
+def test_cached_predictions_depend_on_every_reader(monkeypatch, file):
+    from eval.execution import versions
+
+    before = versions.reader_digest()
+    read = versions._content
+    monkeypatch.setattr(versions, "_content", lambda path: read(path) + b"#" * (path.name == file))
+    assert versions.reader_digest() != before

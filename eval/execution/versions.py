@@ -41,7 +41,14 @@ def source_files(system: System) -> list[Path]:
 
 
 def code_digest(system: System) -> str:
-    """Hash of :func:`source_files`."""
+    """Hash of :func:`source_files`.
+
+    Args:
+        system: its target need not be importable.
+
+    Returns:
+        Sixteen hexadecimal digits.
+    """
     return _digest(source_files(system))
 
 
@@ -53,7 +60,14 @@ def reader_digest() -> str:
 
 
 def library_versions(libraries: tuple[str, ...] = LIBRARIES) -> dict[str, str]:
-    """Versions of the libraries on which numbers depend, those that are installed."""
+    """Versions of the libraries on which numbers depend, those that are installed.
+
+    Args:
+        libraries: names of distributions.
+
+    Returns:
+        Version by name.
+    """
     found = {}
     for name in libraries:
         try:
@@ -64,8 +78,11 @@ def library_versions(libraries: tuple[str, ...] = LIBRARIES) -> dict[str, str]:
 
 
 def depends_on_threads(system: System) -> bool:
-    """Whether the number of threads may change the trajectory: networks and bundle adjustment on torch sum in an order
-    that depends on it, and so may a system of the user's that imports torch."""
+    """Return True if the number of threads may change the trajectory.
+
+    Networks and bundle adjustment on torch sum in an order that depends on it, and so may a system of another package
+    that imports torch.
+    """
     files = source_files(system)
     return any(
         any(file.is_relative_to(room) for room in TORCH_ROOMS)

@@ -123,6 +123,9 @@ def add_system(system: System) -> None:
     A package that only announces ``"module:Class"`` under the entry-point group ``dvo.systems`` needs no call, and is
     found by the worker processes too; licence and description are then those of the package.
 
+    Args:
+        system: with a name that is free.
+
     Raises:
         DvoError: the name is taken.
     """
@@ -160,6 +163,9 @@ def find_system(text: str, weights: str | None = None) -> System:
 
 def split_settings(text: str) -> tuple[str, dict[str, Any]]:
     """``NAME+key=value+key=value`` as name and settings; values are read as YAML.
+
+    Args:
+        text: as on the command line.
 
     Raises:
         DvoError: a value that is no YAML.

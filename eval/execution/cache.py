@@ -23,7 +23,8 @@ from dvo.odometry.results import jsonable
 from eval.execution.predict import RECORD, Job, Prediction, predict, read_prediction
 from eval.execution.versions import code_digest, depends_on_threads, library_versions, reader_digest
 from eval.suites.suite import Sequence
-from eval.systems.registry import System, find_system
+from eval.systems.registry import find_system
+from eval.systems.system import System
 
 KEY = "key.json"
 CONTENT_LIMIT = 64 * 2**20  # bytes of a sequence up to which its files are hashed; beyond, names, sizes and times
@@ -39,12 +40,12 @@ class SystemFacts:
     Attributes:
         name: as on the command line.
         label: as in the tables.
-        licence, about: see :class:`eval.systems.registry.System`.
+        licence, about: see :class:`eval.systems.system.System`.
         version: ``""`` if the system cannot run or has none.
         missing: reason why it cannot run, or None.
         code, libraries, threads: see :mod:`eval.execution.versions`; ``threads`` is whether their number may change
             results.
-        identity: target and settings, see :meth:`eval.systems.registry.System.identity`.
+        identity: target and settings, see :meth:`eval.systems.system.System.identity`.
     """
 
     name: str

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from eval.suites.suite import ROOT
 from eval.systems import plugin
-from eval.systems.registry import System
+from eval.systems.system import System
 
 LIBRARIES = ("numpy", "opencv-python-headless", "opencv-python", "scipy", "torch")
 # Rooms of the library that cannot change a trajectory, or whose output is part of the sequence's own fingerprint.

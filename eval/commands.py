@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--sequences", help="names with commas between (all of the suites)")
     run.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds 0 to N-1 (1)")
-    run.add_argument("--stride", type=int, metavar="N", help="feed every N-th image (as the suite says)")
+    run.add_argument("--stride", type=int, metavar="N", help="feed every N-th image (as in the suite)")
     run.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings ($DVO_DATA, ../shared/data)")
     run.add_argument("--out", type=Path, default=Path("results/eval"), metavar="DIR", help="results (results/eval)")
     run.add_argument("--weights", metavar="FILE", help="weights for dvo-... systems in place of the package's own")
@@ -104,7 +104,7 @@ def run(given: argparse.Namespace) -> None:
         plan.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DvoError(str(error.strerror), file=plan.out, field="--out", remedy="give another folder") from error
-    predict_all(plan, say=tell)
+    predict_all(plan, say=progress)
     _finish(plan.out, page=not given.no_report)
 
 
@@ -162,8 +162,8 @@ def vocabulary(given: argparse.Namespace) -> None:
     print(train_on_renderings(given.out, **options))
 
 
-def tell(text: str) -> None:
-    """Progress goes to the error stream, so that the table can be piped."""
+def progress(text: str) -> None:
+    """Print progress to the error stream, so that the table can be piped."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -180,7 +180,7 @@ def _finish(out: Path, page: bool) -> None:
     if page:
         write_report(out, manifest, rows)
         files.append(PAGE)
-    tell(f"results in {out}: {', '.join(files)}")
+    progress(f"results in {out}: {', '.join(files)}")
 
 
 def _state(suite, sequence, data: Path | None) -> str:  # type: ignore[no-untyped-def]

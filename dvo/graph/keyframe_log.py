@@ -127,7 +127,8 @@ class KeyframeLog:
             frame: position in :attr:`frames`; negative counts from the end.
 
         Returns:
-            ``T_cw`` in the form of the keyframes' poses, or None while the frame or its keyframe has none.
+            ``T_cw`` in the form of the keyframes' poses (not a copy where the frame is at its keyframe), or None while
+            the frame or its keyframe has none.
         """
         record = self.frames[frame]
         anchor = None if record.anchor is None else self._poses.get(record.anchor)
@@ -161,7 +162,8 @@ def _identity(pose: np.ndarray) -> np.ndarray:
 
 def _compose(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:
     """``a b`` of two poses of one form; None stands for the identity."""
-    a = _identity(b) if a is None else a
+    if a is None:
+        return b
     if _is_matrix(b):
         return a @ b
     se3, tensor = _se3()

@@ -81,14 +81,14 @@ def seconds(what: str, tree: Path, settings: Settings) -> float:
         DvoError: the process failed, or printed no time.
     """
     if what == "training":
-        told = _run([sys.executable, "-m", "train", "profile", "--steps", str(settings.steps), "--cpu-time"], tree)
-        found = _STEP.search(told)
+        output = _run([sys.executable, "-m", "train", "profile", "--steps", str(settings.steps), "--cpu-time"], tree)
+        found = _STEP.search(output)
     else:
         script = str(Path(__file__).with_name("measurements.py"))
         clip = [str(settings.data / settings.clip)] if what == "tracking" else []
         frames = ["--frames", str(settings.frames)] if settings.frames else []
-        told = _run([sys.executable, script, what, *clip, *frames], tree)
-        found = re.search(r"SECONDS ([0-9.]+)", told)
+        output = _run([sys.executable, script, what, *clip, *frames], tree)
+        found = re.search(r"SECONDS ([0-9.]+)", output)
     if found is None:
         raise DvoError("printed no time", file=tree, field=what, remedy="run the measurement by hand")
     return float(found[1])
@@ -121,7 +121,11 @@ def trajectory(tree: Path, clip: Path, out: Path) -> bytes:
 
 
 def same_trajectories(base: Path, current: Path, settings: Settings) -> dict[str, bool]:
-    """Whether both trees give the same bytes, by clip."""
+    """Compare the trajectories of both trees byte by byte.
+
+    Returns:
+        True where they are equal, by clip.
+    """
     found = {}
     with tempfile.TemporaryDirectory(prefix="dvo-tracks-") as folder:
         for name in settings.clips:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import cProfile
+import math
 import pstats
 import resource
 import time
@@ -19,7 +20,7 @@ from dvo.synth.sequence import make_sequence
 
 STAGES = {
     "encoder and patches": ("tracker.py", "_observe"),
-    "graph index": ("graph.py", "build_graph"),
+    "graph index": ("edges.py", "build_graph"),
     "reprojection": ("projection.py", "reproject"),
     "correlation": ("edge_correlation.py", "lookup"),
     "  of it fetching new windows": ("edge_correlation.py", "_refresh"),
@@ -31,7 +32,7 @@ STAGES = {
 
 def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
     rows = [row for (path, _, name), row in stats.stats.items() if path.endswith(file) and name == function]  # type: ignore[attr-defined]
-    return max((row[3] for row in rows), default=0.0)
+    return max((row[3] for row in rows), default=math.nan)  # nan: no such function ran
 
 
 def main() -> None:

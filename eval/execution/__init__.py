@@ -1,0 +1,1 @@
+"""Runs of systems on sequences, each in its own process and stored by key. Start in ``runner.py``."""

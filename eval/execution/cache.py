@@ -23,13 +23,14 @@ from dvo.odometry.results import jsonable
 from eval.execution.predict import RECORD, Job, Prediction, predict, read_prediction
 from eval.execution.versions import code_digest, depends_on_threads, library_versions, reader_digest
 from eval.suites.suite import Sequence
-from eval.systems.registry import System, find_system
+from eval.systems.registry import find_system
+from eval.systems.system import System
 
 KEY = "key.json"
 CONTENT_LIMIT = 64 * 2**20  # bytes of a sequence up to which its files are hashed; beyond, names, sizes and times
 # Fields of a sequence that change tables, or whose content is in the fingerprint; what is left chooses images.
 NOT_IN_KEY = ("name", "about", "judged_by", "path", "calib", "times", "groundtruth")
-PASSING = ("unavailable", "no data")  # states that the user mends without changing the key
+PASSING = ("unavailable", "no data")  # states that can change while the key stays
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,12 @@ class SystemFacts:
     Attributes:
         name: as on the command line.
         label: as in the tables.
-        licence, about: see :class:`eval.systems.registry.System`.
+        licence, about: see :class:`eval.systems.system.System`.
         version: ``""`` if the system cannot run or has none.
         missing: reason why it cannot run, or None.
         code, libraries, threads: see :mod:`eval.execution.versions`; ``threads`` is whether their number may change
             results.
-        identity: target and settings, see :meth:`eval.systems.registry.System.identity`.
+        identity: target and settings, see :meth:`eval.systems.system.System.identity`.
     """
 
     name: str
@@ -88,10 +89,17 @@ def system_facts(name: str, weights: str | None = None) -> SystemFacts:
 
 
 def data_fingerprint(source: Source, sequence: Sequence) -> str:
-    """A hash of the images and the calibration of an open sequence.
+    """Hash of the images and the calibration of an open sequence.
 
     Files of a small sequence are hashed whole, so that a copy elsewhere is the same; of a large one names, sizes and
     times of change count.
+
+    Args:
+        source: as opened.
+        sequence: names the files beside the images that count too.
+
+    Returns:
+        Sixteen hexadecimal digits.
     """
     digest = hashlib.sha256()
     _add(digest, [asdict(source.recorded_camera), reader_digest()])
@@ -111,7 +119,7 @@ def data_fingerprint(source: Source, sequence: Sequence) -> str:
 
 
 def job_key(job: Job, facts: SystemFacts, fingerprint: str, suite: dict[str, Any]) -> dict[str, Any]:
-    """Everything that the trajectory of a job depends on, JSON-able.
+    """Key of a prediction: everything that the trajectory of a job depends on, JSON-able.
 
     Args:
         fingerprint: of the data, see :func:`data_fingerprint`.
@@ -135,12 +143,12 @@ def job_key(job: Job, facts: SystemFacts, fingerprint: str, suite: dict[str, Any
 
 
 def digest_of(key: dict[str, Any]) -> str:
-    """Twelve letters for the name of a folder."""
+    """Twelve hexadecimal digits of the hash of a key, for the name of a folder."""
     return hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def reusable(job: Job, retry: bool = False) -> Prediction | None:
-    """The prediction that lies in the job's folder, unless it has to be made (again).
+    """Prediction in the job's folder, or None if it has to be made (again).
 
     Args:
         retry: make failed ones again.
@@ -163,7 +171,17 @@ def obtain(
     run: Callable[[Job], Prediction] = predict,
     retry: bool = False,
 ) -> tuple[Prediction, bool]:
-    """The prediction of a job, and whether it was there already. What is written appears in one step."""
+    """Prediction of a job, made now unless it is there; a new one appears in its folder in one step.
+
+    Args:
+        job: with its folder.
+        key: written beside the prediction.
+        run: makes a prediction.
+        retry: make failed ones again.
+
+    Returns:
+        The prediction, and whether it was there already.
+    """
     found = reusable(job, retry)
     if found is not None:
         return found, True
@@ -174,7 +192,14 @@ def obtain(
 
 
 def part_folder(job: Job) -> Path:
-    """Where a job works until it is done: beside its folder, so that a rename is enough."""
+    """Folder in which a job works until it is done: beside its own, so that a rename is enough.
+
+    Args:
+        job: its folder need not exist.
+
+    Returns:
+        Folder, made now.
+    """
     folder = Path(job.folder)
     part = folder.with_name(f".part-{folder.name}-{os.getpid()}-{threading.get_ident()}")
     part.mkdir(parents=True, exist_ok=True)
@@ -182,27 +207,33 @@ def part_folder(job: Job) -> Path:
 
 
 def commit(part: Path, folder: Path, key: dict[str, Any]) -> None:
-    """Make a finished prediction appear."""
+    """Move a finished prediction into its folder.
+
+    Args:
+        part: folder in which the prediction was made.
+        folder: its place; replaced if it exists.
+        key: written as ``key.json``.
+    """
     (part / KEY).write_text(json.dumps(key, indent=1) + "\n", encoding="utf-8")
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(part, folder)
 
 
 def sweep(predictions: Path) -> None:
-    """Remove what killed runs have left half done. Only for the one who holds the folder."""
+    """Remove unfinished predictions of killed runs. Only for the process that holds the lock of the folder."""
     for part in predictions.rglob(".part-*"):
         shutil.rmtree(part, ignore_errors=True)
 
 
 def slug(name: str) -> str:
-    """A name as part of a path."""
+    """Name as part of a path, every other character replaced by ``_``."""
     return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_") or "_"
 
 
 def _version(system: System) -> str:
     try:
         return system.version()
-    except Exception:  # the run itself will say what is wrong with a system that cannot name its version
+    except Exception:  # the run itself will report what is wrong with a system without a version
         return ""
 
 

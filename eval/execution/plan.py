@@ -1,4 +1,4 @@
-"""What an evaluation consists of, and ``run.json``, from which scores and reports are made without the command line."""
+"""Plan of an evaluation, and its record ``run.json``, from which scores and reports are made later."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MANIFEST, PREDICTIONS, GROUNDTRUTH = "run.json", "predictions", "groundtruth"
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run and where to put it.
+    """Plan of an evaluation.
 
     Attributes:
         suites, systems, seeds: every sequence of the suites, times the systems, times the seeds, is the list of runs.
@@ -62,7 +62,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What ``run.json`` holds.
+    """Content of ``run.json``.
 
     Attributes:
         suites, systems, seeds: of the plan; systems by the names in the tables.
@@ -88,7 +88,16 @@ class Manifest:
 
 
 def write_manifest(plan: Plan, runs: list[Run], facts: dict[str, SystemFacts]) -> Manifest:
-    """Write ``run.json`` into the plan's folder, whole or not at all."""
+    """Write ``run.json`` into the plan's folder, whole or not at all.
+
+    Args:
+        plan: names the folder.
+        runs: every run of the plan.
+        facts: of the systems, by label.
+
+    Returns:
+        Content of the file.
+    """
     manifest = Manifest(
         plan.suites,
         tuple(facts),
@@ -111,6 +120,9 @@ def write_manifest(plan: Plan, runs: list[Run], facts: dict[str, SystemFacts]) -
 def read_manifest(out: Path) -> Manifest:
     """Read ``run.json``.
 
+    Args:
+        out: folder of an evaluation.
+
     Raises:
         DvoError: there is none, or it is no such file.
     """
@@ -131,18 +143,30 @@ def read_manifest(out: Path) -> Manifest:
 
 
 def prediction_folder(plan: Plan, system: str, suite: Suite, sequence: Sequence, seed: int, digest: str) -> Path:
-    """Where one run's prediction lies."""
+    """Folder of the prediction of one run.
+
+    Args:
+        plan: names the folder of results.
+        system: label.
+        suite, sequence, seed: of the run.
+        digest: of the key of the prediction.
+    """
     place = plan.out / PREDICTIONS / slug(system) / slug(suite.name) / slug(sequence.name)
     return place / f"seed{seed}-{digest}"
 
 
 def groundtruth_file(out: Path, suite: str, sequence: str) -> Path:
-    """Where the ground truth of a sequence is kept."""
+    """File with the copy of the ground truth of a sequence.
+
+    Args:
+        out: folder of an evaluation.
+        suite, sequence: names.
+    """
     return out / GROUNDTRUTH / slug(suite) / f"{slug(sequence)}.txt"
 
 
 def machine() -> str:
-    """The processor, in words."""
+    """Name of the processor and number of its cores."""
     name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():

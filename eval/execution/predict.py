@@ -1,4 +1,4 @@
-"""The first half of an evaluation: run a system on a sequence and keep what it says, without looking at ground truth.
+"""First half of an evaluation: run a system on a sequence and store its trajectory, without the ground truth.
 
 Each run has its own process (:func:`predict`), so that peak memory is its own, a hang meets the time limit, and a crash
 of native code stays outside; its folder then holds ``trajectory.txt`` and ``prediction.json``.
@@ -58,12 +58,12 @@ class Job:
 
 @dataclass
 class Prediction:
-    """What a run left behind.
+    """Record of a run.
 
     Attributes:
         status: ``ok``, ``crashed``, ``timeout``, ``invalid`` (poses that are not finite), ``unavailable`` (the system),
             ``no data`` (the sequence).
-        reason: in words, where the status is not ok.
+        reason: message, where the status is not ok.
         version: of the system.
         stamps: times of the frames that were fed, seconds.
         tracked: rows of the trajectory.
@@ -73,7 +73,7 @@ class Prediction:
         peak_memory_mb: of the whole process.
         threads, device, parallel, time_limit: of the job, under which the resources were measured.
         dark: stretches of frames that show nothing, between lit ones: first and last stamp of each.
-        info: what the system says of itself.
+        info: :attr:`dvo.odometry.protocol.Result.info` of the system.
     """
 
     status: str
@@ -94,7 +94,14 @@ class Prediction:
 
 
 def predict(job: Job) -> Prediction:
-    """Run a job in a process of its own and wait for it. Never raises on a run that fails."""
+    """Run a job in a process of its own and wait for it. Never raises on a run that fails.
+
+    Args:
+        job: its folder is emptied first.
+
+    Returns:
+        The record; ``unavailable``, ``timeout`` or ``crashed`` where the system did not come to an end.
+    """
     folder = Path(job.folder)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -116,7 +123,14 @@ def predict(job: Job) -> Prediction:
 
 
 def predict_here(job: Job) -> Prediction:
-    """Run a job in this process: what the worker does."""
+    """Run a job in this process: what the worker does.
+
+    Args:
+        job: its folder exists.
+
+    Returns:
+        The record, which is written too.
+    """
     folder = Path(job.folder)
     system = find_system(job.system, job.weights)
     version = ""
@@ -127,7 +141,7 @@ def predict_here(job: Job) -> Prediction:
     try:
         version = system.version()
         prediction, trajectory = drive(system.build(job.seed, job.device), source)
-    except Exception as error:  # whatever a system raises is its result, and becomes a row
+    except Exception as error:  # an error of a system is its result, and becomes a row
         return write_prediction(job, Prediction("crashed", f"{type(error).__name__}: {error}", version))
     prediction.version = version
     if prediction.status == "ok":
@@ -179,6 +193,9 @@ def drive(odometry: Odometry, source: Source) -> tuple[Prediction, Trajectory]:
 def read_prediction(folder: Path | str) -> Prediction:
     """Read a record.
 
+    Args:
+        folder: of a run.
+
     Raises:
         DvoError: there is none.
     """
@@ -189,7 +206,11 @@ def read_prediction(folder: Path | str) -> Prediction:
 
 
 def read_trajectory(folder: Path | str) -> Trajectory:
-    """The trajectory of a run, without rows where it left none."""
+    """The trajectory of a run, without rows where it left none.
+
+    Args:
+        folder: of a run.
+    """
     path = Path(folder) / TRAJECTORY
     if not path.is_file() or path.read_text(encoding="utf-8").count("\n") < 2:
         return Trajectory(np.zeros(0), np.zeros((0, 7)))
@@ -210,7 +231,15 @@ def process_peak_mb() -> float | None:
 
 
 def write_prediction(job: Job, prediction: Prediction) -> Prediction:
-    """Put a record into the job's folder, whole or not at all."""
+    """Write a record into the job's folder, whole or not at all.
+
+    Args:
+        job: its folder and circumstances.
+        prediction: record; the circumstances are filled in.
+
+    Returns:
+        The record.
+    """
     prediction.threads, prediction.device = job.threads, job.device
     prediction.parallel, prediction.time_limit = job.parallel, job.time_limit
     path = Path(job.folder) / RECORD

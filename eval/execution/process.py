@@ -17,16 +17,16 @@ _stopped = threading.Event()
 
 
 class StoppedError(Exception):
-    """The program was ended because the whole evaluation was: this says nothing of the program."""
+    """The program was ended together with the whole evaluation, for no fault of its own."""
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a program ended.
+    """End of a program.
 
     Attributes:
         code: exit code, minus the number of the signal that killed it; None if the time ran out.
-        last_line: of what it wrote.
+        last_line: of its output.
     """
 
     code: int | None
@@ -41,6 +41,15 @@ class Ending:
 
 def run_limited(command: list[str], environment: dict[str, str], seconds: float, log: Path) -> Ending:
     """Run a program; what it writes goes to ``log``. When the time is out it ends with all that it has started.
+
+    Args:
+        command: program and arguments.
+        environment: variables of the program.
+        seconds: time limit.
+        log: file for its output.
+
+    Returns:
+        Exit code and last line of output.
 
     Raises:
         StoppedError: :func:`end_all` was called.

@@ -1,4 +1,4 @@
-"""The first step for a whole plan: open every sequence once, then make the predictions that are not there yet."""
+"""Runs of a whole plan: open every sequence once, then make the predictions that are missing."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from eval.execution.predict import Job, Prediction, predict, write_prediction
 from eval.suites.selection import is_rendered, settle
 from eval.suites.suite import Sequence, Suite, open_sequence
 
-# Of a suite: how it is judged and described, not which images it has.
+# Fields of a suite that change how it is judged and described, not its images.
 _JUDGING = ("label", "sequences", "alignment", "rpe_gap", "stride", "lost_below", "time_limit", "download")
 _LOCK = ".lock"
 
@@ -64,6 +64,11 @@ def predict_all(plan: Plan, say: Callable[[str], None], run: Callable[[Job], Pre
 
     One run at a time unless the plan has several workers, so that speed means something.
 
+    Args:
+        plan: what runs, on what, and where.
+        say: called with a line for each run.
+        run: makes a prediction.
+
     Raises:
         DvoError: a system that does not exist (before anything runs), another evaluation at work in the same folder, or
             a Ray cluster that cannot be reached.
@@ -94,7 +99,16 @@ def predict_all(plan: Plan, say: Callable[[str], None], run: Callable[[Job], Pre
 
 
 def open_once(plan: Plan, suite: Suite, sequence: Sequence, say: Callable[[str], None]) -> Opened:
-    """Find a sequence, keep a copy of its ground truth, and take the fingerprint of its data."""
+    """Find a sequence, keep a copy of its ground truth, and take the fingerprint of its data.
+
+    Args:
+        plan: of the evaluation.
+        suite, sequence: to open.
+        say: called before a rendering, which takes a while.
+
+    Returns:
+        The sequence as found, with the problem if it cannot be used.
+    """
     truth_file = groundtruth_file(plan.out, suite.name, sequence.name)
     if is_rendered(sequence):
         say(f"{suite.name}: {sequence.name}")  # rendering it for the first time takes a while
@@ -110,7 +124,18 @@ def open_once(plan: Plan, suite: Suite, sequence: Sequence, say: Callable[[str],
 
 
 def make_task(plan: Plan, suite: Suite, opened: Opened, facts: SystemFacts, seed: int) -> Task:
-    """The job of one run, its folder named by its key."""
+    """The job of one run, its folder named by its key.
+
+    Args:
+        plan: of the evaluation.
+        suite: of the sequence.
+        opened: the sequence as found.
+        facts: of the system.
+        seed: of the run.
+
+    Returns:
+        Job, key, and the problem that keeps it from running.
+    """
     job = Job(
         system=facts.name,
         sequence=opened.sequence,

@@ -13,7 +13,7 @@ from pathlib import Path
 from dvo.data.registry import READERS
 from eval.suites.suite import ROOT
 from eval.systems import plugin
-from eval.systems.registry import System
+from eval.systems.system import System
 
 LIBRARIES = ("numpy", "opencv-python-headless", "opencv-python", "scipy", "torch")
 # Rooms of the library that cannot change a trajectory, or whose output is part of the sequence's own fingerprint.
@@ -42,7 +42,14 @@ def source_files(system: System) -> list[Path]:
 
 
 def code_digest(system: System) -> str:
-    """Hash of :func:`source_files`."""
+    """Hash of :func:`source_files`.
+
+    Args:
+        system: its target need not be importable.
+
+    Returns:
+        Sixteen hexadecimal digits.
+    """
     return _digest(source_files(system))
 
 
@@ -55,7 +62,14 @@ def reader_digest() -> str:
 
 
 def library_versions(libraries: tuple[str, ...] = LIBRARIES) -> dict[str, str]:
-    """Versions of the libraries on which numbers depend, those that are installed."""
+    """Versions of the libraries on which numbers depend, those that are installed.
+
+    Args:
+        libraries: names of distributions.
+
+    Returns:
+        Version by name.
+    """
     found = {}
     for name in libraries:
         try:
@@ -66,8 +80,11 @@ def library_versions(libraries: tuple[str, ...] = LIBRARIES) -> dict[str, str]:
 
 
 def depends_on_threads(system: System) -> bool:
-    """Whether the number of threads may change the trajectory: networks and bundle adjustment on torch sum in an order
-    that depends on it, and so may a system of the user's that imports torch."""
+    """Return True if the number of threads may change the trajectory.
+
+    Networks and bundle adjustment on torch sum in an order that depends on it, and so may a system of another package
+    that imports torch.
+    """
     files = source_files(system)
     return any(
         any(file.is_relative_to(room) for room in TORCH_ROOMS)

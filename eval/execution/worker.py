@@ -15,7 +15,11 @@ from eval.suites.selection import sequence_from
 
 
 def main(path: str) -> None:
-    """Do the job in the file; the prediction lies in the job's folder afterwards."""
+    """Do the job in the file; the prediction lies in the job's folder afterwards.
+
+    Args:
+        path: JSON form of a :class:`eval.execution.predict.Job`.
+    """
     die_with_parent()
     entry = json.loads(Path(path).read_text(encoding="utf-8"))
     job = Job(**{**entry, "sequence": sequence_from(entry["sequence"])})

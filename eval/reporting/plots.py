@@ -32,7 +32,7 @@ LOG_SPREAD = 8.0  # largest over smallest typical error, from which an axis is l
 
 @dataclass(frozen=True)
 class Style:
-    """How a system is drawn."""
+    """Colour, line and marker of a system."""
 
     color: str
     line: Any = "-"
@@ -68,7 +68,7 @@ def plot_sequence(
 
     Args:
         groundtruth: camera to world, metres.
-        estimates: by the name in the legend; aligned here, as the suite says.
+        estimates: by the name in the legend; aligned here by the alignment of the suite.
         dark: stretches without light, shaded.
     """
     figure = _figure(10.4, 4.3)

@@ -74,7 +74,13 @@ class Shown:
 
 
 def write_tables(out: Path, manifest: Manifest, rows: list[Row]) -> str:
-    """Write results.csv, table.md (a table per suite) and axes.md; returns the text of table.md."""
+    """Write results.csv, table.md (a table per suite) and axes.md; returns the text of table.md.
+
+    Args:
+        out: folder of the evaluation.
+        manifest: of the evaluation.
+        rows: of all its runs.
+    """
     write_csv(out / RESULTS, rows)
     table = "\n".join(markdown(manifest, suite, rows) for suite in manifest.suites)
     (out / TABLE).write_text(table, encoding="utf-8")
@@ -86,6 +92,15 @@ def write_report(
     out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str], None] = lambda text: None
 ) -> Path:
     """Write report.html with all figures in it, and the figures beside it as SVG files.
+
+    Args:
+        out: folder of the evaluation.
+        manifest: of the evaluation.
+        rows: of all its runs.
+        say: called with a line for each figure.
+
+    Returns:
+        Path of the page.
 
     Raises:
         DvoError: jinja2 is not installed.
@@ -107,7 +122,14 @@ def write_report(
 
 
 def content(out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str], None]) -> dict[str, Any]:
-    """Everything that the page shows."""
+    """Everything that the page shows.
+
+    Args:
+        out, manifest, rows, say: see :func:`write_report`.
+
+    Returns:
+        Variables of the template.
+    """
     axes = axes_of(manifest)
     figures = Figures(out / FIGURE_FOLDER)
     sections = []
@@ -167,7 +189,12 @@ def shown_cells(axis: Axis, manifest: Manifest, rows: list[Row]) -> list[Shown]:
 
 
 def shade(found: Cell, zero: float) -> str:
-    """Class of a cell: how its median stands to that of knowing nothing (null), in steps."""
+    """Class of a cell: how its median stands to that of knowing nothing (null), in steps.
+
+    Args:
+        found: of a system on an axis.
+        zero: median of the null system; nan without one.
+    """
     if not math.isfinite(found.median):
         return "lost"
     if not (math.isfinite(zero) and zero > 0):
@@ -214,7 +241,15 @@ def speed_figures(axes: list[Axis], manifest: Manifest, rows: list[Row], figures
 
 
 def overall(system: str, rows: list[Row]) -> list[str]:
-    """A line of the table of systems: over all their runs."""
+    """A line of the table of systems: over all their runs.
+
+    Args:
+        system: label.
+        rows: of all runs.
+
+    Returns:
+        Texts of the columns of ``OVERALL`` and of the resources.
+    """
     mine = [row for row in rows if row.system == system and row.status not in VOID]
     cells = []
     for _, field, digits in OVERALL:

@@ -24,7 +24,15 @@ from eval.suites.suite import Suite
 
 
 def axis_table(manifest: Manifest, rows: list[Row]) -> str:
-    """Table of systems by axis for the README: medians, bold the best of a line, failed runs in brackets."""
+    """Table of systems by axis for the README: medians, bold the best of a line, failed runs in brackets.
+
+    Args:
+        manifest: of the evaluation.
+        rows: of all its runs.
+
+    Returns:
+        Markdown.
+    """
     systems = list(manifest.systems)
     lines = [_line(["axis", "median", *systems]), _line(["---", "---", *["--:"] * len(systems)])]
     for axis in axes_of(manifest):
@@ -34,7 +42,12 @@ def axis_table(manifest: Manifest, rows: list[Row]) -> str:
 
 
 def write_csv(path: Path, rows: Iterable[Row]) -> None:
-    """Every run, one line each; an empty cell is a value without meaning, ``inf`` one that was never reached."""
+    """Every run, one line each; an empty cell is a value without meaning, ``inf`` one that was never reached.
+
+    Args:
+        path: file; replaced if it exists.
+        rows: in the order of the file.
+    """
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
@@ -48,6 +61,11 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     Every figure is the median over seeds, with minimum and maximum in brackets where they differ. A failed run counts
     as infinite in the median of an error, so a system that fails more often than not has no figure. The best value of
     the column that decides a sequence is bold.
+
+    Args:
+        manifest: of the evaluation.
+        suite: of the table.
+        rows: of all runs; those of other suites are left out.
     """
     rows = [row for row in rows if row.suite == suite.name]
     systems = list(dict.fromkeys(row.system for row in rows))
@@ -79,7 +97,13 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
 
 
 def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
-    """What the figures of a suite stand for, in a few sentences (Markdown)."""
+    """Protocol of a suite in a few sentences (Markdown).
+
+    Args:
+        manifest: of the evaluation.
+        suite: to describe.
+        rows: of its runs.
+    """
     seeds = manifest.seeds
     sizes = {
         name: ", ".join(dict.fromkeys(r.resolution for r in rows if r.system == name and r.resolution))
@@ -108,7 +132,7 @@ def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
 
 
 def speed_note(manifest: Manifest, rows: list[Row]) -> str:
-    """How the speed columns were taken."""
+    """Sentence on the measurement of the speed columns."""
     threads = sorted({row.threads for row in rows if row.threads}) or [manifest.threads]
     counts = " or ".join(map(str, threads)) + f" thread{'s' if threads != [1] else ''}"
     parallel = max((row.parallel for row in rows), default=1)

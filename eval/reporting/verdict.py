@@ -31,7 +31,12 @@ class Verdict:
 
 
 def verdicts(manifest: Manifest, rows: list[Row]) -> list[Verdict]:
-    """One for each system of ours (names beginning with ``dvo``) that ran."""
+    """One for each system of ours (names beginning with ``dvo``) that ran.
+
+    Args:
+        manifest: of the evaluation.
+        rows: of all its runs.
+    """
     return [found for name in manifest.systems if name.startswith("dvo") and (found := _verdict(name, manifest, rows))]
 
 

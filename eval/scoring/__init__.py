@@ -1,0 +1,1 @@
+"""Errors of stored trajectories, and their summary over runs. Start in ``score.py``."""

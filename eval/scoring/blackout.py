@@ -1,4 +1,4 @@
-"""Sequences that go dark for a while: where, how well each lit part was tracked, how soon the way was found again."""
+"""Errors on sequences that go dark for a while: of each lit part, and the time until the pose is right again."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ NEAR_PERCENT, NEAR_DEGREES = 10.0, 10.0  # found again: within this part of the 
 
 @dataclass(frozen=True)
 class BlackoutErrors:
-    """How a run took the dark.
+    """Errors of a run on a sequence with stretches of dark.
 
     Attributes:
-        blackouts: how many.
+        blackouts: number of stretches.
         segment_ate_percent: every lit part aligned on its own; root mean square error in percent of the lit path; inf
-            if a lit part has no trajectory. This asks whether tracking works again, in whatever world.
+            if a lit part has no trajectory. Low if tracking works again after the dark, in any world frame.
         recovery_s: mean time from the return of light until the pose is right again in the world of before the dark.
             inf if it never is: only a system that relocalises has a number here, or one that has guessed the motion.
     """
@@ -34,7 +34,11 @@ class BlackoutErrors:
 
 
 def is_dark(image: np.ndarray) -> bool:
-    """Whether a ``(H, W, 3)`` uint8 image shows nothing."""
+    """Return True if a ``(H, W, 3)`` uint8 image shows nothing.
+
+    Args:
+        image: RGB.
+    """
     sample = image[::4, ::4].astype(np.float32)
     return float(sample.mean()) < DARK_MEAN and float(sample.std()) < DARK_SPREAD
 
@@ -58,7 +62,13 @@ def dark_spans(stamps: np.ndarray, dark: np.ndarray) -> list[tuple[float, float]
 def blackout_errors(
     estimate: Trajectory, reference: Trajectory, spans: list[tuple[float, float]], align: Alignment
 ) -> BlackoutErrors:
-    """Judge a run on a sequence with stretches of dark (``spans``, from :func:`dark_spans`)."""
+    """Judge a run on a sequence with stretches of dark (``spans``, from :func:`dark_spans`).
+
+    Args:
+        estimate, reference: camera to world, metres and seconds.
+        spans: first and last dark stamp of each stretch, seconds.
+        align: alignment of each lit part.
+    """
     if not spans or not len(reference):
         return BlackoutErrors()
     return BlackoutErrors(

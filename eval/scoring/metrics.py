@@ -1,4 +1,4 @@
-"""Errors by evo, and the protocols that evo has not: KITTI's segments, the relative-pose AUC, per-frame scale.
+"""Errors by evo, and protocols that evo does not have: KITTI's segments, relative-pose AUC, per-frame scale.
 
 Each function takes an estimate and a reference as camera-to-world trajectories in metres and seconds; a value without a
 meaning is nan.
@@ -74,6 +74,12 @@ def align_pair(
     """Match and align. Where that has no meaning, dvo's :class:`Metrics` that say why.
 
     evo refuses to align points on a line, as the turn about the line is open; then dvo's fit is taken.
+
+    Args:
+        estimate, reference: camera to world, metres and seconds.
+        align: ``none``, ``scale``, ``se3`` or ``sim3``.
+        rpe_gap: frames between the two of a relative error.
+        max_dt: largest difference of matched stamps, seconds.
     """
     ours = evaluate(estimate, reference, align, rpe_gap=rpe_gap, max_dt=max_dt)
     if not math.isfinite(ours.ate_rmse):
@@ -102,7 +108,11 @@ def evo_metrics(
     rpe_gap: int = 1,
     max_dt: float = 0.01,
 ) -> Metrics:
-    """:func:`dvo.metrics.evaluate` with ATE, RPE, scale and path length computed by evo."""
+    """:func:`dvo.metrics.evaluate` with ATE, RPE, scale and path length computed by evo.
+
+    Args:
+        estimate, reference, align, rpe_gap, max_dt: see :func:`align_pair`.
+    """
     pair = align_pair(estimate, reference, align, rpe_gap=rpe_gap, max_dt=max_dt)
     return metrics_of(pair) if isinstance(pair, Aligned) else pair
 
@@ -129,7 +139,12 @@ def metrics_of(pair: Aligned) -> Metrics:
 
 
 def absolute_rmse(pair: Aligned, angle: bool = False) -> float:
-    """Root mean square distance to the reference, metres; or the angle between orientations, degrees (evo's APE)."""
+    """Root mean square distance to the reference, metres; or the angle between orientations, degrees (evo's APE).
+
+    Args:
+        pair: from :func:`align_pair`.
+        angle: orientations in place of positions.
+    """
     from evo.core import metrics
 
     relation = metrics.PoseRelation.rotation_angle_deg if angle else metrics.PoseRelation.translation_part
@@ -202,6 +217,14 @@ def relative_pose_auc(
     The error of a pair ``i, i + gap`` of reference frames is the larger of its rotation error and the angle between the
     translations' directions (rotation alone where the reference hardly moves: under a tenth of its median step). The
     area under a curve of steps is ``mean(max(0, 1 - error / threshold))``. A pair that the estimate lacks fails.
+
+    Args:
+        estimate, reference: camera to world, seconds.
+        gap: frames between the two of a pair.
+        max_dt: largest difference of matched stamps, seconds.
+
+    Returns:
+        Area by threshold, degrees; nan for a reference that is too short.
     """
     if len(reference) <= gap:
         return dict.fromkeys(AUC_DEGREES, math.nan)
@@ -225,6 +248,13 @@ def per_frame_scale(estimate: Trajectory, reference: Trajectory, max_dt: float =
 
     This is how TartanVO and its heirs report; it hands the estimate one true number per frame, so its ATE stands in a
     column of its own and is never compared with an ordinary one. A step without a direction stays at zero.
+
+    Args:
+        estimate, reference: camera to world, seconds.
+        max_dt: largest difference of matched stamps, seconds.
+
+    Returns:
+        Camera to world at the matched stamps of the reference.
     """
     i, j = associate(estimate, reference, max_dt)
     track = pose_matrices(estimate.poses_wc[i])

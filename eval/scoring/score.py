@@ -1,4 +1,4 @@
-"""The second step: compare what the runs left behind with ground truth. Errors are evo's where evo has them."""
+"""Second half of an evaluation: compare trajectories with ground truth. Errors are evo's where evo has them."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ class Row:
 
     Attributes:
         ate_rmse, ate_percent: metres, percent of the path; after the alignment, as all errors.
-        rpe_trans, rpe_rot_deg: median over all pairs as many frames apart as the suite says; ``_rmse`` beside.
-        rotation_error_ratio: sum of relative rotation errors over sum of relative rotations; 1 for one who never turns.
+        rpe_trans, rpe_rot_deg: median over all pairs of frames :attr:`Suite.rpe_gap` apart; ``_rmse`` beside.
+        rotation_error_ratio: sum of relative rotation errors over sum of relative rotations; 1 without any turn.
         scale_drift: scale of the last third over scale of the first, minus 1.
         t_rel, r_rel, kitti_longest_m: see :class:`eval.scoring.metrics.SegmentErrors`.
         auc: DPVO's, of this run: ``max(0, 1 - ATE)`` with a metre as threshold, 0 for a failed run.
         pose_auc_1, ...: see :func:`eval.scoring.metrics.relative_pose_auc`; 0 for a failed run.
-        ate_per_frame_scale: metres, every step given the true length first; comparable with nothing but itself.
+        ate_per_frame_scale: metres, every step given the true length first; not comparable with an ordinary ATE.
         ate_rot_deg: root mean square angle to the truth after the alignment.
         rpe_distance_m, rpe_distance_percent, rpe_distance_deg: see :class:`eval.scoring.metrics.PathErrors`.
         blackouts, segment_ate_percent, recovery_s: see :class:`eval.scoring.blackout.BlackoutErrors`.
@@ -103,7 +103,15 @@ COLUMNS = tuple(column.name for column in fields(Row))
 
 
 def score_all(out: Path, manifest: Manifest) -> list[Row]:
-    """Every run of an evaluation as a row, those that were never made included."""
+    """Every run of an evaluation as a row, those that were never made included.
+
+    Args:
+        out: folder of the evaluation.
+        manifest: names its runs.
+
+    Returns:
+        Rows in the order of the runs.
+    """
     truths: dict[tuple[str, str], Trajectory | None] = {}
     rows = []
     for run in manifest.runs:
@@ -116,7 +124,14 @@ def score_all(out: Path, manifest: Manifest) -> list[Row]:
 
 
 def score_run(out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory | None) -> Row:
-    """One run of an evaluation as a row."""
+    """One run of an evaluation as a row.
+
+    Args:
+        out: folder of the evaluation.
+        manifest: of the evaluation.
+        run: to score.
+        groundtruth: of the whole sequence; None where there are no data.
+    """
     suite = manifest.suite(run.suite)
     sequence = next(sequence for sequence in suite.sequences if sequence.name == run.sequence)
     folder = out / run.folder

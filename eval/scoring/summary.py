@@ -1,7 +1,7 @@
 """Summary of runs: median, range, failures and the best system; the one source of tables, report, verdicts and figures.
 
 One rule for all of them: a failed run counts as an infinite error and is never left out; a value without a meaning
-(nan) is left out; a run that could not be made (no data, system not installed) says nothing about the system and is
+(nan) is left out; a run that could not be made (no data, system not installed) is
 left out where systems are compared over an axis.
 """
 
@@ -132,7 +132,11 @@ def summarise(values: Iterable[float], failed: int = 0, runs: int | None = None)
 
 
 def quartiles(values: Iterable[float]) -> tuple[float, float, float] | None:
-    """Quartiles of the runs that did not fail; None without any."""
+    """Quartiles of the runs that did not fail; None without any.
+
+    Args:
+        values: infinite for a failed run, nan without a meaning.
+    """
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return None
@@ -141,17 +145,32 @@ def quartiles(values: Iterable[float]) -> tuple[float, float, float] | None:
 
 
 def errors_of(rows: Iterable[Row], field: str) -> list[float]:
-    """Field of every row, infinite where the run failed."""
+    """Field of every row, infinite where the run failed.
+
+    Args:
+        rows: of some runs.
+        field: column of results.csv.
+    """
     return [math.inf if row.failed else float(getattr(row, field)) for row in rows]
 
 
 def error_cell(rows: Sequence[Row], field: str) -> Cell:
-    """Summary of an error over some runs."""
+    """Summary of an error over some runs.
+
+    Args:
+        rows: of some runs.
+        field: column of results.csv.
+    """
     return summarise(errors_of(rows, field), failed=sum(row.failed for row in rows))
 
 
 def resource_cell(rows: Sequence[Row], field: str) -> Cell:
-    """Summary of a quantity that failed runs have too: speed, memory, completeness."""
+    """Summary of a quantity that failed runs have too: speed, memory, completeness.
+
+    Args:
+        rows: of some runs.
+        field: column of results.csv.
+    """
     return summarise([float(getattr(row, field)) for row in rows], failed=sum(row.failed for row in rows))
 
 
@@ -192,7 +211,16 @@ def axis_rows(axis: Axis, system: str, rows: Iterable[Row]) -> list[Row]:
 
 
 def axis_cell(axis: Axis, system: str, rows: Iterable[Row]) -> Cell:
-    """Summary of one system on one axis."""
+    """Summary of one system on one axis.
+
+    Args:
+        axis: line of the table.
+        system: label.
+        rows: of all runs.
+
+    Returns:
+        A cell with a note where no run was made, or none has a value.
+    """
     mine = axis_rows(axis, system, rows)
     made = [row for row in mine if row.status not in VOID]
     if not made:
@@ -202,7 +230,13 @@ def axis_cell(axis: Axis, system: str, rows: Iterable[Row]) -> Cell:
 
 
 def axis_cells(axis: Axis, systems: Iterable[str], rows: Sequence[Row]) -> dict[str, Cell]:
-    """A line of the table of systems by axis, the best marked to the digits shown."""
+    """A line of the table of systems by axis, the best marked to the digits shown.
+
+    Args:
+        axis: line of the table.
+        systems: labels.
+        rows: of all runs.
+    """
     return mark_best({name: axis_cell(axis, name, rows) for name in systems}, axis.digits)
 
 

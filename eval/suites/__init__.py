@@ -1,0 +1,1 @@
+"""Suites of sequences with their protocol. Start in ``suite.py``."""

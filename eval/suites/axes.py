@@ -1,4 +1,4 @@
-"""The rendered suites of configs/eval/axes.yaml: which sequence has which seed and which options."""
+"""Rendered suites of configs/eval/axes.yaml: seed and options of each sequence."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def expand(table: Table, file: Path, axis: str, split: str, tier: str) -> Table:
     """One suite as a table of settings, its sequences with the options of :func:`dvo.synth.make_sequence`.
 
     Args:
-        table: what the file holds.
+        table: content of the file.
         file: for messages.
-        axis, split, tier: which suite.
+        axis, split, tier: of the suite.
 
     Raises:
         DvoError: the file lacks a setting.
@@ -52,11 +52,16 @@ def expand(table: Table, file: Path, axis: str, split: str, tier: str) -> Table:
             "sequences": sequences,
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DvoError(f"a setting is missing or wrong ({error!r})", file=file, field=axis, remedy="mend it") from error
+        raise DvoError(f"a setting is missing or wrong ({error!r})", file=file, field=axis, remedy="fix it") from error
 
 
 def choose(text: str, table: Table, group: str) -> list[tuple[str, str, str]]:
     """``NAME[/SPLIT][/TIER]`` to (axis, split, tier): of one axis, or of all if the name is that of the ``group``.
+
+    Args:
+        text: as on the command line.
+        table: content of the file.
+        group: name of all axes together.
 
     Raises:
         DvoError: no such axis, split or tier.

@@ -50,7 +50,13 @@ def prepare(suites: list[Suite]) -> list[Path]:
 
 
 def contact_sheet(folders: list[Path], columns: int = 6, width: int = 200) -> np.ndarray:
-    """``(H, W, 3)`` uint8 RGB: a row of frames for every sequence."""
+    """``(H, W, 3)`` uint8 RGB: a row of frames for every sequence.
+
+    Args:
+        folders: of rendered sequences.
+        columns: frames of a row.
+        width: of a frame, pixels.
+    """
     import cv2
 
     rows = []
@@ -67,6 +73,10 @@ def contact_sheet(folders: list[Path], columns: int = 6, width: int = 200) -> np
 
 def write_sheet(path: Path, folders: list[Path]) -> None:
     """Write a contact sheet as a picture.
+
+    Args:
+        path: a PNG file.
+        folders: of rendered sequences.
 
     Raises:
         DvoError: the file cannot be written, or its suffix names no format.

@@ -19,7 +19,7 @@ from dvo.data.trajectory import write_tum
 from dvo.errors import DvoError
 
 RECORD = "sequence.json"
-STALE = 24 * 3600.0  # seconds after which an unfinished folder is nobody's work in progress
+STALE = 24 * 3600.0  # seconds after which an unfinished folder belongs to no running process
 
 
 def cache_folder() -> Path:
@@ -39,7 +39,12 @@ def cache_folder() -> Path:
 
 
 def place_of(name: str, options: dict[str, Any]) -> Path:
-    """The folder of a sequence; another one whenever name, version or an option is another."""
+    """The folder of a sequence; another one whenever name, version or an option is another.
+
+    Args:
+        name: of the sequence.
+        options: of the rendering, with its version.
+    """
     text = json.dumps(options, sort_keys=True)
     return cache_folder() / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
@@ -74,7 +79,7 @@ def rendered_folder(name: str, options: dict[str, Any]) -> Path:
 
 
 def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
-    import cv2  # here, as rendering is: the evaluation of recordings needs neither
+    import cv2  # imported here, like rendering: the evaluation of recordings needs neither
 
     from dvo.synth.sequence import make_sequence
 
@@ -83,7 +88,7 @@ def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
     try:
         sequence = make_sequence(**chosen)
     except TypeError as error:
-        raise DvoError(f"options that cannot be rendered ({error})", field=name, remedy="mend the suite") from error
+        raise DvoError(f"options that cannot be rendered ({error})", field=name, remedy="fix the suite") from error
     (folder / "rgb").mkdir()
     rows = ["# timestamp filename"]
     for frame in sequence:

@@ -1,4 +1,4 @@
-"""From what stands on the command line to suites: names of configs, files, and folders of the user's own."""
+"""Suites by what is given on the command line: names of configs, files, and folders of sequences."""
 
 from __future__ import annotations
 
@@ -43,6 +43,9 @@ def load_suites(names: list[str], only: list[str] | None = None, stride: int | N
 def suite_of_folder(path: Path) -> Suite:
     """A suite of the one sequence in a folder (TUM, EuRoC, KITTI, TartanAir, or images with ``groundtruth_tum.txt``).
 
+    Args:
+        path: of the folder.
+
     Raises:
         DvoError: the folder has none of these layouts.
     """
@@ -58,7 +61,7 @@ def suite_of_folder(path: Path) -> Suite:
 
 
 def needs_data_folder(suites: list[Suite]) -> bool:
-    """Whether any sequence lies in the data folder (and is neither rendered nor named by an absolute path)."""
+    """Return True if any sequence lies in the data folder, neither rendered nor named by an absolute path."""
     return any(
         not is_rendered(sequence) and not Path(sequence.path).is_absolute()
         for suite in suites
@@ -67,7 +70,11 @@ def needs_data_folder(suites: list[Suite]) -> bool:
 
 
 def folder_of_data(suites: list[Suite], given: Path | None) -> Path:
-    """The data folder, which has to be there only if a sequence lies in it.
+    """Data folder, which has to exist only if a sequence lies in it.
+
+    Args:
+        suites: of the evaluation.
+        given: by the user; None for none.
 
     Raises:
         DvoError: not there, though it is needed.
@@ -78,7 +85,7 @@ def folder_of_data(suites: list[Suite], given: Path | None) -> Path:
 
 
 def is_rendered(sequence: Sequence) -> bool:
-    """Whether a sequence is made on demand and not recorded."""
+    """Return True if a sequence is rendered on demand, not recorded."""
     return sequence.rendered is not None
 
 

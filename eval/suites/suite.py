@@ -53,7 +53,7 @@ class Suite:
 
     Attributes:
         name: of the suite, in results.csv.
-        label: what the figures are good for; printed above the table.
+        label: what the suite is used for; printed above the table.
         sequences: in the order of the table.
         alignment: fitted before errors are taken.
         rpe_gap: frame gap of the relative errors; their median is reported.
@@ -91,11 +91,14 @@ class Suite:
 
 
 def read_suites(text: str) -> list[Suite]:
-    """Suites by what stands on a command line.
+    """Suites by name.
 
     ``fast`` is the mini tier of the validation split of a rendered axis, ``fast/test``, ``fast/large`` and
-    ``fast/test/large`` the others; ``axes`` (or ``axes/test``, ...) stands for all twelve. Anything else is the name of
+    ``fast/test/large`` the others; ``axes`` (or ``axes/test``, ...) names all twelve. Anything else is the name of
     a config or a file, as for :func:`read_suite`.
+
+    Args:
+        text: NAME, NAME/SPLIT/TIER, or a file.
 
     Raises:
         DvoError: no such suite.
@@ -114,6 +117,9 @@ def read_suites(text: str) -> list[Suite]:
 
 def read_suite(name_or_file: str | Path) -> Suite:
     """A suite by name (configs/eval/NAME.yaml) or from a file.
+
+    Args:
+        name_or_file: name of a config, or a YAML file.
 
     Raises:
         DvoError: no such suite, or a file with unknown or missing settings.
@@ -137,7 +143,7 @@ def _table(path: Path) -> Any:
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
-        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="mend the file") from error
+        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="fix the file") from error
 
 
 def _checked(suite: Suite, path: Path) -> Suite:
@@ -152,7 +158,10 @@ def _checked(suite: Suite, path: Path) -> Suite:
 
 
 def data_folder(given: str | Path | None = None) -> Path:
-    """Where recordings lie: the argument, else ``$DVO_DATA``, else ``../shared/data`` beside the checkout.
+    """Folder of the recordings: the argument, else ``$DVO_DATA``, else ``../shared/data`` beside the checkout.
+
+    Args:
+        given: by the user; None for none.
 
     Raises:
         DvoError: not there.
@@ -165,6 +174,11 @@ def data_folder(given: str | Path | None = None) -> Path:
 
 def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, Trajectory]:
     """The frames of a sequence and its ground truth; rendered ones are rendered if they are not in the cache.
+
+    Args:
+        sequence: of a suite.
+        data: folder of the recordings.
+        stride: every how many-th image is opened.
 
     Raises:
         DvoError: the data are not there, or hold no ground truth.
@@ -186,7 +200,13 @@ def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, 
 
 
 def reference_for(groundtruth: Trajectory, stamps: np.ndarray, max_dt: float = 0.02) -> Trajectory:
-    """The ground truth of exactly the frames that were fed: one row for each that has one, at the frame's time."""
+    """The ground truth of exactly the frames that were fed: one row for each that has one, at the frame's time.
+
+    Args:
+        groundtruth: of the whole sequence.
+        stamps: ``(N,)`` of the frames fed, seconds.
+        max_dt: largest difference of matched stamps, seconds.
+    """
     fed, rows = associate(Trajectory(stamps, np.zeros((len(stamps), 7))), groundtruth, max_dt)
     return Trajectory(stamps[fed], groundtruth.poses_wc[rows])
 

@@ -1,0 +1,1 @@
+"""Systems that are compared: baselines, peers, the learned odometry. Start in ``system.py``, then ``registry.py``."""

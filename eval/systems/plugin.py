@@ -14,7 +14,7 @@ from typing import Any
 
 
 def is_plugin(target: str) -> bool:
-    """Whether a target has the form ``FILE.py:NAME``."""
+    """Return True if a target has the form ``FILE.py:NAME``."""
     file, colon, _ = target.rpartition(":")
     return bool(colon) and file.endswith(".py")
 
@@ -37,7 +37,10 @@ def version(target: str) -> str:
 
 
 def load(target: str) -> Callable[..., Any]:
-    """Run the file of a plugin and return what its name stands for.
+    """Run the file of a plugin and return the object of its name.
+
+    Args:
+        target: ``FILE.py:NAME``.
 
     Raises:
         ImportError: the file is no Python file.

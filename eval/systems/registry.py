@@ -15,81 +15,20 @@ Nothing of a system is imported before it is built, in a process of its own.
 
 from __future__ import annotations
 
-import hashlib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from importlib import metadata
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-import dvo
 from dvo.errors import DvoError
-from dvo.odometry.protocol import Odometry
-from dvo.registry import Registry, is_target, resolve_target
+from dvo.registry import Registry, is_target
 from eval.systems import plugin
+from eval.systems.system import System, package_facts
 
 DEFAULT = ("dvo-small", "klt-pnp", "null")
 LEARNED = "dvo:load"
-_OWN = ("dvo", "eval")
-
-
-@dataclass(frozen=True)
-class System:
-    """Description of a system; makes odometries of it.
-
-    Attributes:
-        name: in the tables.
-        target: ``"module:Class"`` or ``"FILE.py:Class"``; called with the settings, and with ``seed`` and ``device``
-            if it accepts them.
-        settings: keyword arguments of the class.
-        licence: of the code that runs.
-        about: one line.
-        version_from, missing_from: ``"module:function"`` that returns the version, or the reason why the system cannot
-            run here (None if it can); called with those of the settings that it accepts. Empty for the default.
-    """
-
-    name: str
-    target: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    licence: str = "MIT"
-    about: str = ""
-    version_from: str = ""
-    missing_from: str = ""
-
-    def build(self, seed: int, device: str) -> Odometry:
-        """Odometry for one sequence.
-
-        Args:
-            seed: of everything random in it.
-            device: where networks compute.
-
-        Raises:
-            DvoError: there is no such module or class.
-        """
-        make = plugin.load(self.target) if plugin.is_plugin(self.target) else resolve_target(self.target, "system")
-        return plugin.call(make, {"seed": seed, "device": device}, self.settings)
-
-    def version(self) -> str:
-        """Version of what would run: of its package, or a hash of the file of a plugin."""
-        if self.version_from:
-            return str(plugin.call(resolve_target(self.version_from), self.settings))
-        if plugin.is_plugin(self.target):
-            return plugin.version(self.target)
-        top = self.target.split(".")[0].split(":")[0]
-        return dvo.__version__ if top in _OWN else _package(top).get("version", "-")
-
-    def missing(self) -> str | None:
-        """Reason why the system cannot run here, or None."""
-        if self.missing_from:
-            return plugin.call(resolve_target(self.missing_from), self.settings)
-        return plugin.missing(self.target)
-
-    def identity(self) -> dict[str, Any]:
-        """Target and settings, JSON-able, for the key of a prediction; a file in the settings counts by its content."""
-        return {"target": self.target, "settings": {name: _identity(value) for name, value in self.settings.items()}}
 
 
 _BASELINES, _PEERS = "eval.systems.baselines", "eval.systems.peers"
@@ -122,6 +61,9 @@ def add_system(system: System) -> None:
 
     A package that only announces ``"module:Class"`` under the entry-point group ``dvo.systems`` needs no call, and is
     found by the worker processes too; licence and description are then those of the package.
+
+    Args:
+        system: with a name that is free.
 
     Raises:
         DvoError: the name is taken.
@@ -160,6 +102,9 @@ def find_system(text: str, weights: str | None = None) -> System:
 
 def split_settings(text: str) -> tuple[str, dict[str, Any]]:
     """``NAME+key=value+key=value`` as name and settings; values are read as YAML.
+
+    Args:
+        text: as on the command line.
 
     Raises:
         DvoError: a value that is no YAML.
@@ -212,25 +157,5 @@ def _learned(weights: str, name: str | None = None) -> System:
 
 def _announced(name: str, target: str) -> System:
     """System of another package, described by the package's metadata."""
-    package = _package(target.split(".")[0].split(":")[0])
+    package = package_facts(target.split(".")[0].split(":")[0])
     return System(name, target, licence=package.get("licence", "the user's"), about=package.get("about", target))
-
-
-def _package(top: str) -> dict[str, str]:
-    """Version, licence and summary of the distribution that holds a top-level module; empty if none does."""
-    found = metadata.packages_distributions().get(top)
-    if not found:
-        return {}
-    about = metadata.metadata(found[0])
-    facts = {
-        "version": about["Version"],
-        "licence": about["License-Expression"] or about["License"],
-        "about": about["Summary"],
-    }
-    return {name: value for name, value in facts.items() if value}
-
-
-def _identity(value: Any) -> Any:
-    if isinstance(value, str) and Path(value).is_file():
-        return f"sha256:{hashlib.sha256(Path(value).read_bytes()).hexdigest()}"
-    return value

@@ -22,7 +22,8 @@ from eval.execution.predict import Job, Prediction, predict, predict_here
 from eval.execution.runner import predict_all
 from eval.scoring.score import Row, score_all
 from eval.suites.suite import Sequence, Suite
-from eval.systems.registry import System, add_system, find_system, remove_system
+from eval.systems.registry import add_system, find_system, remove_system
+from eval.systems.system import System
 
 CAMERA = Camera(250.0, 250.0, 159.5, 119.5, 320, 240)
 TEXELS = 120  # a metre of wall

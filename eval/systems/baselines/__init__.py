@@ -1,0 +1,1 @@
+"""Classical systems written here, one for each school of the field."""

@@ -49,7 +49,7 @@ class FrameLog:
         self.keyframes.frames[index].lost = True
 
     def is_lost(self, index: int) -> bool:
-        """Whether a frame is marked as lost."""
+        """Return True if a frame is marked as lost."""
         return self.keyframes.frames[index].lost
 
     def pose(self, index: int) -> np.ndarray | None:
@@ -115,6 +115,10 @@ def back_fill(
 
 
 def map_of(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> SparseMap:
-    """One map from pieces of points ``(n, 3)`` and colours ``(n, 3)``."""
+    """One map from pieces of points ``(n, 3)`` and colours ``(n, 3)``.
+
+    Args:
+        parts: points and RGB colours of each piece.
+    """
     points, colors = (np.concatenate(part) for part in zip(*parts, strict=True)) if parts else ((), ())
     return SparseMap(np.array(points, np.float32).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3))

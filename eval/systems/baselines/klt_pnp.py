@@ -246,9 +246,10 @@ class KltPnp:
         self._observe(old, tracks.uv[old], T)
         new = np.flatnonzero(~tracks.has_point & (tracks.anchor != index))
         if len(new):
-            anchors = [self._log.pose(a) for a in tracks.anchor[new]]
-            R = np.array([a[:3, :3] for a in anchors])
-            centres = np.array([_centre(a) for a in anchors])
+            first, which = np.unique(tracks.anchor[new], return_inverse=True)
+            anchors = [self._log.pose(a) for a in first]
+            R = np.array([a[:3, :3] for a in anchors])[which]
+            centres = np.array([_centre(a) for a in anchors])[which]
             one = np.einsum("nji,nj->ni", R, two_view.rays(tracks.anchor_uv[new], self._intrinsics))
             two = two_view.rays(tracks.uv[new], self._intrinsics) @ T[:3, :3]
             ones = np.ones(len(new))

@@ -1,7 +1,7 @@
-"""The null system: a straight line at constant speed, no rotation, no look at the images.
+"""Null system: a straight line at constant speed, no rotation, images unread.
 
-What a metric gives it is the error of knowing nothing; a table without that row says little (on short forward windows
-it scores around one percent of the path).
+Its errors are those of a system without information, the zero line of every table (on short forward windows it scores
+around one percent of the path).
 """
 
 from __future__ import annotations

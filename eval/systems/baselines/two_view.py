@@ -30,7 +30,13 @@ def rays(uv: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
 
 
 def project(points: np.ndarray, T_cw: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World points ``(N, 3)`` to pixels ``(N, 2)`` and depths ``(N,)``; pixels of points behind the camera are nan."""
+    """World points ``(N, 3)`` to pixels ``(N, 2)`` and depths ``(N,)``; pixels of points behind the camera are nan.
+
+    Args:
+        points: world frame.
+        T_cw: ``(4, 4)`` world to camera.
+        intrinsics: ``(4,)`` fx fy cx cy, pixels.
+    """
     local = points @ T_cw[:3, :3].T + T_cw[:3, 3]
     depth = local[:, 2]
     safe = np.where(depth > 1e-9, depth, np.nan)
@@ -48,6 +54,10 @@ def rotation_between(first: np.ndarray, second: np.ndarray, intrinsics: np.ndarr
 
     Kabsch on unit rays, reweighted six times with Cauchy's weight at the median residual, so that near points that
     move by parallax count little.
+
+    Args:
+        first, second: ``(N, 2)`` pixels of the same points in two views.
+        intrinsics: ``(4,)`` fx fy cx cy, pixels.
     """
     a, b = rays(first, intrinsics), rays(second, intrinsics)
     a, b = (r / np.linalg.norm(r, axis=1, keepdims=True) for r in (a, b))
@@ -102,6 +112,12 @@ def refine_relative_pose(
     """Gauss-Newton on the Sampson error (Hartley & Zisserman, eq. 11.9), Huber at half the threshold; ``T_21 (4, 4)``.
 
     RANSAC ends at a fit to few pairs or an algebraic error, which over a short baseline is a tenth of a degree off.
+
+    Args:
+        R, t: ``(3, 3)`` and ``(3,)`` of ``T_21``, the translation of unit length.
+        first, second: ``(N, 2)`` pixels of the same points in two views.
+        intrinsics: ``(4,)`` fx fy cx cy, pixels.
+        threshold: inlier threshold, pixels.
     """
     a, b = rays(first, intrinsics), rays(second, intrinsics)
     focal = float(intrinsics[:2].mean())
@@ -145,7 +161,11 @@ def ray_terms(directions: np.ndarray, centres: np.ndarray, weights: np.ndarray) 
 
 
 def solve_points(normal: np.ndarray) -> np.ndarray:
-    """Points ``(N, 3)`` closest to their rays, nan where the rays are parallel."""
+    """Points ``(N, 3)`` closest to their rays, nan where the rays are parallel.
+
+    Args:
+        normal: ``(N, 3, 4)`` sums of :func:`ray_terms`.
+    """
     points = np.full((len(normal), 3), np.nan)
     spread = np.linalg.eigvalsh(normal[:, :, :3]) if len(normal) else np.zeros((0, 3))
     good = spread[:, 0] > 1e-10 * np.maximum(spread[:, 2], 1e-300)
@@ -161,7 +181,7 @@ def step_length(local: np.ndarray, seen: np.ndarray, T_21: np.ndarray) -> np.nda
         seen: ``(N, 3)`` rays to them in the second camera.
         T_21: first camera to second, translation of unit length.
 
-    ``x x (R X + s t) = 0`` is solved for s; a ray along the translation says nothing and is left out.
+    ``x x (R X + s t) = 0`` is solved for s; a ray along the translation has no information and is left out.
     """
     turned = np.cross(seen, local @ T_21[:3, :3].T)
     along = np.cross(seen, T_21[:3, 3])

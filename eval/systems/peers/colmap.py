@@ -23,7 +23,7 @@ version = version_of("pycolmap")
 
 
 def missing() -> str | None:
-    """Why it cannot run here, or None."""
+    """Reason why it cannot run here, or None."""
     return missing_module("pycolmap", "pip install pycolmap (BSD-3)")
 
 

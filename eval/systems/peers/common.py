@@ -1,4 +1,4 @@
-"""What the wrappers share: pictures as the peers want them, and the trajectory out of what they said."""
+"""Common parts of the wrappers: images of the size and kind that the peers need, and the result."""
 
 from __future__ import annotations
 
@@ -77,7 +77,13 @@ def longest_part(rows: list[Row]) -> list[Row]:
 
 
 def result(rows: list[Row], frames: int, info: dict[str, Any]) -> Result:
-    """A result without a map."""
+    """A result without a map.
+
+    Args:
+        rows: frames with a pose.
+        frames: number of frames fed.
+        info: for :class:`dvo.odometry.protocol.Result`.
+    """
     matrices = np.array([row.T_wc for row in rows]).reshape(-1, 4, 4)
     trajectory = Trajectory(np.array([row.timestamp for row in rows]), poses_from_matrices(matrices))
     return Result(trajectory, SparseMap(), frames, frames - len(rows), info)
@@ -96,5 +102,5 @@ def version_of(package: str) -> Callable[[], str]:
 
 
 def missing_module(module: str, remedy: str) -> str | None:
-    """Why a peer cannot run: its module is not there. Looks without importing."""
+    """Reason why a peer cannot run, or None if its module is installed; does not import it."""
     return None if find_spec(module) is not None else f"{module} is not installed; {remedy}"

@@ -49,7 +49,7 @@ def vocabulary_file() -> Path:
 
 
 def missing() -> str | None:
-    """Everything that keeps it from running here, the package and the vocabulary, or None."""
+    """Reasons why it cannot run here, package and vocabulary, or None."""
     reasons = [missing_module("pyorbslam3", "pip install pyorbslam3 (GPL-3; Linux x86-64)")]
     try:
         vocabulary_file()
@@ -175,7 +175,7 @@ def settings(camera: Camera) -> str:
         "ORBextractor.nLevels": 8,
         "ORBextractor.iniThFAST": 20,
         "ORBextractor.minThFAST": 7,
-        # The viewer is off, but its settings are asked for.
+        # The viewer is off, but its settings are required.
         **{f"Viewer.{name}": 0.1 for name in ("KeyFrameSize", "GraphLineWidth", "PointSize", "CameraSize")},
         **{f"Viewer.{name}": 1.0 for name in ("KeyFrameLineWidth", "CameraLineWidth", "ViewpointX", "ViewpointY")},
         **{f"Viewer.{name}": 1.0 for name in ("ViewpointZ", "ViewpointF")},

@@ -1,6 +1,6 @@
 """SVO (Forster, Pizzoli, Scaramuzza 2014), from the package ``svo-cpp`` (GPL-3): semi-direct, no loops, no refinement.
 
-One object per process: a second one meets timers that the first has taken down. The package asks for ``opencv-python``,
+One object per process: a second one uses timers that the first has destroyed. The package requires ``opencv-python``,
 which would overwrite ``opencv-python-headless``, and does not use it: install it with ``--no-deps``.
 """
 
@@ -22,7 +22,7 @@ version = version_of("svo-cpp")
 
 
 def missing() -> str | None:
-    """Why it cannot run here, or None."""
+    """Reason why it cannot run here, or None."""
     return missing_module("svo_cpp", "pip install --no-deps svo-cpp (GPL-3)")
 
 

@@ -30,7 +30,7 @@ class Vocabulary:
 
     Attributes:
         branching, depth: most children of a node, most levels below the root.
-        parents: ``(n,)`` node that each node hangs from; smaller than its own number.
+        parents: ``(n,)`` parent of each node; smaller than its own number.
         descriptors: ``(n, 32)`` uint8.
         weights: ``(n,)`` of words, 0 elsewhere.
     """
@@ -150,6 +150,10 @@ def train(images: list[np.ndarray], branching: int, depth: int, seed: int) -> Vo
 def write_vocabulary(path: Path | str, vocabulary: Vocabulary) -> None:
     """Write DBoW2's text format (scoring L1, weighting tf-idf).
 
+    Args:
+        path: text file; its folder is made if needed.
+        vocabulary: to write.
+
     Raises:
         DvoError: the file cannot be written.
     """
@@ -165,7 +169,13 @@ def write_vocabulary(path: Path | str, vocabulary: Vocabulary) -> None:
 
 
 def rendered_descriptors(sequences: int, frames: int, features: int, seed: int) -> Iterator[np.ndarray]:
-    """ORB descriptors ``(N, 32)`` of pictures 640x480, a few seconds apart, of rendered sequences of all families."""
+    """ORB descriptors ``(N, 32)`` of pictures 640x480, a few seconds apart, of rendered sequences of all families.
+
+    Args:
+        sequences, frames: rendered sequences, and pictures of each.
+        features: most descriptors of a picture.
+        seed: of the renderings.
+    """
     from dvo.synth.sequence import make_sequence
 
     orb = cv2.ORB_create(features, fastThreshold=7)  # type: ignore[attr-defined]

@@ -18,7 +18,8 @@ from dvo.odometry.protocol import Odometry
 from eval.execution.cache import digest_of, job_key, system_facts
 from eval.execution.predict import predict_here
 from eval.suites.suite import ROOT
-from eval.systems.registry import System, add_system, find_system, list_systems, remove_system
+from eval.systems.registry import add_system, find_system, list_systems, remove_system
+from eval.systems.system import System
 
 TARGET = "eval.systems.baselines.klt_pnp:KltPnp"
 

@@ -159,7 +159,7 @@ class DepthMap:
         return out
 
     def carried(self, T: np.ndarray, key: Level, gain: float, offset: float) -> DepthMap:
-        """The filter of the next keyframe: what this one knows, seen from there.
+        """Depth filter of the next keyframe: this one's estimates, transformed into its view.
 
         Args:
             T: ``(4, 4)`` this keyframe to the next.

@@ -52,7 +52,7 @@ def _level(grey: np.ndarray, intrinsics: np.ndarray) -> Level:
 
 
 def inside(u: np.ndarray, v: np.ndarray, shape: tuple[int, ...], margin: float = 0.0) -> np.ndarray:
-    """Whether pixels lie in the image, ``margin`` from its edge; False for nan."""
+    """True where pixels lie in the image, ``margin`` from its edge; False for nan."""
     right, bottom = shape[1] - 1 - margin, shape[0] - 1 - margin
     return (u >= margin) & (u <= right) & (v >= margin) & (v <= bottom)
 

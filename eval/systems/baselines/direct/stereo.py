@@ -105,7 +105,7 @@ def search_lines(
     stretch = ((stepped - place(inverse_depth)) * along).sum(axis=1)
     line, stretch = line * np.sign(stretch)[:, None], np.abs(stretch)
 
-    # What a match could tell: photometric and geometric error of the place on the line, in inverse depth.
+    # Uncertainty of a match: photometric and geometric error of the place on the line, in inverse depth.
     gradient = key.packed[uv[:, 1].astype(int), uv[:, 0].astype(int), 1:]
     slope = np.abs((gradient * line).sum(axis=1))
     across = slope / np.maximum(np.linalg.norm(gradient, axis=1), 1e-6)

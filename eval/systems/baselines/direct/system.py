@@ -37,7 +37,7 @@ class DirectConfig:
         start_parallax: rotation-compensated parallax of the first two views, as part of the focal length; while the
             camera waits, half of it comes to be enough.
         start_wait: frames after which half is enough.
-        keyframe_distance: way from the keyframe, in units of its mean depth, that asks for another.
+        keyframe_distance: way from the keyframe, in units of its mean depth, from which another is made.
         keyframe_overlap: part of the keyframe's pixels still seen below which another is made.
         lost_overlap, lost_agreement: parts of pixels seen and of those that fit below which the camera is lost.
         sure_agreement: above it no second prediction is tried.

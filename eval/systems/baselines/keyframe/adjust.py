@@ -20,7 +20,7 @@ def neighbourhood(world: Map, newest: Keyframe, adjusted: int, anchors: int) -> 
             and from four on two, or else the scale would be free.
 
     Returns:
-        Both in order of time, so that ties and rounding never depend on chance.
+        Both in order of time, so that ties and rounding are the same in every run.
     """
     shared = world.shared(newest)
     order = [i for i in np.argsort(-shared, kind="stable") if shared[i] > 0 and world.keyframes[i] is not newest]
@@ -35,8 +35,15 @@ def adjust(
 ) -> None:
     """Move keyframes and the landmarks that they see to the least squared reprojection error; drop what then is off.
 
-    The solver knows no robust loss; observations enter it as inliers of a pose, and are dropped here as soon as they
+    The solver has no robust loss; observations enter it as inliers of a pose, and are dropped here as soon as they
     leave the threshold (pixels).
+
+    Args:
+        world: map; changed in place.
+        free, held: keyframes that move, and that do not.
+        intrinsics: ``(4,)`` fx fy cx cy, pixels.
+        iterations: most steps of the solver.
+        threshold: largest reprojection error of an observation that stays, pixels.
     """
     if not free:
         return

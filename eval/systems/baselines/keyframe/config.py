@@ -22,7 +22,7 @@ class KeyframeConfig:
         epipolar, reprojection: inlier thresholds, pixels.
         pose_points: inliers below which a pose is not believed.
         pose_part: the same as a part of the points seen.
-        keyframe_parallax: parallax since the last keyframe that asks for another, as part of the focal length.
+        keyframe_parallax: parallax since the last keyframe from which another is made, as part of the focal length.
         keyframe_points: part of the last keyframe's points still seen below which another is made.
         adjusted: keyframes that local bundle adjustment moves.
         anchors: older keyframes that see the same points and hold it in place.

@@ -1,4 +1,4 @@
-"""Finding points of the map again: after loss by descriptors, else by searching where they should be."""
+"""Relocalisation: points of the map found again by descriptors after loss, else around their projections."""
 
 from __future__ import annotations
 
@@ -22,6 +22,13 @@ def relocalise(
 
     The keyframes that look most alike (PTAM's small blurred images) and the last one are tried: ORB descriptors of
     their points are matched, then PnP in RANSAC.
+
+    Args:
+        world: map.
+        grey: ``(H, W)`` uint8.
+        intrinsics: ``(4,)`` fx fy cx cy, pixels.
+        config: of the system.
+        seed: of RANSAC.
 
     Returns:
         ``T_cw (4, 4)`` and the keyframe that gave it, or None.
@@ -69,7 +76,12 @@ def describe(grey: np.ndarray, uv: np.ndarray, octave: int) -> tuple[np.ndarray,
 
 
 def match(one: np.ndarray, two: np.ndarray, limit: int = 64) -> np.ndarray:
-    """Pairs of rows ``(M, 2)`` that are each other's nearest within ``limit`` bits."""
+    """Pairs of rows ``(M, 2)`` that are each other's nearest within ``limit`` bits.
+
+    Args:
+        one, two: ``(N, 32)`` and ``(M, 32)`` uint8 descriptors.
+        limit: largest Hamming distance.
+    """
     if not len(one) or not len(two):
         return np.zeros((0, 2), int)
     matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(one, two)
@@ -88,7 +100,7 @@ def search(
     skip: np.ndarray,
     radius: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks of some keyframes, looked for where the pose says that they are.
+    """Search landmarks of some keyframes around their projections.
 
     Args:
         T_cw: pose of the image.
@@ -135,7 +147,7 @@ def search(
 
 
 def _feature(keyframe: Keyframe, name: str) -> np.ndarray:
-    """Thumbnail, descriptors, or the rows that are described; computed when first asked for."""
+    """Thumbnail, descriptors, or the rows that are described; computed on first use."""
     if name not in keyframe.features:
         if name == "thumbnail":
             small = thumbnail(keyframe.grey)

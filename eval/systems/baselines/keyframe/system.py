@@ -107,7 +107,7 @@ class KeyframeOdometry:
         return True
 
     def _guess(self) -> np.ndarray:
-        """Where the tracks would be if the camera moved on as before; without a point, if it turned on as before."""
+        """Pixels of the tracks predicted by the motion model; of those without a point, by its rotation."""
         rays = two_view.rays(self._uv, self._intrinsics) @ self._motion[:3, :3].T
         guess = rays[:, :2] / np.maximum(rays[:, 2:], 0.1) * self._intrinsics[:2] + self._intrinsics[2:]
         projected = two_view.project(self._map.xyz[self._ids], self._motion @ self._T, self._intrinsics)[0]
@@ -135,7 +135,7 @@ class KeyframeOdometry:
         return float(inliers.mean())
 
     def _moved(self, index: int, T: np.ndarray) -> None:
-        """Take a pose: hang it on the newest keyframe and learn the motion."""
+        """Take a pose relative to the newest keyframe and update the motion model."""
         if self._blind == 0:
             self._motion = T @ np.linalg.inv(self._T)
             step = float(np.linalg.norm(centre(T) - centre(self._T)))
@@ -208,7 +208,7 @@ class KeyframeOdometry:
         self._ids, self._uv = self._ids[good], self._uv[good]
 
     def _keyframe(self, index: int, T: np.ndarray, grey: np.ndarray) -> Keyframe:
-        """Put a keyframe of the present tracks into the map and hang its frame on it."""
+        """Add a keyframe of the present tracks to the map; its frame is anchored to it."""
         order = np.argsort(self._ids, kind="stable")
         self._ids, self._uv = self._ids[order], self._uv[order]
         keyframe = Keyframe(index, T, self._ids, self._uv, grey)
@@ -225,7 +225,7 @@ class KeyframeOdometry:
             self._log.keyframes.set_pose(keyframe.frame, keyframe.T_cw)
 
     def _drop(self, gone: Keyframe) -> None:
-        """Remove a keyframe; its frames hang on the one before."""
+        """Remove a keyframe; its frames are anchored to the one before."""
         at = next(i for i, keyframe in enumerate(self._map.keyframes) if keyframe is gone)
         self._log.keyframes.reanchor(gone.frame, self._map.keyframes[at - 1].frame)
         del self._map.keyframes[at]

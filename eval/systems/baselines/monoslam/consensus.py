@@ -1,4 +1,4 @@
-"""Which measurements agree, told from the innovations and their joint covariance alone.
+"""Consensus among measurements, from the innovations and their joint covariance alone.
 
 The filter's prior fixes all but a little of the motion, so one measurement can make a hypothesis of it (one-point
 RANSAC: Civera, Grasa, Davison, Montiel 2010, J. Field Robotics 27(5)). Conditioning the joint Gaussian of the

@@ -19,7 +19,7 @@ from eval.systems.baselines.monoslam.models import (
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the points are expected, all arrays over the N points of the filter.
+    """Predicted measurements, all arrays over the N points of the filter.
 
     Attributes:
         pixels: ``(N, 2)``.
@@ -71,7 +71,7 @@ class Filter:
         self.P[c, c] = F @ self.P[c, c] @ F.T + G * impulses @ G.T
 
     def expect(self) -> Prediction:
-        """Where the points should be seen now, and how surely."""
+        """Predict the pixel of every point and its covariance."""
         pixels, front, by_camera, by_point = observe(self.r, self.q, self.points, self.intrinsics)
         slopes = np.concatenate([by_camera, by_point], -1)
         index = self._index(np.arange(len(self)))
@@ -136,7 +136,7 @@ class Filter:
         self.P, self.points = self.P[np.ix_(rows, rows)], self.points[mask]
 
     def is_sound(self) -> bool:
-        """Whether numbers are finite and variances positive."""
+        """Return True if all numbers are finite and variances positive."""
         return bool(np.isfinite(self.r).all() and np.isfinite(self.P).all() and (np.diag(self.P) > -1e-9).all())
 
     def _index(self, rows: np.ndarray) -> np.ndarray:

@@ -57,6 +57,11 @@ def move(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Constant velocity and angular rate for ``dt`` seconds (Davison 2007, section 3.3).
 
+    Args:
+        r, q: position ``(3,)`` and orientation ``(4,)`` of the camera, camera to world.
+        v, w: velocity per second in the world ``(3,)``, angular rate ``(3,)`` in the camera, rad/s.
+        dt: seconds.
+
     Returns:
         The new position and attitude, and the Jacobians ``F (12, 12)`` for the error of the state and ``G (12, 6)``
         for unknown impulses ``[V, W]`` that change velocity and angular rate at the start of the step.
@@ -83,7 +88,7 @@ def directions(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def observe(
     r: np.ndarray, q: np.ndarray, points: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where a camera sees points.
+    """Project points into a camera.
 
     Args:
         r, q: position and attitude of the camera.

@@ -22,7 +22,7 @@ def image_pyramid(grey: np.ndarray) -> list[np.ndarray]:
 
 
 class Appearance:
-    """What the points look like, as parallel arrays of length N in the order of the filter's points.
+    """Appearance of the points, parallel arrays of length N in the order of the filter's points.
 
     Attributes:
         patch: ``(N, 3, 23, 23)`` uint8 around the pixel of first sight, in every level.

@@ -1,4 +1,4 @@
-"""What every classical system must do, in small: the same of the same, and no crash where there is nothing to see."""
+"""Requirements on every classical system, in small: determinism, and no crash where there is nothing to see."""
 
 from __future__ import annotations
 

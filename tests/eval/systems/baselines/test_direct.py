@@ -35,7 +35,7 @@ def texture(seed: int = 0) -> np.ndarray:
 
 
 def plane_seen_from(image: np.ndarray, T: np.ndarray, depth: float) -> np.ndarray:
-    """What a second camera at ``T_21`` sees of a plane at ``depth`` that looks like ``image`` from the first."""
+    """Image that a second camera at ``T_21`` has of a plane at ``depth`` that looks like ``image`` from the first."""
     K = np.array([[250.0, 0, 159.5], [0, 250, 119.5], [0, 0, 1]])
     H = K @ (T[:3, :3] + np.outer(T[:3, 3], [0, 0, 1]) / depth) @ np.linalg.inv(K)
     return cv2.warpPerspective(image, H, (320, 240), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)

@@ -17,7 +17,8 @@ class StateBlock:
     Attributes:
         value: ``(B, N, ...)``.
         dim: size of the tangent of one element.
-        retract: ``(value (B, N, ...), tangent (B, N, dim)) -> value``; of an eliminated block the tangent is ``(B, N)``.
+        retract: ``(value (B, N, ...), tangent (B, N, dim)) -> value``; the tangent of an eliminated block is
+            ``(B, N)``.
         slot: ``(N,)`` unknown of each element; fixed elements have the value ``free``, elements with the same unknown
             move by the same tangent. None: each element is an unknown of its own.
         free: number of unknowns among the elements.

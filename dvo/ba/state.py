@@ -22,7 +22,7 @@ class StateBlock:
         slot: ``(N,)`` unknown of each element; fixed elements have the value ``free``, elements with the same unknown
             move by the same tangent. None: each element is an unknown of its own.
         free: number of unknowns among the elements.
-        held: the whole block stays in this call; it has no unknowns, whatever ``slot`` says.
+        held: the whole block stays in this call; it has no unknowns, whatever the value of ``slot``.
         eliminated: removed by Schur complement; at most one block, the last, with ``dim`` 1 and ``slot`` None.
     """
 

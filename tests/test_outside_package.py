@@ -100,7 +100,7 @@ def test_the_scene_family_is_rendered(tmp_path):
 
 
 def test_the_factor_fixes_the_scale(monkeypatch):
-    """A scene that is 15 % too small is brought to the known distance of two cameras, and gradients reach the distance."""
+    """A scene that is 15 % too small is brought to the known distance of two cameras; gradients reach the distance."""
     monkeypatch.syspath_prepend(OUTSIDE)
     from distance_vo.factor import KnownDistance
 

@@ -1,6 +1,6 @@
 """Bundle adjustment problems from files.
 
-Two text formats are told apart by their length:
+Two text formats are distinguished by their length:
 
 * BAL (Agarwal et al., "Bundle Adjustment in the Large", 2010): per camera an angle-axis rotation, a translation, f,
   k1, k2; the camera looks down its negative z axis and measures y upwards from the image centre.
@@ -24,15 +24,15 @@ from dvo.geometry import so3
 
 @dataclass(frozen=True)
 class PointProblem:
-    """Cameras and 3-D points, and where the points were seen. All float64, z forward, y down.
+    """Cameras, 3-D points and image measurements of the points. All float64, z forward, y down.
 
     Attributes:
         poses_cw: ``(C, 7)`` world to camera.
         intrinsics: ``(C, 4)`` fx fy cx cy.
-        radial: ``(C, 2)`` k1 k2: a point at normalised ``x`` is seen at ``f (1 + k1 |x|^2 + k2 |x|^4) x + c``.
+        radial: ``(C, 2)`` k1 k2: a point at normalised ``x`` projects to ``f (1 + k1 |x|^2 + k2 |x|^4) x + c``.
         points: ``(K, 3)`` in the world.
-        camera, point: ``(O,)`` which camera saw which point.
-        pixels: ``(O, 2)`` where.
+        camera, point: ``(O,)`` camera and point of each measurement.
+        pixels: ``(O, 2)`` measured position.
     """
 
     poses_cw: Tensor
@@ -44,12 +44,18 @@ class PointProblem:
     pixels: Tensor
 
     def moved(self, poses_cw: Tensor, points: Tensor) -> PointProblem:
-        """The same measurements with other unknowns."""
+        """The same measurements with other poses ``(C, 7)`` and points ``(K, 3)``."""
         return replace(self, poses_cw=poses_cw, points=points)
 
 
 def read_bal(path: Path | str) -> PointProblem:
     """Read a problem, plain or bz2-compressed.
+
+    Args:
+        path: text file in either format.
+
+    Returns:
+        The problem with z forward and y down.
 
     Raises:
         DvoError: missing file, words that are not numbers, a length that fits neither format, or indices out of range.
@@ -93,7 +99,7 @@ def read_bal(path: Path | str) -> PointProblem:
 
 
 def _bal_cameras(parameters: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-    """Half a turn about x takes a camera that looks down -z with y up to one that looks along z with y down."""
+    """Poses, intrinsics, distortion. A rotation by pi about x maps -z forward, y up to z forward, y down."""
     p = torch.from_numpy(np.ascontiguousarray(parameters))
     half_turn = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
     q = so3.multiply(half_turn, so3.exp(p[:, :3]))

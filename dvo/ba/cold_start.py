@@ -1,9 +1,9 @@
 """Damping of the first steps without a starting point, and a solver for that case.
 
 From identity poses and constant depth, rotation and sideways translation explain the flow almost equally well. An
-undamped first step takes a huge difference of the two, and the depths then settle on the wrong side of it (the
-bas-relief ambiguity). Damping relative to the diagonal of the reduced system holds such directions back until the
-depths have begun to tell them apart. With exact targets, 8 frames and 10 updates of 2 steps, about half of rendered
+undamped first step takes a huge difference of the two, and the depths then converge to the wrong side of it (the
+bas-relief ambiguity). Damping relative to the diagonal of the reduced system slows such directions down until the
+depths have begun to separate them. With exact targets, 8 frames and 10 updates of 2 steps, about half of rendered
 clips ended within 2 % of the rotation without this, and nine tenths with it (``tests/train/test_objective.py``).
 """
 
@@ -18,7 +18,7 @@ from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 
 COLD_UPDATES = 4
-"""Updates of a new graph that are damped strongly."""
+"""Number of first updates of a new graph with strong damping."""
 
 
 def damping_at(update: int) -> BADamping:
@@ -34,7 +34,14 @@ def robust_cost(
     poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, targets: Tensor, weights: Tensor, ii: Tensor, jj: Tensor,
     kk: Tensor,
 ) -> Tensor:  # fmt: skip
-    """Weighted mean residual ``(B,)`` of the patch centres, pixels, each edge at most 5."""
+    """Weighted mean residual of the patch centres, each edge at most 5 pixels.
+
+    Args:
+        poses_cw, patches, intrinsics, targets, weights, ii, jj, kk: see :func:`dvo.ba.layer.bundle_adjust`.
+
+    Returns:
+        ``(B,)`` pixels.
+    """
     c = patches.shape[-1] // 2
     seen = reproject(poses_cw, patches, intrinsics, ii, jj, kk).coords[:, :, c, c]
     residual = (weights * (targets - seen)).norm(dim=-1).clamp(max=_REACH)
@@ -53,18 +60,18 @@ def solve_from_nothing(
     updates: int = 10,
     bounds: tuple[float, float] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Bundle adjustment without a starting point: the better of two ways to begin.
+    """Bundle adjustment without a starting point: the better of two initialisations.
 
-    One begins with poses and depths together under strong damping; the other finds the rotations first, as if
-    everything were far away. They fail on different clips, and
-    the residual alone tells which one is right (``tests/train/test_objective.py``).
+    One solves for poses and depths together under strong damping; the other finds the rotations first, as if every
+    point were far away. They fail on different clips, and the residual is enough to choose the right one
+    (``tests/train/test_objective.py``).
 
     Args:
         patches: ``(B, K, 3, p, p)``; only ``x, y`` are used, depths begin at 1.
         intrinsics: ``(B, N, 4)``.
         targets, weights: ``(B, E, 2)``.
         ii, jj, kk: ``(E,)`` edges.
-        updates: calls of bundle adjustment for each way.
+        updates: calls of bundle adjustment for each initialisation.
         bounds: see :func:`dvo.ba.layer.bundle_adjust`.
 
     Returns:

@@ -1,7 +1,7 @@
 """Bundle adjustment of camera poses and 3-D points: Levenberg-Marquardt with acceptance of steps.
 
-The second entry to the Schur solver of this room: landmarks are points with 3x3 blocks instead of inverse depths.
-Intrinsics and distortion are held. Not differentiable; for maps and for problems from files.
+The second use of the Schur solver in this package: landmarks are points with 3x3 blocks instead of inverse depths.
+Intrinsics and distortion are constant. Not differentiable; for maps and for problems from files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dvo.ba.schur import eliminate
 from dvo.geometry import se3, so3
 
 MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32
-"""Bounds of what the damping is a fraction of, as in Ceres: what nothing measures is damped all the same."""
+"""Bounds of the diagonal that damping is a fraction of, as in Ceres: unobserved directions are damped too."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class PointSolution:
         problem: with the new poses and points.
         initial_cost, cost: half the sum of squared residuals, pixels squared, before and after.
         iterations: steps tried.
-        converged: whether a criterion was met before the limit of iterations.
+        converged: a criterion was met before the limit of iterations.
     """
 
     problem: PointProblem
@@ -38,7 +38,7 @@ class PointSolution:
 
 
 def residuals(problem: PointProblem) -> Tensor:
-    """``(O, 2)`` pixels: where the point was seen, less where it projects to."""
+    """Reprojection residuals ``(O, 2)``, measured less projected position, pixels."""
     return _project(problem)[0]
 
 
@@ -53,9 +53,9 @@ def _project(problem: PointProblem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     focal, centre = problem.intrinsics[problem.camera].split(2, -1)
     k1, k2 = problem.radial[problem.camera].split(1, -1)
     r2 = (xy * xy).sum(-1, keepdim=True)
-    bend = 1 + r2 * (k1 + r2 * k2)
-    residual = problem.pixels - (focal * bend * xy + centre)
-    by_xy = (2 * (k1 + 2 * k2 * r2) * xy)[..., None, :] * xy[..., None] + torch.diag_embed(bend.expand(-1, 2))
+    radial = 1 + r2 * (k1 + r2 * k2)
+    residual = problem.pixels - (focal * radial * xy + centre)
+    by_xy = (2 * (k1 + 2 * k2 * r2) * xy)[..., None, :] * xy[..., None] + torch.diag_embed(radial.expand(-1, 2))
     xy_by_point = torch.cat((torch.diag_embed(1 / z.expand(-1, 2)), -(xy / z)[..., None]), -1)
     return residual, seen, focal[..., None] * (by_xy @ xy_by_point), rotation
 
@@ -89,13 +89,20 @@ def solve_points(
     """Minimise half the sum of squared reprojection errors over poses and points.
 
     Damping is a fraction of the Hessian's diagonal and follows the gain ratio (Nielsen 1999); a step that does not
-    lower the cost is undone. The gauge is left to the damping unless cameras are fixed.
+    lower the cost is undone. Without fixed cameras, only the damping fixes the gauge.
 
     Args:
         fixed: how many leading cameras stay.
         max_iterations: steps tried at most.
         tolerance: relative decrease of the cost by an accepted step below which it has converged.
-        damping: at the start.
+        damping: initial fraction.
+
+    Returns:
+        The best poses and points found, with the cost before and after.
+
+    Example:
+        >>> solution = solve_points(read_bal("problem-21-11315-pre.txt"), fixed=1)
+        >>> solution.cost / solution.initial_cost
     """
     cost = initial = _cost(problem)
     growth, converged = 2.0, False

@@ -36,9 +36,15 @@ class Factor(ABC):
 
     Example:
         >>> @dataclass(frozen=True)
-        ... class SpeedLimit(Factor):
-        ...     weight: Tensor  # (B, N, 6)
-        ...     def linearise(self, values): ...
+        ... class HeightPrior(Factor):  # of the second coordinate of each translation
+        ...     height: Tensor  # (B, N)
+        ...     def linearise(self, values):
+        ...         poses = values["poses"]
+        ...         residual = (self.height - poses[..., 1])[..., None]
+        ...         jacobian = torch.zeros(*residual.shape, 6)
+        ...         jacobian[..., 0, 1], jacobian[..., 0, 3], jacobian[..., 0, 5] = 1, -poses[..., 2], poses[..., 0]
+        ...         every = torch.arange(poses.shape[1])
+        ...         return Linearisation(residual, torch.ones_like(residual), ("poses",), (every,), (jacobian,))
     """
 
     @abstractmethod

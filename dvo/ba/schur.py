@@ -16,14 +16,20 @@ import torch
 from torch import Tensor
 
 RETRIES = 6
-"""How often a failed factorisation is tried again, each time with ten times the damping."""
+"""Attempts after a failed factorisation, each with ten times the damping."""
 
 
 def factorise(s: Tensor) -> tuple[Tensor, Tensor]:
-    """Cholesky factors of symmetric ``s (B, P, P)``, and which of them are good ``(B,)``.
+    """Cholesky factors, with damping where the plain factorisation fails.
 
-    Where the factorisation fails, damping of 1e-6 to 0.1 of the largest diagonal entry is tried; where that fails
-    too, or ``s`` is not finite, the factor is the identity.
+    Damping of 1e-6 to 0.1 of the largest diagonal entry is tried in turn; where that fails too, or ``s`` is not finite,
+    the factor is the identity.
+
+    Args:
+        s: ``(B, P, P)`` symmetric.
+
+    Returns:
+        Lower factors ``(B, P, P)``, and ``(B,)`` bool, true where the factor is one of ``s`` (damped if need be).
     """
     factor, info = torch.linalg.cholesky_ex(s)
     ok = (info == 0) & torch.isfinite(factor).all(-1).all(-1)
@@ -35,21 +41,29 @@ def factorise(s: Tensor) -> tuple[Tensor, Tensor]:
     boost = s.diagonal(dim1=-2, dim2=-1).abs().amax(-1).clamp(min=torch.finfo(s.dtype).tiny) * 1e-6
     for _ in range(RETRIES):
         again, info = torch.linalg.cholesky_ex(s + boost[:, None, None] * eye)
-        mended = finite & ~ok & (info == 0)
-        factor = torch.where(mended[:, None, None], again, factor)
-        ok = ok | mended
+        solved = finite & ~ok & (info == 0)
+        factor = torch.where(solved[:, None, None], again, factor)
+        ok = ok | solved
         boost = boost * 10
     return torch.where(ok[:, None, None], factor, eye), ok
 
 
 def solve_with(factor: Tensor, ok: Tensor, y: Tensor) -> Tensor:
-    """``x (B, P)`` with ``L L^T x = y``; zero where the factor is not ``ok (B,)`` or the result is not finite."""
+    """Solve ``L L^T x = y``.
+
+    Args:
+        factor, ok: of :func:`factorise`.
+        y: ``(B, P)``.
+
+    Returns:
+        ``x (B, P)``, zero where the factor is not ``ok`` or the result is not finite.
+    """
     x = torch.cholesky_solve(y[..., None], factor)[..., 0]
     return torch.where((ok & torch.isfinite(x).all(-1))[:, None], x, 0.0)
 
 
 def damped(s: Tensor, absolute: float | Tensor, relative: float | Tensor) -> Tensor:
-    """``s + absolute I + relative diag(s)`` for ``(B, P, P)``."""
+    """Damped matrix ``s + absolute I + relative diag(s)`` for ``s (B, P, P)``."""
     return s + torch.diag_embed(s.diagonal(dim1=-2, dim2=-1) * relative + absolute)
 
 
@@ -65,13 +79,13 @@ def invert_blocks(h_ll: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SchurFactor:
-    """The system at the top of this file with its landmarks eliminated, ready for any right-hand side.
+    """The system at the top of this file with its landmarks eliminated, for any right-hand side.
 
     Attributes:
         h_pl: ``(B, P, K, m)``.
         q: ``(B, K, m, m)`` inverse of ``h_ll``.
         factor: ``(B, P, P)`` Cholesky factor of the damped reduced system.
-        ok: ``(B,)`` whether that factor is one; where not, poses do not move.
+        ok: ``(B,)`` true where the factorisation succeeded; elsewhere poses do not move.
     """
 
     h_pl: Tensor
@@ -97,7 +111,7 @@ def eliminate(
     Args:
         h_pp: ``(B, P, P)``.
         h_pl: ``(B, P, K, m)``.
-        h_ll: ``(B, K, m, m)``, damped by the caller as wished; a block that is not positive is taken as unobserved.
+        h_ll: ``(B, K, m, m)``, with any damping included; a block that is not positive counts as unobserved.
         absolute, relative: damping of the reduced system ``S``: ``S + absolute I + relative diag(S)``.
     """
     q = invert_blocks(h_ll)

@@ -17,11 +17,12 @@ class StateBlock:
     Attributes:
         value: ``(B, N, ...)``.
         dim: size of the tangent of one element.
-        retract: ``(value (B, N, ...), tangent (B, N, dim)) -> value``; an eliminated block has tangents ``(B, N)``.
+        retract: ``(value (B, N, ...), tangent (B, N, dim)) -> value``; the tangent of an eliminated block is
+            ``(B, N)``.
         slot: ``(N,)`` unknown of each element; fixed elements have the value ``free``, elements with the same unknown
             move by the same tangent. None: each element is an unknown of its own.
         free: number of unknowns among the elements.
-        held: the whole block stays in this call; it has no unknowns, whatever ``slot`` says.
+        held: the whole block stays in this call; it has no unknowns, whatever the value of ``slot``.
         eliminated: removed by Schur complement; at most one block, the last, with ``dim`` 1 and ``slot`` None.
     """
 

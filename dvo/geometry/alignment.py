@@ -1,4 +1,4 @@
-"""The similarity that best lays one set of points over another."""
+"""Least-squares alignment of point sets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dvo.geometry import sim3, so3
 
 AlignMode = Literal["none", "scale", "se3", "sim3"]
 
-_RANK = 1e-9  # a direction whose spread is smaller than this fraction of the largest is taken as not there
+_RANK = 1e-9  # a direction whose spread is smaller than this fraction of the largest counts as zero
 
 
 def align(source: Tensor | np.ndarray, target: Tensor | np.ndarray, mode: AlignMode = "sim3") -> Tensor:
@@ -25,12 +25,16 @@ def align(source: Tensor | np.ndarray, target: Tensor | np.ndarray, mode: AlignM
         mode: ``none``; ``scale`` (about the common origin, no rotation, no translation); ``se3``; ``sim3``.
 
     Returns:
-        ``(8,)`` float64 similarity, see :mod:`dvo.geometry.sim3`. What the points do not determine is left alone: the
-        scale is 1 if either set has no extent, and of the rotations that lay one line over another the smallest is
+        ``(8,)`` float64 similarity, see :mod:`dvo.geometry.sim3`. Undetermined parts take their neutral value: the
+        scale is 1 if either set has no extent, and of the rotations that map one line onto another the smallest is
         taken.
 
     Raises:
         DvoError: shapes that differ, no points, numbers that are not finite, or an unknown mode.
+
+    Example:
+        >>> from dvo.geometry import sim3
+        >>> aligned = sim3.act(align(estimated_centres, true_centres), estimated_centres)
     """
     x, y = (torch.as_tensor(p).detach().to("cpu", torch.float64) for p in (source, target))
     if mode not in get_args(AlignMode):
@@ -57,12 +61,12 @@ def align(source: Tensor | np.ndarray, target: Tensor | np.ndarray, mode: AlignM
 
 
 def _ratio(top: Tensor, bottom: Tensor) -> float:
-    """A scale, or 1 where it is not determined."""
+    """Ratio as a scale, 1 where it is not determined."""
     return float(top / bottom) if top > 0 and bottom > 0 and torch.isfinite(top / bottom) else 1.0
 
 
 def _best_rotation(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """``R (3, 3)`` that maximises ``sum y . R x``, and that maximum."""
+    """Rotation ``R (3, 3)`` that maximises ``sum y . R x``, and the maximum."""
     u, d, vt = torch.linalg.svd(y.T @ x)
     sign = torch.ones_like(d)
     sign[2] = torch.sign(torch.det(u) * torch.det(vt))
@@ -70,7 +74,7 @@ def _best_rotation(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         return torch.eye(3, dtype=x.dtype), d[0]
     if d[1] > _RANK * d[0]:
         return (u * sign) @ vt, (d * sign).sum()
-    # One line over another: turn about their common normal.
+    # One line onto another: rotate about their common normal.
     a, b = vt[0], u[:, 0]
     axis = torch.linalg.cross(a, b)
     if a @ b < -1 + 1e-12:

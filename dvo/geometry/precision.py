@@ -1,4 +1,4 @@
-"""Geometry is computed in full precision, whatever the networks around it run in."""
+"""Full precision for geometry, whatever precision the networks around it run in."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ import torch
 
 @contextmanager
 def full_precision(device: torch.device) -> Iterator[None]:
-    """Switch autocast and TF32 matrix products off: with ten bits of mantissa a pixel is lost in a thousand."""
+    """Context without autocast and without TF32 matrix products.
+
+    Ten bits of mantissa resolve a coordinate of 1000 pixels to one pixel only.
+
+    Args:
+        device: on which the computation runs.
+    """
     matmul = torch.backends.cuda.matmul
     name, exact = ("fp32_precision", "ieee") if hasattr(matmul, "fp32_precision") else ("allow_tf32", False)
     before = getattr(matmul, name)

@@ -19,20 +19,20 @@ from dvo.geometry.precision import full_precision
 MIN_Z_DIVISION = 0.1
 """The projection divides by ``max(Z, this)``."""
 MIN_Z_VALID = 0.2
-"""A point counts as seen only where ``Z`` is greater: in front of the camera by a fifth of its depth in frame i."""
+"""A point is valid only where ``Z`` is greater: in front of the camera by a fifth of its depth in frame i."""
 
 
 @dataclass(frozen=True)
 class Reprojection:
-    """Patches of frames ``ii`` as seen from frames ``jj``.
+    """Projections of patches of frames ``ii`` into frames ``jj``.
 
     Attributes:
         coords: ``(B, E, p, p, 2)`` pixels x, y in frame j.
         depth: ``(B, E, p, p)`` ``Z``, the depth in frame j over the depth in frame i.
         valid: ``(B, E, p, p)`` bool, ``Z > 0.2``.
         jac_i, jac_j: ``(B, E, 2, 6)`` derivative of the centre pixel by a left perturbation ``[tau, phi]`` of
-            ``T_cw[ii]`` and ``T_cw[jj]``; zero where the centre is not valid. None unless asked for.
-        jac_d: ``(B, E, 2, 1)`` the same by the inverse depth.
+            ``T_cw[ii]`` and ``T_cw[jj]``, pixels; zero where the centre is not valid. None unless requested.
+        jac_d: ``(B, E, 2, 1)`` derivative of the centre pixel by the inverse depth. None unless requested.
     """
 
     coords: Tensor
@@ -44,12 +44,15 @@ class Reprojection:
 
 
 def motion_matrices(poses_cw: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor) -> Tensor:
-    """``(B, E, 3, 4)`` matrices M with ``X' = M (x, y, d, 1)``: from pixels of frame i to points in frame j.
+    """Matrices M with ``X' = M (x, y, d, 1)``: from pixels and inverse depth of frame i to points in frame j.
 
     Args:
         poses_cw: ``(B, N, 7)`` world to camera.
-        intrinsics: ``(B, N, 4)`` fx fy cx cy.
+        intrinsics: ``(B, N, 4)`` fx fy cx cy in pixels.
         ii, jj: ``(E,)`` source and target frames.
+
+    Returns:
+        ``(B, E, 3, 4)``.
     """
     b, n = poses_cw.shape[:2]
     rotation, t = so3.matrix(poses_cw[..., 3:]), poses_cw[..., :3, None]
@@ -72,7 +75,15 @@ def motion_matrices(poses_cw: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor
 
 
 def gather(table: Tensor, index: Tensor) -> Tensor:
-    """``table (B, N, C)`` at ``index (E,)`` of dimension 1, over dimension 0: its backward is far faster."""
+    """Rows of a table, gathered over dimension 0 of the flattened batch: the backward pass is far faster.
+
+    Args:
+        table: ``(B, N, C)``.
+        index: ``(E,)`` along dimension 1, shared by the batch.
+
+    Returns:
+        ``(B, E, C)``.
+    """
     b, n, c = table.shape
     if b > 1:
         index = (index + torch.arange(b, device=index.device)[:, None] * n).flatten()
@@ -83,10 +94,10 @@ def centre_jacobians(point: Tensor, inverse_depth: Tensor, translation: Tensor, 
     """Derivatives of projected pixels by the target pose and by the inverse depth.
 
     Args:
-        point: ``(..., 3)`` X' in frame j.
-        inverse_depth: ``(...)`` of the source.
+        point: ``(..., 3)`` X' in frame j, the true point times its inverse depth in frame i.
+        inverse_depth: ``(...)`` in frame i.
         translation: ``(..., 3)`` of the motion from frame i to frame j.
-        focal: ``(..., 2)`` fx fy of frame j.
+        focal: ``(..., 2)`` fx fy of frame j in pixels.
 
     Returns:
         ``jac_j (..., 2, 6)`` and ``jac_d (..., 2, 1)``, zero where ``Z <= 0.2``.
@@ -120,6 +131,19 @@ def reproject(
         intrinsics: ``(B, N, 4)`` fx fy cx cy in the same pixels.
         ii, jj, kk: ``(E,)`` source frame, target frame, patch; shared by the batch.
         jacobians: also fill ``jac_i``, ``jac_j``, ``jac_d``.
+
+    Returns:
+        Pixels of all ``p x p`` points of each edge, their depths and validity; differentiable by poses, patches and
+        intrinsics. Where ``Z`` is below 0.1 the division is by 0.1, so that values stay finite; such points are not
+        valid. Indices are not checked.
+
+    Raises:
+        RuntimeError: shapes that do not belong together (from torch).
+
+    Example:
+        >>> seen = reproject(poses_cw, patches, intrinsics, ii, jj, kk)
+        >>> flow = seen.coords - patches[:, kk, :2].permute(0, 1, 3, 4, 2)
+        >>> flow[~seen.valid] = 0
     """
     with full_precision(poses_cw.device):
         b, k, _, p, _ = patches.shape

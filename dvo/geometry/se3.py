@@ -35,14 +35,29 @@ __all__ = [
 
 
 def identity(*shape: int, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
-    """``(*shape, 7)`` poses that move nothing."""
+    """Identity poses.
+
+    Args:
+        shape: batch dimensions.
+        dtype, device: of the result.
+
+    Returns:
+        ``(*shape, 7)``.
+    """
     pose = torch.zeros(*shape, 7, dtype=dtype, device=device)
     pose[..., 6] = 1
     return pose
 
 
 def exp(xi: Tensor) -> Tensor:
-    """Tangent ``(..., 6)`` to pose ``(..., 7)``."""
+    """Exponential map (Sola et al., eq. 172).
+
+    Args:
+        xi: ``(..., 6)`` tangent ``[tau, phi]``, radians.
+
+    Returns:
+        ``(..., 7)`` pose.
+    """
     tau, phi = xi[..., :3], xi[..., 3:]
     q, b, c = so3.exp_terms(phi)
     first = torch.linalg.cross(phi, tau)
@@ -50,7 +65,14 @@ def exp(xi: Tensor) -> Tensor:
 
 
 def log(pose: Tensor) -> Tensor:
-    """Pose ``(..., 7)`` to tangent ``(..., 6)``, rotation angle at most pi."""
+    """Logarithm map (Sola et al., eq. 173).
+
+    Args:
+        pose: ``(..., 7)``; ``q`` and ``-q`` give the same result.
+
+    Returns:
+        ``(..., 6)`` tangent ``[tau, phi]`` with ``|phi| <= pi``.
+    """
     t = pose[..., :3]
     phi, e = so3.log_terms(pose[..., 3:])
     first = torch.linalg.cross(phi, t)
@@ -58,47 +80,92 @@ def log(pose: Tensor) -> Tensor:
 
 
 def compose(a: Tensor, b: Tensor) -> Tensor:
-    """``a b``: first ``b``, then ``a``."""
+    """Product ``a b``: first ``b``, then ``a``.
+
+    Args:
+        a, b: ``(..., 7)``; batch dimensions broadcast.
+
+    Returns:
+        ``(..., 7)``.
+    """
     t = rotate(a[..., 3:], b[..., :3]) + a[..., :3]
     return torch.cat((t, so3.multiply(a[..., 3:], b[..., 3:])), -1)
 
 
 def inverse(pose: Tensor) -> Tensor:
-    """``pose^-1``."""
+    """Inverse motion.
+
+    Args:
+        pose: ``(..., 7)``, for example ``T_cw``.
+
+    Returns:
+        ``(..., 7)``, then ``T_wc``.
+    """
     q = so3.conjugate(pose[..., 3:])
     return torch.cat((-rotate(q, pose[..., :3]), q), -1)
 
 
 def relative(a: Tensor, b: Tensor) -> Tensor:
-    """``b a^-1``: with world-to-camera poses, the motion of points from camera ``a`` to camera ``b``."""
+    """Relative motion ``b a^-1``: with world-to-camera poses, points of camera ``a`` to camera ``b``.
+
+    Args:
+        a, b: ``(..., 7)``; batch dimensions must be equal.
+
+    Returns:
+        ``(..., 7)``.
+    """
     q = so3.multiply(b[..., 3:], so3.conjugate(a[..., 3:]))
     return torch.cat((b[..., :3] - rotate(q, a[..., :3]), q), -1)
 
 
 def act(pose: Tensor, points: Tensor) -> Tensor:
-    """``R p + t`` on points ``(..., 3)``; batch dimensions broadcast: ``pose[..., None, :]`` for many points."""
+    """Transform points: ``R p + t``.
+
+    Args:
+        pose: ``(..., 7)``; ``pose[..., None, :]`` for many points per pose.
+        points: ``(..., 3)``; batch dimensions broadcast.
+
+    Returns:
+        ``(..., 3)``.
+    """
     return rotate(pose[..., 3:], points) + pose[..., :3]
 
 
 def act_homogeneous(pose: Tensor, points: Tensor) -> Tensor:
-    """``(R x + t h, h)`` on homogeneous points ``(..., 4)`` = ``(x, h)``."""
+    """Transform homogeneous points: ``(R x + t h, h)``.
+
+    Args:
+        pose: ``(..., 7)``.
+        points: ``(..., 4)`` = ``(x, h)``; ``h`` is an inverse depth if ``x`` is a ray.
+
+    Returns:
+        ``(..., 4)``.
+    """
     x, h = points[..., :3], points[..., 3:]
     moved = rotate(pose[..., 3:], x) + pose[..., :3] * h
     return torch.cat((moved, h.expand(*moved.shape[:-1], 1)), -1)
 
 
 def normalise(pose: Tensor) -> Tensor:
-    """Bring the quaternion back to unit length."""
+    """Scale the quaternion of a pose ``(..., 7)`` to unit length."""
     return torch.cat((pose[..., :3], so3.normalise(pose[..., 3:])), -1)
 
 
 def retract(pose: Tensor, xi: Tensor) -> Tensor:
-    """``Exp(xi) pose``, renormalised."""
+    """Left retraction ``Exp(xi) pose``, with a unit quaternion.
+
+    Args:
+        pose: ``(..., 7)``.
+        xi: ``(..., 6)`` tangent ``[tau, phi]``.
+
+    Returns:
+        ``(..., 7)``.
+    """
     return normalise(compose(exp(xi), pose))
 
 
 def matrix(pose: Tensor) -> Tensor:
-    """``(..., 4, 4)`` matrix ``[[R, t], [0, 1]]``."""
+    """Homogeneous matrix ``(..., 4, 4)`` = ``[[R, t], [0, 1]]`` of a pose ``(..., 7)``."""
     upper = torch.cat((so3.matrix(pose[..., 3:]), pose[..., :3, None]), -1)
     last = torch.zeros_like(upper[..., :1, :])
     last[..., 3] = 1
@@ -106,12 +173,19 @@ def matrix(pose: Tensor) -> Tensor:
 
 
 def from_matrix(m: Tensor) -> Tensor:
-    """``(..., 4, 4)`` or ``(..., 3, 4)`` matrix to pose ``(..., 7)``."""
+    """Pose ``(..., 7)`` of a matrix ``(..., 4, 4)`` or ``(..., 3, 4)`` whose upper left block is a rotation."""
     return torch.cat((m[..., :3, 3], so3.from_matrix(m[..., :3, :3])), -1)
 
 
 def adjoint(pose: Tensor) -> Tensor:
-    """``(..., 6, 6)`` with ``pose Exp(xi) pose^-1 = Exp(adjoint(pose) xi)``: ``[[R, [t]x R], [0, R]]``."""
+    """Adjoint ``[[R, [t]x R], [0, R]]``: ``pose Exp(xi) pose^-1 = Exp(adjoint(pose) xi)``.
+
+    Args:
+        pose: ``(..., 7)``.
+
+    Returns:
+        ``(..., 6, 6)``.
+    """
     r = so3.matrix(pose[..., 3:])
     tr = hat(pose[..., :3]) @ r
     upper = torch.cat((r, tr), -1)

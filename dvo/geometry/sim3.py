@@ -20,70 +20,100 @@ _NODES, _NODE_WEIGHTS = (torch.from_numpy(x) for x in np.polynomial.legendre.leg
 
 
 def identity(*shape: int, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Tensor:
-    """``(*shape, 8)`` similarities that move nothing."""
+    """Identity similarities ``(*shape, 8)``."""
     return from_se3(se3.identity(*shape, dtype=dtype, device=device))
 
 
 def from_se3(pose: Tensor, scale: Tensor | float = 1.0) -> Tensor:
-    """Pose ``(..., 7)`` and scale ``(...)`` to ``(..., 8)``."""
+    """Similarity of a rigid motion and a scale.
+
+    Args:
+        pose: ``(..., 7)``.
+        scale: ``(...)`` or a number, positive.
+
+    Returns:
+        ``(..., 8)``.
+    """
     scale = torch.as_tensor(scale, dtype=pose.dtype, device=pose.device)
     return torch.cat((pose, scale.expand(pose.shape[:-1])[..., None]), -1)
 
 
 def _left_jacobian(phi: Tensor, sigma: Tensor) -> Tensor:
-    """``(..., 3, 3)`` for ``phi (..., 3)`` and ``sigma (..., 1)``."""
+    """Map ``(..., 3, 3)`` from ``tau`` to the translation, for ``phi (..., 3)`` and ``sigma (..., 1)``."""
     u, w = ((x.to(phi) + (0.5 if shift else 0)) for x, shift in ((_NODES / 2, True), (_NODE_WEIGHTS / 2, False)))
     turned = so3.matrix(so3.exp(phi[..., None, :] * u[:, None]))
     return ((w * torch.exp(sigma * u))[..., None, None] * turned).sum(-3)
 
 
 def exp(xi: Tensor) -> Tensor:
-    """Tangent ``(..., 7)`` to similarity ``(..., 8)``."""
+    """Exponential map.
+
+    Args:
+        xi: ``(..., 7)`` tangent ``[tau, phi, sigma]``, ``|sigma| < 10``.
+
+    Returns:
+        ``(..., 8)``.
+    """
     tau, phi, sigma = xi.split((3, 3, 1), -1)
     t = (_left_jacobian(phi, sigma) * tau[..., None, :]).sum(-1)
     return torch.cat((t, so3.exp(phi), sigma.exp()), -1)
 
 
 def log(sim: Tensor) -> Tensor:
-    """Similarity ``(..., 8)`` to tangent ``(..., 7)``, rotation angle at most pi."""
+    """Logarithm map.
+
+    Args:
+        sim: ``(..., 8)``.
+
+    Returns:
+        ``(..., 7)`` tangent ``[tau, phi, sigma]`` with ``|phi| <= pi``.
+    """
     phi, sigma = so3.log(sim[..., 3:7]), sim[..., 7:].log()
     tau = torch.linalg.solve(_left_jacobian(phi, sigma), sim[..., :3])
     return torch.cat((tau, phi, sigma), -1)
 
 
 def compose(a: Tensor, b: Tensor) -> Tensor:
-    """``a b``: first ``b``, then ``a``."""
+    """Product ``a b`` of similarities ``(..., 8)``: first ``b``, then ``a``."""
     return torch.cat((act(a, b[..., :3]), so3.multiply(a[..., 3:7], b[..., 3:7]), a[..., 7:] * b[..., 7:]), -1)
 
 
 def inverse(sim: Tensor) -> Tensor:
-    """``sim^-1``."""
+    """Inverse of a similarity ``(..., 8)``."""
     q, scale = so3.conjugate(sim[..., 3:7]), 1 / sim[..., 7:]
     return torch.cat((-scale * so3.rotate(q, sim[..., :3]), q, scale), -1)
 
 
 def act(sim: Tensor, points: Tensor) -> Tensor:
-    """``s R p + t`` on points ``(..., 3)``."""
+    """Transform points ``(..., 3)`` by ``sim (..., 8)``: ``s R p + t``; batch dimensions broadcast."""
     return sim[..., 7:] * so3.rotate(sim[..., 3:7], points) + sim[..., :3]
 
 
 def act_on_pose(sim: Tensor, poses_wc: Tensor) -> Tensor:
-    """Camera-to-world poses ``(..., 7)`` in the new world: the centre is moved and scaled, the camera only turned."""
+    """Camera-to-world poses in a new world frame: centres are moved and scaled, orientations only rotated.
+
+    Args:
+        sim: ``(..., 8)`` old world to new world.
+        poses_wc: ``(..., 7)``.
+
+    Returns:
+        ``(..., 7)``.
+    """
     return torch.cat((act(sim, poses_wc[..., :3]), so3.multiply(sim[..., 3:7], poses_wc[..., 3:])), -1)
 
 
 def normalise(sim: Tensor) -> Tensor:
-    """Bring the quaternion back to unit length."""
+    """Scale the quaternion of a similarity ``(..., 8)`` to unit length."""
     return torch.cat((sim[..., :3], so3.normalise(sim[..., 3:7]), sim[..., 7:]), -1)
 
 
 def retract(sim: Tensor, xi: Tensor) -> Tensor:
-    """``Exp(xi) sim``, renormalised."""
+    """Left retraction ``Exp(xi) sim`` of ``sim (..., 8)`` by ``xi (..., 7)``, with a unit quaternion."""
     return normalise(compose(exp(xi), sim))
 
 
 def matrix(sim: Tensor) -> Tensor:
-    """``(..., 4, 4)`` matrix ``[[s R, t], [0, 1]]``."""
+    """Homogeneous matrix ``(..., 4, 4)`` = ``[[s R, t], [0, 1]]`` of a similarity ``(..., 8)``."""
     rigid = se3.matrix(sim[..., :7])
     scale = torch.ones_like(rigid)
     scale[..., :3, :3] = sim[..., 7:, None]
@@ -91,7 +121,7 @@ def matrix(sim: Tensor) -> Tensor:
 
 
 def adjoint(sim: Tensor) -> Tensor:
-    """``(..., 7, 7)`` with ``sim Exp(xi) sim^-1 = Exp(adjoint(sim) xi)``."""
+    """Adjoint ``(..., 7, 7)`` of ``sim (..., 8)``: ``sim Exp(xi) sim^-1 = Exp(adjoint(sim) xi)``."""
     r, t, s = so3.matrix(sim[..., 3:7]), sim[..., :3], sim[..., 7:, None]
     o, column = torch.zeros_like(r), torch.zeros_like(t)[..., None]
     top = torch.cat((s * r, so3.hat(t) @ r, -t[..., None]), -1)

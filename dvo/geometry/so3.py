@@ -54,7 +54,7 @@ def _bilinear(a: Tensor, b: Tensor, table: Tensor) -> Tensor:
 
 
 def hat(v: Tensor) -> Tensor:
-    """``(..., 3)`` to the skew matrix ``(..., 3, 3)`` with ``hat(a) b = a x b``."""
+    """Skew matrix ``(..., 3, 3)`` of ``v (..., 3)``: ``hat(a) b = a x b``."""
     return _linear(v, _HAT.view(3, 9)).unflatten(-1, (3, 3))
 
 
@@ -64,17 +64,32 @@ def cross(a: Tensor, b: Tensor, dim: int = -1) -> Tensor:
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product ``a b`` of quaternions ``(..., 4)``: first ``b``, then ``a``."""
+    """Hamilton product ``a b`` of quaternions: first ``b``, then ``a``.
+
+    Args:
+        a, b: ``(..., 4)``; batch dimensions broadcast.
+
+    Returns:
+        ``(..., 4)``.
+    """
     return _bilinear(a, b, _MULTIPLY.view(16, 4))
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """The inverse of a unit quaternion ``(..., 4)``."""
+    """Conjugate of a quaternion ``(..., 4)``, the inverse of a unit one."""
     return q * _CONJUGATE.to(q)
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Turn vectors ``(..., 3)`` by unit quaternions ``(..., 4)``."""
+    """Rotate vectors.
+
+    Args:
+        q: ``(..., 4)`` unit quaternions.
+        v: ``(..., 3)``; batch dimensions broadcast.
+
+    Returns:
+        ``(..., 3)``.
+    """
     return (matrix(q) * v[..., None, :]).sum(-1)
 
 
@@ -84,14 +99,20 @@ def normalise(q: Tensor) -> Tensor:
 
 
 def matrix(q: Tensor) -> Tensor:
-    """Unit quaternions ``(..., 4)`` to rotation matrices ``(..., 3, 3)``."""
+    """Rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
     return _bilinear(q, q, _MATRIX.reshape(16, 9)).unflatten(-1, (3, 3))
 
 
 def from_matrix(r: Tensor) -> Tensor:
-    """Rotation matrices ``(..., 3, 3)`` to unit quaternions with ``qw >= 0`` where it is not tiny.
+    """Unit quaternions of rotation matrices.
 
     Of the four textbook solutions the one with the largest divisor is taken (Shepperd 1978).
+
+    Args:
+        r: ``(..., 3, 3)``.
+
+    Returns:
+        ``(..., 4)`` with ``qw >= 0``.
     """
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = r.flatten(-2).unbind(-1)
     # four times the outer product q q^T: column c is q scaled by 4 q_c
@@ -125,7 +146,7 @@ _EXP_SERIES = torch.tensor(
 
 
 def exp_terms(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The quaternion of a rotation vector, and the two factors of the left Jacobian.
+    """Quaternion of a rotation vector, and the two coefficients of the left Jacobian of SO(3).
 
     Args:
         phi: ``(..., 3)`` radians.
@@ -137,7 +158,7 @@ def exp_terms(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     s = (phi * phi).sum(-1, keepdim=True)
     small = s < SMALL
     safe = torch.where(small, 1.0, s)
-    low = torch.where(small, s, 0.0)  # the series would overflow on a huge angle, and poison its gradient
+    low = torch.where(small, s, 0.0)  # the series would overflow on a huge angle and make its gradient NaN
     t = safe.sqrt()
     sin, cos = (0.5 * t).sin(), (0.5 * t).cos()
     closed = torch.cat((sin / t, cos, (t - 2 * sin * cos) / (safe * t)), -1)
@@ -147,14 +168,17 @@ def exp_terms(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def exp(phi: Tensor) -> Tensor:
-    """Rotation vectors ``(..., 3)`` in radians to unit quaternions ``(..., 4)``."""
+    """Unit quaternions ``(..., 4)`` of rotation vectors ``phi (..., 3)`` in radians."""
     return exp_terms(phi)[0]
 
 
 def log_terms(q: Tensor) -> tuple[Tensor, Tensor]:
-    """The rotation vector of a quaternion, and the factor of the inverse left Jacobian.
+    """Rotation vector of a quaternion, and the coefficient of the inverse left Jacobian of SO(3).
 
     ``q`` and ``-q`` are the same rotation; the one with ``qw >= 0`` is taken, hence angles in ``[0, pi]``.
+
+    Args:
+        q: ``(..., 4)`` unit quaternions.
 
     Returns:
         ``phi (..., 3)`` radians and ``e (..., 1)`` with ``V^-1 x = x - phi x x / 2 + e phi x (phi x x)``,
@@ -177,12 +201,19 @@ def log_terms(q: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def log(q: Tensor) -> Tensor:
-    """Unit quaternions ``(..., 4)`` to rotation vectors ``(..., 3)`` in radians, length at most pi."""
+    """Rotation vectors ``(..., 3)`` in radians, length at most pi, of unit quaternions ``q (..., 4)``."""
     return log_terms(q)[0]
 
 
 def angle(q: Tensor) -> Tensor:
-    """The rotation angle ``(...)`` in radians, in ``[0, pi]``. Its gradient at the identity is zero, not NaN."""
+    """Rotation angle.
+
+    Args:
+        q: ``(..., 4)`` unit quaternions.
+
+    Returns:
+        ``(...)`` radians in ``[0, pi]``. The gradient at the identity is zero, not NaN.
+    """
     phi = log(q)
     s = (phi * phi).sum(-1)
     zero = s == 0

@@ -22,7 +22,7 @@ from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import ModelConfig
 from dvo.nets.correlation import Correlation, CorrelationVolume
 from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates, random_centres
-from dvo.nets.update import Update
+from dvo.nets.update import UPDATE_OPERATORS
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
 
@@ -46,7 +46,7 @@ class PatchVO(nn.Module):
         super().__init__()
         self.config = config
         self.patchify = Patchifier(config)
-        self.update = Update(config)
+        self.update = UPDATE_OPERATORS.resolve(config.update_operator)(config)
 
     def forward(
         self,

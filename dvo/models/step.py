@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dvo.ba.layer import bundle_adjust
 from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.problem import Factor
 from dvo.geometry.projection import reproject
 from dvo.graph.edges import PatchGraph
 from dvo.nets.correlation import CorrelationLookup
@@ -74,6 +75,7 @@ class StepOptions:
         damping: of bundle adjustment.
         bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.bundle_adjust`.
         check: indices and weights, see :class:`dvo.ba.options.BAOptions`.
+        factors: further measurements for bundle adjustment, for example of depth or of an inertial sensor.
     """
 
     mode: Mode = "joint"
@@ -82,6 +84,7 @@ class StepOptions:
     damping: BADamping = BADamping()
     bounds: tuple[float, float] | None = None
     check: bool | None = False
+    factors: tuple[Factor, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -173,6 +176,7 @@ def step(
             bounds=options.bounds,
             check=options.check,
         ),
+        factors=options.factors,
     )
     return replace(state, poses_cw=solved.poses_cw, patches=solved.patches)
 

@@ -22,6 +22,7 @@ class ModelConfig:
         pyramid: down-sampling of each correlation level relative to the features.
         training_patches: patches drawn from a frame in training.
         self_edges: join patches with their own frame too, as DPVO does.
+        update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`.
     """
 
     stem_channels: int = 32
@@ -34,6 +35,7 @@ class ModelConfig:
     pyramid: tuple[int, ...] = (1, 4)
     training_patches: int = 80
     self_edges: bool = True
+    update_operator: str = "gated"
 
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
 

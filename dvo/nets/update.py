@@ -1,6 +1,7 @@
 """Gated recurrent update operator (DPVO 3.2): correlation in, flow revision and confidence out, one state an edge.
 
-Any module with the signature of :meth:`Update.forward` can take its place (:class:`UpdateOperator`).
+Any module with the signature of :meth:`Update.forward` can take its place: it is chosen by the ``update_operator`` of a
+model's configuration, a name in :data:`UPDATE_OPERATORS`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,10 @@ from torch.nn import functional
 from dvo.graph.edges import Groups, PatchGraph
 from dvo.nets.config import ModelConfig
 from dvo.nets.correlation import Correlation
+from dvo.registry import Registry
+
+UPDATE_OPERATORS = Registry("update operator", "dvo.update_operators", {"gated": "dvo.nets.update:Update"})
+"""Names to ``"module:Class"`` of an :class:`UpdateOperator` whose constructor takes a :class:`ModelConfig`."""
 
 
 class UpdateOperator(Protocol):

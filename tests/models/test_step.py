@@ -1,11 +1,14 @@
 """The public step: the same for a clip that is unrolled and for a window that is tracked."""
 
+import sys
 from dataclasses import replace
 
 import pytest
 import torch
 
 from dvo.ba.cold_start import damping_at
+from dvo.ba.factors import DepthPrior
+from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
@@ -14,6 +17,7 @@ from dvo.models.step import StepOptions, UpdateState, recent_depth, revise, step
 from dvo.nets.config import preset
 from dvo.nets.correlation import Correlation, correlate_reference
 from dvo.nets.patchifier import normalise_images, patch_coordinates, random_centres
+from dvo.nets.update import UPDATE_OPERATORS
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
 from dvo.synth.clip import make_clip
@@ -115,6 +119,39 @@ def test_modes(model, clip):
     joint = step(model, state, lookup, StepOptions(fixed=2, bounds=bounds))
     assert torch.equal(joint.poses_cw[:, :2], state.poses_cw[:, :2])
     assert not torch.equal(joint.poses_cw[:, 2:], state.poses_cw[:, 2:])
+
+
+@torch.no_grad()
+def test_further_factors_take_part(model, clip):
+    """Inverse depths held by a strong prior stay where the prior wants them."""
+    state, lookup, bounds = start(model, clip)
+    wanted = torch.full((1, FRAMES * PATCHES), 0.7)
+    prior = DepthPrior(wanted, torch.full_like(wanted, 1e6))
+    after = step(model, state, lookup, StepOptions(bounds=bounds, factors=(prior,)))
+    torch.testing.assert_close(after.patches[:, :, 2, 1, 1], wanted, atol=1e-3, rtol=0)
+
+
+class Idle(torch.nn.Module):
+    """Update operator that never revises anything."""
+
+    def __init__(self, config):
+        super().__init__()
+
+    def forward(self, hidden, context, correlation, graph):
+        return hidden, torch.zeros(*hidden.shape[:2], 2), torch.ones(*hidden.shape[:2], 2)
+
+
+def test_the_update_operator_is_exchanged_by_a_word(clip):
+    UPDATE_OPERATORS.register("idle", f"{__name__}:Idle")
+    sys.modules.setdefault(__name__, sys.modules[Idle.__module__])
+    try:
+        model = PatchVO(replace(preset("tiny"), training_patches=PATCHES, update_operator="idle"))
+        after = model(clip.images[None], clip.intrinsics[None], updates=2)
+        torch.testing.assert_close(after.poses_cw, se3.identity(1, FRAMES), atol=1e-5, rtol=0)
+    finally:
+        UPDATE_OPERATORS.unregister("idle")
+    with pytest.raises(DvoError, match="no update operator 'idle'"):
+        PatchVO(replace(preset("tiny"), update_operator="idle"))
 
 
 def test_gradients_reach_encoder_and_operator(model, clip):

@@ -9,13 +9,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
+from dvo.data.root import data_root
 from dvo.errors import DvoError
 from eval.execution.plan import Plan, read_manifest
 from eval.execution.runner import predict_all
 from eval.reporting.report import AXES, PAGE, RESULTS, TABLE, write_report, write_tables
 from eval.scoring.score import score_all
 from eval.suites.selection import config_names, folder_of_data, is_rendered, load_suites, settle
-from eval.suites.suite import data_folder, read_suites
+from eval.suites.suite import read_suites
 from eval.systems.registry import DEFAULT, list_systems
 
 
@@ -126,7 +127,7 @@ def show_list(given: argparse.Namespace) -> None:
     for system in list_systems():
         print(f"  {system.name:14} {system.licence:10} {system.missing() or 'available'}\n      {system.about}")
     try:
-        data: Path | None = data_folder(getattr(given, "data", None))
+        data: Path | None = data_root(getattr(given, "data", None))
         print(f"\nSuites (data in {data})")
     except DvoError as error:
         data = None

@@ -22,8 +22,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from dvo.data.root import data_root
 from dvo.errors import DvoError
-from eval.suites.suite import ROOT, data_folder
+from eval.suites.suite import ROOT
 
 CLIPS = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr1_rpy_60")
 WHAT = ("tracking", "ba", "training")
@@ -179,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise DvoError(f"no measurement '{unknown[0]}'", field="--what", remedy=f"choose from {', '.join(WHAT)}")
         if given.pairs < 1:
             raise DvoError(f"must be 1 or more, got {given.pairs}", field="--pairs", remedy="give a whole number")
-        data = data_folder(given.data).resolve() if "tracking" in names else Path()
+        data = data_root(given.data).resolve() if "tracking" in names else Path()
         clips = tuple(name for name in given.clips.split(",") if name)
         settings = Settings(data, given.clip, given.frames, given.steps, clips)
         with worktree(given.base) as base:

@@ -19,7 +19,7 @@ from dvo.odometry.tracker import PatchOdometry, load
 from dvo.synth.sequence import make_sequence
 
 STAGES = {
-    "encoder and patches": ("tracker.py", "_observe"),
+    "encoder and patches": ("front_end.py", "observe"),
     "graph index": ("edges.py", "build_graph"),
     "reprojection": ("projection.py", "reproject"),
     "correlation": ("edge_correlation.py", "lookup"),

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from dvo.data.registry import is_dataset
+from dvo.data.root import data_root
 from dvo.errors import DvoError
-from eval.suites.suite import SUITES, Sequence, Suite, data_folder, read_suites
+from eval.suites.suite import SUITES, Sequence, Suite, read_suites
 
 
 def load_suites(names: list[str], only: list[str] | None = None, stride: int | None = None) -> list[Suite]:
@@ -80,7 +81,7 @@ def folder_of_data(suites: list[Suite], given: Path | None) -> Path:
         DvoError: not there, though it is needed.
     """
     if needs_data_folder(suites) or given is not None:
-        return data_folder(given)
+        return data_root(given)
     return Path()
 
 

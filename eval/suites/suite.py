@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -155,21 +154,6 @@ def _checked(suite: Suite, path: Path) -> Suite:
             )
         _check(sequence.judged_by, get_args(Judge), f"{sequence.name}: judged_by", path)
     return suite
-
-
-def data_folder(given: str | Path | None = None) -> Path:
-    """Folder of the recordings: the argument, else ``$DVO_DATA``, else ``../shared/data`` beside the checkout.
-
-    Args:
-        given: by the user; None for none.
-
-    Raises:
-        DvoError: not there.
-    """
-    path = Path(given or os.environ.get("DVO_DATA") or ROOT.parent / "shared" / "data")
-    if not path.is_dir():
-        raise DvoError("no such data folder", file=path, field="--data", remedy="set DVO_DATA or give --data DIR")
-    return path
 
 
 def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, Trajectory]:

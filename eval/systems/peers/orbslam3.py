@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.data.root import data_root
 from dvo.data.trajectory import read_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.odometry.protocol import Estimate, Result, Status
-from eval.suites.suite import data_folder
 from eval.systems.peers.common import Pictures, Row, longest_part, missing_module, result, version_of
 
 VOCABULARY = "DVO_ORB_VOCABULARY"
@@ -40,7 +40,7 @@ def vocabulary_file() -> Path:
     """
     remedy = f"run python -m eval vocabulary --out FILE, then set {VOCABULARY}=FILE"
     try:
-        path = Path(os.environ.get(VOCABULARY) or data_folder(None) / "orb_vocabulary" / "tiny_orb_vocabulary.txt")
+        path = Path(os.environ.get(VOCABULARY) or data_root(None) / "orb_vocabulary" / "tiny_orb_vocabulary.txt")
     except DvoError:  # no data folder either: the vocabulary is what this system lacks
         raise DvoError("no ORB vocabulary", field=VOCABULARY, remedy=remedy) from None
     if not path.is_file():

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dvo.data.root import data_root
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from eval.suites.suite import data_folder, read_suite, reference_for
+from eval.suites.suite import read_suite, reference_for
 
 
 def test_validation_suite_of_the_checkout():
@@ -51,5 +52,5 @@ def test_reference_has_the_rows_of_the_frames_fed():
 def test_missing_data_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("DVO_DATA", str(tmp_path / "nowhere"))
     with pytest.raises(DvoError, match="nowhere"):
-        data_folder()
-    assert data_folder(tmp_path) == tmp_path
+        data_root()
+    assert data_root(tmp_path) == tmp_path

@@ -1,0 +1,59 @@
+"""The scripts of ``examples/`` run as they are, on few frames or steps."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+
+
+def run(*arguments, cwd):
+    """Output of ``python ARGUMENTS``, which must succeed."""
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)], cwd=cwd, env={**os.environ, "PYTHONPATH": path}, capture_output=True,
+        text=True, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_every_example_is_run_here():
+    text = Path(__file__).read_text(encoding="utf-8")
+    assert all(f'"{script.name}' in text for script in EXAMPLES.glob("*.py"))
+
+
+def test_track_arrays(tmp_path):
+    assert "14 of 14 frames" in run(EXAMPLES / "track_arrays.py", "--frames", "14", cwd=tmp_path)
+
+
+def test_fine_tune(tmp_path):
+    out = run(EXAMPLES / "fine_tune.py", "--steps", "2", "--out", "tuned.safetensors", cwd=tmp_path)
+    assert "gives dvo-tuned" in out and len(re.findall(r"^step \d: loss \d", out, re.MULTILINE)) == 2
+
+
+def test_bundle_adjustment_in_training(tmp_path):
+    out = run(EXAMPLES / "bundle_adjustment_in_training.py", cwd=tmp_path)
+    first, last = map(float, re.findall(r"third ([\d.]+)", out))
+    assert last < 0.6 * first
+
+
+def test_own_odometry_alone(tmp_path):
+    assert "ATE" in run(EXAMPLES / "own_odometry.py", cwd=tmp_path)
+
+
+def test_own_odometry_in_the_evaluation(tmp_path):
+    pytest.importorskip("evo")
+    rendered = {"seed": 3, "frames": 8, "height": 48, "width": 64, "fps": 10.0, "version": 3}
+    suite = {"name": "short", "label": "a short clip", "sequences": [{"name": "short", "rendered": rendered}]}
+    (tmp_path / "short.yaml").write_text(yaml.safe_dump(suite))
+    system = f"{EXAMPLES / 'own_odometry.py'}:PhaseOdometry"
+    run("-m", "eval", "run", "--suite", tmp_path / "short.yaml", "--systems", f"{system},null", "--seeds", "1",
+        "--out", tmp_path / "out", "--threads", "1", cwd=ROOT)  # fmt: skip
+    assert "PhaseOdometry" in (tmp_path / "out" / "results.csv").read_text()

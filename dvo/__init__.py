@@ -16,29 +16,65 @@ from typing import TYPE_CHECKING, Any
 from dvo.errors import DvoError
 
 if TYPE_CHECKING:
+    from dvo import losses
     from dvo.ba.layer import bundle_adjust
+    from dvo.ba.options import BADamping, BAOptions, BAResult
+    from dvo.data.frame import Frame
     from dvo.data.source import open_source as open
+    from dvo.data.trajectory import Trajectory
+    from dvo.geometry import se3
+    from dvo.geometry.camera import Camera
+    from dvo.metrics import Metrics, evaluate
     from dvo.models.weights import load_model
-    from dvo.odometry.tracker import load
+    from dvo.nets.config import ModelConfig
+    from dvo.odometry.config import TrackerConfig
+    from dvo.odometry.load import load
+    from dvo.odometry.protocol import Estimate, Odometry, Result, SparseMap, Status
+    from dvo.odometry.session import run
+    from dvo.synth.dataset import ClipDataset
 
-__version__ = "0.1.0"
-
-__all__ = ["DvoError", "__version__", "bundle_adjust", "load", "load_model", "open"]
+__version__ = "0.2.0"
 
 _LAZY = {
+    "BADamping": ("dvo.ba.options", "BADamping"),
+    "BAOptions": ("dvo.ba.options", "BAOptions"),
+    "BAResult": ("dvo.ba.options", "BAResult"),
+    "Camera": ("dvo.geometry.camera", "Camera"),
+    "ClipDataset": ("dvo.synth.dataset", "ClipDataset"),
+    "Estimate": ("dvo.odometry.protocol", "Estimate"),
+    "Frame": ("dvo.data.frame", "Frame"),
+    "Metrics": ("dvo.metrics", "Metrics"),
+    "ModelConfig": ("dvo.nets.config", "ModelConfig"),
+    "Odometry": ("dvo.odometry.protocol", "Odometry"),
+    "Result": ("dvo.odometry.protocol", "Result"),
+    "SparseMap": ("dvo.odometry.protocol", "SparseMap"),
+    "Status": ("dvo.odometry.protocol", "Status"),
+    "TrackerConfig": ("dvo.odometry.config", "TrackerConfig"),
+    "Trajectory": ("dvo.data.trajectory", "Trajectory"),
     "bundle_adjust": ("dvo.ba.layer", "bundle_adjust"),
-    "load": ("dvo.odometry.tracker", "load"),
+    "evaluate": ("dvo.metrics", "evaluate"),
+    "load": ("dvo.odometry.load", "load"),
     "load_model": ("dvo.models.weights", "load_model"),
+    "losses": ("dvo.losses", ""),
     "open": ("dvo.data.source", "open_source"),
+    "run": ("dvo.odometry.session", "run"),
+    "se3": ("dvo.geometry.se3", ""),
 }
+
+__all__ = [
+    "BADamping", "BAOptions", "BAResult", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "Metrics",
+    "ModelConfig", "Odometry", "Result", "SparseMap", "Status", "TrackerConfig", "Trajectory", "__version__",
+    "bundle_adjust", "evaluate", "load", "load_model", "losses", "open", "run", "se3",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    """PEP 562: resolve a public name on first use."""
+    """Resolve a public name on first use (PEP 562)."""
     if name not in _LAZY:
         raise AttributeError(f"module 'dvo' has no attribute '{name}'")
     module, attribute = _LAZY[name]
-    value = getattr(import_module(module), attribute)
+    found = import_module(module)
+    value = getattr(found, attribute) if attribute else found
     globals()[name] = value
     return value
 

@@ -3,8 +3,8 @@
     python examples/bundle_adjustment_in_training.py [--steps 60]
 
 A scene is seen from five cameras; a third of the measurements is wrong by several pixels, and a feature of each
-measurement betrays it, though not linearly. A small network maps the feature to a weight, `dvo.bundle_adjust` solves for
-the poses with these weights, and the gradient of the pose error flows back through the solver.
+measurement tells which, though not linearly. A small network maps the feature to a weight, `dvo.bundle_adjust` solves
+for the poses with these weights, and the gradient of the pose error flows back through the solver.
 """
 
 import argparse

@@ -55,7 +55,7 @@ def main() -> None:
     clip = make_sequence(3, frames=30, family="corridor", fps=15.0, height=120, width=160)
     run = dvo.run(PhaseOdometry(), clip)
     metrics = dvo.evaluate(run.result.trajectory, clip.groundtruth)
-    print(f"ATE {metrics.ate_percent:.1f} % of the path, rotation error over rotation {metrics.rotation_error_ratio:.2f}")
+    print(f"ATE {metrics.ate_percent:.1f} %, rotation error over rotation {metrics.rotation_error_ratio:.2f}")
 
 
 if __name__ == "__main__":

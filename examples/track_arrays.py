@@ -11,7 +11,7 @@ import dvo
 
 
 def images(count: int):
-    """Stand-in for your own images: a rendered walk through a room. Yields time in seconds and ``(H, W, 3)`` uint8 RGB."""
+    """Stand-in for your own images: a rendered walk. Yields seconds, ``(H, W, 3)`` uint8 RGB, and the camera."""
     from dvo.synth import make_sequence
 
     for frame in make_sequence(0, frames=count, family="room", kind="handheld", fps=30.0):

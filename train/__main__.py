@@ -1,10 +1,12 @@
 """Training programs, run from a checkout:
 
-- ``python -m train fit --config configs/train/small.yaml`` trains (LightningCLI). Ctrl-C stops after the running step
-  and saves; the same command goes on.
-- ``export CHECKPOINT FILE`` ships the weights; ``validate CHECKPOINT`` tracks real sequences with them.
-- ``snr CHECKPOINT`` measures the signal-to-noise ratio of the flow loss's gradient, plain and weighted (V2V).
-- ``study --config configs/train/study.yaml`` compares DPVO's loss with V2V's.
+- ``python -m train fit --config configs/train/small.yaml`` trains the network of the task that the configuration names
+  (LightningCLI). Ctrl-C stops after the running step and saves; the same command goes on.
+- ``export CHECKPOINT FILE`` writes the weights; ``validate CHECKPOINT`` tracks real sequences with them.
+- ``state CHECKPOINT FILE`` copies a training state without the paths of the machine that it comes from.
+- ``snr CHECKPOINT`` measures the signal-to-noise ratio of gradients, for ``patch_vo`` of the plain and the weighted
+  (V2V) flow loss.
+- ``study --config configs/train/study.yaml`` compares losses on the same clips, for ``patch_vo`` DPVO's with V2V's.
 - ``profile`` prints where the seconds of a training step go.
 """
 
@@ -14,11 +16,12 @@ import importlib
 import sys
 
 COMMANDS = {
-    "export": "train.engine.export",
-    "validate": "train.validation.validate",
-    "snr": "train.studies.snr",
-    "study": "train.studies.study",
-    "profile": "train.studies.breakdown",
+    "export": "train.engine.export:export",
+    "state": "train.engine.export:export_state",
+    "validate": "train.validation.validate:main",
+    "snr": "train.studies.snr:main",
+    "study": "train.studies.study:main",
+    "profile": "train.studies.breakdown:main",
 }
 
 
@@ -34,19 +37,17 @@ def main() -> None:
 
 
 def run() -> None:
-    """What may be typed after ``python -m train``."""
+    """Run the command that the command line names; whatever is none of :data:`COMMANDS` is for LightningCLI."""
     command, rest = (sys.argv[1:2] or [""])[0], sys.argv[2:]
     if command in COMMANDS:
-        importlib.import_module(COMMANDS[command]).main(rest)
+        module, _, function = COMMANDS[command].partition(":")
+        getattr(importlib.import_module(module), function)(rest)
         return
-    from lightning.pytorch.cli import LightningCLI
-
     from dvo.allocator import reuse_freed_memory
-    from train.data.clips import Renderings
-    from train.tasks.patch_vo.module import PatchVOTraining
+    from train.engine.cli import train
 
     reuse_freed_memory()
-    LightningCLI(PatchVOTraining, Renderings, seed_everything_default=0, save_config_kwargs={"overwrite": True})
+    train()
 
 
 if __name__ == "__main__":

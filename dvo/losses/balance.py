@@ -15,21 +15,26 @@ import torch
 from torch import Tensor
 
 FLOOR = 1e-6
-"""Gradient norms below this count as this."""
+"""Lowest gradient norm: smaller ones count as this."""
 
 PARAMETER = "update.gru.1.res.0.weight"
-"""Where V2V measures: the first linear layer of the first gated residual of the update operator."""
+"""Parameter on which V2V measures: the first linear layer of the first gated residual of the update operator."""
 
 
 @dataclass
 class Coefficient:
-    """A weight that follows the ratio of two gradient norms, slowly.
+    """Weight that follows the ratio of two gradient norms, slowly.
 
     Attributes:
         value: present weight.
         window: measurements in the mean.
         reach: one measurement counts as at most ``reach`` times, at least ``1 / reach`` of the present value.
         recent: the last measurements, clamped.
+
+    Example:
+        >>> beta = Coefficient()
+        >>> norms = [float(gradient(loss, parameter).norm()) for loss in (pose_loss, flow_loss)]
+        >>> total = pose_loss + beta.follow(*norms) * flow_loss
     """
 
     value: float = 1.0
@@ -43,6 +48,9 @@ class Coefficient:
         Args:
             leading: gradient norm of the term whose weight stays.
             balanced: gradient norm, unweighted, of the term whose weight this is.
+
+        Returns:
+            the mean of the last clamped ratios ``leading / balanced``.
         """
         ratio = max(leading, FLOOR) / max(balanced, FLOOR)
         clamped = min(max(ratio, self.value / self.reach), self.value * self.reach)
@@ -51,16 +59,27 @@ class Coefficient:
         return self.value
 
     def state_dict(self) -> dict[str, Any]:
+        """Plain values, for checkpoints."""
         return {"value": self.value, "recent": list(self.recent)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore :meth:`state_dict`; measurements beyond the window are dropped."""
         self.value, self.recent = float(state["value"]), tuple(state["recent"])[-self.window :]
 
 
 def gradient(loss: Tensor, parameter: Tensor) -> Tensor:
-    """Gradient of a loss with respect to one parameter, zero where it does not depend on it; the graph is kept and
-    nothing is accumulated. Under distributed training it is the mean over all processes, so that its norm is that of
-    the gradient which the optimiser would see."""
+    """Gradient of a loss with respect to one parameter.
+
+    The graph is kept and nothing is accumulated. Under distributed training it is the mean over all processes, so that
+    its norm is that of the gradient which the optimiser would see.
+
+    Args:
+        loss: scalar.
+        parameter: any shape.
+
+    Returns:
+        tensor of the shape of the parameter, detached; zero if the loss does not depend on it.
+    """
     found = None
     if loss.requires_grad:
         (found,) = torch.autograd.grad(loss, parameter, retain_graph=True, allow_unused=True)

@@ -27,8 +27,17 @@ class PoseErrors:
 def alignment_scale(
     estimate: Float[Tensor, "B N 3"], truth: Float[Tensor, "B N 3"], limit: float = 10.0
 ) -> Float[Tensor, " B"]:
-    """The factor for the estimated camera centres: variance of the truth over the sum of singular values of the
-    covariance (DPVO's ``kabsch_umeyama``), detached, at most ``limit``."""
+    """Scale that aligns the estimated camera centres with the true ones (DPVO's ``kabsch_umeyama``).
+
+    Variance of the truth over the sum of the singular values of the covariance; detached.
+
+    Args:
+        estimate, truth: camera centres in the world frame; the unit of the result is that of the truth.
+        limit: highest scale, for estimates that hardly move.
+
+    Returns:
+        factor for the estimate, one a clip.
+    """
     with torch.no_grad():
         a = (truth - truth.mean(1, keepdim=True)).double()
         b = (estimate - estimate.mean(1, keepdim=True)).double()
@@ -40,10 +49,19 @@ def alignment_scale(
 
 
 def pose_errors(estimate_cw: Float[Tensor, "B N 7"], truth_cw: Float[Tensor, "B N 7"]) -> PoseErrors:
-    """Errors of all relative motions ``i -> j``, ``i != j``; only the scale of the estimate is aligned.
+    """Errors of all relative motions ``i -> j``, ``i != j``; only the scale of the estimate is aligned (DPVO 3.3).
 
     Args:
-        estimate_cw, truth_cw: world to camera.
+        estimate_cw: estimated poses, world to camera.
+        truth_cw: true poses, world to camera; their unit is that of the translation error.
+
+    Returns:
+        mean norms of the two halves of ``log(truth_ij estimate_ij^-1)``, with gradients to ``estimate_cw`` (finite also
+        where the error is zero).
+
+    Example:
+        >>> errors = pose_errors(state.poses_cw, truth_cw)
+        >>> loss = (errors.translation + errors.rotation).mean()
     """
     estimate, truth = se3.inverse(estimate_cw), se3.inverse(truth_cw)
     scale = alignment_scale(estimate[..., :3], truth[..., :3])

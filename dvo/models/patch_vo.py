@@ -19,7 +19,7 @@ from dvo.geometry import se3
 from dvo.graph.edges import PatchGraph
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
-from dvo.nets.config import ModelConfig
+from dvo.nets.config import PRESETS, ModelConfig
 from dvo.nets.correlation import Correlation, CorrelationVolume
 from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates, random_centres
 from dvo.nets.update import UPDATE_OPERATORS
@@ -41,6 +41,10 @@ class PatchVO(nn.Module):
         >>> state.poses_cw.shape
         torch.Size([1, 5, 7])
     """
+
+    architecture = "patch_vo"
+    config_type = ModelConfig
+    presets = PRESETS
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()

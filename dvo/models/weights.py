@@ -1,4 +1,4 @@
-"""Weights files: safetensors with the architecture in the metadata; import of DPVO's pickled checkpoints."""
+"""Weights files: safetensors with architecture and sizes in the metadata; import of DPVO's pickled checkpoints."""
 
 from __future__ import annotations
 
@@ -12,25 +12,32 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from dvo.errors import DvoError
-from dvo.models.patch_vo import PatchVO
-from dvo.nets.config import PRESETS, ModelConfig
+from dvo.models.registry import (
+    DEFAULT_ARCHITECTURE,
+    NetworkConfig,
+    as_network,
+    build_network,
+    network_class,
+    preset_name,
+)
 
 FOLDER = Path(__file__).resolve().parent.parent / "weights"
-"""Where the weights of the package lie."""
+"""Folder of the weights that ship with the package."""
 
 
 @dataclass(frozen=True)
 class WeightsInfo:
-    """What a weights file says of itself.
+    """Contents of a weights file, without its tensors.
 
     Attributes:
         name: stem of the file.
-        path: where it lies.
-        preset: preset that it was made from, or ``custom``.
-        config: its architecture.
+        path: the file.
+        architecture: name in :data:`dvo.models.registry.ARCHITECTURES`.
+        preset: preset with these sizes, or ``custom``.
+        config: sizes of the network.
         parameters, tensors: counts.
         sha256: of the file.
         card: free facts of the model card: training steps, hours, licence, validation figures.
@@ -38,8 +45,9 @@ class WeightsInfo:
 
     name: str
     path: Path
+    architecture: str
     preset: str
-    config: ModelConfig
+    config: NetworkConfig
     parameters: int
     tensors: int
     sha256: str
@@ -48,16 +56,38 @@ class WeightsInfo:
 
 @dataclass(frozen=True)
 class LoadedWeights:
-    """A network with its origin."""
+    """A network with its origin.
 
-    model: PatchVO
+    Attributes:
+        model: the network, in evaluation mode.
+        name: of the weights; reports call the odometry ``dvo-NAME``.
+        architecture: name in :data:`dvo.models.registry.ARCHITECTURES`.
+        preset: preset with the network's sizes, or ``custom``.
+        info: the weights file; None for a network from elsewhere, for instance from a training checkpoint.
+    """
+
+    model: nn.Module
     name: str
+    architecture: str
     preset: str
-    info: WeightsInfo
+    info: WeightsInfo | None = None
+
+    @classmethod
+    def of(cls, model: nn.Module, name: str, info: WeightsInfo | None = None) -> LoadedWeights:
+        """Describe a network that is in memory already.
+
+        Raises:
+            DvoError: a module that does not name its architecture and sizes.
+        """
+        network = as_network(model)
+        return cls(model, name, network.architecture, preset_name(network, network.config), info)
 
 
 def find_weights(name_or_file: str | Path) -> Path:
     """The file of shipped weights by name, or a file by path.
+
+    Args:
+        name_or_file: a path wins over a name.
 
     Raises:
         DvoError: neither.
@@ -85,21 +115,30 @@ def _open(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def _parse(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> WeightsInfo:
+    architecture = metadata.get("architecture", DEFAULT_ARCHITECTURE)
+    network = network_class(architecture, path)
     try:
-        config = ModelConfig.from_dict(json.loads(metadata["config"]))
+        config = network.config_type.from_dict(json.loads(metadata["config"]))
         card = json.loads(metadata.get("card", "{}"))
     except (KeyError, ValueError, TypeError, AttributeError, DvoError) as error:
         raise DvoError(
-            f"metadata does not tell the architecture ({error})", file=path, field="config", remedy="give dvo weights"
+            f"metadata does not give the sizes of the network ({error})",
+            file=path,
+            field="config",
+            remedy="give dvo weights",
         ) from error
-    preset = next((name for name, known in PRESETS.items() if known == config), "custom")
     count = sum(t.numel() for t in tensors.values())
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return WeightsInfo(path.stem, path, preset, config, count, len(tensors), digest, card)
+    preset = preset_name(network, config)
+    return WeightsInfo(path.stem, path, architecture, preset, config, count, len(tensors), digest, card)
 
 
 def weights_info(name_or_file: str | Path) -> WeightsInfo:
-    """What is in a weights file. Raises DvoError as :func:`load_weights` does."""
+    """Contents of a weights file, without its tensors.
+
+    Raises:
+        DvoError: as :func:`load_weights`, but for the tensors, which are counted and not compared.
+    """
     path = find_weights(name_or_file)
     return _parse(path, *_open(path))
 
@@ -110,29 +149,43 @@ def list_weights() -> list[WeightsInfo]:
 
 
 def load_weights(name_or_file: str | Path, device: torch.device | str = "cpu") -> LoadedWeights:
-    """Read a network.
+    """Read a network of any architecture.
 
     Args:
-        name_or_file: shipped weights by name, or a safetensors file.
+        name_or_file: shipped weights by name, or a safetensors file. A file that names no architecture holds
+            ``patch_vo``.
+        device: where to put the network.
 
     Raises:
-        DvoError: no such file; not safetensors (a pickle is never opened here); tensors that are missing, of the wrong
-            shape, or not finite.
+        DvoError: no such file; not safetensors (a pickle is never opened here); an architecture that is not
+            registered; tensors that are missing, of the wrong shape, or not finite.
     """
     path = find_weights(name_or_file)
     tensors, metadata = _open(path)
     info = _parse(path, tensors, metadata)
-    model = PatchVO(info.config)
+    model = build_network(info.architecture, info.config)
     _fill(model, tensors, path)
-    return LoadedWeights(model.to(device).eval(), info.name, info.preset, info)
+    return LoadedWeights.of(model.to(device).eval(), info.name, info)
 
 
-def load_model(name_or_file: str | Path = "small", device: torch.device | str = "cpu") -> PatchVO:
-    """The bare network, see :func:`load_weights`."""
+def load_model(name_or_file: str | Path = "small", device: torch.device | str = "cpu") -> nn.Module:
+    """The bare network of a weights file, in evaluation mode.
+
+    Args:
+        name_or_file: shipped weights by name, or a safetensors file.
+        device: where to put the network.
+
+    Raises:
+        DvoError: see :func:`load_weights`.
+
+    Example:
+        >>> sum(parameter.numel() for parameter in dvo.load_model("small").parameters())
+        462692
+    """
     return load_weights(name_or_file, device).model
 
 
-def _fill(model: PatchVO, tensors: dict[str, Tensor], path: Path) -> None:
+def _fill(model: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     wanted = model.state_dict()
     missing, extra = sorted(set(wanted) - set(tensors)), sorted(set(tensors) - set(wanted))
     wrong = [k for k in wanted if k in tensors and wanted[k].shape != tensors[k].shape]
@@ -144,19 +197,31 @@ def _fill(model: PatchVO, tensors: dict[str, Tensor], path: Path) -> None:
     bad = [k for k, t in tensors.items() if not torch.isfinite(t.float()).all()]
     if bad:
         raise DvoError("holds numbers that are not finite", file=path, field=bad[0], remedy="use another checkpoint")
-    model.load_state_dict({k: t.float() for k, t in tensors.items()})
+    model.load_state_dict({k: t.float() if t.is_floating_point() else t for k, t in tensors.items()})
 
 
-def save_weights(path: str | Path, model: PatchVO, card: dict[str, Any], half: bool = True) -> None:
-    """Write a network as safetensors.
+def save_weights(path: str | Path, model: nn.Module, card: dict[str, Any], half: bool = True) -> None:
+    """Write a network as safetensors, with its architecture and sizes in the metadata.
 
     Args:
+        path: file to write; its folder is made if need be.
+        model: a network as :class:`dvo.models.registry.Network` describes it.
         card: facts for the model card, JSON-able.
         half: store float16.
+
+    Raises:
+        DvoError: a module that does not name its architecture and sizes.
     """
+    network = as_network(model)
     dtype = torch.float16 if half else torch.float32
-    tensors = {k: t.detach().cpu().to(dtype).contiguous() for k, t in model.state_dict().items()}
-    metadata = {"config": json.dumps(model.config.to_dict()), "card": json.dumps(card), "format": "pt"}
+    tensors = {
+        k: (t.to(dtype) if t.is_floating_point() else t).detach().cpu().contiguous()
+        for k, t in model.state_dict().items()
+    }
+    metadata = {
+        "architecture": network.architecture, "config": json.dumps(network.config.to_dict()), "card": json.dumps(card),
+        "format": "pt",
+    }  # fmt: skip
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     save_file(tensors, path, metadata)
 
@@ -169,6 +234,7 @@ def import_checkpoint(file: str | Path, out: str | Path) -> WeightsInfo:
     BGR and dvo RGB.
 
     Args:
+        file: the checkpoint, ``dpvo.pth``.
         out: the safetensors file to write.
 
     Raises:
@@ -190,7 +256,7 @@ def import_checkpoint(file: str | Path, out: str | Path) -> WeightsInfo:
         raise DvoError("holds no state dict", file=file, remedy="give a DPVO checkpoint (dpvo.pth)")
     tensors = {key.removeprefix("module."): value.float() for key, value in state.items()}
     tensors.pop("update.lmbda", None)
-    model = PatchVO(PRESETS["full"])
+    model = build_network("patch_vo", network_class("patch_vo").presets["full"])
     for name in ("patchify.fnet.conv1.weight", "patchify.inet.conv1.weight"):
         if name in tensors and tensors[name].ndim == 4:
             tensors[name] = tensors[name].flip(1)

@@ -10,7 +10,7 @@ from dvo.errors import DvoError
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Architecture of :class:`dvo.models.patch_vo.PatchVO`.
+    """Sizes of :class:`dvo.models.patch_vo.PatchVO`.
 
     Attributes:
         stem_channels, trunk_channels: encoder channels at 1/2 and 1/4 of the image resolution.
@@ -23,6 +23,9 @@ class ModelConfig:
         training_patches: patches drawn from a frame in training.
         self_edges: join patches with their own frame too, as DPVO does.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`.
+
+    Raises:
+        DvoError: a size below 1, or an even patch.
     """
 
     stem_channels: int = 32
@@ -39,11 +42,24 @@ class ModelConfig:
 
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
 
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, str):
+                continue
+            sizes = value if isinstance(value, tuple) else (value,)
+            if not sizes or not all(isinstance(size, int) and (size > 0 or size is False) for size in sizes):
+                raise DvoError(f"must be 1 or more, got {value}", field=field.name, remedy="give a whole number")
+        if self.patch_size % 2 == 0:
+            raise DvoError(f"must be odd, got {self.patch_size}", field="patch_size", remedy="give 1, 3 or 5")
+
     @property
     def correlation_channels(self) -> int:
+        """Correlations of one edge: levels x offsets x pixels of a patch."""
         return len(self.pyramid) * (2 * self.radius + 1) ** 2 * self.patch_size**2
 
     def to_dict(self) -> dict[str, Any]:
+        """Plain values, for the metadata of weights."""
         return asdict(self)
 
     @classmethod
@@ -90,6 +106,9 @@ PRESETS: dict[str, ModelConfig] = {
 
 def preset(name: str) -> ModelConfig:
     """The preset of that name.
+
+    Args:
+        name: key of :data:`PRESETS`.
 
     Raises:
         DvoError: no such preset.

@@ -7,7 +7,7 @@ keyframe. What leaves the window is archived (:mod:`dvo.graph.keyframe_graph`).
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import numpy as np
 import torch
@@ -21,9 +21,8 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions, recent_depth
-from dvo.models.weights import load_weights
 from dvo.nets.patchifier import patch_coordinates
-from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.config import TrackerConfig
 from dvo.odometry.front_end import observe
 from dvo.odometry.initialisation import initialise, median_revision
 from dvo.odometry.motion import flow_magnitude, predict_pose
@@ -233,31 +232,3 @@ class PatchOdometry:
 
     def _pose_wc(self, position: int) -> np.ndarray:
         return se3.inverse(self.window.poses_cw[position]).double().cpu().numpy()
-
-
-def load(
-    weights: str = "small",
-    *,
-    device: torch.device | str = "cpu",
-    seed: int = 0,
-    config: TrackerConfig | None = None,
-    **overrides: object,
-) -> PatchOdometry:
-    """The learned odometry, ready to track one sequence.
-
-    Args:
-        weights: name of weights that ship with dvo, or a file.
-        device: where to compute.
-        seed: see :class:`PatchOdometry`.
-        config: settings; None takes those of the preset.
-        overrides: single settings, by the names of :class:`TrackerConfig`.
-
-    Raises:
-        DvoError: no such weights, or a file that is none; an unknown setting.
-    """
-    loaded = load_weights(weights, device)
-    config = config or TRACKER_PRESETS.get(loaded.preset, TrackerConfig())
-    if overrides:
-        TrackerConfig.from_dict(dict(overrides))
-        config = replace(config, **overrides)  # type: ignore[arg-type]
-    return PatchOdometry(loaded.model, config, seed=seed, device=device, name=f"dvo-{loaded.name}")

@@ -69,15 +69,9 @@ def clip_seconds(count: int, recipe: dict[str, Any]) -> tuple[float, list[dict[s
 
 def step_seconds(count: int, recipe: dict[str, Any], batches: list[dict[str, torch.Tensor]]) -> float:
     """Mean seconds of a training step: loss, backward, clipping, optimiser; the phase with bundle adjustment."""
-    from train.data.augment import Augmentation
-    from train.tasks.patch_vo.module import PatchVOTraining
-    from train.tasks.patch_vo.objective import LossConfig
+    from train.engine.build import make_program
 
-    given = dict(recipe["model"])
-    given["loss"] = LossConfig(**given.get("loss", {}))
-    if given.get("augmentation") is not None:
-        given["augmentation"] = Augmentation(**given["augmentation"])
-    module = PatchVOTraining(**{**given, "warmup_until": 0.0})
+    module = make_program(**{**recipe["model"], "warmup_until": 0.0})
     module.log_dict = module.log = lambda *_, **__: None  # type: ignore[assignment,method-assign]
     optimizer = module.configure_optimizers()["optimizer"]
     spent = []

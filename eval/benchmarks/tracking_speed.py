@@ -15,7 +15,8 @@ import time
 import torch
 
 from dvo.allocator import reuse_freed_memory
-from dvo.odometry.tracker import PatchOdometry, load
+from dvo.odometry.load import load
+from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
 
 STAGES = {

@@ -9,7 +9,7 @@ import torch
 import dvo.synth.dataset
 from dvo.synth.clip import make_clip
 from train.data.clips import Renderings
-from train.tasks.patch_vo.module import PatchVOTraining
+from train.engine.build import make_program
 
 CLIP = {"frames": 4, "sizes": [(48, 64), (64, 48)], "workers": 0, "seed": 5}
 
@@ -44,7 +44,7 @@ class Runs:
     def module(**changes):
         torch.manual_seed(0)
         options = {"model": "tiny", "updates": 3, "initial": 3, "settle": 1, "warmup_until": 0.0}
-        return PatchVOTraining(**(options | changes))
+        return make_program("patch_vo", **(options | changes))
 
     @staticmethod
     def data(**changes):

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What to draw; one draw for all frames of a clip, but for the exposure. The defaults are DPVO's.
+    """Distribution of the changes; one draw for all frames of a clip, but for the exposure. The defaults are DPVO's.
 
     Attributes:
         colour: probability of a change of colours.
@@ -21,8 +21,8 @@ class Augmentation:
         grey, invert: probabilities, given a change of colours.
         zoom: probability of crop-and-resize.
         zoom_range: the window is the image over ``2^u``, ``u`` from ``[0, zoom_range]``.
-        off_centre: whether the window lies anywhere, or in the middle as DPVO's.
-        exposure: probability that the exposure drifts from frame to frame and jumps once, as an automatic one does.
+        off_centre: draw the position of the window; otherwise it is in the middle, as in DPVO.
+        exposure: probability of an exposure that drifts from frame to frame and jumps once, as automatic exposure does.
         exposure_range: lowest and highest size of the jump, stops; the drift is a third of it over the clip.
     """
 
@@ -41,7 +41,14 @@ class Augmentation:
 
 
 def augment(batch: dict[str, Tensor], settings: Augmentation, seed: int, step: int) -> dict[str, Tensor]:
-    """The batch, changed; the same for the same seed, step and process."""
+    """Change a batch at random, the same for the same seed, step and process.
+
+    Args:
+        batch: ``images (B, N, 3, H, W)`` uint8, ``depth (B, N, H, W)``, ``intrinsics (B, N, 4)``, and whatever else.
+        settings: distribution of the changes.
+        seed: of the draws.
+        step: of training.
+    """
     from train.engine.ranks import rank
 
     clips = []
@@ -69,7 +76,7 @@ def _zoom(clip: dict[str, Tensor], settings: Augmentation, draw: torch.Generator
 
 
 def crop_and_resize(clip: dict[str, Tensor], scale: float, left: float, top: float) -> dict[str, Tensor]:
-    """A window of a clip, enlarged to the size of the clip.
+    """Enlarge a window of a clip to the size of the clip.
 
     Args:
         clip: ``images (N, 3, H, W)`` uint8, ``depth (N, H, W)``, ``intrinsics (N, 4)``; pixel centres at integers.

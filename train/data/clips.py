@@ -3,32 +3,19 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import lightning as L
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
 from dvo.allocator import reuse_freed_memory
+from dvo.errors import DvoError
 from dvo.synth.dataset import ClipDataset
 from train.data.real import RealClips, RealData
-
-
-class _From(Sampler[int]):
-    """Indices from a start on, without end: clip ``i`` is the same whenever training is resumed. Of several processes
-    each takes its part of every batch."""
-
-    def __init__(self, start: int, batch: int = 1, processes: int = 1, rank: int = 0) -> None:
-        self.start, self.batch, self.processes, self.rank = start, batch, processes, rank
-
-    def __iter__(self) -> Iterator[int]:
-        first = self.start + self.rank * self.batch
-        while True:
-            yield from range(first, first + self.batch)
-            first += self.batch * self.processes
+from train.data.stream import ClipStream, StreamSampler
 
 
 def _start_worker(_: int) -> None:
@@ -38,8 +25,8 @@ def _start_worker(_: int) -> None:
 
 
 @dataclass
-class Course:
-    """What clips look like from a clip on (a curriculum is a list of these).
+class CurriculumStage:
+    """Kind of clips from an index on; a curriculum is a list of these.
 
     Attributes:
         from_clip: index of the first such clip.
@@ -58,26 +45,33 @@ class MixedClips(Dataset[dict[str, torch.Tensor]]):
 
     Args:
         seed: of scenes, paths and sensors.
-        courses: what to render, by increasing ``from_clip``, the first 0.
+        stages: kinds of clips, by increasing ``from_clip``, the first 0.
         batch_size: clips that must share a size, those of all processes together.
         real: recordings to mix in.
         options: further options of :class:`dvo.synth.dataset.ClipDataset`.
+
+    Items are as those of :class:`dvo.synth.dataset.ClipDataset`.
     """
 
     def __init__(
-        self, seed: int, courses: Sequence[Course], batch_size: int, real: RealData | None = None, **options: Any
+        self,
+        seed: int,
+        stages: Sequence[CurriculumStage],
+        batch_size: int,
+        real: RealData | None = None,
+        **options: Any,
     ) -> None:
         self.seed, self.batch_size, self.real = seed, batch_size, real
-        self.courses = list(courses)
+        self.stages = list(stages)
         self.rendered: list[Sequence[Dataset[dict[str, torch.Tensor]]]] = []
         self.recorded: list[Sequence[Dataset[dict[str, torch.Tensor]]]] = []
-        for course in self.courses:
-            flow = (course.flow_low, course.flow_high)
+        for stage in self.stages:
+            flow = (stage.flow_low, stage.flow_high)
             self.rendered.append(
-                [ClipDataset(seed, 2**62, height=h, width=w, flow_range=flow, **options) for h, w in course.sizes]
+                [ClipDataset(seed, 2**62, height=h, width=w, flow_range=flow, **options) for h, w in stage.sizes]
             )
             if real is not None:
-                self.recorded.append([RealClips(seed, real, options["frames"], h, w) for h, w in course.sizes])
+                self.recorded.append([RealClips(seed, real, options["frames"], h, w) for h, w in stage.sizes])
 
     def __len__(self) -> int:
         return 2**62
@@ -85,14 +79,14 @@ class MixedClips(Dataset[dict[str, torch.Tensor]]):
     def __getitem__(self, index: int) -> dict[str, torch.Tensor]:
         batch = index // self.batch_size
         first = batch * self.batch_size
-        course = max(i for i, c in enumerate(self.courses) if c.from_clip <= first)
-        clips = self.rendered[course]
+        stage = max(i for i, s in enumerate(self.stages) if s.from_clip <= first)
+        clips = self.rendered[stage]
         if self.real is not None and np.random.default_rng([self.seed, 9109, batch]).random() < self.real.share:
-            clips = self.recorded[course]
+            clips = self.recorded[stage]
         return clips[batch % len(clips)][index]
 
 
-class Renderings(L.LightningDataModule):
+class Renderings(ClipStream):
     """An endless stream of rendered clips, the same for the same seed whatever the number of workers and processes.
 
     Args:
@@ -102,9 +96,13 @@ class Renderings(L.LightningDataModule):
         sizes: height and width of a clip in pixels, taken in turn by the batches.
         flow_low, flow_high: range of the mean induced flow between consecutive frames, pixels.
         workers: rendering processes; 0 renders in the training process.
-        courses: later changes of sizes and flow, by the index of the first clip; None for none.
+        stages: later changes of sizes and flow, by the index of the first clip; None for none.
         real: recordings to train on as well or instead.
         textures: folder of photographs to paint the scenes with; None: those that scikit-image ships.
+        courses: former name of ``stages``.
+
+    Raises:
+        DvoError: ``stages`` under both names.
     """
 
     def __init__(
@@ -116,35 +114,35 @@ class Renderings(L.LightningDataModule):
         flow_low: float = 2.0,
         flow_high: float = 19.0,
         workers: int = 1,
-        courses: list[Course] | None = None,
+        stages: list[CurriculumStage] | None = None,
         real: RealData | None = None,
         textures: str | None = None,
+        courses: list[CurriculumStage] | None = None,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters(ignore=["courses", "real"], logger=False)  # its seed need not be that of the module
+        if stages and courses:
+            raise DvoError("is the former name of 'stages'", field="data.courses", remedy="give one of the two")
+        self.save_hyperparameters(
+            ignore=["stages", "courses", "real"], logger=False
+        )  # its seed need not be that of the module
         self.seed, self.batch_size, self.frames, self.workers = seed, batch_size, frames, workers
-        self.courses = [Course(0, flow_low, flow_high, sizes or [(120, 160)]), *(courses or [])]
+        first = CurriculumStage(0, flow_low, flow_high, sizes or [(120, 160)])
+        self.stages = [first, *(stages or courses or [])]
         self.real, self.textures = real, textures
-        self.clips_seen = 0
 
     def clips(self, processes: int = 1) -> MixedClips:
-        """The clips, in batches that span the processes."""
+        """The clips, in batches that span so many processes."""
         options = {"frames": self.frames, "textures": self.textures}
-        return MixedClips(self.seed, self.courses, self.batch_size * processes, self.real, **options)
+        return MixedClips(self.seed, self.stages, self.batch_size * processes, self.real, **options)
 
     def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
+        """Batches of this process, from the position on."""
         processes, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
         return DataLoader(
             self.clips(processes),
             batch_size=self.batch_size,
-            sampler=_From(self.clips_seen, self.batch_size, processes, rank),
+            sampler=StreamSampler(self.clips_seen, self.batch_size, processes, rank),
             num_workers=self.workers,
             worker_init_fn=_start_worker,
             persistent_workers=self.workers > 0,
         )
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"clips_seen": self.clips_seen}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.clips_seen = int(state_dict["clips_seen"])

@@ -1,4 +1,4 @@
-"""Training clips from recorded sequences: TartanAir with depth, and whatever dvo reads that has ground truth.
+"""Training clips from recorded sequences: TartanAir with depth, and every format that dvo reads with ground truth.
 
 Where a data set has depth (TartanAir v1 and v2) the whole loss applies; elsewhere the depth is nan, and only the poses
 count.
@@ -30,7 +30,7 @@ depth, have about this)."""
 
 @dataclass
 class RealData:
-    """Which recordings to train on.
+    """Selection of recordings to train on.
 
     Attributes:
         folders: sequence folders with ground truth.
@@ -90,7 +90,16 @@ class RealClips(Dataset[dict[str, Tensor]]):
         return {name: torch.from_numpy(value) for name, value in clip.items()}
 
     def read(self, number: int, start: int, hop: int) -> dict[str, np.ndarray]:
-        """The clip of one recording from a frame on, every ``hop``-th frame."""
+        """Read a clip of one recording.
+
+        Args:
+            number: index of the recording.
+            start: first frame.
+            hop: gap between frames.
+
+        Returns:
+            arrays as those of an item; the world is the first camera, the unit the median depth.
+        """
         height, width = self.size
         indices = range(start, start + (self.frames - 1) * hop + 1, hop)
         images, depths, intrinsics = [], [], []
@@ -148,7 +157,7 @@ def _depth(image: Path) -> np.ndarray | None:
 
 
 def _scale_of_motion(poses_wc: np.ndarray) -> float:
-    """What to divide translations by when no depth is known: the mean step becomes :data:`STEP`. A camera that does
-    not move keeps its unit."""
+    """Divisor of translations when no depth is known: the mean step becomes :data:`STEP`. A camera that does not move
+    keeps its unit."""
     step = float(np.linalg.norm(np.diff(poses_wc[:, :3], axis=0), axis=1).mean())
     return step / STEP if step > 1e-4 else 1.0

@@ -1,4 +1,4 @@
-"""Stopping without losing a step."""
+"""Interruption of a run without loss of a step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import lightning as L
 
 
 class StopGently(L.Callback):
-    """On Ctrl-C, finish the running step and save ``last.ckpt``; the same command goes on from there.
+    """Finishes the running step and saves ``last.ckpt`` on Ctrl-C; the same command goes on from there.
 
     A second Ctrl-C stops at once.
 
@@ -24,6 +24,8 @@ class StopGently(L.Callback):
         self._before: Any = None
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take over Ctrl-C."""
+
         def stop(number: int, frame: FrameType | None) -> None:
             if trainer.should_stop:
                 raise KeyboardInterrupt
@@ -34,6 +36,7 @@ class StopGently(L.Callback):
         self._before = signal.signal(signal.SIGINT, stop)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Save, and give Ctrl-C back."""
         trainer.save_checkpoint(self.path)
         if self._before is not None:
             signal.signal(signal.SIGINT, self._before)

@@ -1,4 +1,4 @@
-"""Write shipped weights from a training checkpoint: the moving average, as float16 safetensors with a card."""
+"""Files from a training checkpoint: weights to ship, and a state to keep in the repository."""
 
 from __future__ import annotations
 
@@ -8,38 +8,44 @@ from pathlib import Path
 
 import torch
 
-from dvo.models.patch_vo import PatchVO
+from dvo.errors import DvoError
 from dvo.models.weights import save_weights
-from dvo.nets.config import preset
+from train.engine.checkpoint import facts_of, network_of, portable, read_state
 
 
-def averaged_model(checkpoint: Path) -> tuple[PatchVO, dict[str, object]]:
-    """The moving average in a checkpoint, and facts about it."""
-    state = torch.load(checkpoint, map_location="cpu", weights_only=False)  # our own file: Lightning's, with objects
-    settings = state["hyper_parameters"]
-    model = PatchVO(preset(settings["model"]))
-    prefix = "average."
-    model.load_state_dict({k.removeprefix(prefix): v for k, v in state["state_dict"].items() if k.startswith(prefix)})
-    facts = {
-        "steps": state["global_step"],
-        "clips": state.get("Renderings", {}).get("clips_seen"),
-        "seed": settings["seed"],
-        "preset": settings["model"],
-        "licence": "MIT",
-        "data": "renderings of dvo.synth only",
-    }
-    return model, facts
+def export(arguments: list[str]) -> None:
+    """``python -m train export CHECKPOINT OUT [--card FILE]``: the moving average, as float16 safetensors with a card.
 
-
-def main(arguments: list[str]) -> None:
-    """``python -m train export CHECKPOINT OUT [--card FILE]``."""
+    Raises:
+        DvoError: no such checkpoint or card, or one that cannot be read.
+    """
     parser = argparse.ArgumentParser(prog="python -m train export")
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--card", type=Path, help="JSON with further facts for the model card")
     options = parser.parse_args(arguments)
-    model, facts = averaged_model(options.checkpoint)
+    state = read_state(options.checkpoint)
+    facts = facts_of(state)
     if options.card:
-        facts |= json.loads(options.card.read_text(encoding="utf-8"))
-    save_weights(options.out, model.eval(), facts)
+        try:
+            facts |= json.loads(options.card.read_text(encoding="utf-8"))
+        except (OSError, ValueError, TypeError) as error:
+            raise DvoError(f"is no model card ({error})", file=options.card, remedy="give a JSON object") from error
+    save_weights(options.out, network_of(state, file=options.checkpoint), facts)
     print(f"{options.out}: {facts}")
+
+
+def export_state(arguments: list[str]) -> None:
+    """``python -m train state CHECKPOINT OUT``: a copy that names no folder of this machine.
+
+    Raises:
+        DvoError: no such checkpoint, or one that cannot be read.
+    """
+    parser = argparse.ArgumentParser(prog="python -m train state")
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("out", type=Path)
+    options = parser.parse_args(arguments)
+    state = portable(read_state(options.checkpoint))
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(state, options.out)
+    print(f"{options.out}: step {state['global_step']}")

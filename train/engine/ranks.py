@@ -12,12 +12,16 @@ def world_size() -> int:
 
 
 def rank() -> int:
-    """Which of them this is."""
+    """Number of this process, 0 without a distributed run."""
     return distributed.get_rank() if world_size() > 1 else 0
 
 
 def mean_over_ranks(value: Tensor) -> Tensor:
-    """The mean over the processes."""
+    """Mean over the processes.
+
+    Args:
+        value: of this process, any shape.
+    """
     if world_size() == 1:
         return value
     total = value.detach().clone()
@@ -26,7 +30,11 @@ def mean_over_ranks(value: Tensor) -> Tensor:
 
 
 def all_agree(good: Tensor) -> bool:
-    """True if a boolean scalar is true in every process."""
+    """Whether a boolean scalar is true in every process.
+
+    Args:
+        good: of this process.
+    """
     if world_size() > 1:
         least = good.to(torch.int32)
         distributed.all_reduce(least, op=distributed.ReduceOp.MIN)

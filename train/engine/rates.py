@@ -6,7 +6,16 @@ from collections.abc import Callable
 
 
 def constant_rate(warmup: int, decay_from: int | None = None, decay_steps: int = 1000) -> Callable[[int], float]:
-    """Linear warm-up, then constant; from ``decay_from`` on linearly to zero."""
+    """Linear warm-up, then constant; from ``decay_from`` on linearly to zero.
+
+    Args:
+        warmup: steps of the rise.
+        decay_from: first step of the fall; None: none.
+        decay_steps: length of the fall.
+
+    Returns:
+        factor of the configured rate by step.
+    """
 
     def factor(step: int) -> float:
         value = min(1.0, (step + 1) / max(1, warmup))
@@ -27,6 +36,9 @@ def one_cycle_rate(
         steps: length of the cycle.
         rise: share of it until the top.
         start, end: factors at both ends.
+
+    Returns:
+        factor of the configured rate by step.
     """
     top, last = max(rise * steps - 1, 1e-9), steps - 1
 

@@ -1,4 +1,4 @@
-"""A way back from weights that went bad."""
+"""Recovery from weights that are not finite."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import nn
 
 
 def weights_finite(modules: list[nn.Module]) -> torch.Tensor:
-    """Boolean scalar: no parameter holds a nan or an infinity."""
+    """Boolean scalar, true if no parameter holds a nan or an infinity."""
     parameters = [p.detach() for module in modules for p in module.parameters()]
     return torch.isfinite(torch.stack(torch._foreach_norm(parameters))).all()
 
 
 class LastGood:
-    """Weights and optimiser state in memory, to return to.
+    """Copy of weights and optimiser state in memory.
 
     Every process of a distributed run keeps its own copy; they are equal because the weights are.
     """
@@ -26,12 +26,16 @@ class LastGood:
         self._optimizer: dict[str, Any] | None = None
 
     def keep(self, modules: list[nn.Module], optimizer: torch.optim.Optimizer) -> None:
-        """Remember the present state."""
+        """Copy the present state, over the copy before."""
         self._weights = [copy.deepcopy(module.state_dict()) for module in modules]
         self._optimizer = copy.deepcopy(optimizer.state_dict())
 
     def restore(self, modules: list[nn.Module], optimizer: torch.optim.Optimizer) -> bool:
-        """Return to the remembered state, at the present learning rates; False if there is none."""
+        """Restore the copy, at the present learning rates.
+
+        Returns:
+            False if there is no copy.
+        """
         if self._weights is None or self._optimizer is None:
             return False
         for module, weights in zip(modules, self._weights, strict=True):

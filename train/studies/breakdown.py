@@ -1,4 +1,4 @@
-"""Where the seconds of a training step go: ``python -m train profile [--model small] [--steps 5]``."""
+"""Seconds of a training step of ``patch_vo`` by part: ``python -m train profile [--model small] [--steps 5]``."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from unittest import mock
 
 import torch
 
-import dvo.models.patch_vo as patch_vo
+import dvo.models.step as step_module
 import train.tasks.patch_vo.objective as objective
 from dvo.ba.step import GaussNewtonStep
 from dvo.nets import correlation
 from dvo.nets.patchifier import Patchifier
 from dvo.nets.update import Update
-from train.data.clips import Course, MixedClips
-from train.tasks.patch_vo.module import PatchVOTraining
-from train.tasks.patch_vo.objective import LossConfig
+from train.data.clips import CurriculumStage, MixedClips
+from train.engine.build import make_program
+from train.engine.program import TrainingProgram
 
 FORWARD: tuple[tuple[str, Any, str], ...] = (
     ("encoder", Patchifier, "encode"),
     ("correlation volume", correlation.CorrelationVolume, "__init__"),
     ("correlation look-up", correlation.CorrelationVolume, "lookup"),
     ("update operator", Update, "forward"),
-    ("bundle adjustment", patch_vo, "bundle_adjust"),
-    ("reprojection", patch_vo, "reproject"),
+    ("bundle adjustment", step_module, "bundle_adjust"),
+    ("reprojection", step_module, "reproject"),
 )
 LOSS: tuple[tuple[str, Any, str], ...] = (
     ("ground truth of the flow", objective, "true_reprojection"),
@@ -58,7 +58,7 @@ class Stopwatch:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Time what runs inside."""
+        """Add the time of the block to a part."""
         start = self._now()
         try:
             yield
@@ -66,7 +66,7 @@ class Stopwatch:
             self.seconds[name] += self._now() - start
 
     def timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, timed."""
+        """Wrap a function so that its time counts."""
 
         @functools.wraps(function)
         def run(*args: Any, **kwargs: Any) -> Any:
@@ -77,9 +77,21 @@ class Stopwatch:
 
 
 def measure(
-    program: PatchVOTraining, clips: MixedClips, batch_size: int, steps: int, warm: int = 2, processor: bool = False
+    program: TrainingProgram, clips: MixedClips, batch_size: int, steps: int, warm: int = 2, processor: bool = False
 ) -> dict[str, float]:
-    """Mean seconds a step by part, after ``warm`` steps that do not count; ``step`` is everything but rendering."""
+    """Mean seconds a step by part.
+
+    Args:
+        program: of the task ``patch_vo``.
+        clips: to train on.
+        batch_size: clips a step.
+        steps: steps in the mean.
+        warm: steps before them that do not count.
+        processor: time of the processor instead of the clock.
+
+    Returns:
+        seconds by part; ``step`` is everything but rendering.
+    """
     watch = Stopwatch(program.device, processor)
     optimizer = program.configure_optimizers()["optimizer"]
     program.log_dict = program.log = lambda *a, **k: None  # type: ignore[method-assign, assignment]
@@ -103,14 +115,14 @@ def measure(
                 with watch.part("backward"):
                     loss.backward()
                 with watch.part("optimiser"):
-                    torch.nn.utils.clip_grad_norm_(program.net.parameters(), program.hparams.clip)
+                    torch.nn.utils.clip_grad_norm_(program.net.parameters(), program.settings.clip)
                     optimizer.step()
                     optimizer.zero_grad()
     return {name: seconds / steps for name, seconds in watch.seconds.items()}
 
 
 def table(seconds: dict[str, float]) -> str:
-    """What the command prints."""
+    """Text of the result."""
     step = seconds["step"]
     forward = [name for name, _, _ in FORWARD]
     loss = [name for name, _, _ in LOSS]
@@ -128,7 +140,7 @@ def table(seconds: dict[str, float]) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """``python -m train profile``."""
+    """``python -m train profile``; prints the table."""
     parser = argparse.ArgumentParser(prog="python -m train profile", description=__doc__)
     parser.add_argument("--model", default="small")
     parser.add_argument("--steps", type=int, default=5)
@@ -148,13 +160,13 @@ def main(arguments: list[str]) -> None:
     reuse_freed_memory()
     torch.set_num_threads(options.threads)
     torch.manual_seed(0)
-    loss = LossConfig(10.0, 0.3, 0.5, weighted=options.weighted)
-    program = PatchVOTraining(
-        options.model, updates=options.updates, initial=options.initial or None, warmup_mode=options.mode,
-        warmup_until=0.0 if options.mode == "joint" else 2.0, loss=loss,
+    loss = {"pose": 10.0, "flow": 0.3, "target": 0.5, "weighted": options.weighted}
+    program = make_program(
+        "patch_vo", model=options.model, updates=options.updates, initial=options.initial or None,
+        warmup_mode=options.mode, warmup_until=0.0 if options.mode == "joint" else 2.0, loss=loss,
     ).to(options.device)  # fmt: skip
-    course = Course(0, 1.0, 14.0, [tuple(options.size)])
-    clips = MixedClips(0, [course], options.batch, frames=options.frames)
+    stage = CurriculumStage(0, 1.0, 14.0, [tuple(options.size)])
+    clips = MixedClips(0, [stage], options.batch, frames=options.frames)
     seconds = measure(program, clips, options.batch, options.steps, processor=options.cpu_time)
     print(
         f"{options.model}, {options.batch} clip(s) of {options.frames} frames {options.size[1]}x{options.size[0]}, "

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dvo.viz.plot import ACCENT, INK, PAPER, START, TRUTH
-
-if TYPE_CHECKING:
-    from train.studies.study import StudyConfig
+from train.studies.config import StudyConfig
 
 COLOURS = (TRUTH, ACCENT, START, INK)
 
 
 def curves(results: list[dict[str, Any]], arm: str, rate: float, measure: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps ``(S,)`` and values ``(seeds, S)`` of an arm at a learning rate."""
+    """Curve of a measure.
+
+    Args:
+        results: of :func:`train.studies.study.run_arm`.
+        arm, rate: of the runs.
+        measure: key of a row.
+
+    Returns:
+        steps ``(S,)`` and values ``(seeds, S)``.
+    """
     rows = [r["curve"] for r in sorted(results, key=lambda r: r["seed"]) if (r["arm"], r["rate"]) == (arm, rate)]
     steps = np.array([row["step"] for row in rows[0]])
     return steps, np.array([[row[measure] for row in curve] for curve in rows])
@@ -32,26 +41,30 @@ def table(results: list[dict[str, Any]], config: StudyConfig) -> str:
     """Markdown: error after the last step by arm and rate, the paired difference to the first arm, and the step at
     which the first arm's final error is reached."""
     arms, rates = list(config.arms), list(config.rates)
-    lines = [
-        "| learning rate | arm | pose error after the last step: median [min-max] over seeds | rotation error / motion "
-        f"| better than {arms[0]}, paired, % | steps to {arms[0]}'s final error | skipped steps |",
-        "| --: | --- | --: | --: | --: | --: | --: |",
-    ]
+    judged, *others = config.measures
+    labels = [re.sub(r" \(.*\)", "", label) for label in config.measures.values()]
+    head = ["learning rate", "arm", f"{labels[0]} after the last step: median [min-max] over seeds", *labels[1:]]
+    head += [f"better than {arms[0]}, paired, %", f"steps to {arms[0]}'s final error", "skipped steps"]
+    lines = [_row(head), _row("---" if name == "arm" else "--:" for name in head)]
     for rate in rates:
-        steps, first = curves(results, arms[0], rate, "pose")
+        steps, first = curves(results, arms[0], rate, judged)
         for arm in arms:
-            _, pose = curves(results, arm, rate, "pose")
-            _, ratio = curves(results, arm, rate, "rotation_ratio")
-            end = pose[:, -1]
+            _, error = curves(results, arm, rate, judged)
+            ends = [curves(results, arm, rate, measure)[1][:, -1] for measure in others]
+            end = error[:, -1]
             gain = 100 * (1 - end / first[:, -1])
-            reach = [steps_to(steps, mine, theirs) for mine, theirs in zip(pose, first[:, -1], strict=True)]
+            reach = [steps_to(steps, mine, theirs) for mine, theirs in zip(error, first[:, -1], strict=True)]
             reached = ", ".join("never" if np.isinf(r) else f"{r:.0f}" for r in reach)
             skipped = sum(r["skipped"] for r in results if (r["arm"], r["rate"]) == (arm, rate))
-            lines.append(
-                f"| {rate:g} | {arm} | {np.median(end):.4f} [{end.min():.4f}-{end.max():.4f}] "
-                f"| {np.median(ratio[:, -1]):.3f} | {'' if arm == arms[0] else _spread(gain)} | {reached} | {skipped} |"
-            )
+            cells = [f"{rate:g}", arm, f"{np.median(end):.4f} [{end.min():.4f}-{end.max():.4f}]"]
+            cells += [f"{np.median(other):.3f}" for other in ends]
+            cells += ["" if arm == arms[0] else _spread(gain), reached, f"{skipped}"]
+            lines.append(_row(cells))
     return "\n".join(lines)
+
+
+def _row(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def _spread(values: np.ndarray) -> str:
@@ -59,20 +72,27 @@ def _spread(values: np.ndarray) -> str:
 
 
 def write_report(results: list[dict[str, Any]], config: StudyConfig) -> list[Path]:
-    """Write ``OUT.md`` and ``OUT.png``."""
+    """Write ``OUT.md`` and ``OUT.png``.
+
+    Args:
+        results: of :func:`train.studies.study.run_arm`.
+        config: the study.
+
+    Returns:
+        the files written.
+    """
     out = Path(config.out)
     out.parent.mkdir(parents=True, exist_ok=True)
     picture = out.with_suffix(".png")
     _plot(picture, results, config)
     seconds = np.mean([r["seconds_a_step"] for r in results])
-    text = f"""# V2V on a small scale
+    text = f"""# {config.title}
 
-Does weighting the flow loss by the confidence, and balancing it against the pose loss, make training faster or better?
+{config.about}
 Preset `{config.model}`, clips of {config.frames} frames of {config.size[1]}x{config.size[0]} pixels,
-{config.updates} updates, {config.steps} steps of one OneCycle after {config.start_steps} steps that train the flow head
-alone and are shared. For a seed all arms see the same clips and draw the same patches. The pose error (translation in
-median depths plus rotation in radians over all pairs of frames) is taken on {config.validation_clips} held-out clips.
-Reproduced by
+{config.updates} updates, {config.steps} steps of one OneCycle after {config.start_steps} steps that are shared. For a
+seed all arms see the same clips and draw the same random numbers. Errors are taken on {config.validation_clips}
+held-out clips. Reproduced by
 
     python -m train study --config configs/train/study.yaml
 
@@ -91,7 +111,7 @@ def _plot(path: Path, results: list[dict[str, Any]], config: StudyConfig) -> Non
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    measures = {"pose": "pose error (median depths + rad)", "rotation_ratio": "rotation error / motion"}
+    measures = config.measures
     figure = Figure(figsize=(5.2 * len(config.rates), 7.0), dpi=110, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
     plots = figure.subplots(len(measures), len(config.rates), sharex=True, sharey="row", squeeze=False)

@@ -1,8 +1,9 @@
-"""Signal-to-noise ratio of the flow loss's gradient at the heads of the update operator, plain and weighted.
+"""Signal-to-noise ratio of the gradients of a task's losses.
 
-V2V claims that weighting the flow error by the confidence lowers the variance of the gradient. Here both losses are
-computed from the same forward passes of the same checkpoint: one gradient of the flow-revision and the confidence head
-for each clip, then
+V2V claims that weighting the flow error by the confidence lowers the variance of the gradient. Here the losses that a
+task offers (:meth:`train.tasks.task.Task.loss_variants`; for ``patch_vo`` the flow loss, plain and weighted) are
+computed from the same forward passes of the same checkpoint: one gradient of the probed parameters (for ``patch_vo``
+those of the two heads) for each clip, then
 
     signal = ||mean g||,    noise = mean ||g - mean g||,    SNR = signal / noise.
 
@@ -12,90 +13,57 @@ With N clips even pure noise has an SNR of about 1 / sqrt(N), which is printed b
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import nn
 
-from dvo.geometry import se3
-from dvo.losses.flow import flow_error, flow_loss, weighted_flow_error
-from dvo.models.patch_vo import PatchVO
-from dvo.models.schedule import Stage, training_schedule
-from dvo.nets.config import preset
 from dvo.synth.dataset import ClipDataset
-from train.tasks.patch_vo.objective import true_reprojection, truth_of
+from train.engine.checkpoint import fill, read_state, task_of
+from train.tasks.task import Batch, Task
 
-HEADS = ("update.d.1.weight", "update.w.1.weight")
-SEED = 910_001  # neither of training nor of validation
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One flow loss: weighted or not, over nearby edges (0 < |i - j| <= 2) or all."""
-
-    weighted: bool
-    all_edges: bool
-
-    def __str__(self) -> str:
-        return f"{'weighted' if self.weighted else 'plain'}, {'all' if self.all_edges else 'near'} edges"
-
-
-DPVO, V2V = Variant(False, False), Variant(True, True)
-VARIANTS = (DPVO, V2V, Variant(False, True), Variant(True, False))
+SEED = 910_001
+"""Stream of the clips, neither of training nor of validation."""
 
 
 def signal_to_noise(gradients: np.ndarray) -> float:
-    """SNR of per-sample gradients ``(N, P)``."""
+    """SNR of per-sample gradients ``(N, P)``; infinite without noise."""
     mean = gradients.mean(0)
     noise = np.linalg.norm(gradients - mean, axis=1).mean()
     return float(np.linalg.norm(mean) / noise) if noise > 0 else float("inf")
 
 
-def clip_gradients(
-    model: PatchVO, batch: dict[str, Tensor], stages: list[Stage], seed: int, flow: float = 0.1, margin: float = 4.0
-) -> dict[Variant, np.ndarray]:
-    """Gradient of each flow loss of one clip with respect to both heads, one vector.
+def clip_gradients(task: Task, net: nn.Module, batch: Batch, seed: int) -> dict[str, np.ndarray]:
+    """Gradient of each loss of one clip with respect to the probed parameters.
 
     Args:
+        task: gives losses and parameters.
+        net: the network.
         batch: a clip, as a batch of one.
-        flow: weight of the loss; it matters because the heads clamp their gradients.
+        seed: of everything that the network draws.
+
+    Returns:
+        one float64 vector ``(P,)`` a loss; zero where a loss does not depend on a parameter.
     """
-    truth = truth_of(batch, model.config.STRIDE)
-    b, n = batch["images"].shape[:2]
-    sums: dict[Variant, Tensor] = {}
-    there: Any = None
-    graph = None
-    states = model.unroll(
-        batch["images"], batch["intrinsics"], stages, poses_cw=se3.identity(b, n),
-        generator=torch.Generator().manual_seed(seed),
-    )  # fmt: skip
-    for state in states:
-        if state.graph is not graph:
-            graph = state.graph
-            there = true_reprojection(truth, state.patches.detach(), graph, state.frames, margin)
-        distance = (state.graph.ii - state.graph.jj).abs()
-        near = (distance > 0) & (distance <= 2)
-        errors = {
-            False: flow_error(state.coords, *there),
-            True: weighted_flow_error(state.coords, *there, state.weights),
-        }
-        for variant in VARIANTS:
-            edges = torch.ones_like(near) if variant.all_edges else near
-            term = flow * flow_loss(errors[variant.weighted], edges)
-            sums[variant] = sums[variant] + term if variant in sums else term
+    parameters = [net.get_parameter(name) for name in task.probed_parameters(net)]
     found = {}
-    for variant, loss in sums.items():
-        heads = torch.autograd.grad(loss, [model.get_parameter(name) for name in HEADS], retain_graph=True)
-        found[variant] = torch.cat([g.flatten() for g in heads]).numpy().astype(np.float64)
+    for name, loss in task.loss_variants(net, batch, seed).items():
+        gradients = torch.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
+        vectors = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, gradients, strict=True)]
+        found[name] = torch.cat([vector.flatten() for vector in vectors]).numpy().astype(np.float64)
     return found
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """SNR of one variant with a bootstrap interval, and its ratio to the plain loss on the same resampled clips."""
+    """SNR of one loss with a bootstrap interval, and its ratio to the reference on the same resampled clips.
+
+    Attributes:
+        snr, low, high: estimate and 90 % interval.
+        gain, gain_low, gain_high: ratio to the reference and its 90 % interval.
+    """
 
     snr: float
     low: float
@@ -105,77 +73,83 @@ class Ratio:
     gain_high: float
 
 
-def compare(gradients: dict[Variant, np.ndarray], reference: Variant = DPVO, draws: int = 400) -> dict[Variant, Ratio]:
-    """SNR of each variant, and its gain over the reference, with 90 % intervals over resampled clips (paired)."""
+def compare(gradients: dict[str, np.ndarray], draws: int = 400) -> dict[str, Ratio]:
+    """SNR of each loss, and its gain over the first one, with 90 % intervals over resampled clips (paired).
+
+    Args:
+        gradients: ``(N, P)`` a loss.
+        draws: number of resamplings.
+    """
     rng = np.random.default_rng(0)
-    count = len(next(iter(gradients.values())))
-    samples: dict[Variant, list[float]] = {variant: [] for variant in gradients}
+    reference = next(iter(gradients))
+    count = len(gradients[reference])
+    samples: dict[str, list[float]] = {name: [] for name in gradients}
     for _ in range(draws):
         chosen = rng.integers(count, size=count)
-        for variant, g in gradients.items():
-            samples[variant].append(signal_to_noise(g[chosen]))
+        for name, g in gradients.items():
+            samples[name].append(signal_to_noise(g[chosen]))
     base = signal_to_noise(gradients[reference])
     result = {}
-    for variant, g in gradients.items():
-        snr, drawn = signal_to_noise(g), np.array(samples[variant])
+    for name, g in gradients.items():
+        snr, drawn = signal_to_noise(g), np.array(samples[name])
         gains = drawn / np.array(samples[reference])
         # Resampling repeats clips, which raises the SNR a little; the interval is shifted back around the estimate.
         low, high = np.quantile(drawn, [0.05, 0.95]) - np.median(drawn) + snr
         gain_low, gain_high = np.quantile(gains, [0.05, 0.95]) - np.median(gains) + snr / base
-        result[variant] = Ratio(snr, float(low), float(high), snr / base, float(gain_low), float(gain_high))
+        result[name] = Ratio(snr, float(low), float(high), snr / base, float(gain_low), float(gain_high))
     return result
 
 
-def table(results: dict[Variant, Ratio], clips: int) -> str:
-    """What the command prints."""
-    rows = [f"SNR of the flow loss's gradient at the heads, {clips} clips, 90 % intervals of the bootstrap over clips"]
-    rows.append(f"{'flow loss':24s} {'SNR':>7s} {'interval':>17s} {'dB':>7s} {'over DPVO':>10s} {'interval':>13s}")
-    for variant, r in results.items():
-        mark = " (DPVO)" if variant == DPVO else " (V2V)" if variant == V2V else ""
+def table(results: dict[str, Ratio], clips: int) -> str:
+    """Text of the results; the last line compares the second loss with the first."""
+    names = list(results)
+    rows = [f"SNR of the gradient at the probed parameters, {clips} clips, 90 % intervals of the bootstrap over clips"]
+    rows.append(f"{'loss':26s} {'SNR':>7s} {'interval':>17s} {'dB':>7s} {'gain':>10s} {'interval':>13s}")
+    for name, r in results.items():
         rows.append(
-            f"{str(variant) + mark:24s} {r.snr:7.3f} [{r.low:7.3f} {r.high:7.3f}] {20 * np.log10(r.snr):7.2f} "
+            f"{name:26s} {r.snr:7.3f} [{r.low:7.3f} {r.high:7.3f}] {20 * np.log10(r.snr):7.2f} "
             f"{r.gain:10.2f} [{r.gain_low:5.2f} {r.gain_high:5.2f}]"
         )
-    rows.append(f"pure noise would have about {clips**-0.5:.3f}")
-    gain = results[V2V]
-    says = "raises" if gain.gain_low > 1 else "lowers" if gain.gain_high < 1 else "does not clearly change"
-    rows.append(f"the weighted flow loss {says} the signal-to-noise ratio on this checkpoint")
+    rows.append(f"pure noise would have about {clips**-0.5:.3f}; gain: over '{names[0]}'")
+    if len(names) > 1:
+        gain = results[names[1]]
+        verb = "raises" if gain.gain_low > 1 else "lowers" if gain.gain_high < 1 else "does not clearly change"
+        rows.append(f"the loss '{names[1]}' {verb} the signal-to-noise ratio on this checkpoint")
     return "\n".join(rows)
 
 
 def main(arguments: list[str]) -> None:
-    """``python -m train snr CHECKPOINT [--clips N]``."""
+    """``python -m train snr CHECKPOINT [--clips N]``.
+
+    Raises:
+        DvoError: no such checkpoint, or one that cannot be read.
+    """
     parser = argparse.ArgumentParser(prog="python -m train snr", description=__doc__.split("\n")[0])
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--clips", type=int, default=200)
     parser.add_argument("--frames", type=int, default=8)
-    parser.add_argument("--updates", type=int, default=10)
+    parser.add_argument("--updates", type=int, default=10, help="of tasks that have this setting")
     parser.add_argument("--initial", type=int, help="frames of the first graph; default: all")
     parser.add_argument("--size", type=int, nargs=2, default=(120, 160), metavar=("HEIGHT", "WIDTH"))
     parser.add_argument("--flow", type=float, nargs=2, default=(2.0, 14.0), metavar=("LOW", "HIGH"))
-    parser.add_argument("--flow-weight", type=float, default=0.1, help="of the loss, as in training")
+    parser.add_argument("--flow-weight", type=float, help="of the flow loss; default: the task's")
     parser.add_argument("--patches", type=int, help="patches a frame; default: the preset's")
     parser.add_argument("--averaged", action="store_true", help="the moving average instead of the weights in training")
     options = parser.parse_args(arguments)
-    state = torch.load(options.checkpoint, map_location="cpu", weights_only=False)  # our own file: Lightning's
-    config = preset(state["hyper_parameters"]["model"])
-    if options.patches:
-        config = replace(config, training_patches=options.patches)
-    model = PatchVO(config)
-    prefix = "average." if options.averaged else "net."
-    model.load_state_dict({k.removeprefix(prefix): v for k, v in state["state_dict"].items() if k.startswith(prefix)})
+    state = read_state(options.checkpoint)
+    changes = {} if options.flow_weight is None else {"loss": {"flow": options.flow_weight}}
+    task = task_of(state, updates=options.updates, initial=options.initial, patches=options.patches, **changes)
+    net = task.network()
+    fill(net, state, "average" if options.averaged else "net", options.checkpoint)
     height, width = options.size
     clips = ClipDataset(
         SEED, options.clips, frames=options.frames, height=height, width=width, flow_range=tuple(options.flow)
     )
-    stages = training_schedule(
-        options.frames, config.training_patches, options.updates, options.initial, self_edges=config.self_edges
-    )
-    found: dict[Variant, list[np.ndarray]] = {variant: [] for variant in VARIANTS}
+    found: dict[str, list[np.ndarray]] = {}
     for index in range(options.clips):
         batch = {name: value[None] for name, value in clips[index].items()}
-        for variant, g in clip_gradients(model, batch, stages, index, options.flow_weight).items():
-            found[variant].append(g)
+        for name, g in clip_gradients(task, net, batch, index).items():
+            found.setdefault(name, []).append(g)
         if (index + 1) % 20 == 0:
             print(f"{index + 1} clips", flush=True)
-    print(table(compare({variant: np.stack(g) for variant, g in found.items()}), options.clips))
+    print(table(compare({name: np.stack(g) for name, g in found.items()}), options.clips))

@@ -11,6 +11,7 @@ import torch
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.projection import reproject
 from dvo.metrics import align_trajectory
+from dvo.odometry.protocol import Odometry
 from dvo.odometry.tracker import PatchOdometry
 from dvo.odometry.working_image import working_image
 from dvo.viz.plot import ACCENT, INK, PAPER, TRUTH, plan_axes
@@ -18,16 +19,19 @@ from dvo.viz.plot import ACCENT, INK, PAPER, TRUTH, plan_axes
 
 @dataclass(frozen=True)
 class PatchFlow:
-    """Where the patches of earlier keyframes are seen in the newest one.
+    """Motion of the patches of earlier keyframes into the newest one.
 
     Attributes:
         timestamp: of the newest keyframe, seconds.
-        tails: ``(E, 2)`` where they were drawn, heads: ``(E, 2)`` where they are now; pixels of the working image.
+        pixels: pixel budget of the working image, 0 for the image as it is.
+        tails: ``(E, 2)`` positions in the frame of the patch, pixels of the working image.
+        heads: ``(E, 2)`` positions in the newest keyframe.
         confidence: ``(E,)`` mean of both axes.
         all_confidence: of every edge of the window.
     """
 
     timestamp: float
+    pixels: int
     tails: np.ndarray
     heads: np.ndarray
     confidence: np.ndarray
@@ -35,8 +39,18 @@ class PatchFlow:
 
 
 @torch.no_grad()
-def patch_flow(odometry: PatchOdometry, back: int = 2) -> PatchFlow | None:
-    """The flow of the last window of a tracker, of patches at most ``back`` keyframes old; None before there is one."""
+def patch_flow(odometry: Odometry, back: int = 2) -> PatchFlow | None:
+    """Flow of the last window of a tracker.
+
+    Args:
+        odometry: any; only that of ``patch_vo`` has patches.
+        back: greatest age of a patch, keyframes.
+
+    Returns:
+        the flow, or None if there is none.
+    """
+    if not isinstance(odometry, PatchOdometry):
+        return None
     window = odometry.window
     newest = len(window) - 1
     edges = (window.jj == newest) & (window.ii < newest) & (window.ii >= newest - back)
@@ -50,7 +64,7 @@ def patch_flow(odometry: PatchOdometry, back: int = 2) -> PatchFlow | None:
     heads = seen[edges, p, p] * stride
     confidence = window.weights.mean(-1)
     found = (x.float().cpu().numpy() for x in (tails, heads, confidence[edges], confidence))
-    return PatchFlow(window.frames[newest].timestamp, *found)
+    return PatchFlow(window.frames[newest].timestamp, odometry.config.pixels, *found)
 
 
 def draw(
@@ -64,8 +78,12 @@ def draw(
     """Write the picture of one clip.
 
     Args:
+        path: PNG file.
+        title: above the trajectory.
         estimate: as tracked; it is aligned by Sim(3) here.
-        image: working image of the newest keyframe, ``(H, W, 3)`` uint8.
+        truth: ground truth.
+        flow: of the last window; None leaves out arrows and histogram.
+        image: working image of the newest keyframe, ``(H, W, 3)`` uint8; None leaves it out.
 
     Returns:
         the picture, ``(H, W, 3)`` uint8.
@@ -108,6 +126,6 @@ def draw(
 
 
 def image_at(frames: list, timestamp: float, pixels: int) -> np.ndarray | None:
-    """The working image of the frame of that time."""
+    """Working image ``(H, W, 3)`` of the frame of that time, None if there is no such frame."""
     frame = next((f for f in frames if abs(f.timestamp - timestamp) < 1e-9), None)
     return None if frame is None else working_image(frame, pixels)[0]

@@ -16,20 +16,24 @@ import numpy as np
 import torch
 
 from dvo.data.frame import Frame
+from dvo.data.root import data_root
 from dvo.data.source import open_source
 from dvo.data.trajectory import Trajectory
-from dvo.metrics import evaluate
-from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
-from dvo.odometry.tracker import PatchOdometry
-from train.validation.pictures import draw, image_at, patch_flow
-from train.validation.validate import data_root, rendered_clip
+from dvo.metrics import Metrics
+from dvo.models.weights import LoadedWeights
+from dvo.odometry.load import build_odometry
+from dvo.odometry.protocol import Estimate, Odometry
+from dvo.odometry.registry import odometry_builder
+from dvo.odometry.session import Run
+from train.validation.pictures import PatchFlow, draw, image_at, patch_flow
+from train.validation.validate import rendered_clip, track_sequence
 
 Clip = tuple[str, list[Frame], Trajectory]
 
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Whatever runs inside draws from copies of the random states of Python, numpy and torch (CPU)."""
+    """Restore the random states of Python, numpy and torch (CPU) after whatever runs inside."""
     python, numpy, torch_cpu = random.getstate(), np.random.get_state(), torch.random.get_rng_state()  # noqa: NPY002
     try:
         yield
@@ -39,8 +43,25 @@ def undisturbed() -> Iterator[None]:
         torch.random.set_rng_state(torch_cpu)
 
 
+def track_with_flow(
+    odometry: Odometry, frames: list[Frame], truth: Trajectory
+) -> tuple[Metrics, Run, PatchFlow | None]:
+    """Track a clip as :func:`train.validation.validate.track_sequence` does, with the flow of the last window."""
+    flow: PatchFlow | None = None
+
+    def keep_flow(frame: Frame, _: Estimate | None) -> None:
+        nonlocal flow
+        if frame is frames[-1]:  # finishing empties the window
+            flow = patch_flow(odometry)
+
+    metrics, done = track_sequence(odometry, frames, truth, keep_flow)
+    return metrics, done, flow
+
+
 class TrackWhileTraining(L.Callback):
-    """Every so many steps, tracks rendered clips of the validation seed and, where ``DVO_DATA`` is, real sequences.
+    """Tracks rendered clips of the validation seed and, where ``DVO_DATA`` is, real sequences, every so many steps.
+
+    Works for every network with an odometry, see :data:`dvo.odometry.registry.ODOMETRIES`.
 
     Logs ATE (Sim(3), % of path) and rotation error over rotation for each clip and as medians; writes a picture of each
     clip to ``dirpath/pictures`` and to TensorBoard. Training itself sees nothing of it: no random number is drawn from
@@ -49,9 +70,12 @@ class TrackWhileTraining(L.Callback):
     Args:
         dirpath: folder of the run.
         every: steps between validations.
-        rendered: number of rendered clips; frames, size (height, width), fps: of each.
-        sequences: names of real sequences under ``DVO_DATA``; missing ones are passed over.
-        real_frames: only the first so many frames of each of these.
+        rendered: number of rendered clips.
+        frames: length of each of them.
+        size: height and width of each of them, pixels.
+        fps: frames a second of each of them.
+        sequences: names of real sequences under ``DVO_DATA``; missing ones are left out.
+        real_frames: only the first so many frames of each real sequence.
         limit_s: no further clip is begun after this many seconds.
     """
 
@@ -74,16 +98,24 @@ class TrackWhileTraining(L.Callback):
         self._last = -1
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Check that there is an odometry for the network, before time is spent.
+
+        Raises:
+            DvoError: there is none.
+        """
+        odometry_builder(pl_module.average.architecture)
         self._last = trainer.global_step
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
-        self._perhaps(trainer, pl_module)
+        """Validate if it is time."""
+        self._validate_if_due(trainer, pl_module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if trainer.global_step >= trainer.max_steps >= 0:  # not when a person waits for it to stop
-            self._perhaps(trainer, pl_module)
+        """Validate the final weights."""
+        if trainer.global_step >= trainer.max_steps >= 0:  # not after Ctrl-C, when somebody waits
+            self._validate_if_due(trainer, pl_module)
 
-    def _perhaps(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def _validate_if_due(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         step = trainer.global_step
         if step % self.every or step == self._last:
             return
@@ -100,23 +132,18 @@ class TrackWhileTraining(L.Callback):
         if self._clips is None:
             self._clips = [*self._rendered_clips(), *self._real_clips()]
             start = time.perf_counter()  # reading and rendering them is paid once
-        config = TRACKER_PRESETS.get(program.hparams.model, TrackerConfig())
-        model = copy.deepcopy(program.average)
+        weights = LoadedWeights.of(copy.deepcopy(program.average).eval(), "training")
         found: dict[str, float] = {}
         for name, frames, truth in self._clips:
             if time.perf_counter() - start > self.limit_s:
                 break
-            tracker = PatchOdometry(model, config, seed=0, device=program.device)
-            for frame in frames:
-                tracker.track(frame)
-            result = tracker.finish()
-            flow = patch_flow(tracker)
-            m = evaluate(result.trajectory, truth, rpe_gap=2)
+            odometry = build_odometry(weights, seed=0, device=program.device)
+            m, done, flow = track_with_flow(odometry, frames, truth)
             found[f"track/{name}/ate_percent"] = m.ate_percent
             found[f"track/{name}/rotation_ratio"] = m.rotation_error_ratio
-            image = None if flow is None else image_at(frames, flow.timestamp, config.pixels)
+            image = None if flow is None else image_at(frames, flow.timestamp, flow.pixels)
             title = f"{name}, step {step}: ATE {m.ate_percent:.1f} %"
-            picture = draw(self.folder / f"{name}_{step:07d}.png", title, result.trajectory, truth, flow, image)
+            picture = draw(self.folder / f"{name}_{step:07d}.png", title, done.result.trajectory, truth, flow, image)
             for logger in trainer.loggers:
                 if hasattr(logger.experiment, "add_image"):
                     logger.experiment.add_image(f"track/{name}", picture, step, dataformats="HWC")
@@ -137,8 +164,8 @@ class TrackWhileTraining(L.Callback):
     def _real_clips(self) -> list[Clip]:
         clips = []
         for name in self.sequences:
-            if (data_root() / name).is_dir():
-                source = open_source(data_root() / name)
+            if (data_root(required=False) / name).is_dir():
+                source = open_source(data_root(required=False) / name)
                 frames = list(islice(source, self.real_frames))
                 truth = source.groundtruth
                 if truth is not None:

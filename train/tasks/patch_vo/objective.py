@@ -1,4 +1,4 @@
-"""What a training step minimises: pose and flow losses summed over the updates (DPVO 3.3), weighted and balanced as in
+"""Objective of a training step: pose and flow losses summed over the updates (DPVO 3.3), weighted and balanced as in
 V2V if wanted."""
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class LossConfig:
     Attributes:
         pose: of the mean translation (in units of median scene depth) plus rotation (rad) error.
         flow: of the flow error after bundle adjustment, feature pixels.
-        target: of the error of the flow that bundle adjustment is asked to explain, feature pixels; trains the flow
-            head directly (DROID-SLAM's residual loss is its kin).
+        target: of the error of the flow that bundle adjustment is given, feature pixels; trains the flow head directly
+            (similar to DROID-SLAM's residual loss).
         target_limit: cap of one edge's target error; beyond the reach of the correlation there is nothing to learn.
         pose_from: first update whose poses count.
         margin: an edge counts while the true position of its centre is within this many feature pixels of the map.
@@ -74,8 +74,13 @@ class Truth:
 
 
 def truth_of(batch: dict[str, Tensor], stride: int) -> Truth:
-    """Ground truth at feature resolution: feature ``(u, v)`` is centred on image pixel ``(4u, 4v)``. Depths that are
-    not known are nan in the batch, and so are their inverses."""
+    """Ground truth at feature resolution: feature ``(u, v)`` is centred on image pixel ``(4u, 4v)``.
+
+    Args:
+        batch: ``depth (B, N, H, W)`` in median scene depths, nan where it is not known; ``poses_cw (B, N, 7)``;
+            ``intrinsics (B, N, 4)`` in image pixels.
+        stride: image pixels to a feature pixel.
+    """
     depth = batch["depth"][:, :, ::stride, ::stride]
     return Truth(batch["poses_cw"], 1.0 / depth.clamp(min=1e-2), batch["intrinsics"] / stride)
 
@@ -83,7 +88,18 @@ def truth_of(batch: dict[str, Tensor], stride: int) -> Truth:
 def true_reprojection(
     truth: Truth, patches: Tensor, graph: PatchGraph, frames: int, margin: float
 ) -> tuple[Tensor, Tensor]:
-    """Where the pixels of the patches really land, ``(B, E, p, p, 2)``, and which of them count ``(B, E, p, p)``."""
+    """True positions of the pixels of the patches.
+
+    Args:
+        truth: of the clips.
+        patches: ``(B, K, 3, p, p)``; only their pixel positions are used.
+        graph: ``E`` edges.
+        frames: frames present.
+        margin: an edge counts while the position of its centre is within this many feature pixels of the map.
+
+    Returns:
+        feature pixels ``(B, E, p, p, 2)``, and which of them count, ``(B, E, p, p)`` bool.
+    """
     b, k, _, p, _ = patches.shape
     centres = patches[:, :, :2, p // 2, p // 2].round().long().unflatten(1, (frames, -1))
     disparity = crop_patches(truth.inverse_depth[:, :frames, None], centres, p).flatten(1, 2)
@@ -120,9 +136,10 @@ class Terms:
     rotation: list[Tensor | None] = field(default_factory=list)
 
     def total(self, config: LossConfig, beta: float = 1.0, rotation: float = 1.0) -> Tensor:
-        """The loss.
+        """Weighted sum of all terms.
 
         Args:
+            config: weights.
             beta: further weight of the flow.
             rotation: weight of the rotation against the translation.
         """
@@ -154,11 +171,13 @@ class Terms:
 def clip_terms(
     states: Iterable[UpdateState], truth: Truth, config: LossConfig, mode: Mode = "joint"
 ) -> tuple[Terms, dict[str, Tensor]]:
-    """Terms of the loss of a batch of clips and what to log.
+    """Terms of the loss of a batch of clips, and measures for the log.
 
     Args:
         states: of :meth:`dvo.models.patch_vo.PatchVO.unroll`.
-        mode: what the updates did; the pose loss needs ``joint``, the flow after bundle adjustment any but ``flow``.
+        truth: of the clips.
+        config: weights of the terms.
+        mode: of the updates; the pose loss needs ``joint``, the flow after bundle adjustment any but ``flow``.
 
     Returns:
         the terms, and detached measures of the last update: ``flow``, ``target``, ``translation``,
@@ -215,11 +234,3 @@ def _further_measures(
             "rotation_ratio": (errors.rotation / motion.clamp(min=1e-4)).median(),
         }
     return measures
-
-
-def clip_losses(
-    states: Iterable[UpdateState], truth: Truth, config: LossConfig, mode: Mode = "joint"
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss with constant weights, and what :func:`clip_terms` measures."""
-    terms, measures = clip_terms(states, truth, config, mode)
-    return terms.total(config), measures

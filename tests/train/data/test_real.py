@@ -1,7 +1,6 @@
-"""Positions in the stream, courses, and clips from recordings."""
+"""Clips from recordings."""
 
 import os
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,26 +10,11 @@ import torch
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from train.data.clips import Course, MixedClips, _From
 from train.data.real import RealClips, RealData
 from train.tasks.patch_vo.objective import LossConfig
 
-DATA = Path(os.environ.get("DVO_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+DATA = Path(os.environ.get("DVO_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 real = pytest.mark.skipif(not DATA.is_dir(), reason="set DVO_DATA to the folder of real sequences")
-
-
-def test_processes_share_every_batch():
-    whole = list(islice(_From(8, batch=6), 12))
-    parts = [list(islice(_From(8, 3, processes=2, rank=r), 6)) for r in (0, 1)]
-    assert whole == list(range(8, 20))
-    assert [parts[0][:3] + parts[1][:3], parts[0][3:] + parts[1][3:]] == [whole[:6], whole[6:]]
-
-
-def test_a_course_begins_at_its_clip():
-    courses = [Course(0, 1.0, 4.0, [(48, 64)]), Course(4, 1.0, 4.0, [(64, 48), (32, 48)])]
-    clips = MixedClips(5, courses, 2, frames=2)
-    shapes = [tuple(clips[i]["depth"].shape[1:]) for i in (0, 3, 4, 6)]
-    assert shapes == [(48, 64), (48, 64), (64, 48), (32, 48)]
 
 
 @real

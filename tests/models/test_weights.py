@@ -1,13 +1,18 @@
 """Names and shapes of DPVO's checkpoint; reading and importing weights, good and bad."""
 
+import json
 import pickle
+import sys
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 
+import dvo
 from dvo.errors import DvoError
 from dvo.models.patch_vo import PatchVO
+from dvo.models.registry import ARCHITECTURES, as_network
 from dvo.models.weights import import_checkpoint, load_weights, save_weights, weights_info
 from dvo.nets.config import PRESETS, ModelConfig, preset
 
@@ -80,6 +85,91 @@ def test_half_precision_round_trip_keeps_card_and_architecture(tmp_path):
         torch.testing.assert_close(a, b, atol=1e-3, rtol=1e-3)
 
 
+def metadata(path):
+    with safe_open(path, "pt") as file:
+        return file.metadata()
+
+
+def test_a_file_names_its_architecture_and_one_without_is_patch_vo(tmp_path):
+    model = PatchVO(preset("tiny"))
+    save_weights(tmp_path / "new.safetensors", model, {})
+    written = metadata(tmp_path / "new.safetensors")
+    assert written["architecture"] == "patch_vo"
+    del written["architecture"]
+    save_file({k: t.half() for k, t in model.state_dict().items()}, tmp_path / "old.safetensors", written)
+    new, old = (load_weights(tmp_path / f"{name}.safetensors") for name in ("new", "old"))
+    assert new.architecture == old.architecture == old.info.architecture == "patch_vo"
+    for a, b in zip(new.model.state_dict().values(), old.model.state_dict().values(), strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", ["never_imported:Class", "not_registered", ""])
+def test_a_file_cannot_choose_what_is_imported(tmp_path, monkeypatch, name):
+    (tmp_path / "never_imported.py").write_text("class Class: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "x.safetensors"
+    save_file({"a": torch.zeros(1)}, path, {"architecture": name, "config": "{}"})
+    with pytest.raises(DvoError, match="architecture") as caught:
+        load_weights(path)
+    assert str(path) in str(caught.value) and "patch_vo" in str(caught.value)
+    assert "never_imported" not in sys.modules
+
+
+class CountingConfig:
+    """Sizes of a network of another architecture."""
+
+    def __init__(self, width=2):
+        self.width = width
+
+    def __eq__(self, other):
+        return self.width == other.width
+
+    def to_dict(self):
+        return {"width": self.width}
+
+    @classmethod
+    def from_dict(cls, values):
+        return cls(**values)
+
+
+class Counting(torch.nn.Module):
+    """A network of another architecture, with a whole number in its state."""
+
+    architecture = "counting"
+    config_type = CountingConfig
+    presets = {"wide": CountingConfig(9)}  # noqa: RUF012
+
+    def __init__(self, config):
+        super().__init__()
+        self.config = config
+        self.linear = torch.nn.Linear(config.width, 1)
+        self.register_buffer("steps", torch.tensor(2**53 + 1))
+
+
+def test_networks_of_another_architecture_by_name(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "another_package", type(sys)("another_package"))
+    sys.modules["another_package"].Counting = Counting
+    path = tmp_path / "c.safetensors"
+    save_weights(path, Counting(CountingConfig(9)), {})
+    with pytest.raises(DvoError, match="no architecture 'counting'"):
+        dvo.load_model(path)
+    ARCHITECTURES.register("counting", "another_package:Counting")
+    try:
+        loaded = load_weights(path)
+        assert isinstance(loaded.model, Counting) and (loaded.architecture, loaded.preset) == ("counting", "wide")
+        assert int(loaded.model.steps) == 2**53 + 1 and loaded.model.linear.weight.dtype == torch.float32
+        assert isinstance(dvo.load_model(path), Counting)
+        with pytest.raises(DvoError, match="no odometry.*counting"):
+            dvo.load(str(path))
+    finally:
+        ARCHITECTURES.unregister("counting")
+
+
+def test_a_module_without_an_architecture_is_no_network():
+    with pytest.raises(DvoError, match="Linear.*'architecture'"):
+        as_network(torch.nn.Linear(1, 1))
+
+
 class Malicious:
     def __reduce__(self):
         return (print, ("executed",))
@@ -93,6 +183,7 @@ def bad_files(folder):
     save_file({"a": torch.zeros(1)}, folder / "no_metadata.safetensors")
     save_file({"a": torch.zeros(1)}, folder / "wrong_tensors.safetensors", config)
     save_file({"a": torch.zeros(1)}, folder / "unknown_key.safetensors", {"config": '{"colour": 1}'})
+    save_file({"a": torch.zeros(1)}, folder / "no_size.safetensors", {"config": json.dumps({"hidden_channels": -4})})
     model = PatchVO(preset("tiny"))
     torch.nn.init.constant_(model.update.norm.weight, torch.nan)
     save_weights(folder / "nan.safetensors", model, {})
@@ -101,7 +192,7 @@ def bad_files(folder):
 
 def test_bad_weights_give_one_clear_error(tmp_path, capsys):
     files = bad_files(tmp_path)
-    assert len(files) == 6
+    assert len(files) == 7
     for path in [*files, tmp_path / "absent.safetensors"]:
         with pytest.raises(DvoError) as caught:
             load_weights(path)
@@ -127,6 +218,14 @@ def test_bad_checkpoints_are_refused_without_running_code(tmp_path, capsys, cont
     assert str(path) in str(caught.value)
     assert "executed" not in capsys.readouterr().out
     assert not (tmp_path / "out.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"hidden_channels": 0}, {"pyramid": []}, {"pyramid": [1, -4]}, {"radius": 2.5}, {"patch_size": 2}]
+)
+def test_sizes_that_make_no_network_are_named(wrong):
+    with pytest.raises(DvoError, match=next(iter(wrong))):
+        ModelConfig.from_dict(wrong)
 
 
 def test_unknown_setting_is_named():

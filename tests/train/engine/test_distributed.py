@@ -12,7 +12,7 @@ import torch
 from dvo.synth.clip import make_clip
 
 WORKER = Path(__file__).with_name("distributed_step.py")
-ROOT = WORKER.parents[2]
+ROOT = WORKER.parents[3]
 
 
 def start(path, batch, processes, rank, port, clips):

@@ -10,7 +10,7 @@ from lightning.pytorch.strategies import DDPStrategy
 
 import dvo.synth.dataset
 from train.data.clips import Renderings
-from train.tasks.patch_vo.module import PatchVOTraining
+from train.engine.build import make_program
 from train.tasks.patch_vo.objective import LossConfig
 
 
@@ -23,7 +23,7 @@ class KeepGradients(L.Callback):
     def on_before_optimizer_step(self, trainer, pl_module, optimizer):
         if trainer.global_step == 1 and trainer.is_global_zero:
             grads = {n: p.grad.clone() for n, p in pl_module.net.named_parameters()}
-            balance = (pl_module.beta.value, pl_module.rotation.value)
+            balance = (pl_module.task.beta.value, pl_module.task.rotation.value)
             seen, within = trainer.datamodule.clips_seen, pl_module.within_quarter
             torch.save({"grads": grads, "balance": balance, "seen": seen, "within": within}, self.path)
 
@@ -35,7 +35,7 @@ def main(path, batch, processes, clips):
     torch.manual_seed(0)
     loss = LossConfig(weighted=True, balance="v2v", balance_every=1, pose_from=1)
     # A rate of zero: the second step, where gradients are compared for the balance, sees the same weights.
-    program = PatchVOTraining("tiny", updates=3, initial=3, settle=1, warmup_until=0.0, loss=loss, clip=1e9,
+    program = make_program(model="tiny", updates=3, initial=3, settle=1, warmup_until=0.0, loss=loss, clip=1e9,
                               learning_rate=0.0, weight_decay=0.0)  # fmt: skip
     strategy = DDPStrategy(process_group_backend="gloo", timeout=datetime.timedelta(seconds=300))
     trainer = L.Trainer(

@@ -1,0 +1,86 @@
+"""Odometries from weights: ``dvo.load``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from dvo.models.weights import LoadedWeights, load_weights
+from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.protocol import Odometry
+from dvo.odometry.registry import odometry_builder
+
+if TYPE_CHECKING:
+    import torch
+
+    from dvo.odometry.tracker import PatchOdometry
+
+
+def load(
+    weights: str = "small",
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    config: Any = None,
+    **overrides: Any,
+) -> Odometry:
+    """The odometry of a weights file, ready to track one sequence.
+
+    The architecture that the file names decides which odometry it is, see :data:`dvo.odometry.registry.ODOMETRIES`.
+
+    Args:
+        weights: name of weights that ship with dvo, or a file.
+        device: where to compute.
+        seed: of everything that the odometry draws. The same seed on the same machine gives the same trajectory, bit
+            for bit on the CPU with a fixed number of threads.
+        config: settings, for ``patch_vo`` a :class:`dvo.odometry.config.TrackerConfig`; None takes those of the
+            preset.
+        overrides: single settings, for ``patch_vo`` by the names of :class:`dvo.odometry.config.TrackerConfig`.
+
+    Raises:
+        DvoError: no such weights, or a file that is none; an architecture without an odometry; an unknown setting.
+
+    Example:
+        >>> odometry = dvo.load("small", seed=1, patches=32)
+        >>> for frame in dvo.open("video.mp4", calib="calib.txt"):
+        ...     estimate = odometry.track(frame)
+        >>> result = odometry.finish()
+    """
+    return build_odometry(load_weights(weights, device), device=device, seed=seed, config=config, **overrides)
+
+
+def build_odometry(
+    weights: LoadedWeights,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    config: Any = None,
+    **overrides: Any,
+) -> Odometry:
+    """The odometry for a network in memory; arguments and errors as :func:`load`.
+
+    Args:
+        weights: the network with its name and preset; :meth:`dvo.models.weights.LoadedWeights.of` describes one.
+    """
+    builder = odometry_builder(weights.architecture)
+    return builder(weights, device=device, seed=seed, config=config, **overrides)
+
+
+def patch_odometry(
+    weights: LoadedWeights,
+    *,
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    config: TrackerConfig | None = None,
+    **overrides: Any,
+) -> PatchOdometry:
+    """The tracker of ``patch_vo`` networks; arguments and errors as :func:`build_odometry`."""
+    from dvo.models.patch_vo import PatchVO
+    from dvo.odometry.tracker import PatchOdometry
+
+    assert isinstance(weights.model, PatchVO), "the registry gave the builder of another architecture"
+    config = config or TRACKER_PRESETS.get(weights.preset, TrackerConfig())
+    if overrides:
+        TrackerConfig.from_dict(dict(overrides))
+        config = replace(config, **overrides)
+    return PatchOdometry(weights.model, config, seed=seed, device=device, name=f"dvo-{weights.name}")

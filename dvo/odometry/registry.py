@@ -1,0 +1,49 @@
+"""Odometries by the architecture of their network."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, cast
+
+from dvo.errors import DvoError
+from dvo.models.weights import LoadedWeights
+from dvo.odometry.protocol import Odometry
+from dvo.registry import Registry
+
+ODOMETRIES = Registry("odometry", "dvo.odometries", {"patch_vo": "dvo.odometry.load:patch_odometry"})
+"""Architecture name to ``"module:function"`` or ``"module:Class"`` of an :class:`OdometryBuilder`."""
+
+
+class OdometryBuilder(Protocol):
+    """Function, or class, that makes an odometry from a network."""
+
+    def __call__(
+        self, weights: LoadedWeights, *, device: Any = "cpu", seed: int = 0, config: Any = None, **overrides: Any
+    ) -> Odometry:
+        """Build an odometry that tracks one sequence.
+
+        Args:
+            weights: the network with its name and preset.
+            device: where to compute.
+            seed: of everything that the odometry draws.
+            config: settings, of a type that the odometry defines; None for those of the preset.
+            overrides: single settings.
+
+        Raises:
+            DvoError: an unknown setting.
+        """
+        ...
+
+
+def odometry_builder(architecture: str) -> OdometryBuilder:
+    """Builder of the odometry for an architecture.
+
+    Raises:
+        DvoError: an architecture without an odometry.
+    """
+    if architecture not in ODOMETRIES:
+        raise DvoError(
+            f"there is no odometry for networks of the architecture '{architecture}'",
+            field="architecture",
+            remedy=f"use weights of {', '.join(ODOMETRIES)}, or dvo.load_model for the bare network",
+        )
+    return cast(OdometryBuilder, ODOMETRIES.resolve(architecture))

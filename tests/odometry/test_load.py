@@ -1,0 +1,38 @@
+"""``dvo.load``: the odometry of an architecture, its settings and its name."""
+
+import pytest
+
+import dvo
+from dvo.errors import DvoError
+from dvo.models.patch_vo import PatchVO
+from dvo.models.weights import LoadedWeights
+from dvo.nets.config import ModelConfig, preset
+from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.load import build_odometry
+from dvo.odometry.registry import ODOMETRIES, odometry_builder
+from dvo.odometry.tracker import PatchOdometry
+
+
+def test_shipped_weights_give_the_tracker_with_the_settings_of_their_preset():
+    odometry = dvo.load("small", seed=3, patches=16)
+    assert isinstance(odometry, PatchOdometry) and odometry.name == "dvo-small" and odometry.seed == 3
+    assert odometry.config == TrackerConfig.from_dict({**TRACKER_PRESETS["small"].__dict__, "patches": 16})
+    given = TrackerConfig(updates=2)
+    assert dvo.load("small", config=given).config == given
+    assert not odometry.model.training
+
+
+def test_a_network_in_memory():
+    full = LoadedWeights.of(PatchVO(preset("tiny")), "mine")
+    assert (full.architecture, full.preset, full.info) == ("patch_vo", "tiny", None)
+    assert build_odometry(full).config == TRACKER_PRESETS["tiny"]
+    custom = LoadedWeights.of(PatchVO(ModelConfig.from_dict({**preset("tiny").to_dict(), "radius": 2})), "mine")
+    assert custom.preset == "custom" and build_odometry(custom).config == TrackerConfig()
+
+
+def test_unknown_settings_and_architectures_are_named():
+    with pytest.raises(DvoError, match="colour"):
+        dvo.load("small", colour=1)
+    with pytest.raises(DvoError, match="no odometry.*'none'.*patch_vo"):
+        odometry_builder("none")
+    assert list(ODOMETRIES) == ["patch_vo"]

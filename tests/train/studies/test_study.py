@@ -1,0 +1,92 @@
+"""The study: paired arms, resumed runs, report."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dvo.errors import DvoError
+from train.studies import study
+from train.studies.config import StudyConfig
+from train.studies.report import table, write_report
+
+
+def small_study(folder, **changes):
+    options = {
+        "folder": str(folder), "out": str(folder / "report"), "frames": 4, "size": (48, 64), "updates": 3,
+        "start_steps": 1, "steps": 2, "rates": (1e-3,), "seeds": (0,), "clips": 2, "validate_every": 1,
+        "validation_clips": 1,
+    }  # fmt: skip
+    return StudyConfig(**(options | changes))
+
+
+@pytest.mark.slow
+def test_a_study_runs_resumes_and_reports(tmp_path, monkeypatch):
+    config = small_study(tmp_path)
+    names = list(config.arms)
+    results = [study.run_arm(arm, 1e-3, 0, config) for arm in names]
+    assert [row["step"] for row in results[0]["curve"]] == [0, 1, 2]
+    assert results[0]["curve"][0] == results[1]["curve"][0] == results[2]["curve"][0]  # the same start
+    assert results[0]["curve"][-1] != results[1]["curve"][-1]
+    # a run that is done is read; one that stopped half way ends where it would have ended
+    monkeypatch.setattr(study, "_train", None)
+    assert study.run_arm(names[0], 1e-3, 0, config) == results[0]
+    monkeypatch.undo()
+    run = next(p for p in tmp_path.glob("V2V_weighting_rate*"))
+    (run / "result.json").unlink()
+    (run / "last.ckpt").unlink()
+    real, stopped = study._train, []
+
+    def stops_early(folder, program, clips, steps, callbacks, save_every):
+        stopped.append(folder)
+        real(folder, program, clips, steps - 1, callbacks, save_every)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study, "_train", stops_early)
+    with pytest.raises(KeyboardInterrupt):
+        study.run_arm(names[1], 1e-3, 0, config)
+    monkeypatch.undo()
+    again = study.run_arm(names[1], 1e-3, 0, config)
+    assert again["curve"] == results[1]["curve"]
+    report, picture = write_report(results, config)
+    assert all(name in report.read_text() for name in names) and picture.stat().st_size > 10_000
+    assert json.loads((run / "result.json").read_text())["arm"] == names[1]
+
+
+def test_a_study_with_unknown_settings_is_refused(tmp_path):
+    file = tmp_path / "study.yaml"
+    file.write_text("stpes: 3")
+    with pytest.raises(DvoError, match="stpes"):
+        StudyConfig.read(file)
+    file.write_text("{steps: 3, size: [48, 64]}")
+    assert StudyConfig.read(file).size == (48, 64)
+
+
+def test_the_table_compares_by_the_measures_of_the_configuration(tmp_path):
+    config = small_study(tmp_path, arms={"A": {}, "B": {}}, measures={"turn": "turn error (deg)"})
+    results = [
+        {
+            "arm": arm,
+            "rate": 1e-3,
+            "seed": 0,
+            "skipped": 0,
+            "curve": [{"step": s, "turn": e} for s, e in enumerate(errors)],
+        }
+        for arm, errors in (("A", (4.0, 2.0)), ("B", (2.0, 1.0)))
+    ]
+    head, rule, first, second = table(results, config).splitlines()
+    assert len({row.count("|") for row in (head, rule, first, second)}) == 1
+    assert "turn error after the last step" in head and "| 2.0000 [2.0000-2.0000] |" in first
+    assert "+50.0 [+50.0, +50.0] | 0 |" in second
+
+
+def test_ratios_are_medians_and_other_measures_means(tmp_path, monkeypatch):
+    measured = iter([{"a": 1.0, "b_ratio": 1.0}, {"a": 2.0, "b_ratio": 2.0}, {"a": 6.0, "b_ratio": 9.0}])
+
+    class Measures:
+        def measure(self, net, batch, seed):
+            return next(measured)
+
+    clips = study.DiskClips(tmp_path, 0, 3, small_study(tmp_path))
+    monkeypatch.setattr(study.DiskClips, "__getitem__", lambda self, index: {"images": np.zeros(1)})
+    assert study.validation_error(Measures(), None, clips) == {"a": 3.0, "b_ratio": 2.0}

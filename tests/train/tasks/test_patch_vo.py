@@ -1,0 +1,86 @@
+"""The task of the patch-flow network: warm-up, modes, precision, augmentation."""
+
+import pytest
+import torch
+
+from train.data.augment import Augmentation
+from train.engine.build import make_program
+from train.tasks.patch_vo.objective import LossConfig
+
+
+def test_warm_up_ends_when_the_flow_has_clicked():
+    program = make_program(model="tiny", warmup_until=0.5)
+    for _ in range(30):
+        program.task.follow(program.context, torch.tensor(0.6))
+    assert bool(program.warming)
+    for _ in range(100):
+        program.task.follow(program.context, torch.tensor(0.6))
+    assert not bool(program.warming)
+    program.task.follow(program.context, torch.tensor(0.0))
+    assert not bool(program.warming)
+
+
+def test_warm_up_ends_after_its_steps(tmp_path, runs):
+    program, _ = runs.fit(tmp_path, 2, runs.module(warmup_until=2.0, warmup_steps=2, warmup_mode="structure"))
+    assert bool(program.warming)
+    program, _ = runs.fit(tmp_path, 3, program, tmp_path / "last.ckpt")
+    assert not bool(program.warming)
+
+
+@pytest.mark.parametrize("mode", ["joint", "structure", "flow"])
+def test_every_mode_trains_every_part_it_uses(mode, runs):
+    program = make_program(model="tiny", updates=3, warmup_mode=mode, warmup_until=1.0)
+    program.log_dict = lambda *a, **k: None
+    program.training_step(runs.batch(), 0).backward()
+    idle = [name for name, p in program.net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    expected = [n for n, _ in program.net.named_parameters() if n.startswith("update.w.")] if mode == "flow" else []
+    assert idle == expected or (mode == "flow" and set(expected) <= set(idle) and len(idle) <= len(expected) + 1)
+
+
+@pytest.mark.slow
+def test_the_full_network_takes_a_step_of_dpvos_recipe(tmp_path, runs):
+    """The real layer sizes, on few patches of small frames: grows from 3 frames, structure only at first."""
+    program = make_program(
+        model="full",
+        updates=4,
+        initial=3,
+        settle=2,
+        cycle=100,
+        warmup_mode="structure",
+        warmup_until=2.0,
+        warmup_steps=1,
+    )
+    program.net.config = program.average.config = type(program.net.config)(training_patches=6)
+    _, losses = runs.fit(tmp_path, 2, program)
+    assert all(torch.isfinite(torch.tensor(x)) for x in losses)
+    assert int(program.skipped) == 0 and not bool(program.warming)
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        pytest.param(LossConfig(), id="plain", marks=pytest.mark.slow),
+        pytest.param(LossConfig(weighted=True, balance="v2v", balance_every=1), id="v2v"),
+    ],
+)
+def test_mixed_precision_stays_near_full_precision(tmp_path, runs, loss):
+    """Encoder and update operator in bfloat16; poses, bundle adjustment and loss in float32."""
+    _, exact = runs.fit(tmp_path, 2, runs.module(loss=loss))
+    program, mixed = runs.fit(tmp_path, 2, runs.module(loss=loss), precision="bf16-mixed")
+    assert mixed[0] == pytest.approx(exact[0], rel=0.05) and mixed != exact
+    assert int(program.skipped) == 0 and all(p.dtype == torch.float32 for p in program.parameters())
+    seen = []
+    program.net.update.register_forward_hook(lambda m, i, out: seen.append(out[1].dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        terms, _, _ = program.task.terms(program.context, runs.batch(), "joint")
+    assert seen == [torch.bfloat16] * 3
+    assert terms.rotation[-1].dtype == terms.flow[-1].dtype == torch.float32
+
+
+def test_augmentation_is_part_of_a_step_and_repeats(tmp_path, runs):
+    pytest.importorskip("kornia")
+    options = {"augmentation": Augmentation(colour=1.0, zoom=1.0)}
+    _, a = runs.fit(tmp_path, 2, runs.module(**options))
+    _, b = runs.fit(tmp_path, 2, runs.module(**options))
+    _, plain = runs.fit(tmp_path, 2)
+    assert a == b != plain

@@ -1,0 +1,52 @@
+"""Endless streams of clips with a position that training states keep."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import lightning as L
+from torch.utils.data import Sampler
+
+
+class StreamSampler(Sampler[int]):
+    """Indices from a start on, without end: clip ``i`` is the same whenever training is resumed.
+
+    Args:
+        start: first index of all processes together.
+        batch: clips a batch, in each process.
+        processes: number of processes; of every batch each takes its part.
+        rank: number of this process.
+    """
+
+    def __init__(self, start: int, batch: int = 1, processes: int = 1, rank: int = 0) -> None:
+        self.start, self.batch, self.processes, self.rank = start, batch, processes, rank
+
+    def __iter__(self) -> Iterator[int]:
+        first = self.start + self.rank * self.batch
+        while True:
+            yield from range(first, first + self.batch)
+            first += self.batch * self.processes
+
+
+class ClipStream(L.LightningDataModule):
+    """Base of data modules that go on where a training state stopped.
+
+    Lightning saves the position under the name of the class: a class that is renamed loses it, and
+    :class:`train.engine.program.TrainingProgram` warns.
+
+    Attributes:
+        clips_seen: clips trained on so far, in all processes; the engine counts.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.clips_seen = 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Position in the stream."""
+        return {"clips_seen": self.clips_seen}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go to a position."""
+        self.clips_seen = int(state_dict["clips_seen"])

@@ -1,0 +1,102 @@
+"""Settings of a study."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from dvo.errors import DvoError
+from train.tasks.registry import DEFAULT_TASK
+
+
+@dataclass(frozen=True)
+class StudyConfig:
+    """Arms of a study and their common settings.
+
+    Attributes:
+        folder: of clips and runs.
+        out: of the table and the curves, without suffix.
+        title, about: heading and first paragraph of the report.
+        task: registered name of a training task, or ``"module:Class"``.
+        model: preset.
+        frames: length of a clip.
+        size: height and width of a clip, pixels.
+        flow: range of the mean induced flow between frames, pixels.
+        updates: updates a clip.
+        settings: further settings of the task, common to start and arms.
+        start: settings of the task for the start that all arms of a seed share; for ``patch_vo`` they train the flow
+            head alone.
+        start_steps: length of the start, steps.
+        start_rate: learning rate of the start.
+        steps: steps of an arm, one OneCycle.
+        rates: learning rates; every arm is run with each of them.
+        seeds: every arm is run with each of them.
+        clips: rendered clips a seed, used in turn.
+        validate_every: steps between measurements of the validation error.
+        validation_clips: held-out clips of a measurement.
+        base: settings of the loss that all arms share.
+        arms: name to settings of the loss.
+        measures: name of a measure of the task to the label of its curves; the report compares by the first one, and
+            names the second beside it.
+    """
+
+    folder: str = "runs/train/study"
+    out: str = "docs/v2v_study"
+    title: str = "V2V on a small scale"
+    about: str = (
+        "Does weighting the flow loss by the confidence, and balancing it against the pose loss, make training faster "
+        "or better?\nThe pose error is translation in median depths plus rotation in radians over all pairs of frames; "
+        "the shared steps train\nthe flow head alone."
+    )
+    task: str = DEFAULT_TASK
+    model: str = "tiny"
+    frames: int = 6
+    size: tuple[int, int] = (96, 128)
+    flow: tuple[float, float] = (1.0, 10.0)
+    updates: int = 6
+    settings: dict[str, Any] = field(default_factory=dict)
+    start: dict[str, Any] = field(default_factory=lambda: {"warmup_until": 2.0, "loss": {"target": 1.0}})
+    start_steps: int = 300
+    start_rate: float = 2e-3
+    steps: int = 1000
+    rates: tuple[float, ...] = (4e-4, 2e-3)
+    seeds: tuple[int, ...] = (0, 1, 2)
+    clips: int = 500
+    validate_every: int = 100
+    validation_clips: int = 24
+    base: dict[str, Any] = field(default_factory=lambda: {"pose": 10.0, "flow": 0.1, "target": 0.0})
+    arms: dict[str, dict[str, Any]] = field(
+        default_factory=lambda: {
+            "DPVO": {},
+            "V2V weighting": {"weighted": True},
+            "V2V weighting + balance": {"weighted": True, "balance": "v2v"},
+        }
+    )
+    measures: dict[str, str] = field(
+        default_factory=lambda: {
+            "pose": "pose error (median depths + rad)",
+            "rotation_ratio": "rotation error / motion",
+        }
+    )
+
+    @classmethod
+    def read(cls, file: Path) -> StudyConfig:
+        """Read a YAML file.
+
+        Args:
+            file: keys are the attributes of this class.
+
+        Raises:
+            DvoError: no such file, or a setting that does not exist.
+        """
+        import yaml
+
+        if not file.is_file():
+            raise DvoError("no such file", file=file, remedy="give configs/train/study.yaml")
+        values = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+        unknown = sorted(set(values) - {f.name for f in fields(cls)})
+        if unknown:
+            remedy = "see train.studies.config.StudyConfig"
+            raise DvoError("unknown setting", file=file, field=", ".join(unknown), remedy=remedy)
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})

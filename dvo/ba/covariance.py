@@ -13,6 +13,7 @@ from dvo.ba.options import BADamping
 from dvo.ba.problem import Problem
 from dvo.ba.step import normal_equations, reduced_system
 from dvo.errors import DvoError
+from dvo.geometry.precision import full_precision
 
 
 @torch.no_grad()
@@ -43,8 +44,9 @@ def pose_covariance(
     bad = [x for x in frames if not 0 <= x < count]
     if bad:
         raise DvoError(f"frame {bad[0]} outside 0..{count - 1}", field="frames", remedy="give frames that exist")
-    equations, _ = normal_equations(problem, damping.depth)
-    solver = reduced_system(equations, replace(damping, relative=0.0))
+    with full_precision(state[block].value.device):
+        equations, _ = normal_equations(problem, damping.depth)
+        solver = reduced_system(equations, replace(damping, relative=0.0))
     index = torch.tensor(list(frames), dtype=torch.long, device=state[block].value.device)
     rows = state.rows(block, index).flatten()
     # One unit column for each tangent; the column of a fixed pose, past the last row, is zero.

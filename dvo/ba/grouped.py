@@ -30,7 +30,6 @@ from dvo.ba.normal_equations import (
 from dvo.ba.problem import AdjointConstants, Factor, Linearisation, NormalEquations, State, StateBlock
 from dvo.ba.reprojection import MARGIN
 from dvo.geometry import so3
-from dvo.geometry.projection import gather
 
 
 @dataclass(frozen=True)
@@ -82,13 +81,9 @@ class GroupedReprojection(Factor):
 
     def normal_equations(self, state: State) -> tuple[NormalEquations, list[Counted]]:
         poses, depths = state[POSES], state[INVERSE_DEPTHS]
-        index = self.index
-        if index.slot is not poses.slot:
-            assert poses.slot is not None
-            index = sum_index(self.plan, poses.slot, poses.free, len(self.rays))
         equations, used = accumulate(
-            poses.value, depths.value, self.rays, self.target, self.weight, self.plan, self.gate, index,
-            not poses.held, not depths.held,
+            poses.value, depths.value, self.rays, self.target, self.weight, self.plan, self.gate,
+            self._index_for(state), not poses.held, not depths.held,
         )  # fmt: skip
         before, width = state.offsets[POSES], 6 * poses.unknowns
         after = state.size - before - width
@@ -101,8 +96,16 @@ class GroupedReprojection(Factor):
 
     def phi(self, state: State, constants: AdjointConstants, memo: Any) -> Iterator[Tensor]:
         held = None if state[POSES].held else _pose_constants(state, constants)
-        for part, used in zip(self.plan.chunks(), memo, strict=True):
-            yield _edge_terms(self, state, constants, held, part, used)
+        index = self._index_for(state)
+        for part, ends, used in zip(self.plan.chunks(), index.ends, memo, strict=True):
+            yield _edge_terms(self, state, constants, held, part, ends, used)
+
+    def _index_for(self, state: State) -> SumIndex:
+        poses = state[POSES]
+        if self.index.slot is poses.slot:
+            return self.index
+        assert poses.slot is not None
+        return sum_index(self.plan, poses.slot, poses.free, len(self.rays))
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,7 @@ class _PoseConstants:
     Attributes:
         lambda_p, delta_p: ``(B, N, 6)``, zero for the fixed frames.
         s: ``(B, N, 6)``; None without relative damping, as are the other two.
-        e: ``(B, (n + 1) K, 6)`` by slot and patch, zero for the fixed frames. c: ``(B, K)``.
+        e: ``(B (n + 1) K, 6)`` by element, slot and patch, zero for the fixed frames. c: ``(B, K)``.
     """
 
     lambda_p: Tensor
@@ -129,7 +132,7 @@ def _pose_constants(state: State, constants: AdjointConstants) -> _PoseConstants
         return _PoseConstants(lambda_p, delta_p)
     start = state.offsets[POSES]
     e = constants.e[:, start : start + 6 * state[POSES].unknowns].unflatten(1, (-1, 6)).transpose(2, 3)
-    e = torch.nn.functional.pad(e, (0, 0, 0, 0, 0, 1)).flatten(1, 2)
+    e = torch.nn.functional.pad(e, (0, 0, 0, 0, 0, 1)).flatten(0, 2)
     return _PoseConstants(lambda_p, delta_p, spread(state.part(POSES, constants.s)), e, constants.c)
 
 
@@ -145,6 +148,7 @@ def _edge_terms(
     constants: AdjointConstants,
     held: _PoseConstants | None,
     part: slice,
+    ends_of_places: Tensor,
     used: Counted,
 ) -> Tensor:
     """The part of phi that comes from the edges of a slice of groups."""
@@ -181,10 +185,7 @@ def _edge_terms(
     ends = torch.diag_embed(s_j) + (adjoint * s_i[:, :, None]) @ adjoint.mT
     ends = torch.where((plan.pair_i == plan.pair_j)[:, None, None], 0.0, ends)
     quadratic = ((ends.index_select(1, group) @ jacobian) * jacobian).sum(-2).unflatten(-1, (2, size))
-    slot = state[POSES].slot
-    assert slot is not None
-    slot_i, slot_j = (slot[x[group]][:, None] * plan.patches for x in (plan.pair_i, plan.pair_j))
-    e_i, e_j = (gather(held.e, (x + kk.view(-1, size)).flatten()).view(b, -1, size, 6) for x in (slot_i, slot_j))
+    e_j, e_i = (held.e.index_select(0, x).view(b, -1, size, 6) for x in ends_of_places.view(-1, 2).unbind(1))
     e = (e_j - e_i @ adjoint.index_select(1, group).mT).mT[..., None, :]  # (B, G, 6, 1, M)
     linear = (jacobian.unflatten(-1, (2, size)) * e).sum(-3)
     c = held.c.index_select(1, kk).view(b, -1, 1, size)

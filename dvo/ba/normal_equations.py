@@ -108,17 +108,24 @@ class SumIndex:
 
 def sum_index(plan: EdgePlan, slot: Tensor, free: int, batch: int) -> SumIndex:
     """Destinations for a batch of the given size."""
-    element, n, k = torch.arange(batch, device=slot.device)[:, None], free, plan.patches
+    n, k = free, plan.patches
+
+    def over_batch(cells: Tensor, count: int) -> Tensor:
+        """Cells ``(X,)`` of one element among ``count`` to those of the whole batch ``(B X,)``."""
+        if batch == 1:
+            return cells
+        return (torch.arange(batch, device=slot.device)[:, None] * count + cells).flatten()
+
     slot_i, slot_j = slot[plan.pair_i], slot[plan.pair_j]
     by_pair, by_both = [], []
     for part in plan.chunks():
         group = plan.group_pair[part]
         kk = plan.kk[part.start * plan.size : part.stop * plan.size]
         ends = torch.stack((slot_j[group], slot_i[group]), -1)[:, None] * k
-        by_pair.append((element * len(plan.pair_i) + group).flatten())
-        by_both.append((element * (n + 1) * k + (ends + kk.view(-1, plan.size, 1)).flatten()).flatten())
+        by_pair.append(over_batch(group, len(plan.pair_i)))
+        by_both.append(over_batch((ends + kk.view(-1, plan.size, 1)).flatten(), (n + 1) * k))
     row, column = torch.cat((slot_j, slot_j, slot_i, slot_i)), torch.cat((slot_j, slot_i, slot_j, slot_i))
-    blocks = (element * (n + 1) ** 2 + row * (n + 1) + column).flatten()
+    blocks = over_batch(row * (n + 1) + column, (n + 1) ** 2)
     return SumIndex(slot, free, tuple(by_pair), tuple(by_both), blocks, torch.cat((slot_j, slot_i)))
 
 

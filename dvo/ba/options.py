@@ -12,6 +12,7 @@ from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 
 Refine = Literal["none", "focal", "all"]
+_REFINE = get_args(Refine)
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,8 @@ class BAOptions:
     covariance: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
-        if self.refine_intrinsics not in get_args(Refine):
-            known = ", ".join(get_args(Refine))
+        if self.refine_intrinsics not in _REFINE:
+            known = ", ".join(_REFINE)
             raise DvoError(
                 f"unknown value {self.refine_intrinsics!r}", field="refine_intrinsics", remedy=f"use one of {known}"
             )

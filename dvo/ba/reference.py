@@ -47,7 +47,7 @@ def dense_step(problem: Problem, damping: BADamping) -> tuple[Tensor, Tensor]:
     """Step ``(B, P)`` of the reduced unknowns and ``(B, K)`` of the eliminated ones from one joint system."""
     r, w, jac_p, jac_l = dense_rows(problem)
     p, k = jac_p.shape[-1], jac_l.shape[-1]
-    eye = torch.eye(k, dtype=r.dtype)
+    eye = torch.eye(k, dtype=r.dtype, device=r.device)
     h_pp, e = jac_p.mT @ (w[..., None] * jac_p), jac_p.mT @ (w[..., None] * jac_l)
     c = jac_l.mT @ (w[..., None] * jac_l) + damping.depth * eye
     g = (torch.cat((jac_p, jac_l), -1) * (w * r)[..., None]).sum(1)

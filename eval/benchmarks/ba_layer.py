@@ -21,7 +21,15 @@ from dvo.geometry.projection import reproject
 
 
 def training_clip(batch: int, frames: int, per_frame: int, device: torch.device) -> tuple[list[Tensor], list[Tensor]]:
-    """Tensors and edges for ``bundle_adjust``: a clip whose patches are all seen in every other frame."""
+    """Tensors and edges for ``bundle_adjust``: a clip whose patches are all seen in every other frame.
+
+    Args:
+        batch, frames, per_frame: numbers of clips, frames, and patches per frame.
+        device: of the result.
+
+    Returns:
+        Poses, patches, intrinsics, targets, weights; and ``ii, jj, kk``.
+    """
     generator = torch.Generator().manual_seed(0)
     count = frames * per_frame
     poses = se3.exp(0.05 * torch.randn(batch, frames, 6, generator=generator))
@@ -41,7 +49,13 @@ def training_clip(batch: int, frames: int, per_frame: int, device: torch.device)
 
 
 def fastest(run: Callable[[], None], device: torch.device, repeats: int) -> float:
-    """Milliseconds."""
+    """Shortest time of several runs, milliseconds.
+
+    Args:
+        run: the call to time.
+        device: waited for after each run.
+        repeats: number of runs.
+    """
     clock = time.process_time if device.type == "cpu" else time.perf_counter
     best = float("inf")
     for _ in range(repeats):
@@ -54,6 +68,7 @@ def fastest(run: Callable[[], None], device: torch.device, repeats: int) -> floa
 
 
 def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 4])
     parser.add_argument("--frames", type=int, default=8)

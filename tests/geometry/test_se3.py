@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dvo.geometry import se3, so3
+from dvo.geometry import se3, sim3, so3
 
 ANGLES = [0.0, 1e-12, 1e-6, 1e-3, 0.0316, 0.0317, 0.1, 1.0, 3.0, math.pi - 1e-6, math.pi]
 number = st.floats(-2, 2, allow_nan=False, width=32)
@@ -181,3 +182,18 @@ def test_agrees_with_pypose(angle: float) -> None:
     theirs = pypose.se3(xi).Exp()
     torch.testing.assert_close(se3.matrix(se3.exp(xi)), theirs.matrix(), atol=1e-8, rtol=0)
     torch.testing.assert_close(se3.log(theirs.tensor()), theirs.Log().tensor(), atol=1e-7, rtol=0)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-6, 0.5, 3.0]))
+def test_left_jacobians_are_derivatives_of_the_exponential_maps(seed: int, angle: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for group, dim in ((se3, 6), (sim3, 7)):
+        xi = torch.randn(3, dim, dtype=torch.float64, generator=generator)
+        xi[:, 3:6] *= angle / xi[:, 3:6].norm(dim=-1, keepdim=True)
+
+        def turned(step: Tensor, group: ModuleType = group, xi: Tensor = xi) -> Tensor:
+            return group.log(group.compose(group.exp(xi + step), group.inverse(group.exp(xi)))).sum(0)
+
+        expected = torch.autograd.functional.jacobian(turned, torch.zeros_like(xi)).transpose(0, 1)
+        torch.testing.assert_close(group.left_jacobian(xi), expected, atol=1e-9, rtol=0)

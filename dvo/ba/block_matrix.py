@@ -1,21 +1,21 @@
 """Symmetric block-sparse matrices ``(n D, n D)`` and solvers for positive definite systems with them.
 
 Only the blocks of the lower triangle that can be non-zero are stored; which these are (the pattern) is found once and
-their values change with each linearisation. A system is solved either directly through SuperLU, if scipy is
-installed, or by conjugate gradients with a block-Jacobi preconditioner, which needs torch alone.
+their values change with each linearisation. A system is solved either directly, by the sparse Cholesky factorisation
+of :mod:`dvo.ba.cholesky`, or by conjugate gradients with a block-Jacobi preconditioner.
 """
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from dvo.ba.cholesky import TilePlan, best_plan, solve_cholesky
 from dvo.errors import DvoError
 
 LinearSolver = Literal["auto", "direct", "cg"]
@@ -74,11 +74,14 @@ class BlockPattern:
         return torch.nonzero(self.rows != self.columns)[:, 0]
 
     @cached_property
-    def sparse(self) -> Any:
-        """Layout for scipy; made once for a pattern."""
-        from dvo.ba.direct import DirectLayout
+    def _plans(self) -> dict[int, TilePlan | None]:
+        return {}
 
-        return DirectLayout(self.size, self.rows.cpu().numpy(), self.columns.cpu().numpy())
+    def cholesky_plan(self, dim: int) -> TilePlan | None:
+        """Plan of the Cholesky factorisation with blocks of ``dim``, made once; None if it would be too large."""
+        if dim not in self._plans:
+            self._plans[dim] = best_plan(self.size, self.rows, self.columns, dim)
+        return self._plans[dim]
 
     def find(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Positions of blocks that are stored, ``rows >= columns``."""
@@ -220,11 +223,6 @@ def conjugate_gradients(
     return x, options.max_iterations
 
 
-def has_scipy() -> bool:
-    """Whether the direct solver can be used."""
-    return importlib.util.find_spec("scipy") is not None
-
-
 def solve_blocks(
     matrix: BlockMatrix,
     rhs: Tensor,
@@ -236,19 +234,22 @@ def solve_blocks(
     Args:
         matrix: symmetric positive definite.
         rhs: ``(n, D)``.
-        solver: "direct" (sparse LU of scipy, in float64 on the CPU), "cg", or "auto": direct where scipy is there.
+        solver: "direct" (Cholesky), "cg", or "auto": direct unless the factor would be too large.
         options: of conjugate gradients.
 
+    Returns:
+        ``(n, D)``; NaN where a direct solution finds that the matrix is not positive definite.
+
     Raises:
-        DvoError: "direct" without scipy, or an unknown name.
+        DvoError: an unknown solver, or "direct" where the factor would be too large.
     """
     if solver not in ("auto", "direct", "cg"):
         raise DvoError(f"unknown linear solver {solver!r}", field="solver", remedy="use auto, direct or cg")
     if matrix.pattern.size == 0:
         return rhs
-    if solver == "direct" and not has_scipy():
-        raise DvoError("the direct solver needs scipy", field="solver", remedy="pip install scipy, or solver='cg'")
-    if solver == "cg" or not has_scipy():
-        return conjugate_gradients(matrix.operator(), rhs, block_jacobi(matrix, options.cluster), options)[0]
-    x = matrix.pattern.sparse.solve(matrix.blocks.detach().cpu().double().numpy(), rhs.detach().cpu().double().numpy())
-    return torch.from_numpy(x).to(rhs)
+    plan = None if solver == "cg" else matrix.pattern.cholesky_plan(matrix.blocks.shape[-1])
+    if plan is not None:
+        return solve_cholesky(plan, matrix.blocks, rhs)
+    if solver == "direct":
+        raise DvoError("the matrix is too dense to factorise", field="solver", remedy="use solver='cg'")
+    return conjugate_gradients(matrix.operator(), rhs, block_jacobi(matrix, options.cluster), options)[0]

@@ -94,9 +94,11 @@ class ReprojectionEdges:
 
     @cached_property
     def ends(self) -> tuple[Tensor, Tensor]:
-        """``(G * M,)`` unknown of the target and of the source frame of each place."""
+        """``(G * M,)`` unknown of the target and of the source frame of each place; ``free`` for an empty place."""
         pair = self.plan.group_pair.repeat_interleave(self.plan.size)
-        return self.slot[self.plan.pair_j[pair]], self.slot[self.plan.pair_i[pair]]
+        target, source = (self.slot[frames[pair]] for frames in (self.plan.pair_j, self.plan.pair_i))
+        filled = self.plan.filled.flatten()
+        return torch.where(filled, target, self.free), torch.where(filled, source, self.free)
 
     def accumulate(
         self, poses_cw: Tensor, inverse_depth: Tensor, pattern: SchurPattern, at: tuple[Tensor, Tensor]

@@ -66,7 +66,7 @@ class LMOptions:
         max_iterations: steps tried at most.
         tolerance: relative decrease of the cost by an accepted step below which it has converged.
         damping: at the start, a fraction of the Hessian's diagonal.
-        solver: of the linear system: "auto", "direct" (scipy) or "cg".
+        solver: of the linear system: "auto", "direct" (sparse Cholesky) or "cg".
         cg: options of conjugate gradients.
     """
 

@@ -26,7 +26,7 @@ from dvo.errors import DvoError
 
 EXPLICIT_WORK = 400
 """``S`` is formed if that takes at most this many block products for each observation."""
-SCRATCH = 1 << 22
+SCRATCH = 1 << 20
 """Numbers of temporary storage in a product of source frames."""
 
 

@@ -31,7 +31,7 @@ def pose_block(poses_cw: Tensor, fixed: int | Tensor | Sequence[bool] = 1, held:
 
 
 def sim3_block(sims: Tensor, fixed: int | Tensor | Sequence[bool] = 1, held: bool = False) -> StateBlock:
-    """Similarities ``(B, N, 8)`` with tangents ``[tau, phi, sigma]`` on the left; arguments as of :func:`pose_block`."""
+    """Similarities ``(B, N, 8)`` with tangents ``[tau, phi, sigma]`` on the left; see :func:`pose_block`."""
     slot, free = free_slots(fixed, sims.shape[1], sims.device)
     return StateBlock(sims, 7, sim3.retract, slot, free, held or free == 0)
 
@@ -47,16 +47,19 @@ def inverse_depth_block(
     return StateBlock(inverse_depths, 1, retract, None, inverse_depths.shape[1], held, eliminated=True)
 
 
-def intrinsics_block(intrinsics: Tensor, refine: str = "none") -> StateBlock:
-    """Intrinsics ``(B, N, 4)`` = fx fy cx cy, all refined by one common step.
+def intrinsics_block(intrinsics: Tensor, refine: str = "none", shared: bool = True) -> StateBlock:
+    """Intrinsics ``(B, N, 4)`` = fx fy cx cy in pixels.
 
     Args:
-        intrinsics: pixels; rows are cameras that share their calibration errors, for example the frames of one camera.
+        intrinsics: of each camera.
         refine: ``none``, ``focal`` (tangent: log of a common factor of fx and fy) or ``all`` (tangent: log fx, log fy,
             cx / fx, cy / fy).
+        shared: the rows are frames of one camera and move by one common step, rather than cameras of their own.
     """
-    slot = torch.zeros(intrinsics.shape[1], dtype=torch.long, device=intrinsics.device)
-    return StateBlock(intrinsics, REFINED.get(refine, 1), _retract_intrinsics, slot, 1, held=refine == "none")
+    count = intrinsics.shape[1]
+    slot = torch.zeros(count, dtype=torch.long, device=intrinsics.device) if shared else None
+    free = min(count, 1) if shared else count
+    return StateBlock(intrinsics, REFINED.get(refine, 1), _retract_intrinsics, slot, free, held=refine == "none")
 
 
 def _retract_intrinsics(intrinsics: Tensor, step: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""How strongly to damp the first steps from nothing.
+"""Damping of the first steps without a starting point, and a solver for that case.
 
 From identity poses and constant depth, rotation and sideways translation explain the flow almost equally well. An
 undamped first step takes a huge difference of the two, and the depths then settle on the wrong side of it (the
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.layer import bundle_adjust
-from dvo.ba.step import BADamping
+from dvo.ba.options import BADamping, BAOptions
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 
@@ -81,14 +81,13 @@ def solve_from_nothing(
             far = start.clone()
             far[:, :, 2] = _FAR
             for _ in range(2):
-                poses, _ = bundle_adjust(
-                    poses, far, intrinsics, targets, weights, *edges, motion_only=True, bounds=bounds
-                )
+                options = BAOptions(motion_only=True, bounds=bounds)
+                poses = bundle_adjust(poses, far, intrinsics, targets, weights, *edges, options).poses_cw
             poses = torch.cat([torch.zeros_like(poses[..., :3]), poses[..., 3:]], -1)
         for update in range(updates):
-            poses, now = bundle_adjust(
-                poses, now, intrinsics, targets, weights, *edges, damping=damping_at(update), bounds=bounds
-            )
+            options = BAOptions(damping=damping_at(update), bounds=bounds)
+            result = bundle_adjust(poses, now, intrinsics, targets, weights, *edges, options)
+            poses, now = result.poses_cw, result.patches
         cost = robust_cost(poses, now, intrinsics, targets, weights, *edges)
         if best is None:
             best = poses, now, cost

@@ -1,4 +1,4 @@
-"""How the edges of a patch graph are laid out for fast sums.
+"""Layout of the edges of a patch graph for fast sums, and the check of their indices.
 
 Edges come in any order. Most of what an edge needs depends on its frame pair only, and the 6x6 blocks are sums over the
 edges of a pair. Edges are therefore sorted into groups of equal size that share a pair, the last group of a pair being
@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dvo.errors import DvoError
+
 CHUNK = 1 << 17
-"""So many places are linearised at a time: it bounds the memory when every pixel of a feature map is a patch."""
+"""Places linearised at a time: bounds the memory when every pixel of a feature map is a patch."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,7 @@ class EdgePlan:
     """``G`` groups of ``M`` places for ``E`` edges with ``P`` different frame pairs.
 
     Attributes:
-        frames, patches: how many there are.
+        frames, patches: their numbers.
         pair_i, pair_j: ``(P,)`` source and target frame of each pair.
         group_pair: ``(G,)`` pair of each group.
         order: ``(G * M,)`` edge of each place (any edge, if empty).
@@ -53,10 +55,33 @@ class EdgePlan:
         return [slice(start, min(start + step, self.groups)) for start in range(0, self.groups, step)]
 
 
+def check_index(index: Tensor, count: int, field: str) -> None:
+    """Check that indices ``(E,)`` lie in ``0 .. count - 1``. Waits for the device on an accelerator.
+
+    Raises:
+        DvoError: an index out of range.
+    """
+    if len(index) == 0:
+        return
+    low, high = (int(x) for x in index.aminmax())
+    if low < 0 or high >= count:
+        raise DvoError(
+            f"index {low if low < 0 else high} outside 0..{count - 1}",
+            field=field,
+            remedy="give indices of frames and patches of this problem",
+        )
+
+
 def plan_edges(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) -> EdgePlan:
-    """Sort edges ``(E,)`` into groups. A graph that does not change needs this once.
+    """Sort edges into groups. A graph that does not change needs this once.
 
     On an accelerator this waits for the device, as the number of groups depends on the data.
+
+    Args:
+        ii, jj, kk: ``(E,)`` source frame, target frame and patch, in any order. Indices are not checked here, see
+            :func:`check_index`: one out of range would stand for another pair of frames.
+        frames: number of frames.
+        patches: number of patches.
     """
     device, edges = ii.device, ii.shape[0]
     if edges == 0:
@@ -80,7 +105,13 @@ def plan_edges(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) ->
 
 
 def free_slots(fixed: int | Tensor | Sequence[bool], frames: int, device: torch.device) -> tuple[Tensor, int]:
-    """Row of each frame among the free ones ``(N,)``, and their number ``n``; fixed frames share the row ``n``."""
+    """Row of each frame among the free ones ``(N,)``, and their number ``n``; fixed frames share the row ``n``.
+
+    Args:
+        fixed: number of leading frames that stay, or which: bool ``(N,)``.
+        frames: number of frames ``N``.
+        device: of the result.
+    """
     if isinstance(fixed, int):
         free = max(frames - fixed, 0)
         slot = torch.arange(frames, device=device) - fixed

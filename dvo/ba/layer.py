@@ -1,43 +1,34 @@
 """The differentiable dense bundle adjustment layer.
 
-Unknowns are camera poses and one inverse depth per patch; measurements are where each patch centre is seen in other
-frames. Residual of an edge (i, j, k): ``r = target - project(T_j T_i^-1 backproject(patch k))``, weighted by a
-2-vector. Each iteration is a damped Gauss-Newton step without acceptance test, hence differentiable from end to end:
-linearise with analytic Jacobians, eliminate the depths, solve for the poses, substitute back, retract. (Tang and
-Tan, "BA-Net", 2019; Teed et al., "Deep Patch Visual Odometry", 2023.)
+Unknowns are camera poses, one inverse depth per patch and, if wanted, intrinsics; measurements are the positions of
+patch centres in other frames, and any further factors. Residual of an edge (i, j, k):
+``r = target - project(T_j T_i^-1 backproject(patch k))``, weighted by a 2-vector. Each iteration is a damped
+Gauss-Newton step without acceptance test, hence differentiable from end to end: linearise with analytic Jacobians,
+eliminate the depths, solve for the poses, substitute back, retract. (Tang and Tan, "BA-Net", 2019; Teed et al., "Deep
+Patch Visual Odometry", 2023.)
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
 
-from dvo.ba.edges import EdgePlan, free_slots, plan_edges
-from dvo.ba.normal_equations import MARGIN, Gate
-from dvo.ba.setting import BADamping, StepSetting
-from dvo.ba.step import GaussNewtonStep
+from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, inverse_depth_block, pose_block
+from dvo.ba.covariance import pose_covariance
+from dvo.ba.edges import EdgePlan, check_index, plan_edges
+from dvo.ba.grouped import group_measurements
+from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
+from dvo.ba.problem import Factor, Problem, State
+from dvo.ba.reprojection import PatchReprojection
+from dvo.ba.step import solve
 from dvo.errors import DvoError
-from dvo.geometry import se3
 from dvo.geometry.precision import full_precision
 
+__all__ = ["BADamping", "BAOptions", "BAResult", "Sensors", "bundle_adjust", "make_problem"]
 
-@dataclass(frozen=True)
-class DepthPrior:
-    """Adds ``weight (d - value)^2`` for each patch: ``value``, ``weight`` ``(B, K)`` or broadcastable to it."""
-
-    value: Tensor
-    weight: Tensor
-
-
-@dataclass(frozen=True)
-class PosePrior:
-    """Adds ``weight . Log(prior T^-1)^2``: ``poses_cw (B, N, 7)``, ``weight (B, N, 6)`` or broadcastable to it."""
-
-    poses_cw: Tensor
-    weight: Tensor
+_DEFAULT = BAOptions()
 
 
 def bundle_adjust(
@@ -49,96 +40,153 @@ def bundle_adjust(
     ii: Tensor,
     jj: Tensor,
     kk: Tensor,
+    options: BAOptions = _DEFAULT,
     *,
-    fixed: int | Tensor | Sequence[bool] = 1,
-    iterations: int = 2,
-    damping: BADamping = BADamping(),  # noqa: B008 (frozen)
-    structure_only: bool = False,
-    motion_only: bool = False,
-    bounds: tuple[float, float] | None = None,
-    max_residual: float = 128.0,
-    depth_range: tuple[float, float] = (1e-3, 10.0),
-    depth_prior: DepthPrior | None = None,
-    pose_prior: PosePrior | None = None,
+    factors: Iterable[Factor] = (),
     plan: EdgePlan | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> BAResult:
     """Refine poses and inverse depths so that the patches project onto their targets.
 
-    Gradients flow to poses, patches, intrinsics, targets and weights, through all iterations. Neither the result nor a
-    gradient is ever NaN for finite input: an edge whose point is not in front of frame j (``Z <= 0.2``), whose residual
-    is too long, or which leaves the bounds counts for nothing in that iteration, and where the system cannot be solved
-    the step is zero.
+    Gradients flow to poses, patches, intrinsics, targets, weights and the parameters of the factors, through all
+    iterations. Neither the result nor a gradient is ever NaN for finite input: an edge whose point is not in front of
+    frame j (``Z <= 0.2``), whose residual is too long, or which leaves the bounds counts for nothing in that iteration,
+    and where the system cannot be solved the step is zero.
 
     Args:
         poses_cw: ``(B, N, 7)`` world to camera.
         patches: ``(B, K, 3, p, p)`` x, y (feature-map pixels) and inverse depth; all pixels of a patch share the one
             of its centre.
-        intrinsics: ``(B, N, 4)`` fx fy cx cy in the same pixels.
-        targets: ``(B, E, 2)`` where the patch centres are seen, pixels of frame j.
-        weights: ``(B, E, 2)`` confidence per axis, not negative.
+        intrinsics: ``(B, N, 4)`` fx fy cx cy in the same pixels; ``(B, S, 4)`` with several sensors.
+        targets: ``(B, E, 2)`` measured positions of the patch centres, pixels of frame j.
+        weights: ``(B, E, 2)`` confidence per axis (inverse variance, pixels^-2), not negative; an edge with a weight
+            that is not finite does not count.
         ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, in any order, shared by the batch.
-        fixed: how many leading poses stay, or which: bool ``(N,)``.
-        iterations: number of Gauss-Newton steps.
-        damping: see :class:`BADamping`.
-        structure_only: poses stay. motion_only: inverse depths stay.
-        bounds: ``(width, height)`` of the feature map; a projection more than 64 px outside does not count.
-        max_residual: pixels; an edge with a longer residual does not count.
-        depth_range: inverse depths are clamped to it.
-        depth_prior, pose_prior: optional quadratic priors.
-        plan: what :func:`plan_edges` made of ``ii, jj, kk``, to save doing it again for a graph that does not change.
+        options: see :class:`BAOptions`.
+        factors: further measurements, for example priors (:mod:`dvo.ba.factors`).
+        plan: layout that :func:`dvo.ba.edges.plan_edges` made of ``ii, jj, kk``, to save doing it again for a graph
+            that does not change.
 
     Returns:
-        New ``poses_cw`` and ``patches``.
+        New poses and patches, and what the options ask for beyond.
 
     Raises:
-        DvoError: shapes that do not belong together.
+        DvoError: shapes that do not belong together; an edge index out of range or a negative weight (see
+            ``options.check``).
+
+    Example:
+        >>> from dvo.ba.layer import BAOptions, bundle_adjust
+        >>> result = bundle_adjust(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk,
+        ...                        BAOptions(iterations=4, bounds=(160, 120)))
+        >>> loss = pose_loss(result.poses_cw, true_poses_cw)
+        >>> loss.backward()
     """
-    _check(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk)
+    _check_shapes(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk, sensors=options.sensors)
+    if options.check or (options.check is None and weights.device.type == "cpu"):
+        _check_values(poses_cw.shape[1], patches.shape[1], intrinsics.shape[1], weights, ii, jj, kk, options.sensors)
+    arguments = (intrinsics, targets, weights, ii, jj, kk, options)
+    with full_precision(poses_cw.device):
+        problem = make_problem(poses_cw, patches, *arguments, factors=factors, plan=plan)
+        problem = solve(problem, options.iterations, options.damping)
+        state = problem.state
+        poses_cw, inverse_depths = state[POSES].value, state[INVERSE_DEPTHS].value
+        patches = patches.to(poses_cw.dtype)
+        if not state[INVERSE_DEPTHS].held:
+            row = inverse_depths[:, :, None, None, None].expand_as(patches[:, :, :1])
+            patches = torch.cat((patches[:, :, :2], row), 2)
+        intrinsics = state[INTRINSICS].value if INTRINSICS in state.blocks else intrinsics.to(poses_cw.dtype)
+        cost = inliers = covariance = None
+        if options.covariance is not None:
+            covariance = pose_covariance(problem, options.covariance, options.damping)
+        if options.report:
+            arguments = (intrinsics, *arguments[1:])
+            cost, inliers = _report(make_problem(poses_cw, patches, *arguments, factors=factors, grouped=False))
+        return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance)
+
+
+def make_problem(
+    poses_cw: Tensor,
+    patches: Tensor,
+    intrinsics: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+    ii: Tensor,
+    jj: Tensor,
+    kk: Tensor,
+    options: BAOptions = _DEFAULT,
+    *,
+    factors: Iterable[Factor] = (),
+    plan: EdgePlan | None = None,
+    grouped: bool = True,
+) -> Problem:
+    """State blocks and factors of a call of :func:`bundle_adjust`, the reprojection first.
+
+    Args:
+        grouped: use the fast reprojection where it applies: one camera with given intrinsics. False: the generic one,
+            with the intrinsics as a state block.
+
+    The other arguments are those of :func:`bundle_adjust`. They are not checked. Half precision becomes float32.
+    """
     dtype = poses_cw.dtype
     if dtype in (torch.float16, torch.bfloat16):
         dtype = torch.float32
-    with full_precision(poses_cw.device):
-        poses_cw, patches, intrinsics, targets, weights = (
-            x.to(dtype) for x in (poses_cw, patches, intrinsics, targets, weights)
-        )
-        centre = patches.shape[-1] // 2
-        inverse_depth = patches[:, :, 2, centre, centre]
-        batch, frames, count = len(poses_cw), poses_cw.shape[1], patches.shape[1]
-        slot, free = free_slots(fixed, frames, poses_cw.device)
-        move_poses, move_depths = not structure_only and free > 0, not motion_only
+    poses_cw, patches, intrinsics, targets, weights = (
+        x.to(dtype) for x in (poses_cw, patches, intrinsics, targets, weights)
+    )
+    frames, count, centre = poses_cw.shape[1], patches.shape[1], patches.shape[-1] // 2
+    centres = patches[:, :, :2, centre, centre]
+    poses = pose_block(poses_cw, options.fixed, held=options.structure_only)
+    inverse_depths = patches[:, :, 2, centre, centre]
+    depths = inverse_depth_block(inverse_depths, options.depth_range, held=options.motion_only)
+    blocks = {POSES: poses, INVERSE_DEPTHS: depths}
+    sensors, refine = options.sensors, options.refine_intrinsics
+    reprojection: Factor
+    if grouped and sensors is None and refine == "none":
         if plan is None:
             plan = plan_edges(ii, jj, kk, frames, count)
-        rays, target, weight, gate = _measurements(
-            patches[:, :, :2, centre, centre], intrinsics, targets, weights, plan, max_residual, bounds
-        )
-        priors: list[Tensor | None] = [None] * 4
-        if depth_prior is not None:
-            priors[:2] = (x.to(inverse_depth).expand(batch, count) for x in (depth_prior.value, depth_prior.weight))
-        if pose_prior is not None:
-            priors[2] = pose_prior.poses_cw.to(poses_cw).expand(batch, frames, 7)
-            priors[3] = pose_prior.weight.to(poses_cw).expand(batch, frames, 6)
-        setting = StepSetting(plan, gate, slot, free, damping, move_poses, move_depths)
-        stays = (slot == free)[:, None]
-        for _ in range(iterations if move_poses or move_depths else 0):
-            dp, dl = GaussNewtonStep.apply(setting, poses_cw, inverse_depth, rays, target, weight, *priors)
-            if move_poses:
-                poses_cw = torch.where(stays, poses_cw, se3.retract(poses_cw, setting.spread(dp)))
-            if move_depths:
-                inverse_depth = (inverse_depth + dl).clamp(*depth_range)
-        if move_depths:
-            row = inverse_depth[:, :, None, None, None].expand_as(patches[:, :, :1])
-            patches = torch.cat((patches[:, :, :2], row), 2)
-        return poses_cw, patches
+        reprojection = group_measurements(
+            centres, intrinsics, targets, weights, plan, max_residual=options.max_residual, bounds=options.bounds,
+            kernel=options.kernel,
+        )  # fmt: skip
+    else:
+        blocks = {INTRINSICS: intrinsics_block(intrinsics, refine, shared=sensors is None), **blocks}
+        extrinsics, camera_i, camera_j = None, ii, jj
+        if sensors is not None:
+            extrinsics = sensors.from_body.to(poses_cw).expand(len(poses_cw), -1, 7)
+            camera_i, camera_j = sensors.source, sensors.target
+        reprojection = PatchReprojection(
+            centres, targets, weights, ii, jj, kk, camera_i, camera_j, extrinsics, options.max_residual,
+            options.bounds, options.kernel, focal_only=refine == "focal",
+        )  # fmt: skip
+    more = (factor.with_tensors([x.to(poses_cw) for x in factor.tensors()]) for factor in factors)
+    return Problem(State(blocks), (reprojection, *more))
 
 
-def _check(
-    poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, targets: Tensor, weights: Tensor, *edges: Tensor
+@torch.no_grad()
+def _report(problem: Problem) -> tuple[Tensor, Tensor]:
+    """Cost ``(B,)`` and inliers ``(B, E)`` of a problem whose first factor is the generic reprojection."""
+    values = problem.state.values()
+    linear = [factor.linearise(values) for factor in problem.factors]
+    return torch.stack([x.cost() for x in linear]).sum(0), (linear[0].weight > 0).any(-1)
+
+
+def _check_shapes(
+    poses_cw: Tensor,
+    patches: Tensor,
+    intrinsics: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+    *edges: Tensor,
+    sensors: Sensors | None,
 ) -> None:
-    """Shapes only: looking at the indices would make an accelerator wait."""
     b, n = poses_cw.shape[:2] if poses_cw.dim() == 3 else (-1, -1)
     count = len(edges[0])
-    wanted: dict[str, tuple[Tensor, tuple[int, ...]]]
-    wanted = {"poses_cw": (poses_cw, (b, n, 7)), "intrinsics": (intrinsics, (b, n, 4))}
+    wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {"poses_cw": (poses_cw, (b, n, 7))}
+    if sensors is None:
+        wanted["intrinsics"] = (intrinsics, (b, n, 4))
+    else:
+        cameras = sensors.from_body.shape[-2] if sensors.from_body.dim() > 1 else -1
+        wanted["intrinsics"] = (intrinsics, (b, cameras, 4))
+        wanted |= {"sensors.source": (sensors.source, (count,)), "sensors.target": (sensors.target, (count,))}
     wanted |= {"targets": (targets, (b, count, 2)), "weights": (weights, (b, count, 2))}
     wanted |= {name: (x, (count,)) for name, x in zip(("ii", "jj", "kk"), edges, strict=True)}
     if patches.dim() == 5:
@@ -152,27 +200,20 @@ def _check(
             )
 
 
-def _measurements(
-    xy: Tensor,
-    intrinsics: Tensor,
-    targets: Tensor,
+def _check_values(
+    frames: int,
+    patches: int,
+    cameras: int,
     weights: Tensor,
-    plan: EdgePlan,
-    max_residual: float,
-    bounds: tuple[float, float] | None,
-) -> tuple[Tensor, Tensor, Tensor, Gate]:
-    """Rays ``(B, G, 3, M)``, targets and weights ``(B, G, 2, M)``, laid out by group, in normalised coordinates."""
-    shape = (len(xy), plan.groups, plan.size, 2)
-    f_i, c_i = intrinsics.index_select(1, plan.pair_i[plan.group_pair])[:, :, None].split(2, -1)
-    f_j, c_j = intrinsics.index_select(1, plan.pair_j[plan.group_pair])[:, :, None].split(2, -1)
-    source = (xy.index_select(1, plan.kk).view(shape) - c_i) / f_i
-    rays = torch.cat((source, torch.ones_like(source[..., :1])), -1).mT.contiguous()
-    target = (targets.index_select(1, plan.order).view(shape) - c_j) / f_j
-    weight = weights.index_select(1, plan.order).view(shape) * (f_j * f_j)
-    # A weight that is not finite is none at all; the empty places of a group have none either.
-    weight = torch.where(plan.filled[..., None] & torch.isfinite(weight).all(-1, keepdim=True), weight, 0.0)
-    gate = Gate(max_residual, f_j.detach().mT)
-    if bounds is not None:
-        middle = xy.new_tensor(bounds) / 2
-        gate = replace(gate, offset=(c_j.detach() - middle).mT, reach=middle[:, None] + MARGIN)
-    return rays, target.mT.contiguous(), weight.mT.contiguous(), gate
+    ii: Tensor,
+    jj: Tensor,
+    kk: Tensor,
+    sensors: Sensors | None,
+) -> None:
+    for field, index, count in (("ii", ii, frames), ("jj", jj, frames), ("kk", kk, patches)):
+        check_index(index, count, field)
+    if sensors is not None:
+        check_index(sensors.source, cameras, "sensors.source")
+        check_index(sensors.target, cameras, "sensors.target")
+    if bool((weights < 0).any()):
+        raise DvoError("negative", field="weights", remedy="give inverse variances, zero for an edge to leave out")

@@ -1,4 +1,4 @@
-"""From edges to normal equations: residuals, analytic Jacobians, and their sums by frame and by patch.
+"""Normal equations of patch reprojection by frame pairs: residuals, analytic Jacobians, their sums by frame and patch.
 
 Everything is in normalised camera coordinates of the target frame; the focal lengths enter with the weights. The
 Jacobian by the source pose is ``J_i = -J_j Ad(G_ij)``, and the adjoint depends on the frame pair only, so that the
@@ -16,49 +16,42 @@ import torch
 from torch import Tensor
 
 from dvo.ba.edges import EdgePlan
+from dvo.ba.kernels import Kernel
+from dvo.ba.linearisation import NormalEquations
 from dvo.geometry import so3
 from dvo.geometry.projection import MIN_Z_VALID
 
-MARGIN = 64.0
-"""A projection counts while it lies within the feature map grown by this many pixels."""
+Counted = tuple[Tensor, Tensor | None]
+"""Of a slice of groups: places that count, ``(B, G, 1, M)`` bool, and their kernel weights of the same shape."""
 
 
 @dataclass(frozen=True)
 class Gate:
-    """Which edges count.
+    """Conditions on which edges count.
 
     Attributes:
         max_residual: pixels; a longer residual is an outlier.
         focal: ``(B, G, 2, 1)`` of the target frames, to go from normalised coordinates to pixels.
-        offset: ``(B, G, 2, 1)`` their principal points, seen from the middle of the feature map.
+        offset: ``(B, G, 2, 1)`` their principal points relative to the middle of the feature map.
         reach: ``(2, 1)`` farthest distance from that middle along each axis, or None for no bounds.
+        kernel: robust kernel of the weighted residual.
     """
 
     max_residual: float
     focal: Tensor
     offset: Tensor | None = None
     reach: Tensor | None = None
+    kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
 
 
 @dataclass(frozen=True)
 class View:
-    """Points of a slice of groups as seen from the target frame: all ``(B, G, 1, M)`` but ``xy (B, G, 2, M)``."""
+    """Points of a slice of groups in the target frame: all ``(B, G, 1, M)`` but ``xy (B, G, 2, M)``."""
 
     xy: Tensor
     h: Tensor
     inv_z: Tensor
     seen: Tensor
-
-
-@dataclass
-class NormalEquations:
-    """``h_pp (B, 6n, 6n)``, ``h_pl (B, 6n, K, 1)``, ``h_ll (B, K, 1, 1)``, ``g_p (B, 6n)``, ``g_l (B, K, 1)``."""
-
-    h_pp: Tensor
-    h_pl: Tensor
-    h_ll: Tensor
-    g_p: Tensor
-    g_l: Tensor
 
 
 def relative_motion(poses_cw: Tensor, plan: EdgePlan) -> tuple[Tensor, Tensor]:
@@ -78,7 +71,7 @@ def view(rotation: Tensor, t: Tensor, rays: Tensor, inverse_depth: Tensor) -> Vi
 
 
 def counts(v: View, residual: Tensor, gate: Gate, part: slice) -> Tensor:
-    """Which places count: ``(B, G, 1, M)`` bool. A NaN does not."""
+    """Places that count, ``(B, G, 1, M)`` bool. A NaN does not."""
     focal = gate.focal[:, part]
     use = v.seen & ((residual * focal).square().sum(-2, keepdim=True) < gate.max_residual**2)
     if gate.offset is not None and gate.reach is not None:
@@ -105,16 +98,17 @@ def accumulate(
     free: int,
     pose_part: bool,
     depth_part: bool,
-) -> tuple[NormalEquations, list[Tensor]]:
+) -> tuple[NormalEquations, list[Counted]]:
     """Linearise at the present poses ``(B, N, 7)`` and inverse depths ``(B, K)``, and sum over the edges.
 
     Args:
         rays: ``(B, G, 3, M)``. target, weight: ``(B, G, 2, M)``, normalised.
         slot, free: see :func:`dvo.ba.edges.free_slots`.
-        pose_part, depth_part: whether poses, depths are to move. What is not needed stays zero or empty.
+        pose_part, depth_part: poses, depths are unknowns. What is not needed stays zero or empty.
 
     Returns:
-        The equations, and for each chunk of the plan which places counted.
+        The equations of the ``6 n`` pose unknowns and ``K`` inverse depths, and for each chunk of the plan the places
+        that count.
     """
     b, k, n, pairs = len(poses_cw), plan.patches, free, len(plan.pair_i)
     zeros = poses_cw.new_zeros
@@ -130,7 +124,7 @@ def accumulate(
 
     by_pair, by_both = zeros(b * pairs, 6, 7), zeros(b * (n + 1) * k, 8)
     batch = torch.arange(b, device=slot.device)[:, None]
-    used = []
+    used: list[Counted] = []
     for part in plan.chunks():
         group = plan.group_pair[part]
         places = slice(part.start * plan.size, part.stop * plan.size)
@@ -140,9 +134,12 @@ def accumulate(
         v = view(rotation.index_select(1, group), motion, rays[:, part], depth)
         residual = target[:, part] - v.xy
         use = counts(v, residual, gate, part)
-        used.append(use)
         w = torch.where(use, weight[:, part], 0.0)
         residual = torch.where(use, residual, 0.0)
+        scale = gate.kernel.weights(residual, w, -2)
+        if scale is not None:
+            w = w * scale
+        used.append((use, scale))
         j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
         # Rows: the six columns of J_j, then the residual, then J_d; each for the x and the y axis.
         f = torch.cat((*pose_jacobian(v), residual, j_d), -2)
@@ -160,10 +157,10 @@ def accumulate(
 
     by_both = by_both.view(b, n + 1, k, 8)
     landmark = by_both[..., 6:].sum(1)
-    g_l, h_ll = landmark[..., :1], landmark[..., 1:, None]
+    g_l, h_ll = landmark.unbind(-1)
     if not pose_part:
-        return NormalEquations(zeros(b, 0, 0), zeros(b, 0, k, 1), h_ll, zeros(b, 0), g_l), used
-    h_pl = by_both[:, :n, :, :6].transpose(2, 3).reshape(b, 6 * n, k, 1)
+        return NormalEquations(zeros(b, 0, 0), zeros(b, 0, k), h_ll, zeros(b, 0), g_l), used
+    h_pl = by_both[:, :n, :, :6].transpose(2, 3).reshape(b, 6 * n, k)
 
     by_pair = by_pair.view(b, pairs, 6, 7)
     hessian, gradient = by_pair[..., :6], by_pair[..., 6:]

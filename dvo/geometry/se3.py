@@ -8,6 +8,7 @@ Formulas: Sola et al., "A micro Lie theory for state estimation in robotics", ap
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,6 +24,7 @@ __all__ = [
     "from_matrix",
     "identity",
     "inverse",
+    "left_jacobian",
     "log",
     "matrix",
     "normalise",
@@ -114,3 +116,23 @@ def adjoint(pose: Tensor) -> Tensor:
     tr = hat(pose[..., :3]) @ r
     upper = torch.cat((r, tr), -1)
     return torch.cat((upper, torch.cat((torch.zeros_like(r), r), -1)), -2)
+
+
+# exp(u ad) is entire in u: ten Gauss nodes integrate it to the last digit for angles up to pi.
+_NODES, _NODE_WEIGHTS = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(10))
+
+
+def left_jacobian(xi: Tensor) -> Tensor:
+    """Left Jacobian of the exponential map: ``Exp(xi + d) = Exp(left_jacobian(xi) d) Exp(xi)`` to first order in ``d``.
+
+    The integral of ``Ad(Exp(u xi))`` over ``u`` in [0, 1] by Gauss-Legendre quadrature, without a branch at small
+    angles. The right Jacobian is ``left_jacobian(-xi)``.
+
+    Args:
+        xi: ``(..., 6)`` tangent ``[tau, phi]``, ``|phi| <= pi``.
+
+    Returns:
+        ``(..., 6, 6)``.
+    """
+    nodes, weights = _NODES.to(xi) / 2 + 0.5, _NODE_WEIGHTS.to(xi) / 2
+    return (weights[:, None, None] * adjoint(exp(xi[..., None, :] * nodes[:, None]))).sum(-3)

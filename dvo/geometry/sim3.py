@@ -98,3 +98,19 @@ def adjoint(sim: Tensor) -> Tensor:
     middle = torch.cat((o, r, column), -1)
     last = torch.cat((torch.zeros_like(sim[..., :6]), torch.ones_like(sim[..., 7:])), -1)[..., None, :]
     return torch.cat((top, middle, last), -2)
+
+
+def left_jacobian(xi: Tensor) -> Tensor:
+    """Left Jacobian of the exponential map: ``Exp(xi + d) = Exp(left_jacobian(xi) d) Exp(xi)`` to first order in ``d``.
+
+    The integral of ``Ad(Exp(u xi))`` over ``u`` in [0, 1] by Gauss-Legendre quadrature, without a branch at small
+    angles. The right Jacobian is ``left_jacobian(-xi)``.
+
+    Args:
+        xi: ``(..., 7)`` tangent ``[tau, phi, sigma]``, ``|phi| <= pi`` and ``|sigma| < 10``.
+
+    Returns:
+        ``(..., 7, 7)``.
+    """
+    nodes, weights = _NODES.to(xi) / 2 + 0.5, _NODE_WEIGHTS.to(xi) / 2
+    return (weights[:, None, None] * adjoint(exp(xi[..., None, :] * nodes[:, None]))).sum(-3)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dvo.ba.cold_start import damping_at
-from dvo.ba.layer import bundle_adjust
+from dvo.ba.layer import BAOptions, bundle_adjust
 from dvo.geometry.projection import reproject
 from dvo.graph.edges import PatchGraph
 from dvo.models.schedule import Stage
@@ -140,7 +140,7 @@ class PatchVO(nn.Module):
             if mode == "flow":
                 coords = coords + delta[:, :, None, None]
             else:
-                poses, patches = bundle_adjust(
+                result = bundle_adjust(
                     poses,
                     patches,
                     now,
@@ -149,12 +149,14 @@ class PatchVO(nn.Module):
                     graph.ii,
                     graph.jj,
                     graph.kk,
-                    fixed=1,
-                    iterations=ba_iterations,
-                    damping=damping_at(update),
-                    structure_only=mode == "structure",
-                    bounds=(width, height),
+                    BAOptions(
+                        iterations=ba_iterations,
+                        damping=damping_at(update),
+                        structure_only=mode == "structure",
+                        bounds=(width, height),
+                    ),
                 )
+                poses, patches = result.poses_cw, result.patches
                 coords = reproject(poses, patches, now, graph.ii, graph.jj, graph.kk).coords
             yield UpdateState(graph, frames, poses, patches, coords, targets, weights)
 

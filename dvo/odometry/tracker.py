@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.cold_start import COLD_UPDATES, damping_at, robust_cost, solve_from_nothing
-from dvo.ba.layer import bundle_adjust
+from dvo.ba.layer import BAOptions, bundle_adjust
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry import se3
@@ -211,7 +211,7 @@ class PatchOdometry:
         window.hidden, delta, window.weights, centres = self._revise()
         n = len(window)
         fixed = max(1, n - config.optimisation) if self._initialised else 1
-        poses, patches = bundle_adjust(
+        result = bundle_adjust(
             window.poses_cw[None],
             window.patches[None],
             window.intrinsics[None],
@@ -220,11 +220,9 @@ class PatchOdometry:
             window.ii,
             window.jj,
             window.kk,
-            fixed=fixed,
-            damping=damping_at(age),
-            bounds=self._bounds,
+            BAOptions(fixed=fixed, damping=damping_at(age), bounds=self._bounds),
         )
-        window.poses_cw, window.patches = poses[0], patches[0]
+        window.poses_cw, window.patches = result.poses_cw[0], result.patches[0]
 
     def _probe(self) -> float:
         """Median revision of the flow from the last keyframe to the newest frame, if poses did not change."""

@@ -73,15 +73,15 @@ def main() -> None:
 
             def layer(leaves: list[Tensor] = leaves, backward: bool = backward) -> None:
                 a, b, c, d, e = leaves
-                poses, patches = bundle_adjust(a, b, c, d, e, ii, jj, kk, plan=plan)  # noqa: B023 (called in this turn)
+                result = bundle_adjust(a, b, c, d, e, ii, jj, kk, plan=plan)  # noqa: B023 (called in this turn)
                 if backward:
-                    (poses.sum() + patches.sum()).backward()
+                    (result.poses_cw.sum() + result.patches.sum()).backward()
 
             def twin(leaves: list[Tensor] = leaves, backward: bool = backward) -> None:
                 a, b, c, d, e = leaves
-                poses, patches = bundle_adjust_reference(a, b, c, d, e, ii, jj, kk)  # noqa: B023
+                result = bundle_adjust_reference(a, b, c, d, e, ii, jj, kk)  # noqa: B023
                 if backward:
-                    (poses.sum() + patches.sum()).backward()
+                    (result.poses_cw.sum() + result.patches.sum()).backward()
 
             ours, theirs = fastest(layer, device, 30), fastest(twin, device, 3)
             name = "forward, backward" if backward else "forward"

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dvo.ba.layer import bundle_adjust
+from dvo.ba.layer import BAOptions, BAResult, bundle_adjust
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 
@@ -34,8 +34,13 @@ class Problem:
         names = ("poses", "patches", "intrinsics", "targets", "weights", "ii", "jj", "kk")
         return tuple(getattr(self, name) for name in names)
 
+    def adjust(self, factors: tuple = (), plan: object = None, **options: object) -> BAResult:
+        return bundle_adjust(*self.arguments(), BAOptions(**options), factors=factors, plan=plan)  # type: ignore[arg-type]
+
     def solve(self, **options: object) -> tuple[Tensor, Tensor]:
-        return bundle_adjust(*self.arguments(), **options)  # type: ignore[arg-type]
+        """New poses and patches."""
+        result = self.adjust(**options)  # type: ignore[arg-type]
+        return result.poses_cw, result.patches
 
     def edges(self, which: Tensor) -> Problem:
         """The same with some edges, or with edges in another order."""

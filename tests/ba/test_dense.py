@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dvo.ba.layer import bundle_adjust
+from dvo.ba.layer import BAOptions, bundle_adjust
 from dvo.data.trajectory import read_tum
 from dvo.geometry import se3, so3
 
@@ -48,10 +48,11 @@ def test_motion_from_the_flow_of_every_pixel(clip: tuple[Tensor, Tensor, Tensor,
     patches = torch.cat((pixels, torch.ones(count, 1)), -1)[None, :, :, None, None].repeat(PAIRS, 1, 1, 1, 1)
     weights = valid.reshape(PAIRS, -1, 1).expand(-1, -1, 2).float()
     zero = torch.zeros(count, dtype=torch.long)
-    poses, found = bundle_adjust(
+    result = bundle_adjust(
         se3.identity(PAIRS, 2), patches, k.expand(PAIRS, 2, 4), pixels + flow.reshape(PAIRS, -1, 2), weights,
-        zero, zero + 1, torch.arange(count), iterations=10, bounds=(width, height),
+        zero, zero + 1, torch.arange(count), BAOptions(iterations=10, bounds=(width, height)),
     )  # fmt: skip
+    poses, found = result.poses_cw, result.patches
     motion = poses[:, 1].double()
     rotation = torch.rad2deg(so3.angle(so3.multiply(motion[:, 3:], so3.conjugate(truth[:, 3:]))))
     a, b = motion[:, :3], truth[:, :3]

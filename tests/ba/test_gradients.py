@@ -9,23 +9,26 @@ import pytest
 import torch
 from torch import Tensor
 
-from dvo.ba.layer import BADamping, DepthPrior, PosePrior, bundle_adjust
+from dvo.ba.factors import DepthPrior, PosePrior
+from dvo.ba.layer import BADamping, BAOptions, bundle_adjust
 from dvo.geometry import se3
 
 DAMPING = BADamping(pose=0.1, relative=0.2, depth=1e-2)
 Maker = Callable[..., Any]
 
 
-def layer_of(p: Any, **options: Any) -> tuple[Callable[..., tuple[Tensor, Tensor]], tuple[Tensor, ...]]:
+def layer_of(
+    p: Any, factors: tuple = (), **options: Any
+) -> tuple[Callable[..., tuple[Tensor, Tensor]], tuple[Tensor, ...]]:
     """The layer on tangents of the poses, inverse depths, intrinsics, targets and weights."""
 
     def f(xi: Tensor, depth: Tensor, intrinsics: Tensor, targets: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         poses = se3.compose(se3.exp(xi), p.poses)
         row = depth[:, :, None, None, None].expand_as(p.patches[:, :, :1])
         patches = torch.cat((p.patches[:, :, :2], row), 2)
-        poses, patches = bundle_adjust(
-            poses, patches, intrinsics, targets, weights, p.ii, p.jj, p.kk, damping=DAMPING, **options
-        )
+        chosen = BAOptions(damping=DAMPING, **options)
+        result = bundle_adjust(poses, patches, intrinsics, targets, weights, p.ii, p.jj, p.kk, chosen, factors=factors)
+        poses, patches = result.poses_cw, result.patches
         return se3.log(se3.relative(p.poses, poses)), patches[:, :, 2, 1, 1]
 
     inputs = (torch.zeros_like(p.poses[..., :6]), p.patches[:, :, 2, 1, 1], p.intrinsics, p.targets, p.weights)
@@ -63,11 +66,8 @@ def test_gradcheck_of_priors(problem: Maker) -> None:
 
     def with_priors(*tensors: Tensor) -> tuple[Tensor, Tensor]:
         value, weight, step, stiffness = tensors[5:]
-        options = {
-            "depth_prior": DepthPrior(value, weight),
-            "pose_prior": PosePrior(se3.compose(se3.exp(step), p.true_poses), stiffness),
-        }
-        return layer_of(p, **options)[0](*tensors[:5])
+        pose_prior = PosePrior(se3.compose(se3.exp(step), p.true_poses), stiffness)
+        return layer_of(p, factors=(DepthPrior(value, weight), pose_prior))[0](*tensors[:5])
 
     inputs = (*inputs, *(x.requires_grad_() for x in (value, weight, step, stiffness)))
     assert torch.autograd.gradcheck(with_priors, inputs, atol=1e-5, rtol=1e-4, fast_mode=True)
@@ -80,7 +80,7 @@ def test_a_network_can_learn_through_the_layer(problem: Maker) -> None:
     optimiser = torch.optim.Adam([targets], lr=0.1)
     losses = []
     for _ in range(20):
-        poses, _ = bundle_adjust(p.poses, p.patches, p.intrinsics, targets, p.weights, p.ii, p.jj, p.kk)
+        poses = bundle_adjust(p.poses, p.patches, p.intrinsics, targets, p.weights, p.ii, p.jj, p.kk).poses_cw
         loss = se3.log(se3.relative(poses, p.true_poses)).square().sum()
         optimiser.zero_grad()
         loss.backward()

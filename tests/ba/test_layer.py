@@ -12,7 +12,8 @@ from torch import Tensor
 
 from dvo.ba import edges as edges_module
 from dvo.ba.edges import plan_edges
-from dvo.ba.layer import BADamping, DepthPrior, PosePrior
+from dvo.ba.factors import DepthPrior, PosePrior
+from dvo.ba.layer import BADamping, BAOptions
 from dvo.ba.reference import bundle_adjust_reference
 from dvo.errors import DvoError
 from dvo.geometry import se3
@@ -104,9 +105,8 @@ def test_the_dense_twin_gives_the_same_values_and_gradients(problem: Maker, opti
     for twin in (False, True):
         p = problem(noise=0.5).leaves()
         if twin:
-            d = options.get("damping", BADamping())
-            plain = {**options, "damping": (d.pose, d.relative, d.depth)}
-            poses, patches = bundle_adjust_reference(*p.arguments(), **plain)
+            result = bundle_adjust_reference(*p.arguments(), BAOptions(**options))
+            poses, patches = result.poses_cw, result.patches
         else:
             poses, patches = p.solve(**options)
         generator = torch.Generator().manual_seed(1)
@@ -145,7 +145,7 @@ def test_ragged_and_repeated_edges(problem: Maker) -> None:
         weights=torch.cat((p.weights, p.weights[:, :3]), 1),
     )  # fmt: skip
     expected = bundle_adjust_reference(*p.arguments())
-    for found, theirs in zip(p.solve(), expected, strict=True):
+    for found, theirs in zip(p.solve(), (expected.poses_cw, expected.patches), strict=True):
         torch.testing.assert_close(found, theirs, atol=1e-9, rtol=1e-9)
 
 
@@ -164,7 +164,8 @@ def test_chunks_change_nothing(problem: Maker, monkeypatch: pytest.MonkeyPatch) 
         p = problem(noise=0.5).leaves()
         plan = plan_edges(p.ii, p.jj, p.kk, 4, 24)
         assert (len(plan.chunks()) > 1) == (chunk == 10)
-        poses, patches = p.solve(plan=plan)
+        result = p.adjust(plan=plan)
+        poses, patches = result.poses_cw, result.patches
         (poses.square().sum() + patches.square().sum()).backward()
         results.append((poses, patches, p.targets.grad, p.weights.grad, p.poses.grad, p.patches.grad))
     for a, b in zip(*results, strict=True):
@@ -192,7 +193,7 @@ def test_outliers_and_points_out_of_bounds_do_not_count(problem: Maker) -> None:
 def test_depth_prior(problem: Maker) -> None:
     p = problem(noise=0.5)
     goal = torch.full((2, 24), 0.7, dtype=torch.float64)
-    _, patches = p.solve(depth_prior=DepthPrior(goal, torch.tensor(1e9, dtype=torch.float64)))
+    patches = p.adjust((DepthPrior(goal, torch.tensor(1e9, dtype=torch.float64)),)).patches
     torch.testing.assert_close(patches[:, :, 2, 1, 1], goal, atol=1e-5, rtol=0)
 
 
@@ -200,7 +201,7 @@ def test_pose_prior(problem: Maker) -> None:
     p = problem(noise=0.5)
     weight = torch.zeros(2, 4, 6, dtype=torch.float64)
     weight[:, 2] = 1e9
-    poses, _ = p.solve(iterations=3, pose_prior=PosePrior(p.true_poses, weight))
+    poses = p.adjust((PosePrior(p.true_poses, weight),), iterations=3).poses_cw
     torch.testing.assert_close(se3.matrix(poses[:, 2]), se3.matrix(p.true_poses[:, 2]), atol=1e-5, rtol=0)
     free, _ = p.solve(iterations=3)
     assert (free[:, 2] - p.true_poses[:, 2]).abs().max() > 1e-4

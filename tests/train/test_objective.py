@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dvo.ba.cold_start import damping_at, solve_from_nothing
-from dvo.ba.layer import bundle_adjust
+from dvo.ba.layer import BAOptions, bundle_adjust
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.pose import pose_errors
@@ -123,10 +123,11 @@ def test_exact_targets_from_identity_find_the_rotation(clips):
         poses = se3.identity(1, 8)
         h, w = truth.inverse_depth.shape[-2:]
         for update in range(10):
-            poses, patches = bundle_adjust(
+            result = bundle_adjust(
                 poses, patches, truth.intrinsics, coords[:, :, 1, 1], valid[:, :, 1, 1, None].float().expand(-1, -1, 2),
-                graph.ii, graph.jj, graph.kk, bounds=(w, h), damping=damping_at(update),
+                graph.ii, graph.jj, graph.kk, BAOptions(bounds=(w, h), damping=damping_at(update)),
             )  # fmt: skip
+            poses, patches = result.poses_cw, result.patches
         error = pose_errors(poses, truth.poses_cw).rotation
         motion = pose_errors(se3.identity(1, 8), truth.poses_cw).rotation
         good += bool(error < 0.02 * motion)

@@ -1,15 +1,78 @@
-"""Generic normal equations and adjoint of a linearised factor.
+"""Linearised factors, and the generic sums over their rows: normal equations and adjoint.
 
-The specification of every fast path: it uses nothing of a factor but its :class:`dvo.ba.problem.Linearisation`.
+The specification of every fast path: the sums use nothing of a factor but its :class:`Linearisation`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+
 import torch
 from torch import Tensor
 
-from dvo.ba.problem import AdjointConstants, Linearisation, NormalEquations, State
+from dvo.ba.state import State
 from dvo.errors import DvoError
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals of a factor and their derivatives at a state.
+
+    To first order a step ``delta`` changes the residual to ``r - J delta``: ``J`` is minus the derivative of the
+    residual by the left tangents of the blocks.
+
+    Attributes:
+        residual: ``(B, F, D)``.
+        weight: ``(B, F, D)``, not negative; zero for a row that does not count. Kernel weights are included, computed
+            from detached residuals.
+        blocks: name of the state block of each slot. At most one slot is of an eliminated block.
+        indices: per slot ``(F,)`` element of the block; -1 if the row does not touch it.
+        jacobians: per slot ``(B, F, D, dim)``.
+    """
+
+    residual: Tensor
+    weight: Tensor
+    blocks: tuple[str, ...]
+    indices: tuple[Tensor, ...]
+    jacobians: tuple[Tensor, ...]
+
+    def cost(self) -> Tensor:
+        """``(B,)`` sum of ``weight * residual^2``."""
+        return (self.weight * self.residual.square()).sum((1, 2))
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """``h_pp (B, P, P)``, ``h_pl (B, P, K)``, ``h_ll (B, K)``, ``g_p (B, P)``, ``g_l (B, K)``."""
+
+    h_pp: Tensor
+    h_pl: Tensor
+    h_ll: Tensor
+    g_p: Tensor
+    g_l: Tensor
+
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        return NormalEquations(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class AdjointConstants:
+    """Constants of the adjoint scalar ``phi`` (see :mod:`dvo.ba.adjoint`), none of which is differentiated.
+
+    Attributes:
+        lambda_p, delta_p: ``(B, P)`` reduced parts of lambda and delta. lambda_l, delta_l: ``(B, K)`` their parts of
+            the eliminated block.
+        s: ``(B, P)``; None without relative damping, as are the other two.
+        e: ``(B, P, K)``. c: ``(B, K)``.
+    """
+
+    lambda_p: Tensor
+    delta_p: Tensor
+    lambda_l: Tensor
+    delta_l: Tensor
+    s: Tensor | None = None
+    e: Tensor | None = None
+    c: Tensor | None = None
 
 
 def landmark_count(state: State) -> int:

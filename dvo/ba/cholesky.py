@@ -101,10 +101,10 @@ def plan_tiles(size: int, rows: Tensor, columns: Tensor, width: int, limit: floa
     flip = rank[a] < rank[b]
     keys = torch.tensor([i * count + j for i, j in stored], dtype=torch.long, device=device)
     sorted_keys, at = keys.sort()
-    tile = at[torch.searchsorted(sorted_keys, torch.where(flip, b * count + a, a * count + b))]
+    storage = at[torch.searchsorted(sorted_keys, torch.where(flip, b * count + a, a * count + b))]
     row, column = torch.where(flip, columns, rows) % width, torch.where(flip, rows, columns) % width
     products = sum((len(under) + 1) * (len(under) + 2) // 2 for under in below)
-    return TilePlan(size, width, steps, tile, row, column, flip, len(stored), products)
+    return TilePlan(size, width, steps, storage, row, column, flip, len(stored), products)
 
 
 def best_plan(size: int, rows: Tensor, columns: Tensor, dim: int) -> TilePlan | None:

@@ -15,8 +15,10 @@ from torch import Tensor
 from dvo.ba.blocks import INVERSE_DEPTHS, POSES
 from dvo.ba.edges import free_slots, plan_edges
 from dvo.ba.global_edges import ReprojectionEdges
-from dvo.ba.levenberg import Kernel, LMOptions, levenberg_marquardt
-from dvo.ba.problem import Factor, Linearisation
+from dvo.ba.kernels import Kernel
+from dvo.ba.levenberg import LMOptions, levenberg_marquardt
+from dvo.ba.linearisation import Linearisation
+from dvo.ba.problem import Factor
 from dvo.ba.sparse import SchurPattern, SparseSystem, make_schur_pattern
 from dvo.errors import DvoError
 from dvo.geometry import se3
@@ -94,7 +96,8 @@ def global_bundle_adjust(
             have the same source frame.
         options: see :class:`GlobalBAOptions`.
         factors: further measurements of the state blocks "poses" ``(1, N, 7)`` and "inverse_depths" ``(1, K)``; the
-            elements that they touch must not change between linearisations.
+            elements that they touch must not change between linearisations. Their cost is half the sum of
+            ``weight * residual^2``, with the weights of their kernels.
 
     Returns:
         Poses and patches of the lowest cost found, and how it went.

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.edges import EdgePlan
-from dvo.ba.levenberg import Kernel
+from dvo.ba.kernels import Kernel
+from dvo.ba.levenberg import robust_cost, robust_weight
 from dvo.ba.normal_equations import Gate, View, counts, pose_jacobian, relative_motion, view
 from dvo.ba.sparse import SchurPattern
 from dvo.geometry import so3
@@ -78,7 +79,7 @@ class ReprojectionEdges:
         total = 0.0
         for part in self.plan.chunks():
             s = self._view(rotation, t, inverse_depth, part)[3]
-            total += 0.5 * float(self.kernel.value(s).sum(dtype=torch.float64))
+            total += 0.5 * float(robust_cost(self.kernel, s).sum(dtype=torch.float64))
         return total
 
     def inliers(self, poses_cw: Tensor, inverse_depth: Tensor) -> Tensor:
@@ -129,7 +130,7 @@ class ReprojectionEdges:
             group = plan.group_pair[part]
             places = slice(part.start * plan.size, part.stop * plan.size)
             v, residual, weight, s = self._view(rotation, t, inverse_depth, part)
-            weight = weight * self.kernel.weight(s)
+            weight = weight * robust_weight(self.kernel, s)
             motion = t.index_select(1, group)
             j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
             # Rows: the six columns of J_j, then the residual, then J_d; each for the x and the y axis.

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt with acceptance of steps, and the robust kernels of least squares.
+"""Levenberg-Marquardt with acceptance of steps, and the cost of robust kernels.
 
 Shared by the sparse problems of this package; not differentiable.
 """
@@ -7,55 +7,39 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from dvo.ba.block_matrix import CGOptions, LinearSolver
-from dvo.errors import DvoError
+from dvo.ba.kernels import Kernel
 
-KernelName = Literal["none", "huber", "cauchy"]
 MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32
 """Bounds of the diagonal that damping is a fraction of, as in Ceres: directions without measurement are damped too."""
 
 
-@dataclass(frozen=True)
-class Kernel:
-    """Robust kernel ``rho`` on the squared whitened residual ``s = r^T W r``; the cost is ``rho(s) / 2``.
+def robust_cost(kernel: Kernel, s: Tensor) -> Tensor:
+    """``rho(s)`` of squared whitened residuals ``s = r^T W r``; a term of the cost is ``rho(s) / 2``.
 
-    Attributes:
-        name: "none" (``s``), "huber" (``s`` up to ``width^2``, then ``2 width sqrt(s) - width^2``) or
-            "cauchy" (``width^2 log(1 + s / width^2)``).
-        width: whitened residual at which the kernel takes effect; with unit weights in the units of the residual.
+    "none" is ``s``; "huber" is ``s`` up to ``width^2``, then ``2 width sqrt(s) - width^2``; "cauchy" is
+    ``width^2 log(1 + s / width^2)``. :func:`robust_weight` is its derivative.
     """
+    square = kernel.width * kernel.width
+    if kernel.name == "huber":
+        return torch.where(s <= square, s, 2 * kernel.width * s.clamp(min=square).sqrt() - square)
+    if kernel.name == "cauchy":
+        return square * torch.log1p(s / square)
+    return s
 
-    name: KernelName = "none"
-    width: float = 1.0
 
-    def __post_init__(self) -> None:
-        if self.name not in ("none", "huber", "cauchy"):
-            raise DvoError(f"unknown kernel {self.name!r}", field="kernel", remedy="use none, huber or cauchy")
-        if not self.width > 0:
-            raise DvoError(f"width is {self.width}", field="kernel", remedy="give a positive width")
-
-    def value(self, s: Tensor) -> Tensor:
-        """``rho(s)``."""
-        square = self.width * self.width
-        if self.name == "huber":
-            return torch.where(s <= square, s, 2 * self.width * s.clamp(min=square).sqrt() - square)
-        if self.name == "cauchy":
-            return square * torch.log1p(s / square)
-        return s
-
-    def weight(self, s: Tensor) -> Tensor:
-        """``rho'(s)``, the weight of iteratively reweighted least squares."""
-        square = self.width * self.width
-        if self.name == "huber":
-            return self.width / s.clamp(min=square).sqrt()
-        if self.name == "cauchy":
-            return 1 / (1 + s / square)
-        return torch.ones_like(s)
+def robust_weight(kernel: Kernel, s: Tensor) -> Tensor:
+    """``rho'(s)``, the weight of iteratively reweighted least squares."""
+    if kernel.name == "huber":
+        return kernel.width / s.clamp(min=kernel.width**2).sqrt()
+    if kernel.name == "cauchy":
+        return 1 / (1 + s / kernel.width**2)
+    return torch.ones_like(s)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """Pose graphs: absolute poses from relative ones, in SE(3) or Sim(3).
 
 The residual of an edge is ``e = chart(M_ij T_i T_j^-1)`` for a measurement ``M_ij`` of ``T_j T_i^-1``, weighted by an
-information matrix. With camera-to-world poses ``X = T^-1`` and ``Z_ij = M_ij^-1`` this is
-``chart(Z_ij^-1 X_i^-1 X_j)``, the error of g2o (Kuemmerle et al., "g2o: a general framework for graph optimization", 2011). In Sim(3) each pose has a
-scale of its own, so that a loop can correct drift of scale (Strasdat, Montiel and Davison, "Scale drift-aware large
-scale monocular SLAM", 2010).
+information matrix; with the chart "log" that of :class:`dvo.ba.factors.RelativePose`. With camera-to-world poses
+``X = T^-1`` and ``Z_ij = M_ij^-1`` it is ``chart(Z_ij^-1 X_i^-1 X_j)``, the error of g2o (Kuemmerle et al., "g2o: a
+general framework for graph optimization", 2011). In Sim(3) each pose has a scale of its own, so that a loop can correct
+drift of scale (Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010).
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.edges import free_slots
-from dvo.ba.levenberg import Kernel, LMOptions, levenberg_marquardt
+from dvo.ba.kernels import Kernel
+from dvo.ba.levenberg import LMOptions, levenberg_marquardt, robust_cost, robust_weight
 from dvo.ba.sparse import SparseSystem, make_schur_pattern
 from dvo.errors import DvoError
 from dvo.geometry import se3, sim3, so3
@@ -107,13 +108,13 @@ def optimise_pose_graph(
 
         def cost(poses: Tensor) -> float:
             s = whitened(poses).square().sum(-1)
-            return 0.5 * float(options.kernel.value(s).sum(dtype=torch.float64))
+            return 0.5 * float(robust_cost(options.kernel, s).sum(dtype=torch.float64))
 
         def linearise(poses: Tensor) -> SparseSystem:
             e, j_i, j_j = residuals_and_jacobians(poses, ii, jj, measurements, options.chart)
             if root is not None:
                 e, j_i, j_j = (root @ e[..., None])[..., 0], root @ j_i, root @ j_j
-            weight = options.kernel.weight(e.square().sum(-1, keepdim=True)).expand_as(e)
+            weight = robust_weight(options.kernel, e.square().sum(-1, keepdim=True)).expand_as(e)
             zeros = poses.new_zeros
             system = SparseSystem(
                 pattern, zeros(pattern.h_pp.count, dim, dim), zeros(0, dim), zeros(0), zeros(free, dim), zeros(0), False
@@ -154,7 +155,7 @@ def residuals_and_jacobians(
     """
     error, motion = _errors(poses_cw, ii, jj, measurements)
     e = _coordinates(error, chart)
-    by_right = torch.linalg.inv(right_jacobian(e)) if chart == "log" else _chart_jacobian(error, chart)
+    by_right = _chart_jacobian(error, e, chart)
     adjoint = se3.adjoint(motion) if e.shape[-1] == 6 else sim3.adjoint(motion)
     return e, by_right @ adjoint, -by_right
 
@@ -163,24 +164,23 @@ def right_jacobian(xi: Tensor) -> Tensor:
     """Right Jacobian of the exponential of SE(3) or Sim(3): ``Exp(xi + d) = Exp(xi) Exp(J_r d)`` to first order.
 
     ``J_r = phi(-ad(xi))`` with ``phi(x) = (e^x - 1) / x``: a Taylor series at ``x / 8``, then three doublings
-    ``phi(2 x) = (e^x + 1) phi(x) / 2``. Accurate to rounding for angles up to pi.
+    ``phi(2 x) = (e^x + 1) phi(x) / 2``. The quadrature of :func:`dvo.geometry.sim3.left_jacobian` gives the same from
+    256 rotations for each element, too much for graphs of many thousand edges.
 
     Args:
-        xi: ``(..., 6)`` or ``(..., 7)``.
+        xi: ``(..., 6)`` or ``(..., 7)``, angle at most pi.
 
     Returns:
         ``(..., 6, 6)`` or ``(..., 7, 7)``.
     """
     x = -_small_adjoint(xi) / 8
     eye = torch.eye(xi.shape[-1], dtype=xi.dtype, device=xi.device)
-    phi = eye
-    for order in range(13, 1, -1):
+    phi = eye + x / 13
+    for order in range(12, 1, -1):
         phi = eye + x @ phi / order
     power = eye + x @ phi
-    for doubling in range(3):
-        phi = 0.5 * (power @ phi + phi)
-        if doubling < 2:
-            power = power @ power
+    for _ in range(3):
+        phi, power = 0.5 * (power @ phi + phi), power @ power
     return phi
 
 
@@ -214,8 +214,10 @@ def _coordinates(error: Tensor, chart: Chart) -> Tensor:
     return torch.cat((t, torch.where(q[..., 3:] < 0, -q[..., :3], q[..., :3]), scale), -1)
 
 
-def _chart_jacobian(error: Tensor, chart: Chart) -> Tensor:
-    """Derivative ``(E, D, D)`` of the charts without logarithm of the group by a right perturbation of the error."""
+def _chart_jacobian(error: Tensor, e: Tensor, chart: Chart) -> Tensor:
+    """Derivative ``(E, D, D)`` of the coordinates ``e`` of an error by a right perturbation of it."""
+    if chart == "log":
+        return torch.linalg.inv(right_jacobian(e))
     q = error[..., 3:7]
     q = torch.where(q[..., 3:] < 0, -q, q)
     dim = error.shape[-1] - 1

@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
-from dvo.ba.levenberg import Kernel, LMOptions
+from dvo.ba.kernels import Kernel
+from dvo.ba.levenberg import LMOptions
 from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
 

@@ -1,11 +1,13 @@
-"""Pose graphs from g2o files: ``python -m eval.benchmarks.pose_graph FILE...``.
+"""Pose graphs from g2o files, and a generated one: ``python -m eval.benchmarks.pose_graph [FILE...] [--poses 10000]``.
 
-Prints for each file poses, edges, chi2 before and after (as g2o defines it), iterations and seconds.
+Prints for each file poses, edges, chi2 before and after (as g2o defines it), iterations and seconds; likewise for laps
+of a circle in Sim(3) whose scale drifts.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +19,7 @@ from torch import Tensor
 from dvo.ba.levenberg import LMOptions
 from dvo.ba.pose_graph import Chart, PoseGraphOptions, optimise_pose_graph
 from dvo.errors import DvoError
-from dvo.geometry import se3, so3
+from dvo.geometry import se3, sim3, so3
 
 HELD = 1.0
 """Information of the three coordinates that a planar graph does not measure."""
@@ -55,11 +57,11 @@ def read_g2o(path: Path | str) -> PoseGraph:
     path = Path(path)
     if not path.is_file():
         raise DvoError("no such file", file=path, remedy="give a pose graph in g2o format")
-    rows: dict[str, list[list[float]]] = {}
+    rows: dict[str, list[list[str]]] = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         word, *numbers = line.split() or [""]
         if word in ("VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "VERTEX_SE2", "EDGE_SE2"):
-            rows.setdefault(word, []).append([float(x) for x in numbers])
+            rows.setdefault(word, []).append(numbers)
     planar = "EDGE_SE2" in rows
     if planar == ("EDGE_SE3:QUAT" in rows):
         raise DvoError("no edges, or edges of 2-D and 3-D", file=path, remedy="give a graph with one kind of edges")
@@ -68,7 +70,11 @@ def read_g2o(path: Path | str) -> PoseGraph:
         vertices = np.array(rows.get(f"VERTEX_{kind}", []), dtype=np.float64).reshape(-1, 1 + size)
         edges = np.array(rows[f"EDGE_{kind}"], dtype=np.float64).reshape(-1, 2 + size + upper * (upper + 1) // 2)
     except ValueError as error:
-        raise DvoError("lines of unequal length", file=path, remedy="check that the file is complete") from error
+        raise DvoError(
+            "lines of unequal length, or words that are not numbers",
+            file=path,
+            remedy="check that the file is complete",
+        ) from error
     names, order = np.unique(vertices[:, 0].astype(np.int64), return_index=True)
     ends = edges[:, :2].astype(np.int64)
     at = np.searchsorted(names, ends).clip(max=max(len(names) - 1, 0))
@@ -99,27 +105,66 @@ def _poses(numbers: np.ndarray, planar: bool) -> Tensor:
     return torch.cat((x[:, :2], zero, so3.exp(torch.cat((zero, zero, x[:, 2:]), -1))), -1)
 
 
+def make_laps(
+    count: int, lap: int = 500, every: int = 5, seed: int = 0
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Similarities along laps of a circle: noisy motions, and loops to the lap before.
+
+    Args:
+        count: poses.
+        lap: poses of a lap.
+        every: so many poses apart are the loops.
+        seed: of the noise.
+
+    Returns:
+        ``poses (N, 8)`` by chaining the motions, ``ii``, ``jj``, ``measurements (E, 8)`` and ``information (E, 7)``.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / lap)
+    zero = torch.zeros_like(angle)
+    centre = torch.stack((10 * angle.sin(), 0.001 * torch.arange(count), 10 * angle.cos()), -1)
+    true = sim3.from_se3(se3.inverse(torch.cat((centre, so3.exp(torch.stack((zero, angle, zero), -1))), -1)))
+    loops = torch.arange(lap, count, every)
+    ii = torch.cat((torch.arange(count - 1), loops - lap))
+    jj = torch.cat((torch.arange(1, count), loops))
+    sigma = torch.tensor([2e-3] * 3 + [1e-3] * 3 + [2e-3], dtype=torch.float64)
+    noise = sim3.exp(sigma * torch.randn(len(ii), 7, dtype=torch.float64, generator=generator))
+    measured = sim3.normalise(sim3.compose(noise, sim3.compose(true[jj], sim3.inverse(true[ii]))))
+    poses = [true[0]]
+    for motion in measured[: count - 1]:
+        poses.append(sim3.compose(motion, poses[-1]))
+    return sim3.normalise(torch.stack(poses)), ii, jj, measured, (sigma**-2).expand(len(ii), 7)
+
+
 def main() -> None:
-    """Print a row for each file."""
+    """Print a row for each graph."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("files", nargs="+", type=Path)
+    parser.add_argument("files", nargs="*", type=Path)
+    parser.add_argument("--poses", type=int, default=0, help="of the generated graph")
     parser.add_argument("--solver", default="auto", choices=("auto", "direct", "cg"))
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    print(f"{'file':28} {'poses':>6} {'edges':>6} {'chi2 before':>14} {'after':>14} {'steps':>5} {'s':>6} {'cpu s':>6}")
-    for file in arguments.files:
-        graph = read_g2o(file)
-        solver = LMOptions(max_iterations=arguments.iterations, damping=1e-6, solver=arguments.solver)
-        options = PoseGraphOptions(chart=graph.chart, solver=solver)
+    solver = LMOptions(max_iterations=arguments.iterations, damping=1e-6, solver=arguments.solver)
+    print(
+        f"{'graph':28} {'poses':>6} {'edges':>6} {'chi2 before':>14} {'after':>14} {'steps':>5} {'s':>6} {'cpu s':>6}"
+    )
+
+    def row(name: str, chart: Chart, *graph: Tensor) -> None:
         start, cpu = time.perf_counter(), time.process_time()
-        result = optimise_pose_graph(graph.poses_cw, graph.ii, graph.jj, graph.measurements, graph.information, options)
+        result = optimise_pose_graph(*graph, options=PoseGraphOptions(chart=chart, solver=solver))
         start, cpu = time.perf_counter() - start, time.process_time() - cpu
         print(
-            f"{file.name:28} {len(graph.poses_cw):6} {len(graph.ii):6} {result.initial_chi2:14.6f} {result.chi2:14.6f}"
+            f"{name:28} {len(graph[0]):6} {len(graph[1]):6} {result.initial_chi2:14.6f} {result.chi2:14.6f}"
             f" {result.iterations:5} {start:6.1f} {cpu:6.1f}"
         )
+
+    for file in arguments.files:
+        g = read_g2o(file)
+        row(file.name, g.chart, g.poses_cw, g.ii, g.jj, g.measurements, g.information)
+    if arguments.poses:
+        row("laps in Sim(3)", "log", *make_laps(arguments.poses))
 
 
 if __name__ == "__main__":

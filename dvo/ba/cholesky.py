@@ -20,6 +20,8 @@ SECONDS_PER_PRODUCT = 1e-10
 """Rough cost of a multiplication and addition, against which :data:`SECONDS_PER_CALL` is weighed."""
 SECONDS_PER_CALL = 1.5e-5
 
+AT_ONCE = 512
+"""Rows below a tile up to which all products of a column are one product: twice the arithmetic, but few calls."""
 MAX_PRODUCTS, MAX_NUMBERS = 5e11, 1.2e8
 """Multiplications and stored numbers of a factorisation that is still worth doing."""
 
@@ -179,6 +181,7 @@ def solve_cholesky(plan: TilePlan, blocks: Tensor, rhs: Tensor) -> Tensor:
         if tile == count - 1 and unused:
             tiles[diagonal].diagonal()[side - unused * dim :] = 1
     factors, panels = [], []
+    lower: dict[int, Tensor] = {}
     info = torch.zeros((), dtype=torch.int32, device=rhs.device)
     for _, diagonal, under, here, goes in plan.columns:
         factor, bad = torch.linalg.cholesky_ex(tiles[diagonal])
@@ -186,6 +189,11 @@ def solve_cholesky(plan: TilePlan, blocks: Tensor, rhs: Tensor) -> Tensor:
         panel = tiles[here].view(-1, side)
         if under:
             panel = torch.linalg.solve_triangular(factor.mT, panel, upper=True, left=False)
+        if 0 < len(panel) <= AT_ONCE:
+            row, column = lower.setdefault(len(under), torch.tril_indices(*[len(under)] * 2, device=rhs.device))
+            product = (panel @ panel.mT).view(len(under), side, len(under), side)[row, :, column]
+            tiles.index_add_(0, torch.cat(goes), product, alpha=-1)
+            goes = []
         for at, target in enumerate(goes):
             product = panel[: (at + 1) * side] @ panel[at * side : (at + 1) * side].mT
             tiles.index_add_(0, target, product.view(at + 1, side, side).mT, alpha=-1)

@@ -1,0 +1,268 @@
+"""Pose graphs: absolute poses from relative ones, in SE(3) or Sim(3).
+
+The residual of an edge is ``e = chart(M_ij T_i T_j^-1)`` for a measurement ``M_ij`` of ``T_j T_i^-1``, weighted by an
+information matrix; with the chart "log" that of :class:`dvo.ba.factors.RelativePose`. With camera-to-world poses
+``X = T^-1`` and ``Z_ij = M_ij^-1`` it is ``chart(Z_ij^-1 X_i^-1 X_j)``, the error of g2o (Kuemmerle et al., "g2o: a
+general framework for graph optimization", 2011). In Sim(3) each pose has a scale of its own, so that a loop can correct
+drift of scale (Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dvo.ba.edges import free_slots
+from dvo.ba.kernels import Kernel
+from dvo.ba.levenberg import LMOptions, levenberg_marquardt, robust_cost, robust_weight
+from dvo.ba.sparse import SparseSystem, make_schur_pattern
+from dvo.errors import DvoError
+from dvo.geometry import se3, sim3, so3
+from dvo.geometry.precision import full_precision
+
+Chart = Literal["log", "split", "quaternion"]
+"""Coordinates of an error ``(R, t)`` or ``(s, R, t)``: "log" is the logarithm of the group; "split" is ``[t, log R]``,
+that of 2-D graphs; "quaternion" is ``[t, q_xyz]`` with ``q_w >= 0``, that of 3-D graphs in g2o files. In Sim(3)
+``log s`` comes last."""
+
+
+@dataclass(frozen=True)
+class PoseGraphOptions:
+    """Settings of :func:`optimise_pose_graph`.
+
+    Attributes:
+        fixed: how many leading poses stay, or which: bool ``(N,)``.
+        chart: coordinates of the residual.
+        kernel: robust kernel on ``e^T Omega e``.
+        solver: of Levenberg-Marquardt and its linear systems.
+    """
+
+    fixed: int | Tensor | Sequence[bool] = 1
+    chart: Chart = "log"
+    kernel: Kernel = field(default_factory=Kernel)
+    solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=100, damping=1e-6))
+
+
+@dataclass(frozen=True)
+class PoseGraphResult:
+    """Outcome of :func:`optimise_pose_graph`.
+
+    Attributes:
+        poses_cw: ``(N, 7)`` or ``(N, 8)``.
+        initial_chi2, chi2: sum of ``e^T Omega e`` (of its kernel), without a factor 1/2, before and after.
+        iterations: steps tried.
+        converged: whether a criterion was met before the limit of iterations.
+    """
+
+    poses_cw: Tensor
+    initial_chi2: float
+    chi2: float
+    iterations: int
+    converged: bool
+
+
+def optimise_pose_graph(
+    poses_cw: Tensor,
+    ii: Tensor,
+    jj: Tensor,
+    measurements: Tensor,
+    information: Tensor | None = None,
+    options: PoseGraphOptions = PoseGraphOptions(),  # noqa: B008 (frozen)
+) -> PoseGraphResult:
+    """Minimise ``sum e^T Omega e`` over the edges of a pose graph.
+
+    Args:
+        poses_cw: ``(N, 7)`` world to camera for SE(3), or ``(N, 8)`` similarities for Sim(3).
+        ii, jj: ``(E,)`` frames of each edge.
+        measurements: ``(E, 7)`` or ``(E, 8)``, of ``T_j T_i^-1``.
+        information: ``(E, D, D)`` symmetric, ``(E, D)`` diagonal, or None for the identity; ``D`` is 6 or 7, in the
+            order of the chart.
+        options: see :class:`PoseGraphOptions`.
+
+    Returns:
+        Poses of the lowest chi2 found, and how it went.
+
+    Raises:
+        DvoError: shapes or indices that do not fit, or information that is not positive semi-definite.
+
+    Example:
+        >>> result = optimise_pose_graph(poses_cw, ii, jj, measurements)
+        >>> result.poses_cw, result.chi2
+    """
+    dim = _check(poses_cw, ii, jj, measurements, options.chart)
+    with torch.no_grad(), full_precision(poses_cw.device):
+        measurements = measurements.to(poses_cw)
+        root = _square_root(information, dim, poses_cw, len(ii))
+        slot, free = free_slots(options.fixed, len(poses_cw), poses_cw.device)
+        group = se3 if dim == 6 else sim3
+        none = torch.zeros(0, dtype=torch.long, device=ii.device)
+        pattern = make_schur_pattern(free, none, none, none, slot[ii], slot[jj])
+
+        def whitened(poses: Tensor) -> Tensor:
+            e = residuals(poses, ii, jj, measurements, options.chart)
+            return e if root is None else (root @ e[..., None])[..., 0]
+
+        def cost(poses: Tensor) -> float:
+            s = whitened(poses).square().sum(-1)
+            return 0.5 * float(robust_cost(options.kernel, s).sum(dtype=torch.float64))
+
+        def linearise(poses: Tensor) -> SparseSystem:
+            e, j_i, j_j = residuals_and_jacobians(poses, ii, jj, measurements, options.chart)
+            if root is not None:
+                e, j_i, j_j = (root @ e[..., None])[..., 0], root @ j_i, root @ j_j
+            weight = robust_weight(options.kernel, e.square().sum(-1, keepdim=True)).expand_as(e)
+            zeros = poses.new_zeros
+            system = SparseSystem(
+                pattern, zeros(pattern.h_pp.count, dim, dim), zeros(0, dim), zeros(0), zeros(free, dim), zeros(0), False
+            )
+            system.add(e, weight, [(slot[ii], -j_i), (slot[jj], -j_j)])
+            return system
+
+        def move(poses: Tensor, step: tuple[Tensor, Tensor]) -> Tensor:
+            moved = group.retract(poses, torch.nn.functional.pad(step[0], (0, 0, 0, 1))[slot])
+            return torch.where((slot == free)[:, None], poses, moved)
+
+        outcome = levenberg_marquardt(poses_cw, linearise, cost, move, options.solver)
+    return PoseGraphResult(
+        outcome.state, 2 * outcome.initial_cost, 2 * outcome.cost, outcome.iterations, outcome.converged
+    )
+
+
+def residuals(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, chart: Chart = "log") -> Tensor:
+    """Errors ``(E, D)`` of edges; arguments as of :func:`optimise_pose_graph`."""
+    error, _ = _errors(poses_cw, ii, jj, measurements)
+    return _coordinates(error, chart)
+
+
+def residuals_and_jacobians(
+    poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, chart: Chart = "log"
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Errors of edges and their derivatives by left perturbations ``T <- Exp(xi) T`` of both poses.
+
+    ``M Exp(a) T_i (Exp(b) T_j)^-1 = E Exp(Ad(T_j T_i^-1) a - b)`` to first order, hence ``J_j = -C`` and
+    ``J_i = C Ad(T_j T_i^-1)``, where ``C`` is the derivative of the chart by a right perturbation of ``E``.
+
+    Args:
+        poses_cw, ii, jj, measurements: as of :func:`optimise_pose_graph`.
+        chart: coordinates of the residual.
+
+    Returns:
+        ``e (E, D)``, ``J_i (E, D, D)`` and ``J_j (E, D, D)``.
+    """
+    error, motion = _errors(poses_cw, ii, jj, measurements)
+    e = _coordinates(error, chart)
+    by_right = _chart_jacobian(error, e, chart)
+    adjoint = se3.adjoint(motion) if e.shape[-1] == 6 else sim3.adjoint(motion)
+    return e, by_right @ adjoint, -by_right
+
+
+def right_jacobian(xi: Tensor) -> Tensor:
+    """Right Jacobian of the exponential of SE(3) or Sim(3): ``Exp(xi + d) = Exp(xi) Exp(J_r d)`` to first order.
+
+    ``J_r = phi(-ad(xi))`` with ``phi(x) = (e^x - 1) / x``: a Taylor series at ``x / 8``, then three doublings
+    ``phi(2 x) = (e^x + 1) phi(x) / 2``. The quadrature of :func:`dvo.geometry.sim3.left_jacobian` gives the same from
+    256 rotations for each element, too much for graphs of many thousand edges.
+
+    Args:
+        xi: ``(..., 6)`` or ``(..., 7)``, angle at most pi.
+
+    Returns:
+        ``(..., 6, 6)`` or ``(..., 7, 7)``.
+    """
+    x = -_small_adjoint(xi) / 8
+    eye = torch.eye(xi.shape[-1], dtype=xi.dtype, device=xi.device)
+    phi = eye + x / 13
+    for order in range(12, 1, -1):
+        phi = eye + x @ phi / order
+    power = eye + x @ phi
+    for _ in range(3):
+        phi, power = 0.5 * (power @ phi + phi), power @ power
+    return phi
+
+
+def _small_adjoint(xi: Tensor) -> Tensor:
+    """``ad(xi)``, the derivative of the adjoint of ``Exp(xi)`` at the identity."""
+    tau, phi = so3.hat(xi[..., :3]), so3.hat(xi[..., 3:6])
+    dim = xi.shape[-1]
+    out = xi.new_zeros(*xi.shape[:-1], dim, dim)
+    out[..., :3, :3] = out[..., 3:6, 3:6] = phi
+    out[..., :3, 3:6] = tau
+    if dim == 7:
+        out[..., :3, :3].diagonal(dim1=-2, dim2=-1).add_(xi[..., 6:])
+        out[..., :3, 6] = -xi[..., :3]
+    return out
+
+
+def _errors(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor) -> tuple[Tensor, Tensor]:
+    """``M T_i T_j^-1`` and ``T_j T_i^-1``."""
+    a, b = poses_cw.index_select(0, ii), poses_cw.index_select(0, jj)
+    group = se3 if poses_cw.shape[-1] == 7 else sim3
+    motion = group.compose(b, group.inverse(a))
+    return group.normalise(group.compose(measurements, group.inverse(motion))), motion
+
+
+def _coordinates(error: Tensor, chart: Chart) -> Tensor:
+    if chart == "log":
+        return se3.log(error) if error.shape[-1] == 7 else sim3.log(error)
+    t, q, scale = error[..., :3], error[..., 3:7], error[..., 7:].log()
+    if chart == "split":
+        return torch.cat((t, so3.log(q), scale), -1)
+    return torch.cat((t, torch.where(q[..., 3:] < 0, -q[..., :3], q[..., :3]), scale), -1)
+
+
+def _chart_jacobian(error: Tensor, e: Tensor, chart: Chart) -> Tensor:
+    """Derivative ``(E, D, D)`` of the coordinates ``e`` of an error by a right perturbation of it."""
+    if chart == "log":
+        return torch.linalg.inv(right_jacobian(e))
+    q = error[..., 3:7]
+    q = torch.where(q[..., 3:] < 0, -q, q)
+    dim = error.shape[-1] - 1
+    out = error.new_zeros(*error.shape[:-1], dim, dim)
+    out[..., :3, :3] = so3.matrix(q) * (error[..., 7:, None] if dim == 7 else 1.0)
+    out[..., 6:, 6:] = 1
+    eye = torch.eye(3, dtype=error.dtype, device=error.device)
+    if chart == "split":
+        phi, factor = so3.log_terms(q)
+        cross = so3.hat(phi)
+        out[..., 3:6, 3:6] = eye + 0.5 * cross + factor[..., None] * (cross @ cross)
+    else:
+        out[..., 3:6, 3:6] = 0.5 * (q[..., 3:, None] * eye + so3.hat(q[..., :3]))
+    return out
+
+
+def _square_root(information: Tensor | None, dim: int, like: Tensor, edges: int) -> Tensor | None:
+    """``(E, D, D)`` with ``root^T root = information``."""
+    if information is None:
+        return None
+    if information.shape not in ((edges, dim, dim), (edges, dim)):
+        raise DvoError(
+            f"has shape {tuple(information.shape)}", field="information", remedy=f"give ({edges}, {dim}, {dim})"
+        )
+    full = information.double() if information.dim() == 3 else torch.diag_embed(information.double())
+    if not bool(torch.isfinite(full).all()):
+        raise DvoError("not finite", field="information", remedy="give finite numbers")
+    values, vectors = torch.linalg.eigh(full)
+    if bool((values < -1e-9 * values.abs().amax(-1, keepdim=True)).any()):
+        raise DvoError("has a negative eigenvalue", field="information", remedy="give positive semi-definite matrices")
+    return (values.clamp(min=0).sqrt()[..., None] * vectors.mT).to(like)
+
+
+def _check(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, chart: str) -> int:
+    """Dimension of the tangent."""
+    if poses_cw.dim() != 2 or poses_cw.shape[-1] not in (7, 8):
+        raise DvoError(f"has shape {tuple(poses_cw.shape)}", field="poses_cw", remedy="give (N, 7) or (N, 8)")
+    if chart not in ("log", "split", "quaternion"):
+        raise DvoError(f"unknown chart {chart!r}", field="chart", remedy="use log, split or quaternion")
+    if poses_cw.dtype not in (torch.float32, torch.float64):
+        raise DvoError(f"has dtype {poses_cw.dtype}", field="poses_cw", remedy="use float32 or float64")
+    wanted = (len(ii), poses_cw.shape[1])
+    if measurements.shape != wanted or len(jj) != len(ii):
+        raise DvoError(f"has shape {tuple(measurements.shape)}", field="measurements", remedy=f"give {wanted}")
+    for name, index in (("ii", ii), ("jj", jj)):
+        if len(index) and (int(index.min()) < 0 or int(index.max()) >= len(poses_cw)):
+            raise DvoError(f"has an index outside 0..{len(poses_cw) - 1}", field=name, remedy="give existing frames")
+    return poses_cw.shape[1] - 1

@@ -38,7 +38,7 @@ def test_settings_are_read_as_yaml():
         "patches": 16, "motion_damping": 0.5, "name": "x",
     }  # fmt: skip
     for wrong in ("patches", "=3"):
-        with pytest.raises(DvoError, match="--set"):
+        with pytest.raises(DvoError, match="NAME=VALUE"):
             parse_settings([wrong])
 
 

@@ -25,14 +25,15 @@ guess."""
 
 @dataclass(frozen=True)
 class GraphProblem:
-    """Bundle adjustment problem of archived keyframes, in the form of :func:`dvo.ba.layer.bundle_adjust`.
+    """Bundle adjustment problem of archived keyframes: arguments of
+    :func:`dvo.ba.global_adjust.global_bundle_adjust`.
 
     Attributes:
         identifiers: ``(N,)`` keyframe of each pose.
-        poses_cw: ``(1, N, 7)`` float64 world to camera.
-        patches: ``(1, K, 3, 1, 1)`` float64 x, y (feature-map pixels), inverse depth.
-        intrinsics: ``(1, N, 4)`` float64 of the feature maps.
-        targets, weights: ``(1, E, 2)`` float64.
+        poses_cw: ``(N, 7)`` float64 world to camera.
+        patches: ``(K, 3, 1, 1)`` float64 x, y (feature-map pixels), inverse depth.
+        intrinsics: ``(N, 4)`` float64 of the feature maps.
+        targets, weights: ``(E, 2)`` float64.
         ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge.
     """
 
@@ -157,14 +158,14 @@ class KeyframeGraph:
         ii = np.searchsorted(identifiers, edges.source[known])
         jj = np.searchsorted(identifiers, edges.target[known])
         patches = [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
-        shape = (1, len(frames) * m, 3, 1, 1)
+        shape = (len(frames) * m, 3, 1, 1)
         return GraphProblem(
             identifiers=identifiers,
-            poses_cw=torch.stack([poses[i] for i in identifiers.tolist()])[None] if frames else torch.zeros(1, 0, 7),
+            poses_cw=torch.stack([poses[i] for i in identifiers.tolist()]) if frames else torch.zeros(0, 7).double(),
             patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(shape),
-            intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(1, -1, 4)),
-            targets=torch.from_numpy(edges.position[known].astype(np.float64))[None],
-            weights=torch.from_numpy(edges.weight[known].astype(np.float64))[None],
+            intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(-1, 4)),
+            targets=torch.from_numpy(edges.position[known].astype(np.float64)),
+            weights=torch.from_numpy(edges.weight[known].astype(np.float64)),
             ii=torch.from_numpy(ii),
             jj=torch.from_numpy(jj),
             kk=torch.from_numpy(ii * m + edges.patch[known]),

@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
@@ -91,8 +92,9 @@ def scene(frames=6, seed=0):
 
 
 def residual(problem):
-    found = reproject(problem.poses_cw, problem.patches, problem.intrinsics, problem.ii, problem.jj, problem.kk).coords
-    return (found[:, :, 0, 0] - problem.targets).abs().max()
+    state = (x[None] for x in (problem.poses_cw, problem.patches, problem.intrinsics))
+    found = reproject(*state, problem.ii, problem.jj, problem.kk).coords
+    return (found[0, :, 0, 0] - problem.targets).abs().max()
 
 
 def test_everything_that_left_is_a_problem_that_bundle_adjustment_can_take():
@@ -107,13 +109,37 @@ def test_everything_that_left_is_a_problem_that_bundle_adjustment_can_take():
     assert len(graph.archive) == 6 and graph.archive[2].anchor == 1
     problem = graph.problem()
     assert len(problem.kk) == count and problem.identifiers.tolist() == [0, 1, 2, 3, 4, 5]
-    torch.testing.assert_close(problem.poses_cw[0].float(), poses, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(problem.poses_cw.float(), poses, atol=1e-5, rtol=1e-4)
     assert residual(problem) < 1e-3
     kept = graph.problem(dropped=False)
     assert kept.identifiers.tolist() == [0, 1, 3, 4, 5] and residual(kept) < 1e-3
     assert len(kept.kk) == 5 * M * 4
     # The frame of the dropped keyframe still has its row.
     assert len(graph.log.trajectory()) == 6
+
+
+def test_a_global_adjustment_of_the_archive_moves_frames_and_points_back():
+    """Archived poses are disturbed; bundle adjustment of everything archived finds them again."""
+    graph, poses = scene()
+    while len(graph.window):
+        graph.archive_oldest()
+    generator = torch.Generator().manual_seed(3)
+    for identifier in range(2, 6):
+        noise = 0.02 * torch.randn(6, generator=generator, dtype=torch.float64)
+        moved = se3.retract(torch.from_numpy(graph.archive[identifier].pose_cw), noise)
+        graph.correct(identifier, moved.numpy())
+    problem = graph.problem()
+    measured = (problem.targets, problem.weights, problem.ii, problem.jj, problem.kk)
+    found = global_bundle_adjust(
+        problem.poses_cw, problem.patches, problem.intrinsics, *measured, GlobalBAOptions(fixed=2)
+    )
+    assert found.cost < 1e-3 * found.initial_cost
+    depth = found.patches[:, 2, 0, 0].view(-1, M).numpy()
+    for row, identifier in enumerate(problem.identifiers.tolist()):
+        graph.correct(identifier, found.poses_cw[row].numpy(), depth[row])
+    back = np.array([keyframe.pose_cw for keyframe in graph.archive])
+    np.testing.assert_allclose(back, poses.double().numpy(), atol=2e-3)
+    np.testing.assert_allclose(graph.log.trajectory().poses_wc, se3.inverse(torch.from_numpy(back)).numpy(), atol=1e-6)
 
 
 def test_points_are_anchored_on_their_keyframes():

@@ -1,19 +1,17 @@
 """Clips from recordings."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
+from dvo.data.root import data_root
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from train.data.real import RealClips, RealData
 from train.tasks.patch_vo.objective import LossConfig
 
-DATA = Path(os.environ.get("DVO_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
+DATA = data_root(required=False)
 real = pytest.mark.skipif(not DATA.is_dir(), reason="set DVO_DATA to the folder of real sequences")
 
 

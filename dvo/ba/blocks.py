@@ -47,6 +47,16 @@ def inverse_depth_block(
     return StateBlock(inverse_depths, 1, retract, None, inverse_depths.shape[1], held, eliminated=True)
 
 
+def vector_block(value: Tensor, held: bool = False) -> StateBlock:
+    """Vectors ``(B, N, D)`` that add, for example velocities or biases.
+
+    Args:
+        value: at the start.
+        held: none of them moves.
+    """
+    return StateBlock(value, value.shape[-1], torch.add, None, value.shape[1], held)
+
+
 def intrinsics_block(intrinsics: Tensor, refine: str = "none", shared: bool = True) -> StateBlock:
     """Intrinsics ``(B, N, 4)`` = fx fy cx cy in pixels.
 

@@ -10,7 +10,7 @@ Patch Visual Odometry", 2023.)
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from dvo.ba.covariance import pose_covariance
 from dvo.ba.edges import EdgePlan, check_index, plan_edges
 from dvo.ba.grouped import group_measurements
 from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
-from dvo.ba.problem import Factor, Problem, State
+from dvo.ba.problem import Factor, Problem, State, StateBlock
 from dvo.ba.reprojection import PatchReprojection
 from dvo.ba.step import solve
 from dvo.errors import DvoError
@@ -43,6 +43,7 @@ def bundle_adjust(
     options: BAOptions = _DEFAULT,
     *,
     factors: Iterable[Factor] = (),
+    blocks: Mapping[str, StateBlock] | None = None,
     plan: EdgePlan | None = None,
 ) -> BAResult:
     """Refine poses and inverse depths so that the patches project onto their targets.
@@ -63,6 +64,8 @@ def bundle_adjust(
         ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, in any order, shared by the batch.
         options: see :class:`BAOptions`.
         factors: further measurements, for example priors (:mod:`dvo.ba.factors`).
+        blocks: further unknowns that the factors concern, by name, for example velocities; see
+            :func:`dvo.ba.blocks.vector_block`.
         plan: layout that :func:`dvo.ba.edges.plan_edges` made of ``ii, jj, kk``, to save doing it again for a graph
             that does not change.
 
@@ -85,7 +88,8 @@ def bundle_adjust(
         _check_values(poses_cw.shape[1], patches.shape[1], intrinsics.shape[1], weights, ii, jj, kk, options.sensors)
     arguments = (intrinsics, targets, weights, ii, jj, kk, options)
     with full_precision(poses_cw.device):
-        problem = make_problem(poses_cw, patches, *arguments, factors=factors, plan=plan)
+        factors = tuple(factors)
+        problem = make_problem(poses_cw, patches, *arguments, factors=factors, blocks=blocks, plan=plan)
         problem = solve(problem, options.iterations, options.damping)
         state = problem.state
         poses_cw, inverse_depths = state[POSES].value, state[INVERSE_DEPTHS].value
@@ -99,8 +103,11 @@ def bundle_adjust(
             covariance = pose_covariance(problem, options.covariance, options.damping)
         if options.report:
             arguments = (intrinsics, *arguments[1:])
-            cost, inliers = _report(make_problem(poses_cw, patches, *arguments, factors=factors, grouped=False))
-        return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance)
+            more = {name: state[name] for name in blocks or {}}
+            final = make_problem(poses_cw, patches, *arguments, factors=factors, blocks=more, grouped=False)
+            cost, inliers = _report(final)
+        further = {name: state[name].value for name in blocks or {}}
+        return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance, further)
 
 
 def make_problem(
@@ -115,6 +122,7 @@ def make_problem(
     options: BAOptions = _DEFAULT,
     *,
     factors: Iterable[Factor] = (),
+    blocks: Mapping[str, StateBlock] | None = None,
     plan: EdgePlan | None = None,
     grouped: bool = True,
 ) -> Problem:
@@ -137,7 +145,8 @@ def make_problem(
     poses = pose_block(poses_cw, options.fixed, held=options.structure_only)
     inverse_depths = patches[:, :, 2, centre, centre]
     depths = inverse_depth_block(inverse_depths, options.depth_range, held=options.motion_only)
-    blocks = {POSES: poses, INVERSE_DEPTHS: depths}
+    further = {name: block.with_value(block.value.to(dtype)) for name, block in (blocks or {}).items()}
+    own = {POSES: poses, INVERSE_DEPTHS: depths}
     sensors, refine = options.sensors, options.refine_intrinsics
     reprojection: Factor
     if grouped and sensors is None and refine == "none":
@@ -148,7 +157,7 @@ def make_problem(
             bounds=options.bounds, kernel=options.kernel,
         )  # fmt: skip
     else:
-        blocks = {INTRINSICS: intrinsics_block(intrinsics, refine, shared=sensors is None), **blocks}
+        own = {INTRINSICS: intrinsics_block(intrinsics, refine, shared=sensors is None), **own}
         extrinsics, camera_i, camera_j = None, ii, jj
         if sensors is not None:
             extrinsics = sensors.from_body.to(poses_cw).expand(len(poses_cw), -1, 7)
@@ -158,7 +167,7 @@ def make_problem(
             options.bounds, options.kernel, focal_only=refine == "focal",
         )  # fmt: skip
     more = (factor.with_tensors([x.to(poses_cw) for x in factor.tensors()]) for factor in factors)
-    return Problem(State(blocks), (reprojection, *more))
+    return Problem(State({**further, **own}), (reprojection, *more))
 
 
 @torch.no_grad()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from torch import Tensor
@@ -112,6 +112,7 @@ class BAResult:
         inliers: ``(B, E)`` bool, edges that count at the result; None unless ``report``.
         covariance: ``(B, 6m, 6m)`` joint marginal covariance of the left tangents ``[tau, phi]`` of the ``m`` poses in
             ``covariance``, see :func:`dvo.ba.covariance.pose_covariance`; None unless wanted. Without gradient.
+        blocks: values of the further state blocks, by name.
     """
 
     poses_cw: Tensor
@@ -120,3 +121,4 @@ class BAResult:
     cost: Tensor | None = None
     inliers: Tensor | None = None
     covariance: Tensor | None = None
+    blocks: Mapping[str, Tensor] = field(default_factory=dict)

@@ -55,7 +55,7 @@ def test_a_registered_reader_comes_before_those_that_take_anything(own):
 
 def test_a_reader_announced_by_another_package(own, monkeypatch):
     announced = [EntryPoint("mine", "package_of_mine:READER", "dvo.readers")]
-    monkeypatch.setattr("dvo.registry.entry_points", lambda group: announced if group == "dvo.readers" else [])
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: announced if group == "dvo.readers" else [])
     fresh = Registry("reader", "dvo.readers", {name: READERS.target(name) for name in READERS})
     monkeypatch.setattr("dvo.data.registry.READERS", fresh)
     assert names_in_order()[0] == "mine" and open_source(own).kind == "mine"

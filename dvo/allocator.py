@@ -1,4 +1,4 @@
-"""Keep freed memory for the next large tensor."""
+"""Settings of the memory allocator for large tensors on the CPU."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 
 
 def reuse_freed_memory() -> bool:
-    """Tell glibc's malloc to hold on to freed memory; returns whether it could be told.
+    """Configure glibc's malloc to reuse freed memory instead of returning it to the system.
 
-    By default every tensor above some megabytes is mapped afresh and its pages are zeroed by the kernel, which on a CPU
-    takes longer than much of the arithmetic on them. Elsewhere than on glibc this does nothing.
+    By default every tensor above some megabytes is a new memory mapping whose pages are zeroed by the kernel, which
+    takes longer than much of the arithmetic on it. Systems without glibc are left unchanged.
+
+    Returns:
+        True if the allocator was configured.
     """
     if not sys.platform.startswith("linux"):
         return False

@@ -1,6 +1,6 @@
-"""The command ``dvo``: what may be typed, and how errors are said. The work is done in :mod:`dvo.commands`.
+"""Command line ``dvo``: parsing of options and printing of errors; :mod:`dvo.commands` implements the commands.
 
-Nothing heavy is imported before a command is known, so that ``dvo --help`` answers at once.
+Heavy modules are imported only for the command in use, so that ``dvo --help`` is fast.
 """
 
 from __future__ import annotations
@@ -15,17 +15,23 @@ from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED
 from dvo.errors import DvoError
 
-EXIT_CODES = "exit codes: 0 done, 1 no frame could be tracked, 2 bad input, 130 interrupted (what was tracked is kept)"
+EXIT_CODES = (
+    "exit codes: 0 done, 1 no frame could be tracked, 2 bad input, 130 interrupted (results so far are written)"
+)
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """One line, as for every other bad input."""
+        """Exit with the message on one line, as for every other invalid input."""
         self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The whole command line. Each command names ``module:function``, called with the parsed arguments."""
+    """Build the command line.
+
+    Returns:
+        The parser; the default ``run`` of each command is ``"module:function"``, called with the parsed arguments.
+    """
     parser = _Parser(prog="dvo", description="Learned monocular visual odometry.", epilog=EXIT_CODES)
     parser.add_argument("--version", action="version", version=f"dvo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -41,8 +47,12 @@ def build_parser() -> argparse.ArgumentParser:
     _tracking_options(run)
     run.add_argument("--stride", type=_positive_int, default=1, metavar="N", help="track every N-th frame")
     times = run.add_mutually_exclusive_group()
-    times.add_argument("--times", metavar="FILE", help="time of each image in seconds, first column")
-    times.add_argument("--fps", type=_positive_float, metavar="F", help="frames a second, where nothing else says")
+    times.add_argument(
+        "--times", metavar="FILE", help="file with the time of each image in seconds in the first column"
+    )
+    times.add_argument(
+        "--fps", type=_positive_float, metavar="F", help="frames per second, if the source does not define it"
+    )
     run.add_argument("--groundtruth", metavar="FILE", help="TUM trajectory (camera to world) to compare with")
     run.set_defaults(run="dvo.commands.run:run")
 
@@ -57,9 +67,9 @@ def build_parser() -> argparse.ArgumentParser:
     info.add_argument("weights", metavar="NAME|FILE")
     info.set_defaults(run="dvo.commands.weights:info")
 
-    synth = commands.add_parser("synth", help="render scenes and meshes: look at them, or write sequences")
+    synth = commands.add_parser("synth", help="render scenes and meshes: preview them, or write sequences")
     verbs = synth.add_subparsers(dest="verb", required=True, metavar="VERB")
-    preview = verbs.add_parser("preview", help="contact sheet: frames, depth, flow, path")
+    preview = verbs.add_parser("preview", help="write a contact sheet of frames, depth, flow and path")
     preview.add_argument(
         "source",
         metavar="SOURCE",
@@ -70,16 +80,16 @@ def build_parser() -> argparse.ArgumentParser:
     preview.add_argument("--rows", type=_positive_int, metavar="N", help="rows of a family, mesh or 'clips'")
     _rendering_options(preview, "160x120")
     preview.set_defaults(run="dvo.commands.synth:preview")
-    export = verbs.add_parser("export", help="write a sequence with ground truth in a dataset's layout")
+    export = verbs.add_parser("export", help="write a sequence with ground truth in the layout of a dataset")
     export.add_argument("--layout", choices=("tum", "tartanair"), default="tum", help="default: %(default)s")
     export.add_argument("--out", metavar="DIR", required=True, help="new folder")
-    what = export.add_mutually_exclusive_group()
-    what.add_argument("--family", metavar="F", help="family of scenes (default: drawn)")
-    what.add_argument("--mesh", metavar="FILE", help="glTF, OBJ or PLY to move around or within")
+    content = export.add_mutually_exclusive_group()
+    content.add_argument("--family", metavar="F", help="family of scenes (default: random)")
+    content.add_argument("--mesh", metavar="FILE", help="glTF, OBJ or PLY file to render, from inside or outside")
     export.add_argument("--frames", type=_positive_int, default=150, metavar="N", help="default: %(default)s")
     export.add_argument("--fps", type=_positive_float, default=30.0, metavar="F", help="default: %(default)g")
     export.add_argument("--path", metavar="KIND", help="kind of path: handheld, forward, orbit, rotation, drone, ...")
-    export.add_argument("--sensor", action="store_true", help="noise, vignetting and so on; without: clean and exact")
+    export.add_argument("--sensor", action="store_true", help="simulate noise, vignetting and other sensor effects")
     export.add_argument(
         "--lens", choices=("none", "radtan", "fisheye"), default="none", help="distortion (default: %(default)s)"
     )
@@ -92,18 +102,25 @@ def build_parser() -> argparse.ArgumentParser:
 def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
     parser.add_argument("--size", type=_size, default=_size(size), metavar="WxH", help=f"pixels (default: {size})")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
-    parser.add_argument("--textures", metavar="DIR", help="photographs to paint scenes with")
+    parser.add_argument("--textures", metavar="DIR", help="folder of photographs for the textures of the scenes")
     parser.add_argument("--up", choices=("y", "z"), help="axis of the mesh that points up (default: y; z for PLY)")
     parser.add_argument(
-        "--view", choices=("auto", "inside", "outside"), default="auto", help="where the camera is as to the mesh"
+        "--view",
+        choices=("auto", "inside", "outside"),
+        default="auto",
+        help="position of the camera: inside or outside the mesh",
     )
-    parser.add_argument("--unlit", action="store_true", help="do not shade the mesh: its textures hold the light")
+    parser.add_argument(
+        "--unlit", action="store_true", help="render without shading, for textures that contain the lighting"
+    )
 
 
 def _tracking_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
     parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
-    parser.add_argument("--device", metavar="D", default="auto", help="torch device (default: an accelerator or cpu)")
+    parser.add_argument(
+        "--device", metavar="D", default="auto", help="torch device (default: accelerator if available)"
+    )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
     parser.add_argument("--config", metavar="FILE", help="YAML file with settings of the odometry")
     parser.add_argument(
@@ -133,7 +150,14 @@ def _positive_float(text: str) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command and return the exit code."""
+    """Run a command.
+
+    Args:
+        argv: arguments without the program's name; None for those of the process.
+
+    Returns:
+        Exit code, see :mod:`dvo.commands`.
+    """
     try:
         arguments = build_parser().parse_args(argv)
         module, function = arguments.run.split(":")

@@ -1,4 +1,4 @@
-"""``dvo demo``: render a clip, track it, and compare with the exact ground truth."""
+"""``dvo demo``: render a clip, track it and compare with the exact ground truth."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ SCENE, FAMILY, FPS = 0, "room", 30.0
 
 @dataclass
 class RenderedClip:
-    """Clip in memory, so that the speed in run.json is that of the tracker and not of the renderer.
+    """Clip in memory, so that the speed in run.json excludes rendering.
 
     Attributes:
         name: of the clip.
-        frames: rendered before.
+        frames: rendered frames.
         groundtruth: camera-to-world poses of these frames, metres.
         warnings: always empty; part of the interface of a source.
     """
@@ -44,13 +44,13 @@ class RenderedClip:
 
 
 def render_clip(frames: int) -> RenderedClip:
-    """Render a hand-held walk through a furnished room, 320x240 at 30 Hz.
+    """Render a clip of a hand-held camera in a furnished room, 320x240 at 30 Hz.
 
     Args:
         frames: number of frames.
 
     Returns:
-        The frames, in memory.
+        The clip, with ground truth.
     """
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=frames)
@@ -76,15 +76,15 @@ def demo(arguments: argparse.Namespace) -> int:
     """
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
-    odometry = load_odometry(arguments, device)  # before the rendering: fail early
+    odometry = load_odometry(arguments, device)  # before rendering, so that errors appear early
     clip = render_clip(arguments.frames)
     facts = {
-        "source": f"rendered on the spot: {FAMILY}, seed {SCENE}",
+        "source": f"rendered: {FAMILY}, seed {SCENE}",
         "weights": arguments.weights,
         "device": str(device),
         "seed": arguments.seed,
         "stride": 1,
     }
     code = track(odometry, clip, arguments.out, facts=facts)
-    print("now your own: dvo run VIDEO --calib FILE")
+    print("to track your own video: dvo run VIDEO --calib FILE")
     return code

@@ -1,18 +1,22 @@
-"""The one exception type that dvo raises for bad input."""
+"""Exception that dvo raises for invalid input."""
 
 from __future__ import annotations
 
 
 class DvoError(Exception):
-    """A problem with an input that the user can mend.
+    """Invalid input that the user can fix.
 
     Args:
-        message: what is wrong, in one sentence.
-        file: the file or folder concerned, if any.
-        field: the field, option or row concerned, if any.
-        remedy: what to do about it.
+        message: description of the problem, in one sentence.
+        file: file or folder with the problem, if any.
+        field: field, option or row with the problem, if any.
+        remedy: instruction to fix it.
 
     ``str(error)`` is one line: ``file: field: message. remedy``.
+
+    Example:
+        >>> str(DvoError("no such file", file="calib.txt", field="--calib", remedy="give a calibration file"))
+        'calib.txt: --calib: no such file. Give a calibration file.'
     """
 
     def __init__(

@@ -1,8 +1,8 @@
-"""How far an estimated trajectory is from a reference: ATE, RPE, rotation and scale errors, in plain numpy.
+"""Errors of an estimated trajectory against a reference: ATE, RPE, rotation and scale errors, in plain numpy.
 
 Definitions follow Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems" (IROS 2012) for ATE and RPE and
-Umeyama (PAMI 1991) for the alignment; values agree with evo's, which the tests use as an oracle. A case without a
-meaningful value gives nan and says why in :attr:`Metrics.reason`; nothing here raises on a poor estimate.
+Umeyama (PAMI 1991) for the alignment; the tests compare the values with those of evo. An undefined value is nan, with
+an explanation in :attr:`Metrics.reason`; a poor estimate raises no exception.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from dvo.geometry.poses import pose_matrices, poses_from_matrices
 
 Alignment = Literal["none", "scale", "se3", "sim3"]
 MINIMUM_MATCHES = 3
-_STILL = 1e-9  # relative spread of positions under which a trajectory counts as standing still
+_STILL = 1e-9  # relative spread of positions below which a trajectory counts as not moving
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Errors of one estimate against one reference. A value that has no meaning is nan, and ``reason`` says why.
+    """Errors of an estimate against a reference. An undefined value is nan, with an explanation in ``reason``.
 
     Attributes:
-        alignment: ``none``, ``scale``, ``se3`` or ``sim3``: what was fitted before the errors were taken.
+        alignment: transformation fitted before the errors were computed: ``none``, ``scale``, ``se3`` or ``sim3``.
         ate_rmse: absolute trajectory error, root mean square over the matched frames, metres.
         ate_percent: the same in percent of ``path_length``.
         rpe_gap: frame gap of the relative errors (pairs ``i, i + gap`` of matched frames, all of them).
         rpe_trans, rpe_trans_rmse: relative translation error, median and RMSE, metres.
         rpe_rot_deg, rpe_rot_deg_rmse: relative rotation error, median and RMSE, degrees.
         rotation_error_ratio: sum of the relative rotation errors over the sum of the reference's relative rotations;
-            1 for a system that never turns.
-        scale: factor that takes the estimate to the reference (1 unless the alignment fits it).
+            1 for an estimate without rotation.
+        scale: factor from the estimate to the reference (1 unless the alignment fits it).
         scale_drift: scale of the last third over scale of the first third of the matched frames, minus 1.
-        matched: frames that both trajectories have.
-        reference_frames: frames of the reference.
+        matched: number of frames that both trajectories have.
+        reference_frames: number of frames of the reference.
         completeness: ``matched / reference_frames``.
         path_length: length of the matched reference, metres.
-        reason: why some values are nan, or None.
+        reason: explanation of values that are nan, or None.
     """
 
     alignment: Alignment
@@ -62,13 +62,17 @@ class Metrics:
 
 
 def associate(estimate: Trajectory, reference: Trajectory, max_dt: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
-    """Pair the frames of two trajectories by time, each frame at most once.
+    """Match the frames of two trajectories by time, each frame at most once.
 
-    Every stamp of the shorter trajectory takes the nearest stamp of the longer one within ``max_dt`` seconds; where two
-    want the same one, the nearer gets it.
+    Every timestamp of the shorter trajectory is matched with the nearest one of the longer trajectory within
+    ``max_dt``; of two candidates for the same frame, the nearer is matched.
+
+    Args:
+        estimate, reference: the trajectories, timestamps in seconds.
+        max_dt: largest difference of matched timestamps, seconds.
 
     Returns:
-        Index vectors ``(M,)`` into the estimate and into the reference, both increasing where the stamps are.
+        Index vectors ``(M,)`` into the estimate and into the reference; increasing where the timestamps are.
     """
     swap = len(estimate) > len(reference)
     few, many = (reference, estimate) if swap else (estimate, reference)
@@ -93,9 +97,17 @@ def associate(estimate: Trajectory, reference: Trajectory, max_dt: float = 0.01)
 def fit_alignment(
     source: np.ndarray, target: np.ndarray, mode: Alignment = "sim3"
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """The ``s, R, t`` of ``target ~ s R source + t`` that an alignment stands for, from positions ``(N, 3)``.
+    """Least-squares alignment ``s, R, t`` of positions, ``target ~ s R source + t`` (Umeyama 1991).
 
-    ``scale`` takes the scale of the Sim(3) fit and leaves the pose alone, as evo does.
+    ``scale`` is the scale of the Sim(3) fit with identity rotation and zero translation, as in evo.
+
+    Args:
+        source: ``(N, 3)`` positions.
+        target: ``(N, 3)`` positions.
+        mode: transformation to fit.
+
+    Returns:
+        Scale, rotation ``(3, 3)`` and translation ``(3,)``.
 
     Raises:
         DvoError: an unknown mode.
@@ -106,7 +118,7 @@ def fit_alignment(
         )
     if mode == "none":
         return 1.0, np.eye(3), np.zeros(3)
-    from dvo.geometry.alignment import align  # here, because it brings torch along
+    from dvo.geometry.alignment import align  # imported here because it imports torch
 
     fitted = align(source, target, "se3" if mode == "se3" else "sim3").numpy()
     if mode == "scale":
@@ -116,7 +128,17 @@ def fit_alignment(
 
 
 def transform(trajectory: Trajectory, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Trajectory:
-    """The trajectory seen from another world: positions ``s R p + t``, orientations ``R q``."""
+    """Transform a trajectory to another world frame: positions ``s R p + t``, orientations ``R q``.
+
+    Args:
+        trajectory: camera to world.
+        scale: ``s``.
+        rotation: ``(3, 3)``.
+        translation: ``(3,)``.
+
+    Returns:
+        Trajectory with the same timestamps.
+    """
     positions = scale * trajectory.positions @ rotation.T + translation
     turn = poses_from_matrices(np.column_stack([rotation, translation]))[3:]
     quaternions = _multiply(turn, _unit(trajectory.poses_wc[:, 3:]))
@@ -126,7 +148,19 @@ def transform(trajectory: Trajectory, scale: float, rotation: np.ndarray, transl
 def align_trajectory(
     estimate: Trajectory, reference: Trajectory, align: Alignment = "sim3", max_dt: float = 0.01
 ) -> Trajectory:
-    """The whole estimate brought into the frame of the reference, for plots. Unchanged where no fit is possible."""
+    """Align an estimate with a reference, for plots.
+
+    Args:
+        estimate, reference: camera to world, metres, seconds.
+        align: transformation to fit.
+        max_dt: largest difference of matched timestamps, seconds.
+
+    Returns:
+        All frames of the estimate in the frame of the reference; the estimate itself if no fit is possible.
+
+    Raises:
+        DvoError: an unknown alignment.
+    """
     i, j = associate(estimate, reference, max_dt)
     if len(i) < MINIMUM_MATCHES or _stands_still(estimate.positions[i]):
         return estimate
@@ -136,7 +170,16 @@ def align_trajectory(
 def relative_rotation_errors(
     estimate: Trajectory, reference: Trajectory, gap: int = 1, max_dt: float = 0.01
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation error of every pair ``i, i + gap`` of matched frames: time of its end (s) and error (degrees)."""
+    """Relative rotation error of every pair ``i, i + gap`` of matched frames.
+
+    Args:
+        estimate, reference: camera to world, seconds.
+        gap: distance of the frames of a pair.
+        max_dt: largest difference of matched timestamps, seconds.
+
+    Returns:
+        ``(P,)`` time of the second frame of each pair, seconds, and ``(P,)`` error, degrees.
+    """
     i, j = associate(estimate, reference, max_dt)
     errors, _, _ = _relative_errors(estimate.poses_wc[i], reference.poses_wc[j], gap, 1.0)
     return estimate.timestamps[i][gap:], errors
@@ -150,19 +193,33 @@ def evaluate(
     rpe_gap: int = 1,
     max_dt: float = 0.01,
 ) -> Metrics:
-    """Compare an estimate with a reference (both camera to world, metres, seconds).
+    """Compare an estimate with a reference.
 
     Args:
-        align: what to fit first: ``none``, ``scale``, ``se3`` or ``sim3``.
+        estimate: camera to world ``T_wc``.
+        reference: ground truth, camera to world ``T_wc``, metres.
+        align: transformation to fit first: ``none``, ``scale``, ``se3`` or ``sim3``.
         rpe_gap: frame gap of the relative errors.
-        max_dt: largest difference of stamps that still makes a pair, seconds.
+        max_dt: largest difference of matched timestamps, seconds.
+
+    Returns:
+        Errors in metres and degrees; an undefined value is nan.
 
     Raises:
         DvoError: an unknown alignment or a gap below 1.
+
+    Example:
+        >>> times = np.arange(4.0)
+        >>> poses_wc = np.tile([0.0, 0, 0, 0, 0, 0, 1], (4, 1))
+        >>> poses_wc[:, :3] = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 1, 1]]
+        >>> half = poses_wc * [0.5, 0.5, 0.5, 1, 1, 1, 1]
+        >>> found = evaluate(Trajectory(times, half), Trajectory(times, poses_wc), align="sim3")
+        >>> round(found.ate_rmse, 6), round(found.scale, 6)
+        (0.0, 2.0)
     """
     if rpe_gap < 1:
         raise DvoError(f"must be 1 or more, got {rpe_gap}", field="rpe_gap", remedy="give a number of frames")
-    fit_alignment(np.zeros((1, 3)), np.zeros((1, 3)), align)  # an unknown mode is an error even without matches
+    fit_alignment(np.zeros((1, 3)), np.zeros((1, 3)), align)  # checks the mode, also without matches
     i, j = associate(estimate, reference, max_dt)
     est, ref = estimate.poses_wc[i], reference.poses_wc[j]
     finite = np.isfinite(est).all(axis=1)
@@ -211,7 +268,7 @@ def evaluate(
 def _relative_errors(
     est: np.ndarray, ref: np.ndarray, gap: int, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per pair ``(i, i + gap)``: rotation error and reference rotation in degrees, translation error in metres.
+    """Rotation error and reference rotation (degrees) and translation error (metres) of the pairs ``(i, i + gap)``.
 
     With ``P = inverse(T_i) T_{i+gap}``, the error is ``inverse(P_ref) P_est`` (Sturm 2012, eq. 2).
     """

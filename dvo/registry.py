@@ -1,10 +1,10 @@
-"""Names of exchangeable parts, resolved when they are used.
+"""Registries of exchangeable components by name, imported on use.
 
-A registry maps a name to ``"module:attribute"``. Nothing is imported before a name is looked up, so a registry costs
-nothing at start-up, and a part of another package is added without editing a file of this one:
+A registry maps a name to ``"module:attribute"``. A module is imported only when its name is looked up, so a registry
+adds nothing to the start-up time, and another package can add a component without a change here:
 
 - by a call, ``READERS.register("mine", "my_package.reader:READER")``;
-- by an entry point of the package, in the group that the registry names::
+- by an entry point of the package, in the group of the registry::
 
       [project.entry-points."dvo.readers"]
       mine = "my_package.reader:READER"
@@ -20,12 +20,12 @@ from dvo.errors import DvoError
 
 
 class Registry:
-    """Parts of one kind by name, in the order of registration.
+    """Components of one kind by name, in the order of registration.
 
     Args:
         kind: noun for messages, for instance ``"reader"``.
-        group: group of entry points in which other packages announce parts; None for none.
-        targets: the parts that are there from the start, ``name: "module:attribute"``.
+        group: group of the entry points by which other packages add components; None for none.
+        targets: built-in components, ``name: "module:attribute"``.
 
     Example:
         >>> models = Registry("architecture", "dvo.architectures", {"patch_vo": "dvo.models.patch_vo:PatchVO"})
@@ -41,15 +41,15 @@ class Registry:
             self.register(name, target)
 
     def register(self, name: str, target: str, *, replace: bool = False) -> None:
-        """Add a part.
+        """Add a component.
 
         Args:
-            name: by which it is looked up.
+            name: key of the component.
             target: ``"module:attribute"``.
-            replace: allow a name that is taken.
+            replace: allow a name that is already in use.
 
         Raises:
-            DvoError: a target of another form, or a name that stands for another target already.
+            DvoError: a target of another form, or a name in use for another target.
         """
         if not is_target(target):
             raise DvoError(
@@ -60,11 +60,21 @@ class Registry:
         self._targets[name] = target
 
     def unregister(self, name: str) -> None:
-        """Remove a registered part; a name that is not there is no error."""
+        """Remove a registered component.
+
+        Args:
+            name: key of the component; an unknown name is ignored.
+        """
         self._targets.pop(name, None)
 
     def target(self, name: str) -> str:
-        """``"module:attribute"`` of a name.
+        """Look up a target without importing it.
+
+        Args:
+            name: key of the component.
+
+        Returns:
+            ``"module:attribute"``.
 
         Raises:
             DvoError: no such name.
@@ -75,7 +85,13 @@ class Registry:
         return targets[name]
 
     def resolve(self, name: str) -> Any:
-        """The part of that name.
+        """Import a component.
+
+        Args:
+            name: key of the component.
+
+        Returns:
+            The attribute that the target names.
 
         Raises:
             DvoError: no such name, or its module or attribute cannot be imported.
@@ -98,7 +114,14 @@ class Registry:
 
 
 def is_target(text: str) -> bool:
-    """Whether a text has the form ``module:attribute`` (and is neither a Windows path nor a URL)."""
+    """Test for the form ``module:attribute``.
+
+    Args:
+        text: any text; neither Windows paths nor URLs have this form.
+
+    Returns:
+        True if the text has the form.
+    """
     module, separator, attribute = text.partition(":")
     return bool(separator) and attribute.isidentifier() and all(part.isidentifier() for part in module.split("."))
 
@@ -106,15 +129,22 @@ def is_target(text: str) -> bool:
 def resolve_target(target: str, kind: str = "part") -> Any:
     """Import ``"module:attribute"``.
 
+    Args:
+        target: module and attribute.
+        kind: noun for messages.
+
+    Returns:
+        The attribute.
+
     Raises:
-        DvoError: the module or the attribute is not there; an error inside the module is passed on as it is.
+        DvoError: the module or the attribute does not exist; an error inside the module is raised unchanged.
     """
     module, _, attribute = target.partition(":")
     try:
         return getattr(import_module(module), attribute)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # a dependency of the module is missing: its name says more than ours
+            raise  # a dependency of the module is missing: the original error names it
         raise DvoError(f"no module '{module}'", field=kind, remedy="install it, or set PYTHONPATH") from error
     except AttributeError as error:
         raise DvoError(f"'{module}' has no '{attribute}'", field=kind, remedy="check the name") from error

@@ -1,4 +1,4 @@
-"""Settings dataclasses: checks of their values, and reading them from text and YAML."""
+"""Checks of settings dataclasses, and reading of settings from text and YAML."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
     """Check type and range of the numbers of a settings dataclass.
 
     Args:
-        settings: an instance; its fields are of type int, float, bool or str.
-        ranges: lowest and highest value, both allowed, of the numbers that have one.
+        settings: instance of a dataclass with fields of type int, float, bool or str.
+        ranges: smallest and largest valid value by field, both inclusive; other fields are not bounded.
 
     Raises:
         DvoError: a value of another type, not finite or out of range, with the name of the field.
@@ -42,10 +42,13 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
 
 
 def parse_settings(items: Iterable[str]) -> dict[str, Any]:
-    """Values of ``NAME=VALUE`` texts; values are YAML scalars.
+    """Parse ``NAME=VALUE`` texts; values are YAML scalars.
 
     Args:
         items: such as ``"patches=48"``.
+
+    Returns:
+        Name to value.
 
     Raises:
         DvoError: a text without a name or a value.
@@ -70,13 +73,16 @@ def parse_settings(items: Iterable[str]) -> dict[str, Any]:
 
 
 def read_settings(file: str | Path) -> dict[str, Any]:
-    """Values of a YAML file with one ``name: value`` a line.
+    """Read a YAML file with one ``name: value`` a line.
 
     Args:
         file: path.
 
+    Returns:
+        Name to value.
+
     Raises:
-        DvoError: no such file, or not such YAML.
+        DvoError: no such file, or invalid content.
     """
     import yaml
 
@@ -93,7 +99,11 @@ def read_settings(file: str | Path) -> dict[str, Any]:
 
 
 def check_names(kind: type, values: Mapping[str, Any]) -> None:
-    """Check that every key of ``values`` is a field of the dataclass ``kind``.
+    """Check that all names are fields of a dataclass.
+
+    Args:
+        kind: the dataclass.
+        values: name to value.
 
     Raises:
         DvoError: an unknown name.

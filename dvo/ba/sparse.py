@@ -99,7 +99,7 @@ class SchurPattern:
 
     @cached_property
     def explicit(self) -> bool:
-        """Whether forming ``S`` is cheaper than many products with it."""
+        """True if forming ``S`` is cheaper than many products with it."""
         if len(self.keys) == 0:
             return True
         _, _, frames, patches = self.sizes

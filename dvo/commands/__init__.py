@@ -1,4 +1,4 @@
-"""The commands of the CLI and what they answer to the shell."""
+"""Commands of the CLI, and their exit codes."""
 
 OK = 0
 NOTHING_TRACKED = 1

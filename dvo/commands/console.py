@@ -1,4 +1,4 @@
-"""What the commands share on the terminal: devices, seeds, Ctrl-C and the progress bar."""
+"""Helpers that the commands share: devices, seeds, Ctrl-C and the progress bar."""
 
 from __future__ import annotations
 
@@ -23,10 +23,16 @@ _COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST
 
 
 def device_of(name: str) -> torch.device:
-    """The torch device of that name; ``auto`` takes an accelerator that knows float64, else the CPU.
+    """Device of a name.
+
+    Args:
+        name: of a torch device; ``auto`` selects an accelerator that supports float64, else the CPU.
+
+    Returns:
+        The device.
 
     Raises:
-        DvoError: no such device here.
+        DvoError: the device is not available.
     """
     if name == "auto":
         accelerator = getattr(torch, "accelerator", None)  # torch 2.6 and newer
@@ -48,16 +54,24 @@ def device_of(name: str) -> torch.device:
 
 
 def seed_everything(seed: int) -> None:
-    """Seed what draws from global generators: Python, torch and OpenCV's RANSAC."""
+    """Seed the global random generators in use: Python, torch and OpenCV's RANSAC.
+
+    Args:
+        seed: of all of them.
+    """
     random.seed(seed)
     torch.manual_seed(seed)
     cv2.setRNGSeed(seed)
 
 
 class InterruptSwitch:
-    """While open, the first Ctrl-C only sets :attr:`pressed`; the second raises KeyboardInterrupt.
+    """Context in which the first Ctrl-C only sets :attr:`pressed`; the second raises KeyboardInterrupt.
 
-    An interrupt in the middle of an update would leave the tracker half changed, so it waits for the frame to end.
+    An interrupt in the middle of an update would leave the tracker in an inconsistent state; the caller checks
+    :attr:`pressed` between frames instead.
+
+    Attributes:
+        pressed: True after the first Ctrl-C.
     """
 
     def __init__(self) -> None:
@@ -80,10 +94,10 @@ class InterruptSwitch:
 
 
 class TrackingProgress:
-    """Progress bar with the rate of the last frames and the state of the tracker, on stderr.
+    """Progress bar on stderr, with the rate over the last frames and the state of the tracker.
 
     Args:
-        total: frames to expect, or None.
+        total: number of frames, or None if unknown.
     """
 
     def __init__(self, total: int | None) -> None:
@@ -110,7 +124,12 @@ class TrackingProgress:
         self._progress.stop()
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
-        """Callback of :func:`dvo.odometry.session.run`."""
+        """Advance by a frame; callback of :func:`dvo.odometry.session.run`.
+
+        Args:
+            frame: the frame.
+            estimate: of the frame; None if it was skipped.
+        """
         self._moments.append(time.perf_counter())
         rate = (len(self._moments) - 1) / max(self._moments[-1] - self._moments[0], 1e-9)
         fields: dict[str, Any] = {"rate": rate}

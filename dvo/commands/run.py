@@ -1,4 +1,4 @@
-"""``dvo run``: one source, one odometry, one results folder."""
+"""``dvo run``: track a source and write a results folder."""
 
 from __future__ import annotations
 
@@ -26,22 +26,41 @@ from dvo.viz.plot import plot_trajectory
 
 
 class Clip(Protocol):
-    """What is tracked: :class:`dvo.data.Source`, or the clip that the demo renders."""
+    """Interface of a clip to track: :class:`dvo.data.Source`, or the rendered clip of the demo.
+
+    Attributes:
+        name: of the clip.
+        groundtruth: camera-to-world poses, metres; None if there are none.
+    """
 
     name: str
     groundtruth: Trajectory | None
 
     @property
-    def frame_count(self) -> int | None: ...
+    def frame_count(self) -> int | None:
+        """Number of frames; None if unknown."""
+        ...
 
     @property
-    def warnings(self) -> Sequence[str]: ...
+    def warnings(self) -> Sequence[str]:
+        """Assumptions and problems of reading, a sentence each."""
+        ...
 
     def __iter__(self) -> Iterator[Frame]: ...
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Entry point of ``dvo run``; returns the exit code."""
+    """Entry point of ``dvo run``.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code, see :func:`track`.
+
+    Raises:
+        DvoError: invalid source, weights, device or settings, or a folder that cannot be written.
+    """
     device = device_of(arguments.device)
     source = dvo.open(
         arguments.source,
@@ -68,10 +87,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
-    """Odometry of ``--weights`` with the settings of ``--config`` and, over these, ``--set``.
+    """Load the odometry of ``--weights`` with the settings of ``--config``, overridden by those of ``--set``.
+
+    Args:
+        arguments: of the command line.
+        device: of all computation.
+
+    Returns:
+        The odometry.
 
     Raises:
-        DvoError: no such weights, or a setting that the odometry does not have or accept.
+        DvoError: no such weights, or an unknown or invalid setting.
     """
     settings = read_settings(arguments.config) if arguments.config else {}
     settings |= parse_settings(arguments.set)
@@ -82,22 +108,26 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
 
 
 def track(odometry: Odometry, clip: Clip, out: str | None, *, stride: int = 1, facts: dict[str, Any]) -> int:
-    """Track a clip, write the results folder and say what came of it.
+    """Track a clip, write the results folder and print a summary.
 
-    The first Ctrl-C ends the feeding and still writes everything; a second one gives up.
+    The first Ctrl-C ends tracking and still writes all results; a second one aborts.
 
     Args:
-        facts: goes into run.json as it is.
+        odometry: newly built.
+        clip: frames in order of time, with or without ground truth.
+        out: results folder; None for ``runs/NAME-TIME``.
+        stride: distance of tracked frames, in frames of the clip.
+        facts: metadata to write into run.json.
 
     Returns:
-        0, 1 when no frame was tracked, 130 after Ctrl-C.
+        Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C.
 
     Raises:
-        DvoError: nothing could be read, or the folder cannot be written.
+        DvoError: no frame could be read, or the folder cannot be written.
     """
     is_new = out is None or not Path(out).exists()
     folder = results.make_folder(out, clip.name)
-    told = set(clip.warnings)
+    printed = set(clip.warnings)
     try:
         with InterruptSwitch() as switch, TrackingProgress(clip.frame_count) as progress:
             done = session.run(
@@ -113,7 +143,7 @@ def track(odometry: Odometry, clip: Clip, out: str | None, *, stride: int = 1, f
                 folder.rmdir()
         raise
     for warning in done.warnings:
-        if warning not in told:
+        if warning not in printed:
             print(f"dvo: warning: {warning}", file=sys.stderr)
     _report(folder, done, metrics)
     if done.interrupted:
@@ -126,7 +156,7 @@ def _score(done: session.Run, groundtruth: Trajectory | None) -> Metrics | None:
 
 
 def _draw(folder: Path, done: session.Run, clip: Clip, name: str, metrics: Metrics | None) -> None:
-    """The picture, in the frame of the ground truth where there is one."""
+    """Write the plot, in the frame of the ground truth if there is one."""
     trajectory, points, reference = done.result.trajectory, done.result.map.points, clip.groundtruth
     if reference is not None:
         i, j = associate(trajectory, reference)
@@ -134,9 +164,9 @@ def _draw(folder: Path, done: session.Run, clip: Clip, name: str, metrics: Metri
             scale, rotation, shift = fit_alignment(trajectory.positions[i], reference.positions[j], "sim3")
             points = scale * points @ rotation.T + shift
             trajectory = align_trajectory(trajectory, reference, "sim3")
-        else:  # without a fit the two worlds have nothing to do with each other
+        else:  # without an alignment the two frames are unrelated
             reference = None
-        if reference is not None:  # it may reach beyond the clip
+        if reference is not None:  # ground truth may be longer than the clip
             span = slice(j.min(), j.max() + 1)
             reference = Trajectory(reference.timestamps[span], reference.poses_wc[span])
     plot_trajectory(

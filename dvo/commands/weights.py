@@ -1,4 +1,4 @@
-"""``dvo weights list | import | info``."""
+"""``dvo weights list``, ``import`` and ``info``."""
 
 from __future__ import annotations
 
@@ -16,10 +16,17 @@ from dvo.odometry.results import jsonable
 
 
 def list_shipped(arguments: argparse.Namespace) -> int:
-    """Print a row for each of the weights in the package; returns the exit code."""
+    """Entry point of ``dvo weights list``: print a row for each weights file of the package.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
+    """
     found = list_weights()
     if not found:
-        print("no weights ship with this copy of dvo")
+        print("this installation of dvo has no weights")
         return 0
     table = Table(box=None, pad_edge=False)
     table.add_column("name")
@@ -35,21 +42,33 @@ def list_shipped(arguments: argparse.Namespace) -> int:
 
 
 def import_file(arguments: argparse.Namespace) -> int:
-    """Convert a DPVO checkpoint, never over an existing file; returns the exit code.
+    """Entry point of ``dvo weights import``: convert a DPVO checkpoint; an existing file is not overwritten.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
 
     Raises:
-        DvoError: the file to write is there already, or see :func:`dvo.models.weights.import_checkpoint`.
+        DvoError: the output file exists, or see :func:`dvo.models.weights.import_checkpoint`.
     """
     out = Path(arguments.out or Path(arguments.file).with_suffix(".safetensors").name)
     if out.exists():
-        raise DvoError("exists already", file=out, field="--out", remedy="name another file, or remove this one")
+        raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")
     describe(import_checkpoint(arguments.file, out))
-    print(f"use it as: dvo run SOURCE --weights {out}")
+    print(f"use it with: dvo run SOURCE --weights {out}")
     return 0
 
 
 def info(arguments: argparse.Namespace) -> int:
-    """Print the metadata of a weights file; returns the exit code.
+    """Entry point of ``dvo weights info``: print the metadata of a weights file.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
 
     Raises:
         DvoError: see :func:`dvo.models.weights.weights_info`.
@@ -59,7 +78,11 @@ def info(arguments: argparse.Namespace) -> int:
 
 
 def describe(weights: WeightsInfo) -> None:
-    """Print one fact a line."""
+    """Print the metadata of weights, one value a line.
+
+    Args:
+        weights: the metadata.
+    """
     facts: dict[str, Any] = {
         "name": weights.name,
         "file": str(weights.path),

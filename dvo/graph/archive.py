@@ -1,8 +1,8 @@
-"""Archive of a keyframe graph: keyframes and measurements that have left the active window, within a bound of memory.
+"""Archive of a keyframe graph: keyframes and measurements that have left the active window, in bounded memory.
 
-A keyframe keeps its pose, its patches with their inverse depths (points are anchored on it: they move when it moves),
-their colours, float16 features and the working image as JPEG, from which feature maps can be computed again. An edge
-keeps its target and weight. Global bundle adjustment, loop edges, export and saving work on what is here.
+A keyframe keeps its pose, its patches with their inverse depths (points are relative to their keyframe and move with
+it), their colours, float16 features and the working image as JPEG, from which feature maps can be computed again. An
+edge keeps its target and weight. The archive serves global bundle adjustment, loop edges, export and saving.
 
 With the ``small`` network a keyframe takes about 34 kB of features, 15 to 25 kB of JPEG and 8 kB of edges. When the
 total exceeds :attr:`ArchiveConfig.max_bytes`, features and images of the oldest keyframes are released first, then the
@@ -22,13 +22,16 @@ from dvo.errors import DvoError
 
 @dataclass(frozen=True)
 class ArchiveConfig:
-    """Bound and content of an archive.
+    """Memory bound and content of an archive.
 
     Attributes:
-        max_bytes: bound of the memory of features, images, edges and patches.
+        max_bytes: largest memory of features, images, edges and patches.
         features: keep float16 features of the patches.
         images: keep working images.
         jpeg_quality: 1 to 100.
+
+    Raises:
+        DvoError: a negative bound, or a quality out of range.
     """
 
     max_bytes: int = 256 * 2**20
@@ -49,8 +52,8 @@ class ArchivedKeyframe:
         identifier: running number in the sequence.
         timestamp: seconds.
         intrinsics: ``(4,)`` float32 fx fy cx cy of the feature map.
-        pose_cw: ``(7,)`` float64 world to camera; with an ``anchor``, the pose relative to that keyframe, applied after
-            the anchor's.
+        pose_cw: ``(7,)`` float64 world to camera ``T_cw``; with an ``anchor``, the pose relative to that keyframe,
+            ``T_cw T_cw_anchor^-1``.
         anchor: identifier of the keyframe that a dropped keyframe is relative to, None for one that was kept.
         centres: ``(M, 2)`` float32 patch centres, feature-map pixels; empty once released.
         inverse_depth: ``(M,)`` float32.
@@ -84,7 +87,11 @@ class ArchivedKeyframe:
         return self.centres.nbytes + self.inverse_depth.nbytes + self.colors.nbytes
 
     def image(self) -> np.ndarray | None:
-        """Working image ``(H, W, 3)`` uint8 RGB, decoded; None if it is not kept."""
+        """Decode the working image.
+
+        Returns:
+            ``(H, W, 3)`` uint8 RGB; None if the image is not kept or has been released.
+        """
         if self.jpeg is None:
             return None
         import cv2
@@ -100,7 +107,7 @@ class ArchivedEdges:
     Attributes:
         source: ``(E,)`` int32 identifier of the keyframe of the patch.
         patch: ``(E,)`` int16 index of the patch in it.
-        target: ``(E,)`` int32 identifier of the keyframe that it was seen in.
+        target: ``(E,)`` int32 identifier of the keyframe in which it was measured.
         position: ``(E, 2)`` float32 measured position of the patch centre, feature-map pixels.
         weight: ``(E, 2)`` float16 confidence.
     """
@@ -121,7 +128,14 @@ class ArchivedEdges:
 
     @classmethod
     def concatenate(cls, parts: list[ArchivedEdges]) -> ArchivedEdges:
-        """All edges of several parts, in order."""
+        """Concatenate edges.
+
+        Args:
+            parts: any number of sets of edges.
+
+        Returns:
+            All edges, in order.
+        """
         empty = (np.zeros(0, np.int32), np.zeros(0, np.int16), np.zeros(0, np.int32),
                  np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float16))  # fmt: skip
         columns = zip(empty, *((p.source, p.patch, p.target, p.position, p.weight) for p in parts), strict=True)
@@ -129,7 +143,11 @@ class ArchivedEdges:
 
 
 class Archive:
-    """Keyframes by identifier, and edges in the order in which they left the window."""
+    """Keyframes by identifier, and edges in the order in which they left the window.
+
+    Args:
+        config: memory bound and content; None for the defaults.
+    """
 
     def __init__(self, config: ArchiveConfig | None = None) -> None:
         self.config = config or ArchiveConfig()
@@ -159,7 +177,11 @@ class Archive:
         return self._bytes
 
     def add(self, keyframe: ArchivedKeyframe) -> None:
-        """Add a keyframe, or replace the one of the same identifier."""
+        """Add a keyframe, or replace the one of the same identifier.
+
+        Args:
+            keyframe: the keyframe.
+        """
         before = self._keyframes.get(keyframe.identifier)
         if before is not None:
             self._bytes -= before.feature_bytes + before.patch_bytes
@@ -171,23 +193,31 @@ class Archive:
         self._shrink()
 
     def add_edges(self, edges: ArchivedEdges) -> None:
-        """Add measurements."""
+        """Add measurements.
+
+        Args:
+            edges: the measurements, possibly none.
+        """
         if len(edges):
             self._edges.append(edges)
             self._bytes += edges.nbytes
             self._shrink()
 
     def edges(self) -> ArchivedEdges:
-        """All measurements that are kept, oldest first."""
+        """All measurements that are kept.
+
+        Returns:
+            The edges, oldest first.
+        """
         return ArchivedEdges.concatenate(list(self._edges))
 
     def set_pose(self, identifier: int, pose_cw: np.ndarray, inverse_depth: np.ndarray | None = None) -> None:
         """Correct a keyframe, for instance after a global bundle adjustment; its points move along.
 
         Args:
-            identifier: of the keyframe; a dropped one is freed of its anchor.
-            pose_cw: ``(7,)`` world to camera.
-            inverse_depth: ``(M,)`` of its patches; None leaves them.
+            identifier: of the keyframe; a dropped one loses its anchor.
+            pose_cw: ``(7,)`` world to camera ``T_cw``.
+            inverse_depth: ``(M,)`` of its patches; None leaves them unchanged.
         """
         keyframe = self._keyframes[identifier]
         depth = keyframe.inverse_depth if inverse_depth is None else np.asarray(inverse_depth, np.float32)
@@ -196,7 +226,7 @@ class Archive:
         )
 
     def _shrink(self) -> None:
-        """Release the least useful memory until the bound holds."""
+        """Release memory until the bound holds: features and images, then edges, then patches, each oldest first."""
         limit = self.config.max_bytes
         while self._bytes > limit and self._with_features:
             self._release(self._with_features.popleft(), matching=None, context=None, jpeg=None)
@@ -215,7 +245,15 @@ class Archive:
 
 
 def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
-    """JPEG of an image ``(H, W, 3)`` uint8 RGB."""
+    """Compress an image.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 RGB.
+        quality: 1 to 100.
+
+    Returns:
+        Content of a JPEG file.
+    """
     import cv2
 
     _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])

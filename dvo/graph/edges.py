@@ -1,6 +1,6 @@
-"""Index structure of a patch graph: which edges share a patch, share a frame pair, follow each other in time.
+"""Edges of a patch graph and their neighbourhoods: edges of the same patch, of the same frame pair, next in time.
 
-An edge ``e`` joins patch ``kk[e]``, drawn in frame ``ii[e]``, with a target frame ``jj[e]``.
+An edge ``e`` joins patch ``kk[e]``, extracted in frame ``ii[e]``, with a target frame ``jj[e]``.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Groups:
-    """A partition of the edges, laid out so that a soft aggregation is a dense masked softmax.
+    """Partition of the edges, padded so that a soft aggregation is a dense masked softmax.
 
     Attributes:
         members: ``(G, M)`` edge indices, padded with 0.
         mask: ``(G, M, 1)`` True where a member is real.
-        group: ``(E,)`` the group of each edge.
-        full: no padding at all.
+        group: ``(E,)`` index of the group of each edge.
+        full: True if there is no padding.
     """
 
     members: Tensor
@@ -31,13 +31,13 @@ class Groups:
 
 @dataclass(frozen=True)
 class PatchGraph:
-    """Edges with their neighbourhoods.
+    """Edges of a patch graph with their neighbourhoods.
 
     Attributes:
         ii, jj, kk: ``(E,)`` source frame, target frame, patch.
         previous, following: ``(E,)`` the edge of the same patch with the next smaller / larger target frame, 0 if none.
         has_previous, has_following: ``(E, 1)`` bool.
-        by_patch, by_pair: edges that share a patch, and a (source, target) frame pair.
+        by_patch, by_pair: edges grouped by patch, and by (source, target) frame pair.
     """
 
     ii: Tensor
@@ -55,7 +55,14 @@ class PatchGraph:
 
 
 def group_edges(keys: Int[Tensor, " E"]) -> Groups:
-    """Partition edges by equal key."""
+    """Partition edges by equal key.
+
+    Args:
+        keys: integer key of each edge.
+
+    Returns:
+        The groups, by increasing key.
+    """
     order = torch.argsort(keys, stable=True)
     _, group, counts = torch.unique(keys, return_inverse=True, return_counts=True)
     widest = int(counts.max()) if len(counts) else 0
@@ -68,7 +75,14 @@ def group_edges(keys: Int[Tensor, " E"]) -> Groups:
 
 
 def build_graph(ii: Int[Tensor, " E"], jj: Int[Tensor, " E"], kk: Int[Tensor, " E"]) -> PatchGraph:
-    """Index the edges, given in any order."""
+    """Build the neighbourhoods of a set of edges.
+
+    Args:
+        ii, jj, kk: source frame, target frame and patch of each edge, in any order.
+
+    Returns:
+        The graph, its edges in the given order.
+    """
     frames = int(torch.maximum(ii.max(), jj.max())) + 1 if len(ii) else 1
     keys = kk * frames + jj
     order = torch.argsort(keys, stable=True)

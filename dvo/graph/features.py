@@ -1,4 +1,4 @@
-"""Feature maps of archived keyframes, computed again when they are asked for and kept in a bounded cache."""
+"""Feature maps of archived keyframes, computed on demand and kept in a bounded cache."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from dvo.graph.archive import Archive
 
 
 class FeatureCache:
-    """Feature maps by keyframe; the ones not used for longest are forgotten.
+    """Least-recently-used cache of feature maps by keyframe.
 
     Args:
         archive: holds the working images.
         encode: feature maps of an image ``(H, W, 3)`` uint8 RGB.
         capacity: number of keyframes whose maps are kept.
+
+    Raises:
+        DvoError: a capacity below 1.
     """
 
     def __init__(self, archive: Archive, encode: Callable[[np.ndarray], Tensor], capacity: int = 8) -> None:
@@ -31,7 +34,14 @@ class FeatureCache:
         return len(self._maps)
 
     def maps(self, identifier: int) -> Tensor | None:
-        """Feature maps of a keyframe; None if its image was not kept or has been released."""
+        """Feature maps of a keyframe, from the cache or computed.
+
+        Args:
+            identifier: of the keyframe.
+
+        Returns:
+            Output of ``encode`` for the working image; None if the image was not kept or has been released.
+        """
         if identifier in self._maps:
             self._maps.move_to_end(identifier)
             return self._maps[identifier]

@@ -1,8 +1,8 @@
-"""Keyframe graph of a tracker: the active window, the archive of what has left it, and the log of frames.
+"""Keyframe graph of a tracker: active window, archive of the frames that have left it, and log of all frames.
 
-Whatever leaves the window goes through one of three doors: :meth:`KeyframeGraph.archive_oldest` for a keyframe that was
-kept, :meth:`KeyframeGraph.drop` for one that adds nothing (its frames stay relative to the keyframe before it, and its
-measurements are archived), and :meth:`KeyframeGraph.discard` for a frame that must leave no trace.
+A frame leaves the window in one of three ways: :meth:`KeyframeGraph.archive_oldest` for a keyframe that is kept,
+:meth:`KeyframeGraph.drop` for a redundant one (its frames are then relative to the keyframe before it, and its
+measurements are archived), and :meth:`KeyframeGraph.discard` for a frame of which nothing is kept.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from dvo.graph.keyframe_log import KeyframeLog
 from dvo.graph.window import Keyframe, Window
 
 NEAR = 0.05
-"""A point whose inverse depth is below this share of its keyframe's median is left out of the map: its depth is a
-guess."""
+"""Points whose inverse depth is below this fraction of their keyframe's median are left out of the map, because their
+depth is uncertain."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,12 @@ class GraphProblem:
     :func:`dvo.ba.global_adjust.global_bundle_adjust`.
 
     Attributes:
-        identifiers: ``(N,)`` keyframe of each pose.
+        identifiers: ``(N,)`` identifier of the keyframe of each pose.
         poses_cw: ``(N, 7)`` float64 world to camera.
         patches: ``(K, 3, 1, 1)`` float64 x, y (feature-map pixels), inverse depth.
         intrinsics: ``(N, 4)`` float64 of the feature maps.
-        targets, weights: ``(E, 2)`` float64.
+        targets, weights: ``(E, 2)`` float64 measured positions of the patch centres (feature-map pixels), and their
+            confidence.
         ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge.
     """
 
@@ -56,12 +57,24 @@ class KeyframeGraph:
         patch_size: side of a patch.
         hidden: channels of the state of the update operator.
         device: of the window's tensors.
-        archive: bound and content of the archive.
+        archive: memory bound and content of the archive.
 
     Attributes:
         window: active keyframes and edges.
-        archive: what has left the window.
+        archive: keyframes and edges that have left the window.
         log: every frame that was read, relative to a keyframe.
+
+    Example:
+        Global bundle adjustment of everything that a tracker has archived:
+
+        >>> odometry = dvo.load("small")
+        >>> done = dvo.run(odometry, dvo.open("video.mp4", calib="calib.txt"))
+        >>> p = odometry.graph.problem(dropped=False)
+        >>> blocks = (p.poses_cw[0], p.patches[0], p.intrinsics[0], p.targets[0], p.weights[0])
+        >>> solved = global_bundle_adjust(*blocks, p.ii, p.jj, p.kk)
+        >>> for identifier, pose_cw in zip(p.identifiers.tolist(), solved.poses_cw.numpy()):
+        ...     odometry.graph.correct(identifier, pose_cw)
+        >>> trajectory = odometry.graph.log.trajectory()
     """
 
     def __init__(
@@ -72,15 +85,19 @@ class KeyframeGraph:
         self.log = KeyframeLog()
 
     def keep_edges(self, mask: Tensor) -> None:
-        """Archive the edges of the window where ``mask (E,)`` is False, and remove them from it."""
+        """Move edges from the window to the archive.
+
+        Args:
+            mask: ``(E,)`` bool, False for an edge to move.
+        """
         self._archive_edges(~mask)
         self.window.keep(mask)
 
     def drop(self, position: int) -> None:
-        """Remove a keyframe that is not needed; its frames are relative to the keyframe before it from now on.
+        """Remove a redundant keyframe; its frames become relative to the keyframe before it.
 
         Args:
-            position: in the window, at least 1.
+            position: of the keyframe in the window, at least 1.
         """
         window = self.window
         relative = se3.relative(window.poses_cw[position - 1], window.poses_cw[position]).double().cpu().numpy()
@@ -99,7 +116,14 @@ class KeyframeGraph:
         window.remove(0)
 
     def discard(self, position: int) -> Keyframe:
-        """Remove a frame of the window and everything that was measured with it."""
+        """Remove a frame from the window, and its measurements, without archiving them.
+
+        Args:
+            position: of the frame in the window.
+
+        Returns:
+            The removed keyframe.
+        """
         return self.window.remove(position)
 
     def correct(self, identifier: int, pose_cw: np.ndarray, inverse_depth: np.ndarray | None = None) -> None:
@@ -107,14 +131,14 @@ class KeyframeGraph:
 
         Args:
             identifier: of a keyframe that was not dropped.
-            pose_cw: ``(7,)`` float64 world to camera.
-            inverse_depth: ``(M,)`` of its patches; None leaves them.
+            pose_cw: ``(7,)`` float64 world to camera ``T_cw``.
+            inverse_depth: ``(M,)`` of its patches; None leaves them unchanged.
         """
         self.archive.set_pose(identifier, pose_cw, inverse_depth)
         self.log.set_pose(identifier, np.asarray(pose_cw, np.float64))
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Map points of the archived keyframes, from their anchors' present poses.
+        """Map points of the archived keyframes, from the current poses of these.
 
         Returns:
             ``(P, 3)`` float32 in the world, in the unit of the poses; ``(P, 3)`` uint8 RGB.
@@ -135,10 +159,13 @@ class KeyframeGraph:
         return np.concatenate(points), np.concatenate(colors)
 
     def problem(self, dropped: bool = True) -> GraphProblem:
-        """Bundle adjustment problem of everything that is archived.
+        """Bundle adjustment problem of the archived keyframes and edges.
 
         Args:
-            dropped: dropped keyframes are frames of the problem too.
+            dropped: include dropped keyframes.
+
+        Returns:
+            The problem, on the CPU; keyframes whose patches have been released are left out.
         """
         poses: dict[int, Tensor] = {}
         frames = []
@@ -172,7 +199,7 @@ class KeyframeGraph:
         )
 
     def _archive_edges(self, mask: Tensor) -> None:
-        """Archive the edges where ``mask (E,)`` is True and that an update has seen."""
+        """Archive the edges where ``mask (E,)`` is True, without those that have not been updated yet."""
         window = self.window
         chosen = mask & (window.weights > 0).any(-1)
         if not chosen.any():
@@ -191,7 +218,7 @@ class KeyframeGraph:
         )
 
     def _archive_keyframe(self, position: int, pose_cw: np.ndarray, anchor: int | None) -> None:
-        """Archive a keyframe; of a dropped one, which has an ``anchor``, without features and image."""
+        """Archive a keyframe; a dropped one, which has an ``anchor``, without features and image."""
         window, config = self.window, self.archive.config
         frame, m = window.frames[position], window.per_frame
         centre = window.patches.shape[-1] // 2

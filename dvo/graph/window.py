@@ -1,13 +1,13 @@
 """Sliding window of a tracker: keyframes, their patches, and the edges between them.
 
-Frames are numbered in three ways, each with a name of its own:
+Frames are numbered in three ways:
 
-- the *position* of a keyframe in the window, which ``ii``, ``jj`` and ``kk`` count in and which changes when a frame
-  leaves (:meth:`Window.remove` renumbers);
-- its *identifier*, a running number that is never reused, by which the archive and the log refer to it;
-- its *map slot*, the place of its feature maps in the correlation caches, reused after it has left.
+- the *position* of a keyframe in the window, used by ``ii``, ``jj`` and ``kk``, which changes when a frame leaves
+  (:meth:`Window.remove` renumbers);
+- its *identifier*, a running number that is never reused, used by the archive and the log;
+- its *map slot*, the index of its feature maps in the correlation caches, reused after it has left.
 
-An edge has an *edge slot*, its place in the correlation caches, for as long as it lives.
+An edge has an *edge slot*, its index in the correlation caches, until it is removed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Keyframe:
     Attributes:
         identifier: running number, never reused.
         timestamp: seconds.
-        map_slot: place of its feature maps in the correlation caches.
+        map_slot: index of its feature maps in the correlation caches.
         matching: ``(M, C, p, p)`` matching features of its patches.
         context: ``(M, D)`` context features of its patches.
         colors: ``(M, 3)`` uint8 RGB at the patch centres.
@@ -48,7 +48,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class WindowSnapshot:
-    """Poses, patches and edge states of a window, to return to."""
+    """Poses, patches and edge states of a window, for :meth:`Window.restore`; shapes as in :class:`Window`."""
 
     poses_cw: Tensor
     patches: Tensor
@@ -59,17 +59,17 @@ class WindowSnapshot:
 
 @dataclass
 class Window:
-    """Keyframes and edges.
+    """Keyframes and edges of a sliding window.
 
     Attributes:
         per_frame: patches of a frame ``M``; patch ``k`` belongs to the frame at position ``k // M``.
-        poses_cw: ``(n, 7)`` world to camera.
+        poses_cw: ``(n, 7)`` world to camera ``T_cw``.
         patches: ``(n * M, 3, p, p)`` x, y (feature-map pixels) and inverse depth.
         hidden: ``(E, D)`` state of the update operator.
-        targets: ``(E, 2)`` positions of the patch centres that the last update asked for, feature-map pixels.
-        weights: ``(E, 2)`` their confidence; 0 for an edge that no update has seen yet.
+        targets: ``(E, 2)`` positions of the patch centres measured by the last update, feature-map pixels.
+        weights: ``(E, 2)`` confidence of the targets; 0 for an edge before its first update.
         jj, kk: ``(E,)`` target frame and patch of each edge.
-        edge_slots: ``(E,)`` place of each edge in the correlation caches.
+        edge_slots: ``(E,)`` index of each edge in the correlation caches.
         frames: the keyframes, oldest first.
     """
 
@@ -94,6 +94,9 @@ class Window:
             patch_size: side of a patch.
             hidden: channels of the state of the update operator.
             device: of all tensors.
+
+        Returns:
+            The window.
         """
 
         def zeros(*shape: int) -> Tensor:
@@ -133,13 +136,17 @@ class Window:
 
     @property
     def edges(self) -> PatchGraph:
-        """Index structure of the edges; built when first asked for after a change."""
+        """Edges with their neighbourhoods; built on first access after a change."""
         if self._edges is None:
             self._edges = build_graph(self.ii, self.jj, self.kk)
         return self._edges
 
     def free_map_slot(self) -> int:
-        """Lowest map slot that no frame of the window has."""
+        """Find a map slot for a new frame.
+
+        Returns:
+            The lowest map slot that no frame of the window has.
+        """
         used = {frame.map_slot for frame in self.frames}
         return next(slot for slot in range(len(used) + 1) if slot not in used)
 
@@ -147,22 +154,22 @@ class Window:
         """Add the newest keyframe.
 
         Args:
-            frame: its features.
+            frame: the keyframe with its features.
             pose_cw: ``(7,)`` world to camera.
-            patches: ``(M, 3, p, p)``.
+            patches: ``(M, 3, p, p)`` x, y (feature-map pixels) and inverse depth.
         """
         self.frames.append(frame)
         self.poses_cw = torch.cat([self.poses_cw, pose_cw[None]])
         self.patches = torch.cat([self.patches, patches])
 
     def connect(self, kk: Tensor, jj: Tensor) -> Tensor:
-        """Add edges with an empty state.
+        """Add edges, with zero state and confidence.
 
         Args:
             kk, jj: ``(e,)`` patch and target frame of each new edge.
 
         Returns:
-            ``(e,)`` their edge slots, the lowest free ones.
+            ``(e,)`` edge slots of the new edges, the lowest free ones.
         """
         self._edges = None
         count = len(kk)
@@ -178,17 +185,35 @@ class Window:
         return slots
 
     def keep(self, mask: Tensor) -> None:
-        """Remove the edges where ``mask (E,)`` is False."""
+        """Remove edges.
+
+        Args:
+            mask: ``(E,)`` bool, False for an edge to remove.
+        """
         self._edges = None
         self.kk, self.jj, self.edge_slots = self.kk[mask], self.jj[mask], self.edge_slots[mask]
         self.hidden, self.targets, self.weights = self.hidden[mask], self.targets[mask], self.weights[mask]
 
     def touching(self, position: int) -> Tensor:
-        """``(E,)`` bool: edges from or into the frame at a position."""
+        """Select the edges of a frame.
+
+        Args:
+            position: of the frame in the window.
+
+        Returns:
+            ``(E,)`` bool, True for edges from or into the frame.
+        """
         return (self.ii == position) | (self.jj == position)
 
     def remove(self, position: int) -> Keyframe:
-        """Take a frame out, with its patches and every edge that touches it; later frames move up by one position."""
+        """Remove a frame with its patches and all its edges; the positions of later frames decrease by one.
+
+        Args:
+            position: of the frame in the window.
+
+        Returns:
+            The removed keyframe.
+        """
         m = self.per_frame
         self.keep(~self.touching(position))
         self.kk = self.kk - m * (self.ii > position)
@@ -198,10 +223,18 @@ class Window:
         return self.frames.pop(position)
 
     def snapshot(self) -> WindowSnapshot:
-        """Poses, patches and edge states as they are now."""
+        """Record poses, patches and edge states.
+
+        Returns:
+            The snapshot; it shares memory with the window, which replaces its tensors rather than changing them.
+        """
         return WindowSnapshot(self.poses_cw, self.patches, self.hidden, self.targets, self.weights)
 
     def restore(self, before: WindowSnapshot) -> None:
-        """Return to a snapshot; frames and edges must be those of the snapshot."""
+        """Restore poses, patches and edge states.
+
+        Args:
+            before: a snapshot of the same frames and edges.
+        """
         self.poses_cw, self.patches = before.poses_cw, before.patches
         self.hidden, self.targets, self.weights = before.hidden, before.targets, before.weights

@@ -60,7 +60,7 @@ class PatchVO(nn.Module):
         updates: int = 10,
         generator: torch.Generator | None = None,
     ) -> UpdateState:
-        """State after the last update of a clip whose frames are all joined with each other.
+        """Run a fixed number of updates on a clip in which every patch has an edge into every frame.
 
         Args:
             images: uint8 RGB (or float in the same range).
@@ -69,7 +69,8 @@ class PatchVO(nn.Module):
             generator: of the patch centres; on the CPU.
 
         Returns:
-            Poses ``T_cw`` relative to the first frame, up to scale; patches, targets and confidence of every edge.
+            State after the last update: poses ``T_cw`` relative to the first frame, up to scale; patches, targets and
+            confidence of every edge.
         """
         b, n = images.shape[:2]
         stages = training_schedule(n, self.config.training_patches, updates, self_edges=self.config.self_edges)
@@ -96,15 +97,15 @@ class PatchVO(nn.Module):
             images: uint8 RGB (or float in the same range).
             intrinsics: ``fx fy cx cy`` in image pixels.
             stages: see :func:`dvo.models.schedule.training_schedule`.
-            poses_cw: poses to start from. A frame that joins later starts at the current pose of the one before,
-                unless poses are held as given.
+            poses_cw: initial poses ``T_cw``. A frame that joins later starts at the current pose of the frame before
+                it, except in mode ``structure``, which holds poses as given.
             inverse_depth: of each patch at the start, 1 if None (clips are normalised to median depth 1; a random
                 start ruins bundle adjustment at small resolution).
-            mode: see :data:`dvo.models.step.Mode`. ``flow`` is the cheapest way to learn to see motion, for a schedule
-                in which no frame joins later.
-            generator: draws patch centres and the edges that train the features; on the CPU. With one for each clip a
-                clip draws the same in any batch.
-            correlation_gradient: share of the edges whose correlation sends a gradient to the features.
+            mode: see :data:`dvo.models.step.Mode`. ``flow`` trains the flow revision alone, at the lowest cost; it
+                needs a schedule in which no frame joins later.
+            generator: of the patch centres and of the edges that train the features; on the CPU. With a generator for
+                each clip, the draws of a clip do not depend on the other clips of the batch.
+            correlation_gradient: share of the edges whose correlation propagates a gradient to the features.
             ba_iterations: Gauss-Newton iterations an update.
 
         Yields:

@@ -1,6 +1,6 @@
-"""Which edges are alive at each update of a training clip.
+"""Schedule of the edges of a training clip: the graph of each update.
 
-The schedule does not depend on the data: it is built once and shared by all clips.
+A schedule does not depend on the data: it is built once and shared by all clips.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dvo.graph.edges import Groups, PatchGraph, build_graph
 
 @dataclass(frozen=True)
 class Stage:
-    """One update.
+    """One update of a schedule.
 
     Attributes:
         graph: the edges.
@@ -31,7 +31,17 @@ class Stage:
 
 
 def full_graph(frames: int, patches: int, self_edges: bool, reach: int | None = None) -> PatchGraph:
-    """Every patch joined with every frame, or only with those at most ``reach`` frames away."""
+    """Graph that joins every patch with every frame, or with the frames at most ``reach`` away.
+
+    Args:
+        frames: number of frames.
+        patches: number of patches in each frame.
+        self_edges: join patches with their own frame too.
+        reach: largest distance in frames; None for all.
+
+    Returns:
+        The graph; patch ``k`` belongs to frame ``k // patches``.
+    """
     kk = torch.arange(frames * patches).repeat_interleave(frames)
     jj = torch.arange(frames).repeat(frames * patches)
     ii = kk // patches
@@ -50,7 +60,7 @@ def training_schedule(
     self_edges: bool = True,
     reach: int | None = None,
 ) -> list[Stage]:
-    """Updates on a growing graph, as tracking will see it.
+    """Updates on a growing graph, as in tracking.
 
     Args:
         frames: frames of a clip.
@@ -60,6 +70,9 @@ def training_schedule(
         settle: updates on the first graph before one frame is added at every update.
         self_edges: see :class:`dvo.nets.config.ModelConfig`.
         reach: see :func:`full_graph`.
+
+    Returns:
+        One stage for each update, on the CPU; consecutive stages of the same frames share their graph.
     """
     initial = frames if initial is None else min(initial, frames)
     stages: list[Stage] = []
@@ -80,7 +93,15 @@ def training_schedule(
 
 
 def to_device(stages: list[Stage], device: torch.device | str) -> list[Stage]:
-    """The same schedule with its index tensors on another device; stages that share a graph still share it."""
+    """Copy of a schedule with its index tensors on another device.
+
+    Args:
+        stages: the schedule.
+        device: of the copy.
+
+    Returns:
+        The copy; stages that share a graph still share it.
+    """
     moved: dict[int, PatchGraph] = {}
 
     def move_groups(groups: Groups) -> Groups:

@@ -1,8 +1,8 @@
 """One step of patch-flow visual odometry: reproject, correlate, update, bundle-adjust (DPVO 3.2, 3.3).
 
-Training unrolls this step on a clip (:meth:`dvo.models.patch_vo.PatchVO.unroll`), the tracker takes it once or more a
-frame (:class:`dvo.odometry.tracker.PatchOdometry`). A step maps a state to a state. Everything in which the two loops
-differ is an argument: the edges and the poses and depths to start from (in the state), the implementation of the
+Training unrolls this step on a clip (:meth:`dvo.models.patch_vo.PatchVO.unroll`), the tracker applies it once or more
+per frame (:class:`dvo.odometry.tracker.PatchOdometry`). A step maps a state to a state. All differences between the two
+loops are arguments: the edges and the poses and depths to start from (in the state), the implementation of the
 correlation (the lookup), which poses are fixed and how strongly bundle adjustment is damped (the options).
 """
 
@@ -22,12 +22,12 @@ from dvo.nets.correlation import CorrelationLookup
 from dvo.nets.update import UpdateOperator
 
 Mode = Literal["joint", "structure", "flow"]
-"""``joint`` refines poses and depths, ``structure`` depths alone; ``flow`` leaves bundle adjustment out."""
+"""``joint`` refines poses and depths, ``structure`` depths alone; ``flow`` skips bundle adjustment."""
 
 
 @dataclass(frozen=True)
 class UpdateState:
-    """Poses, patches and edges before or after a step; poses are world to camera, lengths in feature pixels.
+    """Poses, patches and edges before or after a step; poses are ``T_cw``, image coordinates in feature pixels.
 
     Attributes:
         graph: the edges.
@@ -37,8 +37,8 @@ class UpdateState:
         context: ``(B, K, D)`` context features of the patches.
         hidden: ``(B, E, D)`` state of the update operator, zero for a new edge.
         coords: ``(B, E, p, p, 2)`` reprojection of the patches under these poses and depths; None if not computed yet.
-        targets: ``(B, E, 2)`` positions of the patch centres that the network asked for in the step that led here; None
-            before the first step.
+        targets: ``(B, E, 2)`` positions of the patch centres measured by the network in the last step; None before
+            the first one.
         weights: ``(B, E, 2)`` confidence of the targets; None before the first step.
     """
 
@@ -58,7 +58,11 @@ class UpdateState:
         return self.poses_cw.shape[1]
 
     def reprojected(self) -> UpdateState:
-        """The state with ``coords`` computed."""
+        """Reproject the patches of all edges.
+
+        Returns:
+            The state with ``coords`` set.
+        """
         graph = self.graph
         found = reproject(self.poses_cw, self.patches, self.intrinsics, graph.ii, graph.jj, graph.kk)
         return replace(self, coords=found.coords)
@@ -111,7 +115,7 @@ class Revision:
 
 
 class StepModel(Protocol):
-    """The part of a model that a step needs."""
+    """Interface of a model that a step can be taken with: it has an update operator."""
 
     @property
     def update(self) -> UpdateOperator:
@@ -123,15 +127,18 @@ def revise(model: StepModel, state: UpdateState, lookup: CorrelationLookup) -> R
     """Run the update operator on all edges; poses and depths do not change.
 
     Args:
-        model: has the update operator.
-        state: its ``coords`` are used if they are there.
+        model: provides the update operator.
+        state: its ``coords`` are used if they are set, and computed otherwise.
         lookup: correlation of patches and feature maps.
+
+    Returns:
+        Flow revision, confidence and new hidden state of every edge.
     """
     if state.coords is None:
         state = state.reprojected()
     graph, coords = state.graph, state.coords
     assert coords is not None
-    # Positions receive no gradient: the network learns from the targets, not from where it looked (RAFT, DPVO).
+    # Positions receive no gradient, as in RAFT and DPVO: the loss reaches the network through the targets alone.
     coords = coords.detach()
     correlation = lookup(coords, graph)
     context = state.context.index_select(1, graph.kk)
@@ -145,17 +152,20 @@ def step(
     lookup: CorrelationLookup,
     options: StepOptions = StepOptions(),  # noqa: B008
 ) -> UpdateState:
-    """Revise the flow of all edges, and let bundle adjustment explain it by poses and inverse depths.
+    """Revise the flow of all edges, then fit poses and inverse depths to it by bundle adjustment.
 
     Args:
-        model: has the update operator, for instance a :class:`dvo.models.patch_vo.PatchVO`.
+        model: provides the update operator, for instance a :class:`dvo.models.patch_vo.PatchVO`.
         state: edges, poses and patches to start from. Detach poses and patches to cut gradients between steps.
         lookup: correlation of patches and feature maps.
         options: mode, fixed poses, damping.
 
     Returns:
-        The state with new poses, patches, hidden state, targets and weights. ``coords`` is None, but in mode ``flow``,
-        in which each edge moves by its own revision alone.
+        The state with new poses, patches, hidden state, targets and weights. ``coords`` is None, except in mode
+        ``flow``, in which each edge moves by its own revision alone.
+
+    Raises:
+        DvoError: invalid indices or weights, if ``options.check`` is set.
     """
     revision = revise(model, state, lookup)
     targets, graph = revision.targets, state.graph
@@ -182,7 +192,7 @@ def step(
 
 
 def recent_depth(patches: Tensor, per_frame: int, frames: int) -> Tensor:
-    """Median inverse depth of the newest frames, from which the patches of a new frame start (DPVO 3.4).
+    """Median inverse depth of the newest frames, the initial depth of the patches of a new frame (DPVO 3.4).
 
     Args:
         patches: ``(B, K, 3, p, p)``, newest last.
@@ -190,6 +200,6 @@ def recent_depth(patches: Tensor, per_frame: int, frames: int) -> Tensor:
         frames: number of frames to take the median over.
 
     Returns:
-        ``(B,)``.
+        ``(B,)`` inverse depth.
     """
     return patches[:, -frames * per_frame :, 2, 0, 0].median(dim=1).values

@@ -55,19 +55,29 @@ class ModelConfig:
 
     @property
     def correlation_channels(self) -> int:
-        """Correlations of one edge: levels x offsets x pixels of a patch."""
+        """Number of correlation channels of an edge: levels x offsets x patch pixels."""
         return len(self.pyramid) * (2 * self.radius + 1) ** 2 * self.patch_size**2
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the metadata of weights."""
+        """Plain values, for the metadata of weights.
+
+        Returns:
+            Attribute name to value.
+        """
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ModelConfig:
         """Build from plain values, for instance of a YAML file or of weights metadata.
 
+        Args:
+            values: attribute name to value; attributes that are missing take their defaults.
+
+        Returns:
+            The configuration.
+
         Raises:
-            DvoError: a key that is no attribute.
+            DvoError: an unknown attribute, or an invalid size.
         """
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
@@ -105,10 +115,13 @@ PRESETS: dict[str, ModelConfig] = {
 
 
 def preset(name: str) -> ModelConfig:
-    """The preset of that name.
+    """Configuration of a preset.
 
     Args:
         name: key of :data:`PRESETS`.
+
+    Returns:
+        The configuration.
 
     Raises:
         DvoError: no such preset.

@@ -3,7 +3,7 @@
 For each edge and each of the ``p * p`` patch pixels, at its reprojected position: dot products of the pixel's feature
 with the ``(2r + 2)^2`` nearest map features, bilinearly blended to ``(2r + 1)^2``; zero outside the map.
 
-Three implementations give the same numbers:
+Three implementations give the same values:
 
 - :func:`correlate_reference`, the specification: bilinear sampling of the features, then dot products.
 - :class:`CorrelationVolume`: all products of a clip as one matrix product, then cheap look-ups. For training.
@@ -30,7 +30,8 @@ from dvo.nets.patchifier import pool_levels
 
 ChannelOrder = Literal["offsets_first", "pixels_first"]
 """``offsets_first``: x offset slowest, then y offset, patch row, patch column, as DPVO's weights expect.
-``pixels_first``: patch row slowest, then patch column, y offset, x offset, as windows of memory are read fastest."""
+``pixels_first``: patch row slowest, then patch column, y offset, x offset, which is the fastest order to read from
+memory."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +49,20 @@ class Correlation:
 
 
 class CorrelationLookup(Protocol):
-    """Correlation of the edges of a graph at given positions; the part of a step that differs between loops."""
+    """Interface of a correlation look-up: edges of a graph at given positions to correlation channels.
+
+    The part of a step that differs between the training loop and the tracker.
+    """
 
     def __call__(self, coords: Float[Tensor, "B E p p 2"], graph: PatchGraph) -> Correlation:
         """Look up the correlation.
 
         Args:
             coords: reprojected patch pixels ``x, y`` in feature pixels.
-            graph: the edges.
+            graph: the ``E`` edges.
+
+        Returns:
+            Channels of every edge, by pyramid level.
         """
         ...
 
@@ -69,16 +76,18 @@ def correlate_reference(
     pyramid: tuple[int, ...] = (1, 4),
     radius: int = 3,
 ) -> list[Tensor]:
-    """Plain specification, slow and memory-hungry.
+    """Reference implementation: plain, slow and with a large memory footprint.
 
     Args:
         patches: matching features of the patches.
         maps: matching features of the frames.
         coords: reprojected patch pixels ``x, y`` in feature pixels.
         kk, jj: patch and target frame of each edge.
+        pyramid: down-sampling of each level relative to ``maps``.
+        radius: correlation radius in pixels of each level.
 
     Returns:
-        ``(B, E, (2r+1)^2 * p^2)`` a level.
+        One tensor ``(B, E, (2r+1)^2 * p^2)`` for each level, channels in the order ``offsets_first``.
     """
     b, e, p = coords.shape[:3]
     steps = torch.arange(-radius, radius + 1, device=coords.device, dtype=coords.dtype)
@@ -96,14 +105,16 @@ def correlate_reference(
 
 
 def axis_taps(position: Tensor, size: int, radius: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Look-up along one axis.
+    """Indices and bilinear weights of a look-up along one axis.
 
     Args:
         position: ``(...,)`` sub-pixel position.
+        size: number of pixels along the axis.
+        radius: correlation radius ``r``.
 
     Returns:
-        ``(..., 2r+2)`` clamped int64 indices, and the weights ``(..., 2r+1)`` of the lower and the upper neighbour of
-        each tap; a neighbour outside ``[0, size)`` has weight 0, so that clamping its index does no harm.
+        ``(..., 2r+2)`` int64 indices clamped to the axis, and the weights ``(..., 2r+1)`` of the lower and the upper
+        neighbour of each tap; a neighbour outside ``[0, size)`` has weight 0, so its clamped index does not contribute.
     """
     # Far-away projections would overflow the integers; they are out of the map either way.
     position = position.clamp(-4.0 * radius - 8, size + 4.0 * radius + 8)
@@ -118,8 +129,8 @@ def axis_taps(position: Tensor, size: int, radius: int) -> tuple[Tensor, Tensor,
 class _Volume(torch.autograd.Function):
     """All dot products of patch pixels and map pixels.
 
-    The gradient of the volume would be as large as the volume at every look-up. Instead each look-up adds its share
-    into one buffer and passes on a scalar token; autograd calls this backward after all of them.
+    A dense gradient of the volume for every look-up would be as large as the volume. Instead each look-up accumulates
+    its gradient in one buffer and returns a scalar token to autograd, which calls this backward after all look-ups.
     """
 
     @staticmethod
@@ -186,11 +197,13 @@ class _Lookup(torch.autograd.Function):
 class CorrelationVolume:
     """All correlations of a clip, computed once and looked up at every update.
 
+    Memory is ``B * K * p^2 * N * h * w`` floats, summed over the levels.
+
     Args:
         patches: ``(B, K, C, p, p)`` matching features of the patches.
         maps: ``(B, N, C, h, w)`` matching features of the frames.
-        pyramid: scale of each level.
-        radius: correlation radius.
+        pyramid: down-sampling of each level relative to ``maps``.
+        radius: correlation radius in pixels of each level.
     """
 
     def __init__(self, patches: Tensor, maps: Tensor, pyramid: tuple[int, ...] = (1, 4), radius: int = 3) -> None:
@@ -215,11 +228,16 @@ class CorrelationVolume:
         jj: Int[Tensor, " E"],
         learn: Int[Tensor, " L"] | None = None,
     ) -> list[Tensor]:
-        """Correlation channels ``(B, E, c)`` of each level, equal to :func:`correlate_reference`.
+        """Correlation channels of a set of edges, equal to :func:`correlate_reference`.
 
         Args:
-            learn: indices into the flattened ``B * E`` edges that send a gradient back to the features (DPVO lets a
-                random fifth do so), or None for all.
+            coords: reprojected patch pixels ``x, y`` in feature pixels; they receive no gradient.
+            kk, jj: patch and target frame of each edge.
+            learn: indices into the flattened ``B * E`` edges that propagate a gradient to the features (DPVO uses a
+                random fifth), or None for all.
+
+        Returns:
+            One tensor ``(B, E, (2r+1)^2 * p^2)`` for each level, channels in the order ``offsets_first``.
         """
         b, e = coords.shape[:2]
         position = coords.detach().reshape(b * e, self.pixels, 2)

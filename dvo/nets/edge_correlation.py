@@ -1,12 +1,12 @@
 """Correlation of the edges of a sliding window, cached between updates.
 
-Between two updates an edge moves by about a pixel, while most of the cost of correlating it is fetching features. Here
-the products of a patch with a window larger than needed are kept in a slot of the edge and looked up; they are computed
-again only when the edge has moved out of them. Equal to :func:`dvo.nets.correlation.correlate_reference` in value, up
-to the order of the channels.
+Between two updates an edge moves by about a pixel, while most of the cost of its correlation is reading features. The
+products of a patch with a window larger than needed are therefore cached in a slot of the edge; they are computed again
+only when the edge moves out of the window. Values equal :func:`dvo.nets.correlation.correlate_reference`, up to the
+order of the channels.
 
-Memory is read in runs: the maps carry a border of zeros as wide as a window, so that a row of a window is one piece of
-memory wherever it lies, and products are kept with x fastest, so that a row of a look-up is one too.
+Memory is read contiguously: the maps are padded with zeros by the width of a window, so that a row of a window is one
+contiguous range at every position, and products are stored with x fastest, so that a row of a look-up is one too.
 """
 
 from __future__ import annotations
@@ -16,17 +16,31 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 _NOWHERE = -(10**6)
-PIECE = 256  # edges at once: what is in work should stay in the processor's cache
+PIECE = 256  # edges processed at once, so that the working set fits in the processor's cache
 
 
 class EdgeCorrelation:
-    """Maps and slots of one pyramid level.
+    """Cached correlation of edges at one pyramid level.
+
+    Frames have map slots and edges have edge slots; both are assigned by the caller
+    (:class:`dvo.odometry.window_correlation.WindowCorrelation`).
 
     Args:
-        scale: of the level relative to the features.
+        scale: down-sampling of the level relative to the features.
         pixels: patch pixels ``p * p``.
-        radius: correlation radius.
-        side: side of a slot's window in pixels of the level.
+        radius: correlation radius in pixels of the level.
+        side: side of the cached window, pixels of the level; at least ``2 * radius + 2``.
+        device: of the caches.
+
+    Example:
+        >>> cache = EdgeCorrelation(scale=1, pixels=9, radius=3, side=14, device="cpu")
+        >>> cache.keep_map(0, torch.randn(32, 30, 40))
+        >>> slots = torch.arange(2)
+        >>> cache.forget(slots)
+        >>> coords = torch.full((2, 3, 3, 2), 12.0)
+        >>> kk, frames = torch.tensor([0, 1]), torch.tensor([0, 0])
+        >>> cache.lookup(coords, slots, torch.randn(2, 32, 9), kk, frames).shape
+        torch.Size([2, 441])
     """
 
     def __init__(self, scale: int, pixels: int, radius: int, side: int, device: torch.device | str) -> None:
@@ -40,7 +54,12 @@ class EdgeCorrelation:
         return len(self._origin)
 
     def keep_map(self, slot: int, level: Float[Tensor, "C h w"]) -> None:
-        """Put the features of a frame into a slot for frames; the store grows while it fills."""
+        """Store the features of a frame; the storage grows with the largest slot.
+
+        Args:
+            slot: map slot of the frame; its content is overwritten.
+            level: features of the frame at this level.
+        """
         c, h, w = level.shape
         have, s = len(self._maps), self.side
         if slot >= have:
@@ -51,7 +70,11 @@ class EdgeCorrelation:
         self._maps[slot, s : s + h, s : s + w] = level.permute(1, 2, 0)
 
     def forget(self, slots: Int[Tensor, " n"]) -> None:
-        """Slots that get a new edge."""
+        """Invalidate the cached windows of edge slots that are assigned to new edges.
+
+        Args:
+            slots: edge slots; storage is reserved for new ones.
+        """
         if len(slots):
             self._reserve(int(slots.max()) + 1)
             self._origin[slots] = _NOWHERE
@@ -71,14 +94,17 @@ class EdgeCorrelation:
         kk: Int[Tensor, " E"],
         frames: Int[Tensor, " E"],
     ) -> Float[Tensor, "E c"]:
-        """Correlation channels of this level, ordered patch row, patch column, y offset, x offset.
+        """Correlation channels of this level.
 
         Args:
-            coords: reprojected patch pixels in feature pixels (of scale 1).
-            slots: of the edges.
+            coords: reprojected patch pixels ``x, y`` in feature pixels (of scale 1).
+            slots: edge slot of each edge.
             features: patch features, pixels last.
             kk: patch of each edge.
-            frames: slot of the target frame of each edge.
+            frames: map slot of the target frame of each edge.
+
+        Returns:
+            ``c = p^2 * (2r+1)^2`` channels, ordered ``pixels_first``: patch row, patch column, y offset, x offset.
         """
         e, s, r = len(slots), self.side, self.radius
         taps = 2 * r + 2
@@ -101,15 +127,15 @@ class EdgeCorrelation:
         return out.view(e, -1)
 
     def _refresh(self, at: Tensor, slots: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> None:
-        """Fetch the windows of the edges that have left theirs."""
+        """Compute the products again for edges that have moved out of their cached window."""
         s, r = self.side, self.radius
         _, height, width, c = self._maps.shape
-        # A window beyond the border sees zeros wherever it is.
+        # A window beyond the border contains only zeros, at any position.
         limit = torch.tensor([width - 2 * s, height - 2 * s], device=at.device)
         at = at.clamp(-1e5, 1e5).floor().long()  # far-away projections would overflow the integers
         wanted = (at[:, self.pixels // 2] - (s // 2 - 1)).clamp(min=-s).minimum(limit)
         origin = self._origin[slots]
-        # A patch seen much larger than a window can hold stays clamped; only its centre decides then.
+        # A patch whose projection is larger than a window stays clamped; its centre alone decides on a refresh then.
         outside = ((at.amin(1) - r < origin) | (at.amax(1) + r + 1 >= origin + s)).any(-1)
         stale = (outside & (origin != wanted).any(-1)).nonzero()[:, 0]
         runs = self._maps.as_strided((self._maps.numel() // c - s + 1, s * c), (c, 1)) if len(stale) else self._maps

@@ -12,7 +12,13 @@ def _norm(channels: int, kind: str) -> nn.Module:
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions with a skip; the skip is a strided 1x1 convolution where the shape changes."""
+    """Two 3x3 convolutions with a skip; the skip is a strided 1x1 convolution where the shape changes.
+
+    Args:
+        inputs, outputs: number of channels.
+        stride: of the first convolution.
+        norm: ``"instance"`` for instance normalisation, anything else for none.
+    """
 
     def __init__(self, inputs: int, outputs: int, stride: int, norm: str) -> None:
         super().__init__()
@@ -25,6 +31,14 @@ class ResidualBlock(nn.Module):
             self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), _norm(outputs, norm))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply the block.
+
+        Args:
+            x: ``(n, inputs, h, w)``.
+
+        Returns:
+            ``(n, outputs, h / stride, w / stride)``.
+        """
         y = F.relu(self.norm1(self.conv1(x)))
         y = F.relu(self.norm2(self.conv2(y)))
         return F.relu(self.downsample(x) + y)
@@ -35,6 +49,11 @@ class Encoder(nn.Module):
 
     All convolutions are centred, so feature ``(u, v)`` is centred on image pixel ``(4u, 4v)`` and the intrinsics of
     the feature map are exactly those of the image divided by 4.
+
+    Args:
+        stem, trunk: channels at 1/2 and 1/4 of the image resolution.
+        outputs: channels of the features.
+        norm: see :class:`ResidualBlock`.
     """
 
     def __init__(self, stem: int, trunk: int, outputs: int, norm: str) -> None:
@@ -49,13 +68,35 @@ class Encoder(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
-        """All but the last layer, which is linear in each pixel: whoever needs few pixels applies it to those."""
+        """All layers but the last one, a 1x1 convolution that :meth:`head` allows to evaluate at single pixels.
+
+        Args:
+            images: normalised images.
+
+        Returns:
+            Trunk features at a quarter of the image resolution.
+        """
         return self.layer2(self.layer1(F.relu(self.norm1(self.conv1(images)))))
 
     def head(self, outputs: slice) -> tuple[Tensor, Tensor]:
-        """Weight ``(c, t)`` and bias ``(c,)`` of some outputs of the last layer."""
+        """Parameters of some output channels of the last layer.
+
+        Args:
+            outputs: slice of the output channels.
+
+        Returns:
+            Weight ``(c, t)`` and bias ``(c,)``.
+        """
         assert self.conv2.bias is not None
         return self.conv2.weight[outputs, :, 0, 0], self.conv2.bias[outputs]
 
     def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n c h w"]:
+        """Encode images.
+
+        Args:
+            images: normalised images.
+
+        Returns:
+            Features at a quarter of the image resolution.
+        """
         return self.conv2(self.trunk(images))

@@ -1,4 +1,4 @@
-"""Patches: where they are drawn and what is kept of them (DPVO 3.1)."""
+"""Patches: their sampling, and their matching and context features (DPVO 3.1)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from dvo.nets.encoder import Encoder
 
 @dataclass(frozen=True)
 class Features:
-    """What the encoder makes of the frames.
+    """Output of the encoders for a batch of clips.
 
     Attributes:
         matching: ``(B, N, C, h, w)`` features for correlation.
-        trunk: ``(B, N, t, h, w)`` from which the context of the update operator is computed where it is needed.
+        trunk: ``(B, N, t, h, w)`` trunk features, from which context features are computed at the patch centres alone.
     """
 
     matching: Tensor
@@ -27,18 +27,28 @@ class Features:
 
 
 def normalise_images(images: Tensor) -> Tensor:
-    """uint8 RGB ``(..., 3, H, W)`` to float in [-0.5, 1.5], the range that DPVO feeds its encoders."""
+    """Scale images to the input range of the encoders, [-0.5, 1.5], as DPVO does.
+
+    Args:
+        images: ``(..., 3, H, W)`` RGB, uint8 or float in [0, 255].
+
+    Returns:
+        Float tensor of the same shape.
+    """
     return images.float() * (2.0 / 255.0) - 0.5
 
 
 def random_centres(
     frames: int, patches: int, height: int, width: int, generator: torch.Generator | None, batch: int = 1
 ) -> Tensor:
-    """Integer patch centres, uniform away from the border.
+    """Integer patch centres, uniform over the feature map without its border.
 
     Args:
+        frames: number of frames.
+        patches: number of patches in each frame.
         height, width: size of the feature map.
-        generator: on the CPU; the draw is the same whatever the device that tracks.
+        generator: on the CPU, so that the centres do not depend on the device of the network.
+        batch: number of clips.
 
     Returns:
         ``(batch, frames, patches, 2)`` int64 ``x, y`` in ``[1, width - 2] x [1, height - 2]``.
@@ -50,7 +60,16 @@ def random_centres(
 
 
 def crop_patches(maps: Float[Tensor, "B N C h w"], centres: Tensor, size: int) -> Float[Tensor, "B N M C p p"]:
-    """Cut ``size x size`` windows around integer centres ``(B, N, M, 2)`` that lie inside the map."""
+    """Cut square windows out of feature maps.
+
+    Args:
+        maps: feature maps.
+        centres: ``(B, N, M, 2)`` integer centres ``x, y`` in feature pixels; the windows must lie inside the map.
+        size: side ``p`` of a window, odd.
+
+    Returns:
+        The windows.
+    """
     b, n, c, h, w = maps.shape
     m = centres.shape[2]
     offsets = torch.arange(size, device=maps.device) - size // 2
@@ -62,7 +81,11 @@ def crop_patches(maps: Float[Tensor, "B N C h w"], centres: Tensor, size: int) -
 
 
 class Patchifier(nn.Module):
-    """Encoders plus the cutting of patches."""
+    """Encoders and the extraction of patches.
+
+    Args:
+        config: sizes of the network.
+    """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -74,7 +97,14 @@ class Patchifier(nn.Module):
             self.inet = Encoder(*sizes, config.hidden_channels, "none")
 
     def encode(self, images: Float[Tensor, "B N 3 H W"]) -> Features:
-        """Features of normalised images; divided by 4 as in DPVO."""
+        """Encode normalised images; matching features are divided by 4 as in DPVO.
+
+        Args:
+            images: output of :func:`normalise_images`.
+
+        Returns:
+            Matching and trunk features at a quarter of the image resolution.
+        """
         b, n = images.shape[:2]
         flat = images.flatten(0, 1)
         trunk = self.fnet.trunk(flat)
@@ -89,6 +119,7 @@ class Patchifier(nn.Module):
         """Matching and context features of patches.
 
         Args:
+            features: output of :meth:`encode`.
             centres: ``(B, N, M, 2)`` from :func:`random_centres`.
 
         Returns:
@@ -107,8 +138,12 @@ def patch_coordinates(centres: Tensor, inverse_depth: Tensor, size: int) -> Floa
     """Patch tensors ``x, y, d`` of constant inverse depth.
 
     Args:
-        centres: ``(B, N, M, 2)`` integer centres in feature pixels.
+        centres: ``(B, N, M, 2)`` integer centres ``x, y`` in feature pixels.
         inverse_depth: ``(B, N*M)``.
+        size: side ``p`` of a patch, odd.
+
+    Returns:
+        Pixel coordinates and inverse depth of each patch pixel, ``K = N*M`` patches.
     """
     centres = centres.flatten(1, 2).to(inverse_depth.dtype)
     offsets = torch.arange(size, device=centres.device, dtype=centres.dtype) - size // 2
@@ -118,7 +153,15 @@ def patch_coordinates(centres: Tensor, inverse_depth: Tensor, size: int) -> Floa
 
 
 def pool_levels(matching: Tensor, pyramid: tuple[int, ...]) -> list[Tensor]:
-    """Average-pooled copies ``(B, N, C, h / s, w / s)`` of the matching features, one a level."""
+    """Average-pooled feature pyramid.
+
+    Args:
+        matching: ``(B, N, C, h, w)`` matching features.
+        pyramid: down-sampling ``s`` of each level.
+
+    Returns:
+        One tensor ``(B, N, C, h / s, w / s)`` for each level; that of ``s = 1`` is the input itself.
+    """
     b, n = matching.shape[:2]
     flat = matching.flatten(0, 1)
     return [matching if s == 1 else F.avg_pool2d(flat, s, s).unflatten(0, (b, n)) for s in pyramid]

@@ -1,7 +1,7 @@
-"""Gated recurrent update operator (DPVO 3.2): correlation in, flow revision and confidence out, one state an edge.
+"""Gated recurrent update operator (DPVO 3.2): correlation to flow revision and confidence, with a state for each edge.
 
-Any module with the signature of :meth:`Update.forward` can take its place: it is chosen by the ``update_operator`` of a
-model's configuration, a name in :data:`UPDATE_OPERATORS`.
+A module with the signature of :class:`UpdateOperator` can replace it: the ``update_operator`` of a model's
+configuration is a name in :data:`UPDATE_OPERATORS`.
 """
 
 from __future__ import annotations
@@ -23,17 +23,27 @@ UPDATE_OPERATORS = Registry("update operator", "dvo.update_operators", {"gated":
 
 
 class UpdateOperator(Protocol):
-    """Signature of an update operator: state, context and correlation of the edges to state, revision, confidence."""
+    """Interface of an update operator."""
 
     def __call__(
         self, hidden: Tensor, context: Tensor, correlation: Correlation, graph: PatchGraph
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """See :meth:`Update.forward`."""
+        """Revise the flow of every edge.
+
+        Args:
+            hidden: ``(B, E, D)`` state, zero for a new edge.
+            context: ``(B, E, D)`` context features of the patch of each edge.
+            correlation: see :class:`dvo.nets.correlation.Correlation`.
+            graph: the edges and their neighbourhoods.
+
+        Returns:
+            New state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
+        """
         ...
 
 
 class _ClampGradient(torch.autograd.Function):
-    """Identity; gradients lose their NaNs and are clamped, so that one bad edge cannot drown the others."""
+    """Identity whose gradient is clamped, with NaN replaced by 0, so that one bad edge cannot dominate the others."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, limit: float) -> Tensor:
@@ -46,15 +56,29 @@ class _ClampGradient(torch.autograd.Function):
 
 
 class GradientClamp(nn.Module):
-    """Clamp of each element of the gradient to ``+-0.01`` of a batch of one; scaled with ``1 / batch``, because the
-    loss is a mean over clips."""
+    """Identity whose gradient is clamped elementwise to ``+-0.01 / batch``.
+
+    The limit of a batch of one is 0.01; it is scaled because the loss is a mean over clips.
+    """
 
     def forward(self, x: Float[Tensor, "B E c"]) -> Tensor:
+        """Return the input unchanged.
+
+        Args:
+            x: any values.
+
+        Returns:
+            The same values.
+        """
         return _ClampGradient.apply(x, 0.01 / x.shape[0])
 
 
 class GatedResidual(nn.Module):
-    """Residual block whose residual is multiplied by a learned gate (DPVO 3.2)."""
+    """Residual block whose residual is multiplied by a learned gate (DPVO 3.2).
+
+    Args:
+        channels: of input and output.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -62,11 +86,23 @@ class GatedResidual(nn.Module):
         self.res = nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Apply the block.
+
+        Args:
+            x: ``(..., channels)``.
+
+        Returns:
+            ``(..., channels)``.
+        """
         return torch.addcmul(x, self.gate(x), self.res(x))
 
 
 class SoftAggregation(nn.Module):
-    """Per-channel softmax-weighted sum inside each group of edges, handed back to its members (DPVO 3.2)."""
+    """Per-channel softmax-weighted sum over each group of edges, returned to every member of the group (DPVO 3.2).
+
+    Args:
+        channels: of input and output.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -75,6 +111,15 @@ class SoftAggregation(nn.Module):
         self.h = nn.Linear(channels, channels)
 
     def forward(self, x: Float[Tensor, "B E c"], groups: Groups) -> Tensor:
+        """Aggregate over groups.
+
+        Args:
+            x: features of the edges.
+            groups: partition of the ``E`` edges.
+
+        Returns:
+            ``(B, E, c)``, equal for all members of a group.
+        """
         shape = (*groups.members.shape, x.shape[-1])
         flat = groups.members.flatten()
         value = self.f(x).index_select(1, flat).unflatten(1, shape[:2])
@@ -86,7 +131,22 @@ class SoftAggregation(nn.Module):
 
 
 class Update(nn.Module):
-    """DPVO's update operator. Submodule names are those of DPVO's checkpoint."""
+    """Update operator of DPVO; submodules have the names of DPVO's checkpoint.
+
+    Args:
+        config: sizes of the network.
+
+    Example:
+        >>> config = preset("tiny")
+        >>> update = Update(config)
+        >>> graph = full_graph(frames=2, patches=3, self_edges=False)
+        >>> hidden = context = torch.zeros(1, len(graph), config.hidden_channels)
+        >>> channels = config.correlation_channels // len(config.pyramid)
+        >>> correlation = Correlation([torch.zeros(1, len(graph), channels) for _ in config.pyramid])
+        >>> hidden, delta, weights = update(hidden, context, correlation, graph)
+        >>> delta.shape
+        torch.Size([1, 6, 2])
+    """
 
     def __init__(self, config: ModelConfig) -> None:
         super().__init__()
@@ -112,7 +172,7 @@ class Update(nn.Module):
         self.w = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp(), nn.Sigmoid())
 
     def _encode_correlation(self, correlation: Correlation) -> Tensor:
-        """First layer on the channels, level by level: DPVO's weights interleave the levels, level fastest."""
+        """First layer, level by level, because DPVO's weights interleave the levels (level fastest)."""
         levels, first = correlation.levels, self.corr[0]
         assert isinstance(first, nn.Linear)
         table = first.weight.unflatten(1, (-1, len(levels)))

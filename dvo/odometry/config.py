@@ -34,28 +34,32 @@ class TrackerConfig:
     """Settings of :class:`dvo.odometry.tracker.PatchOdometry`.
 
     Attributes:
-        pixels: pixel budget of the working image; the aspect is kept (0: the image as it is).
-        patches: patches of a frame.
-        lifetime: a patch has edges into the frames up to this far before and after its own.
-        removal: edges of patches from frames older than this are dropped.
-        optimisation: poses of this many newest frames are optimised.
+        pixels: largest number of pixels of the working image; the aspect is kept (0: full resolution).
+        patches: number of patches in each frame.
+        lifetime: largest distance, in frames, of the edges of a patch from its own frame.
+        removal: age, in frames, above which the edges of a frame's patches are archived.
+        optimisation: number of newest frames whose poses are optimised.
         initial_frames: keyframes before the first joint optimisation.
         initial_updates, final_updates: updates at initialisation and in ``finish``.
-        updates: updates a frame.
-        initial_motion: revision of the flow, in feature pixels, that makes a frame worth a keyframe before
+        updates: updates of each frame.
+        initial_motion: median revision of the flow, in feature pixels, above which a frame becomes a keyframe before
             initialisation.
         initial_parallax: median parallax without rotation, in feature pixels, above which the status is ``tracking``.
         keyframe_motion: a keyframe is dropped again if the mean flow between its neighbours, in feature pixels, is
             below this.
-        keyframe_index: how many keyframes back that test looks.
-        motion_damping: share of the last motion expected to go on.
-        patience: up to this many lost frames in a row stay out of the graph, so that the first good one after them
-            joins those before them; later ones stay in the graph.
+        keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
+        motion_damping: factor of the last motion in the prediction of the next pose, in [0, 1].
+        patience: number of consecutive lost frames that are kept out of the graph, so that the first frame tracked
+            after them is joined with those before them; later lost frames are added to the graph.
         search_updates: recurrent updates of a frame after a lost one, to track it again.
         lost_confidence: mean confidence of the newest frame's edges below which the status is ``lost``.
 
     Raises:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
+
+    Example:
+        >>> config = TrackerConfig(patches=48, optimisation=10)
+        >>> odometry = dvo.load("small", config=config)
     """
 
     pixels: int = 320 * 240
@@ -81,10 +85,16 @@ class TrackerConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrackerConfig:
-        """Settings from plain values.
+        """Settings from plain values, for instance of a YAML file.
+
+        Args:
+            values: attribute name to value; attributes that are missing take their defaults.
+
+        Returns:
+            The settings.
 
         Raises:
-            DvoError: a key that is no attribute, or a value out of range.
+            DvoError: an unknown attribute, or a value out of range.
         """
         check_names(cls, values)
         return cls(**values)

@@ -1,4 +1,4 @@
-"""Front end of the tracker: a frame to features and patches."""
+"""Front end of the tracker: extraction of features and patches from a frame."""
 
 from __future__ import annotations
 
@@ -45,7 +45,16 @@ class Observation:
 
 
 def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Tensor:
-    """Matching features ``(1, 1, C, h, w)`` of an image ``(H, W, 3)`` uint8 RGB."""
+    """Matching features of an image.
+
+    Args:
+        model: the network.
+        image: ``(H, W, 3)`` uint8 RGB.
+        device: of the network.
+
+    Returns:
+        ``(1, 1, C, h, w)``, at a quarter of the image resolution.
+    """
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
     return model.patchify.encode(normalise_images(rgb)[None, None]).matching
 
@@ -53,7 +62,7 @@ def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Ten
 def observe(
     model: PatchVO, frame: Frame, pixels: int, patches: int, generator: torch.Generator, device: torch.device
 ) -> Observation:
-    """Resize, encode, choose patches.
+    """Resize a frame, encode it and draw its patches.
 
     Args:
         model: the network.
@@ -62,6 +71,9 @@ def observe(
         patches: number of patches.
         generator: of the patch centres, on the CPU.
         device: of the network.
+
+    Returns:
+        Features and patches.
 
     Raises:
         DvoError: the camera of the frame has distortion.

@@ -1,4 +1,4 @@
-"""Start of a track: whether a frame moves enough, and the first joint optimisation."""
+"""Initialisation of the tracker: test for motion, and the first joint optimisation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,15 @@ from dvo.odometry.window_step import WindowStep
 
 
 def median_revision(revision: Revision, window: Window) -> float:
-    """Median revision of the flow from the last keyframe to the newest frame, if poses did not change, pixels."""
+    """Median revision of the flow from the last keyframe to the newest frame, at equal poses.
+
+    Args:
+        revision: output of the network for the edges of the window.
+        window: keyframes, the newest frame last.
+
+    Returns:
+        Feature pixels.
+    """
     n = len(window)
     edges = (window.ii == n - 2) & (window.jj == n - 1)
     return float(revision.delta[0][edges].norm(dim=-1).median())
@@ -21,16 +29,16 @@ def median_revision(revision: Revision, window: Window) -> float:
 def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
     """Optimise the first window.
 
-    Half way, the window is also solved from identity with the flow as seen by then, and the better of the two solutions
-    is kept (:func:`dvo.ba.cold_start.solve_from_nothing`).
+    After half of the updates the window is also solved from identity poses with the current flow, and the better of the
+    two solutions is kept (:func:`dvo.ba.cold_start.solve_from_nothing`).
 
     Args:
-        window: the first keyframes.
-        step: takes the steps.
+        window: the first keyframes; changed in place.
+        step: step of the model on the window.
         config: settings of the tracker.
 
     Returns:
-        Whether there is enough parallax to go on from.
+        True if the parallax is sufficient for tracking.
     """
     for age in range(config.initial_updates):
         step(StepOptions(fixed=1, damping=damping_at(age)))
@@ -44,7 +52,7 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
 
 
 def _solve_again(window: Window, step: WindowStep) -> None:
-    """Replace poses and depths by a solution from identity, if that explains the present flow better."""
+    """Replace poses and depths by a solution from identity poses, if its cost for the current flow is lower."""
     revision = step.revise()
     measured = (revision.targets, revision.weights, window.ii, window.jj, window.kk)
     intrinsics = window.intrinsics[None]

@@ -1,4 +1,4 @@
-"""Odometries from weights: ``dvo.load``."""
+"""Construction of odometries from weights: ``dvo.load``."""
 
 from __future__ import annotations
 
@@ -24,21 +24,24 @@ def load(
     config: Any = None,
     **overrides: Any,
 ) -> Odometry:
-    """The odometry of a weights file, ready to track one sequence.
+    """Load weights and build their odometry, for one sequence.
 
-    The architecture that the file names decides which odometry it is, see :data:`dvo.odometry.registry.ODOMETRIES`.
+    The architecture in the metadata of the file selects the odometry, see :data:`dvo.odometry.registry.ODOMETRIES`.
 
     Args:
         weights: name of weights that ship with dvo, or a file.
-        device: where to compute.
-        seed: of everything that the odometry draws. The same seed on the same machine gives the same trajectory, bit
+        device: of all computation.
+        seed: of all random numbers of the odometry. The same seed on the same machine gives the same trajectory, bit
             for bit on the CPU with a fixed number of threads.
-        config: settings, for ``patch_vo`` a :class:`dvo.odometry.config.TrackerConfig`; None takes those of the
-            preset.
+        config: settings, for ``patch_vo`` a :class:`dvo.odometry.config.TrackerConfig`; None for those of the preset.
         overrides: single settings, for ``patch_vo`` by the names of :class:`dvo.odometry.config.TrackerConfig`.
 
+    Returns:
+        The odometry; its poses are ``T_wc`` in the world of the first keyframe, up to scale.
+
     Raises:
-        DvoError: no such weights, or a file that is none; an architecture without an odometry; an unknown setting.
+        DvoError: no such weights, or an invalid file; an architecture without an odometry; an unknown or invalid
+            setting.
 
     Example:
         >>> odometry = dvo.load("small", seed=1, patches=32)
@@ -57,10 +60,20 @@ def build_odometry(
     config: Any = None,
     **overrides: Any,
 ) -> Odometry:
-    """The odometry for a network in memory; arguments and errors as :func:`load`.
+    """Build the odometry of a network in memory.
 
     Args:
         weights: the network with its name and preset; :meth:`dvo.models.weights.LoadedWeights.of` describes one.
+        device: of all computation.
+        seed: of all random numbers of the odometry.
+        config: settings; None for those of the preset.
+        overrides: single settings.
+
+    Returns:
+        The odometry, see :func:`load`.
+
+    Raises:
+        DvoError: an architecture without an odometry; an unknown or invalid setting.
     """
     builder = odometry_builder(weights.architecture)
     return builder(weights, device=device, seed=seed, config=config, **overrides)
@@ -74,7 +87,21 @@ def patch_odometry(
     config: TrackerConfig | None = None,
     **overrides: Any,
 ) -> PatchOdometry:
-    """The tracker of ``patch_vo`` networks; arguments and errors as :func:`build_odometry`."""
+    """Build the tracker of a ``patch_vo`` network.
+
+    Args:
+        weights: the network, a :class:`dvo.models.patch_vo.PatchVO`.
+        device: of all computation.
+        seed: of the patch centres.
+        config: settings; None for those of the preset.
+        overrides: single settings, by the names of :class:`dvo.odometry.config.TrackerConfig`.
+
+    Returns:
+        The tracker.
+
+    Raises:
+        DvoError: an unknown or invalid setting.
+    """
     from dvo.models.patch_vo import PatchVO
     from dvo.odometry.tracker import PatchOdometry
 

@@ -1,4 +1,4 @@
-"""Motion in the window: prediction of the next pose, and how much frames differ."""
+"""Motion of the window: prediction of the next pose, parallax and flow between frames."""
 
 from __future__ import annotations
 
@@ -11,25 +11,38 @@ from dvo.graph.window import Window
 
 
 def predict_pose(poses_cw: Tensor, times: list[float], time: float, damping: float) -> Tensor:
-    """Damped constant velocity: ``Exp(damping * dt / dt_last * Log(P1 P2^-1)) P1`` (DPVO's motion model).
+    """Damped constant velocity: ``Exp(damping * dt / dt_last * Log(P1 P2^-1)) P1`` (motion model of DPVO).
 
     Args:
-        poses_cw: ``(n, 7)`` of the window; with none the pose is the identity, with one it is repeated.
-        times: their seconds.
-        time: seconds of the new frame.
+        poses_cw: ``(n, 7)`` poses ``T_cw`` of the window, the newest last.
+        times: their timestamps, seconds.
+        time: timestamp of the new frame, seconds.
+        damping: factor of the velocity, in [0, 1].
+
+    Returns:
+        ``(7,)`` predicted ``T_cw``: the identity without poses, the last pose with one.
     """
     if len(times) == 0:
         return se3.identity(device=poses_cw.device)
     if len(times) == 1:
         return poses_cw[-1]
-    # A dropped keyframe or a gap in the video must not throw the guess far away.
+    # Bounded, because a dropped keyframe or a gap in the video would extrapolate too far.
     ratio = min(2.0, max(0.0, (time - times[-1]) / (times[-1] - times[-2])))
     step = se3.log(se3.relative(poses_cw[-2], poses_cw[-1]))
     return se3.retract(poses_cw[-1], damping * ratio * step)
 
 
 def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tensor, Tensor]:
-    """Where the patches of frame ``i`` go in frame ``j``, and where rotation (or translation) alone takes them."""
+    """Patch centres of frame ``i`` reprojected into frame ``j``, and the same with a part of the motion alone.
+
+    Args:
+        window: keyframes.
+        i, j: positions in the window.
+        rotation: the part is the rotation (True) or the translation (False).
+
+    Returns:
+        ``(M, 2)`` positions under the whole motion and ``(M, 2)`` under the part, feature pixels.
+    """
     m = window.per_frame
     device = window.patches.device
     patches = window.patches[None, i * m : (i + 1) * m]
@@ -50,14 +63,29 @@ def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tenso
 
 
 def parallax(window: Window, i: int, j: int) -> float:
-    """Median displacement, in feature pixels, that translation adds to the patches of frame ``i`` seen in ``j``."""
+    """Parallax of a frame pair: median displacement that translation adds to the rotational flow.
+
+    Args:
+        window: keyframes.
+        i, j: positions of source and target frame in the window.
+
+    Returns:
+        Feature pixels.
+    """
     whole, only = _displacement(window, i, j, rotation=True)
     return float((whole - only).norm(dim=-1).median())
 
 
 def flow_magnitude(window: Window, i: int, j: int) -> float:
-    """Mean flow of the patches of frame ``i`` seen in ``j``, half of it taken without the rotation (DPVO's
-    ``flow_mag`` with beta 0.5), feature pixels."""
+    """Mean flow of a frame pair, half of it without the rotation (``flow_mag`` of DPVO with beta 0.5).
+
+    Args:
+        window: keyframes.
+        i, j: positions of source and target frame in the window.
+
+    Returns:
+        Feature pixels.
+    """
     whole, only = _displacement(window, i, j, rotation=False)
     m = window.per_frame
     c = window.patches.shape[-1] // 2

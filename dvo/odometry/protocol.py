@@ -1,7 +1,7 @@
-"""What an odometry is: a thing that is fed frames and asked for a trajectory.
+"""Interface of a streaming visual odometry, and the types of its output.
 
-The learned tracker and every classical baseline stand behind :class:`Odometry`; the CLI, the eval harness, the plots
-and the tests know nothing else.
+The learned tracker and every classical baseline implement :class:`Odometry`. The command line, the evaluation and the
+plots use this interface alone.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is known right after a frame.
+    """Estimate for one frame, available right after it.
 
     Attributes:
         timestamp: seconds, of the frame.
-        pose_wc: ``(7,)`` float64 camera to world, or None while nothing is known.
+        pose_wc: ``(7,)`` float64 camera to world ``T_wc`` (x y z, quaternion x y z w), or None if there is none yet.
         status: state of the tracker.
         confidence: in [0, 1]; comparable within one run only.
     """
@@ -56,14 +56,15 @@ class SparseMap:
 
 @dataclass(frozen=True)
 class Result:
-    """What is known after the last frame.
+    """Result for a sequence, available after the last frame.
 
     Attributes:
-        trajectory: one row for every frame that was tracked (initialisation back-filled); lost frames have no row.
-        map: the sparse coloured map, empty for systems without one.
-        frames_read: frames fed.
-        frames_lost: frames fed that have no row.
-        info: facts for run.json (JSON-able): working resolution, intrinsics, number of keyframes.
+        trajectory: camera-to-world pose of every tracked frame, those before initialisation included; lost frames have
+            no row.
+        map: sparse coloured map, empty for systems without one.
+        frames_read: number of input frames.
+        frames_lost: number of input frames without a row.
+        info: JSON-able metadata for run.json: working resolution, intrinsics, number of keyframes.
     """
 
     trajectory: Trajectory
@@ -75,14 +76,45 @@ class Result:
 
 @runtime_checkable
 class Odometry(Protocol):
-    """A visual odometry. One object tracks one sequence."""
+    """Interface of a streaming visual odometry. One object tracks one sequence.
+
+    Attributes:
+        name: of the system, in reports.
+
+    Example:
+        An odometry that never moves:
+
+        >>> class Still:
+        ...     name = "still"
+        ...     def __init__(self) -> None:
+        ...         self.times: list[float] = []
+        ...     def track(self, frame: Frame) -> Estimate:
+        ...         self.times.append(frame.timestamp)
+        ...         return Estimate(frame.timestamp, np.array([0.0, 0, 0, 0, 0, 0, 1]), Status.TRACKING)
+        ...     def finish(self) -> Result:
+        ...         poses_wc = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(self.times), 1))
+        ...         return Result(Trajectory(np.array(self.times), poses_wc), SparseMap(), len(self.times), 0)
+        >>> isinstance(Still(), Odometry)
+        True
+    """
 
     name: str
 
     def track(self, frame: Frame) -> Estimate:
-        """Take the next frame (timestamps strictly increasing)."""
+        """Process the next frame.
+
+        Args:
+            frame: of the same size as the first, with a later timestamp than the one before.
+
+        Returns:
+            Pose of the frame and state of the tracker.
+        """
         ...
 
     def finish(self) -> Result:
-        """Refine once more and return everything. May be called after any number of frames, also none or one."""
+        """Run the final optimisation. May be called after any number of frames, including none.
+
+        Returns:
+            Trajectory and map of the sequence.
+        """
         ...

@@ -1,4 +1,4 @@
-"""Odometries by the architecture of their network."""
+"""Registry of odometries by the architecture of their network."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ODOMETRIES = Registry("odometry", "dvo.odometries", {"patch_vo": "dvo.odometry.l
 
 
 class OdometryBuilder(Protocol):
-    """Function, or class, that makes an odometry from a network."""
+    """Interface of a function, or class, that builds an odometry from a network."""
 
     def __call__(
         self, weights: LoadedWeights, *, device: Any = "cpu", seed: int = 0, config: Any = None, **overrides: Any
@@ -23,10 +23,13 @@ class OdometryBuilder(Protocol):
 
         Args:
             weights: the network with its name and preset.
-            device: where to compute.
-            seed: of everything that the odometry draws.
+            device: of all computation.
+            seed: of all random numbers of the odometry.
             config: settings, of a type that the odometry defines; None for those of the preset.
             overrides: single settings.
+
+        Returns:
+            The odometry.
 
         Raises:
             DvoError: an unknown setting.
@@ -36,6 +39,12 @@ class OdometryBuilder(Protocol):
 
 def odometry_builder(architecture: str) -> OdometryBuilder:
     """Builder of the odometry for an architecture.
+
+    Args:
+        architecture: name of the architecture.
+
+    Returns:
+        The builder.
 
     Raises:
         DvoError: an architecture without an odometry.

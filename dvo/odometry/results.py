@@ -1,4 +1,4 @@
-"""The results folder: trajectory.txt, map.ply and run.json. (The picture is drawn by :mod:`dvo.viz.plot`.)"""
+"""Output files of a run: trajectory.txt, map.ply and run.json. (:mod:`dvo.viz.plot` draws trajectory.png.)"""
 
 from __future__ import annotations
 
@@ -24,10 +24,17 @@ TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png
 
 
 def make_folder(out: Path | str | None, name: str) -> Path:
-    """Create the results folder: ``out``, or ``runs/<name>-<time>`` when none is given.
+    """Create the results folder.
+
+    Args:
+        out: the folder; None for ``runs/<name>-<time>``.
+        name: of the sequence.
+
+    Returns:
+        The folder.
 
     Raises:
-        DvoError: the path is taken by a file or cannot be written.
+        DvoError: the path is a file or cannot be written.
     """
     if out is None:
         base = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
@@ -49,7 +56,8 @@ def write_results(folder: Path, run: Run, facts: dict[str, Any]) -> None:
 
     Args:
         folder: an existing folder; files of these names in it are replaced.
-        facts: what only the caller knows (source, seed, device, config, metrics); stands first in run.json.
+        run: record of the session.
+        facts: metadata of the caller (source, seed, device, config, metrics), the first entries of run.json.
     """
     write_tum(folder / TRAJECTORY, run.result.trajectory)
     write_ply(folder / MAP, run.result.map)
@@ -58,7 +66,14 @@ def write_results(folder: Path, run: Run, facts: dict[str, Any]) -> None:
 
 
 def summary(run: Run) -> dict[str, Any]:
-    """The measured part of run.json: counts, speed, memory, versions, warnings and the odometry's own facts."""
+    """Measured part of run.json: counts, speed, memory, versions, warnings and the odometry's own metadata.
+
+    Args:
+        run: record of the session.
+
+    Returns:
+        Values for :func:`jsonable`.
+    """
     result = run.result
     return {
         "frames": {
@@ -80,7 +95,12 @@ def summary(run: Run) -> dict[str, Any]:
 
 
 def write_ply(path: Path | str, sparse_map: SparseMap) -> None:
-    """Write the points as a binary little-endian PLY with ``x y z`` float and ``red green blue`` uchar."""
+    """Write a map as binary little-endian PLY with ``x y z`` float and ``red green blue`` uchar.
+
+    Args:
+        path: file to write.
+        sparse_map: the points.
+    """
     layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
     vertices = np.zeros(len(sparse_map.points), dtype=layout)
     for column, name in enumerate(("x", "y", "z")):
@@ -97,7 +117,11 @@ def write_ply(path: Path | str, sparse_map: SparseMap) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Versions of the software that results depend on.
+
+    Returns:
+        Name to version, for Python, the platform and the numerical packages.
+    """
     found = {"python": platform.python_version(), "platform": platform.platform()}
     for name in ("dvo", "torch", "numpy", "opencv-python-headless"):
         try:
@@ -109,7 +133,11 @@ def versions() -> dict[str, str]:
 
 
 def peak_memory_mb() -> float | None:
-    """Largest resident memory of this process so far in MB, or None where the system does not say (Windows)."""
+    """Peak resident memory of this process.
+
+    Returns:
+        MB, or None on systems that do not report it (Windows).
+    """
     try:
         import resource
     except ImportError:
@@ -119,7 +147,14 @@ def peak_memory_mb() -> float | None:
 
 
 def jsonable(value: Any) -> Any:
-    """Plain JSON values from dataclasses, enums, paths, arrays and tuples; numbers that are not finite become null."""
+    """Convert to plain JSON values.
+
+    Args:
+        value: dataclass, enum, path, array, container or scalar.
+
+    Returns:
+        Dictionaries, lists, strings, numbers, booleans and None; numbers that are not finite become None.
+    """
     if is_dataclass(value) and not isinstance(value, type):
         return jsonable(asdict(value))
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Session: one odometry over one source, from the first frame to the result. The one loop that feeds frames."""
+"""Session: run an odometry over a source, from the first frame to the result."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class Run:
     """Record of a session.
 
     Attributes:
-        result: the odometry's result, with rows for strided frames, counted in frames of the source.
-        frames_fed: frames given to the odometry (fewer than read under a stride).
-        interrupted: stopped by the user.
+        result: result of the odometry, with rows for frames skipped by the stride; counts are frames of the source.
+        frames_fed: number of frames passed to the odometry (fewer than read, with a stride).
+        interrupted: True if the user stopped the run.
         warnings: problems that did not end the run, a sentence each.
-        seconds: wall time spent ``reading``, ``tracking`` and ``finishing``.
-        frame_seconds: wall time inside ``track`` of each frame fed.
+        seconds: wall time of ``reading``, ``tracking`` and ``finishing``.
+        frame_seconds: wall time of each call of ``track``.
     """
 
     result: Result
@@ -38,7 +38,7 @@ class Run:
 
     @property
     def frames_per_second(self) -> float:
-        """Frames fed a second of wall time, reading and finishing included."""
+        """Tracked frames per second of wall time, reading and finishing included."""
         return self.frames_fed / max(sum(self.seconds.values()), 1e-9)
 
 
@@ -51,25 +51,25 @@ def run(
     should_stop: Callable[[], bool] | None = None,
     strict: bool = False,
 ) -> Run:
-    """Feed every ``stride``-th frame, and the last one, then finish.
+    """Run an odometry over a source.
 
-    An interruption or a frame that cannot be read ends the feeding, not the run: what was tracked so far is finished
-    and returned with a warning.
+    Every ``stride``-th frame and the last one are tracked; frames between them get interpolated poses. After an
+    interruption, or a frame that cannot be read, the frames tracked so far are finished and returned with a warning.
 
     Args:
-        odometry: a fresh one.
+        odometry: newly built; an odometry tracks one sequence.
         source: frames in order of time.
-        stride: every how many-th frame is fed.
-        on_frame: called after each frame, outside the clock; the estimate is None for a frame passed over.
-        should_stop: called before each frame; True ends the feeding. A caller that gives it handles Ctrl-C; without
-            it, a KeyboardInterrupt ends the feeding too.
-        strict: an error, or an interruption, is raised instead.
+        stride: distance of tracked frames, in frames of the source.
+        on_frame: called after each frame, outside the timings; the estimate is None for a skipped frame.
+        should_stop: called before each frame; True ends tracking. With it the caller handles Ctrl-C; without it a
+            KeyboardInterrupt ends tracking too.
+        strict: raise errors and interruptions instead.
 
     Returns:
-        The result with its timings.
+        The result with its timings. Poses are ``T_wc``.
 
     Raises:
-        DvoError: a stride below 1, or no frame at all; with ``strict`` any error of the source or the odometry.
+        DvoError: a stride below 1, or a source without frames; with ``strict``, any error of the source or odometry.
 
     Example:
         >>> done = run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt"))  # doctest: +SKIP
@@ -92,7 +92,7 @@ def run(
             feeding.take(frame)
         feeding.flush()
     except KeyboardInterrupt:
-        if strict or should_stop is not None:  # the caller handles the first one, so this is an impatient second
+        if strict or should_stop is not None:  # the caller handles the first one, so this is the second
             raise
         interrupted = True
     except (DvoError, OSError) as error:
@@ -122,17 +122,17 @@ def run(
 
 
 def fill_skipped(trajectory: Trajectory, fed: np.ndarray, skipped: np.ndarray) -> Trajectory:
-    """Add the frames that were read but not fed, interpolated between their neighbours.
+    """Add the frames skipped by a stride, interpolated between their neighbours.
 
-    A skipped frame gets a row when the fed frames before and after it both have one; beside a lost frame it is lost.
+    A skipped frame gets a row if the tracked frames before and after it both have one.
 
     Args:
-        trajectory: what the odometry returned.
-        fed: ``(F,)`` increasing stamps of the frames fed, seconds.
-        skipped: ``(S,)`` stamps of the frames passed over, seconds.
+        trajectory: output of the odometry, poses ``T_wc``.
+        fed: ``(F,)`` increasing timestamps of the frames passed to the odometry, seconds.
+        skipped: ``(S,)`` timestamps of the skipped frames, seconds.
 
     Returns:
-        Trajectory with its rows in the order of time.
+        Trajectory in order of time.
     """
     has_row = np.isin(fed, trajectory.timestamps)
     after = np.searchsorted(fed, skipped)
@@ -145,7 +145,7 @@ def fill_skipped(trajectory: Trajectory, fed: np.ndarray, skipped: np.ndarray) -
 
 
 class _Feeding:
-    """Stride, clock and stamps of the frames fed."""
+    """State of the loop over the frames: stride, timings and timestamps."""
 
     def __init__(self, odometry: Odometry, stride: int, on_frame: FrameCallback | None) -> None:
         self.odometry, self.stride, self.on_frame = odometry, stride, on_frame
@@ -153,7 +153,7 @@ class _Feeding:
         self.skipped: list[float] = []
         self.seconds = {"reading": 0.0, "tracking": 0.0, "finishing": 0.0}
         self.frame_seconds: list[float] = []
-        self.pending: Frame | None = None  # the last frame passed over: fed after all if the source ends with it
+        self.pending: Frame | None = None  # last skipped frame, tracked after all if the source ends with it
 
     @property
     def frames_read(self) -> int:
@@ -169,7 +169,7 @@ class _Feeding:
             self._report(frame, self._track(frame))
 
     def flush(self) -> None:
-        """Track the last frame, so that the trajectory reaches to the end of the source."""
+        """Track the last frame if it was skipped, so that the trajectory covers the whole source."""
         if self.pending is not None:
             self._track(self.pending)
             self.skipped.pop()

@@ -1,8 +1,8 @@
 """Streaming tracker of patch-flow visual odometry over a keyframe graph (DPVO 3.4).
 
-For each frame: features and patches; a predicted pose; edges between its patches and the recent frames, both ways; a
-step of the network and bundle adjustment of the window; and, a few frames later, the decision whether to keep it as a
-keyframe. What leaves the window is archived (:mod:`dvo.graph.keyframe_graph`).
+For each frame: extract features and patches; predict the pose; add edges between its patches and recent frames, both
+ways; run the network and bundle adjustment on the window; and, a few frames later, keep or drop the frame as a
+keyframe. Keyframes that leave the window are archived (:mod:`dvo.graph.keyframe_graph`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
 
-_DEPTH_FRAMES = 3  # newest frames whose median depth a new frame starts from
+_DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a new frame
 
 
 class PatchOdometry:
@@ -42,7 +42,7 @@ class PatchOdometry:
         seed: of the patch centres. The same seed on the same machine gives the same trajectory, bit for bit on the
             CPU with a fixed number of threads.
         device: of all computation.
-        name: in reports.
+        name: of the system, in reports.
         archive: bound and content of the archive of keyframes.
 
     Attributes:
@@ -90,16 +90,17 @@ class PatchOdometry:
 
     @torch.inference_mode()
     def track(self, frame: Frame) -> Estimate:
-        """Take the next frame.
+        """Process the next frame.
 
         Args:
-            frame: of the same size as the first, later than the one before.
+            frame: of the same size as the first, later than the one before, without lens distortion.
 
         Returns:
             Pose ``T_wc`` of the frame in the world of the first keyframe, up to scale, and the state of the tracker.
 
         Raises:
-            DvoError: a timestamp that does not increase, or an image of another size than the first.
+            DvoError: a timestamp that does not increase, an image of another size than the first, or a camera with
+                distortion.
         """
         self._check(frame)
         window, config = self.window, self.config
@@ -120,7 +121,7 @@ class PatchOdometry:
         pose_wc = self._pose_wc(len(window) - 1)
         self._lost_in_a_row = self._lost_in_a_row + 1 if lost else 0
         if 0 < self._lost_in_a_row <= config.patience:
-            # Nothing is known of this frame: it must not stand between those before it and those to come.
+            # The pose of a lost frame is unreliable: without it, the next frames are joined with those before it.
             window.restore(before)
             self.graph.discard(len(window) - 1)
             record.anchor = window.frames[-1].identifier
@@ -131,7 +132,11 @@ class PatchOdometry:
 
     @torch.inference_mode()
     def finish(self) -> Result:
-        """Refine the last window and return the trajectory of every frame."""
+        """Refine the last window and archive it.
+
+        Returns:
+            Trajectory ``T_wc`` of all tracked frames and sparse map, in the world of the first keyframe, up to scale.
+        """
         window, config, log = self.window, self.config, self.graph.log
         if len(window) > 1:
             for age in range(config.final_updates if self._initialised else config.initial_updates):
@@ -165,7 +170,7 @@ class PatchOdometry:
         self._size = size
 
     def _append(self, frame: Frame) -> Keyframe:
-        """Add a frame to the window, at a predicted pose and the depth of the frames before it."""
+        """Add a frame to the window, with predicted pose and the median depth of the frames before it."""
         config, window, net = self.config, self.window, self.model.config
         seen = observe(self.model, frame, config.pixels, config.patches, self._generator, self.device)
         height, width = seen.image.shape[:2]
@@ -197,22 +202,22 @@ class PatchOdometry:
         self.correlation.forget(torch.cat(slots))
 
     def _update(self, age: int = COLD_UPDATES) -> None:
-        """Take a step on the newest poses and their depths; ``age`` counts the steps so far."""
+        """Take a step on the window; ``age``, the number of earlier steps, sets the damping of bundle adjustment."""
         fixed = max(1, len(self.window) - self.config.optimisation) if self._initialised else 1
         self._step(StepOptions(fixed=fixed, damping=damping_at(age)))
 
     def _is_still(self) -> bool:
-        """Whether the newest frame moves too little against the keyframe before it to start from."""
+        """True if the motion from the last keyframe to the newest frame is too small for initialisation."""
         return median_revision(self._step.revise(), self.window) < self.config.initial_motion
 
     def _skip(self, frame: Frame) -> Estimate:
-        """Leave out a frame that shows too little motion to start from; it shares the pose of the keyframe before."""
+        """Discard a frame with too little motion for initialisation; it shares the pose of the keyframe before it."""
         self.graph.discard(len(self.window) - 1)
         self.graph.log.add(frame.timestamp, self.window.frames[-1].identifier)
         return Estimate(frame.timestamp, self._pose_wc(len(self.window) - 1), Status.INITIALISING)
 
     def _reduce(self) -> None:
-        """Drop the keyframe that adds nothing, and archive what is too old."""
+        """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
         window, config = self.window, self.config
         n = len(window)
         back = config.keyframe_index

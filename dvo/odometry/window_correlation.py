@@ -12,7 +12,7 @@ from dvo.nets.correlation import Correlation
 from dvo.nets.edge_correlation import EdgeCorrelation
 from dvo.nets.patchifier import pool_levels
 
-# Sides leave room for several pixels of motion before a window of features must be fetched again.
+# Sides allow several pixels of motion before the products of a window must be computed again.
 _SIDE_FINE, _SIDE_COARSE = 14, 12
 
 
@@ -20,7 +20,7 @@ class WindowCorrelation:
     """:class:`dvo.nets.correlation.CorrelationLookup` over a window, with a cache for each level of the pyramid.
 
     Args:
-        window: whose edges are looked up; batch size 1.
+        window: provides the edges and patch features.
         config: of the network.
         device: of the caches.
     """
@@ -43,19 +43,31 @@ class WindowCorrelation:
         """Store the feature maps of a frame.
 
         Args:
-            map_slot: their place; what was there is overwritten.
+            map_slot: slot of the frame; its content is overwritten.
             maps: ``(1, 1, C, h, w)`` matching features.
         """
         for level, pooled in zip(self.levels, pool_levels(maps, self.pyramid), strict=True):
             level.keep_map(map_slot, pooled[0, 0])
 
     def forget(self, edge_slots: Tensor) -> None:
-        """Invalidate the slots ``(e,)`` of new edges."""
+        """Invalidate the slots of new edges.
+
+        Args:
+            edge_slots: ``(e,)``.
+        """
         for level in self.levels:
             level.forget(edge_slots)
 
     def __call__(self, coords: Tensor, graph: PatchGraph) -> Correlation:
-        """Look up the edges of the window, see :class:`dvo.nets.correlation.CorrelationLookup`."""
+        """Look up the edges of the window, see :class:`dvo.nets.correlation.CorrelationLookup`.
+
+        Args:
+            coords: ``(1, E, p, p, 2)`` reprojected patch pixels in feature pixels.
+            graph: the edges of the window.
+
+        Returns:
+            Channels in the order ``pixels_first``.
+        """
         window = self.window
         matching = window.matching.flatten(2)
         maps = window.map_slots[graph.jj]

@@ -10,7 +10,7 @@ from dvo.nets.correlation import CorrelationLookup
 
 
 class WindowStep:
-    """Takes steps of a model on a window, which it changes.
+    """Steps of a model on a window, in place.
 
     Args:
         model: the network.
@@ -26,18 +26,30 @@ class WindowStep:
         self.bounds = (0, 0)
 
     def state(self) -> UpdateState:
-        """State of the window, as a batch of one."""
+        """State of the window.
+
+        Returns:
+            State with a batch dimension of 1.
+        """
         w = self.window
         return UpdateState(
             w.edges, w.poses_cw[None], w.patches[None], w.intrinsics[None], w.context[None], w.hidden[None]
         )
 
     def revise(self) -> Revision:
-        """Output of the network; the window does not change."""
+        """Run the network on the edges of the window, which does not change.
+
+        Returns:
+            Output of the network.
+        """
         return revise(self.model, self.state(), self.lookup)
 
     def __call__(self, options: StepOptions) -> None:
-        """Take a step; see :func:`dvo.models.step.step`. ``bounds`` are those of the feature map."""
+        """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
+
+        Args:
+            options: of the step; ``bounds`` are replaced by those of the feature map.
+        """
         after = step(self.model, self.state(), self.lookup, replace(options, bounds=self.bounds))
         assert after.targets is not None and after.weights is not None
         window = self.window

@@ -1,4 +1,4 @@
-"""The image that the network sees: a fixed budget of pixels, the aspect kept."""
+"""Working image of the tracker: the frame resized to a fixed number of pixels at the same aspect."""
 
 from __future__ import annotations
 
@@ -16,23 +16,37 @@ _MULTIPLE = 8
 
 
 def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
-    """Width and height, multiples of 8, of about ``pixels`` pixels and the same aspect; never larger than the image
-    by more than the rounding. ``pixels = 0`` keeps the size up to the rounding."""
+    """Size of the working image; larger than the image at most by the rounding.
+
+    Args:
+        width, height: of the image.
+        pixels: number of pixels to aim for; 0 keeps the size up to the rounding.
+
+    Returns:
+        Width and height, multiples of 8 and at least 32, of nearly the same aspect.
+    """
     scale = 1.0 if pixels <= 0 else min(1.0, math.sqrt(pixels / (width * height)))
     return tuple(max(_MULTIPLE * 4, _MULTIPLE * round(side * scale / _MULTIPLE)) for side in (width, height))  # type: ignore[return-value]
 
 
 def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
-    """Area-resampled ``(H, W, 3)`` uint8 image and its camera.
+    """Resize a frame by area resampling.
+
+    Args:
+        frame: without lens distortion.
+        pixels: see :func:`working_size`.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB image and its camera.
 
     Raises:
-        DvoError: the frame's camera has distortion, with which poses would be wrong without a word.
+        DvoError: the frame's camera has distortion, which the tracker does not model.
     """
     if needs_undistortion(frame.camera):
         raise DvoError(
             f"frames with {frame.camera.model} distortion cannot be tracked",
             field="camera",
-            remedy="undistort them first: dvo.geometry.undistort.Undistorter, or open_source, which does it",
+            remedy="undistort them first: dvo.geometry.undistort.Undistorter, or dvo.open, which does this",
         )
     width, height = working_size(frame.camera.width, frame.camera.height, pixels)
     if (width, height) == (frame.camera.width, frame.camera.height):

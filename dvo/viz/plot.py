@@ -1,4 +1,4 @@
-"""Pictures of trajectories, drawn without a display."""
+"""Plots of trajectories, written to files without a display."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ SIZE_INCHES, DPI = (7.6, 6.0), 150
 
 
 def plan_axes(positions: np.ndarray) -> tuple[int, int]:
-    """The two coordinate axes, in order, along which ``(N, 3)`` positions reach farthest."""
+    """Coordinate axes of the plan view.
+
+    Args:
+        positions: ``(N, 3)``.
+
+    Returns:
+        Indices of the two axes of largest extent, in increasing order.
+    """
     if len(positions) == 0:
         return 0, 2
     first, second = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2])
@@ -25,9 +32,15 @@ def plan_axes(positions: np.ndarray) -> tuple[int, int]:
 
 
 def with_gaps(trajectory: Trajectory) -> np.ndarray:
-    """``(M, 3)`` positions with a row of nan wherever frames are missing, so that no line is drawn across the gap.
+    """Positions with a row of nan wherever frames are missing, so that no line is drawn across the gap.
 
-    A gap is a step in time beyond five median steps.
+    A gap is a time step longer than five median steps.
+
+    Args:
+        trajectory: camera to world.
+
+    Returns:
+        ``(M, 3)`` positions.
     """
     steps = np.diff(trajectory.timestamps)
     if len(steps) == 0:
@@ -46,13 +59,14 @@ def plot_trajectory(
     subtitle: str = "",
     label: str = "dvo",
 ) -> None:
-    """Draw the plan view: the plane of the two longest axes, equal scales, the start marked.
+    """Draw the plan view of a trajectory: the plane of the two longest axes, equal scales, the start marked.
 
     Args:
-        path: picture to write; the ending chooses the format.
+        path: image to write; the extension selects the format.
         estimate: camera to world, already aligned to the reference if there is one.
-        reference: ground truth, metres.
+        reference: ground truth, camera to world, metres.
         points: ``(M, 3)`` map points in the world of the estimate, drawn faintly behind it.
+        title, subtitle: texts above the plot.
         label: name of the estimate in the legend.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -78,7 +92,7 @@ def plot_trajectory(
 
 
 def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int]) -> None:
-    """Frame the trajectories, not the map: a few far points would shrink the path to a dot."""
+    """Set limits by the trajectories, not by the map: a few far points would make the path invisibly small."""
     if not tracks:
         return
     both = np.concatenate(tracks)[:, axes]

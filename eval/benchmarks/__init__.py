@@ -1,1 +1,1 @@
-"""Measurements of speed, each a program of its own: ``python -m eval.benchmarks.NAME``."""
+"""Benchmarks of speed, each a program of its own: ``python -m eval.benchmarks.NAME``."""

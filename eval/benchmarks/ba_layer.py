@@ -1,7 +1,7 @@
-"""Time the BA layer against its plain twin: ``python -m eval.benchmarks.ba_layer [--batch 1 4] [--device cpu]``.
+"""Benchmark of the BA layer: ``python -m eval.benchmarks.ba_layer [--batch 1 4] [--device cpu]``.
 
 Prints milliseconds of processor time (CPU) or wall time for two iterations, forward alone and with backward, the
-fastest of several runs, and the ratio to the dense normal equations of :mod:`dvo.ba.reference`.
+fastest of several runs, and the ratio to the dense reference implementation in :mod:`dvo.ba.reference`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from dvo.geometry.projection import reproject
 
 
 def training_clip(batch: int, frames: int, per_frame: int, device: torch.device) -> tuple[list[Tensor], list[Tensor]]:
-    """Tensors and edges for ``bundle_adjust``: a clip whose patches are all seen in every other frame.
+    """Input of ``bundle_adjust`` as in training: every patch has an edge into every other frame.
 
     Args:
         batch, frames, per_frame: numbers of clips, frames, and patches per frame.
         device: of the result.
 
     Returns:
-        Poses, patches, intrinsics, targets, weights; and ``ii, jj, kk``.
+        Poses ``T_cw (B, N, 7)``, patches ``(B, K, 3, 3, 3)``, intrinsics ``(B, N, 4)``, targets ``(B, E, 2)`` in
+        feature pixels and weights ``(B, E, 2)``; and ``ii, jj, kk (E,)``.
     """
     generator = torch.Generator().manual_seed(0)
     count = frames * per_frame
@@ -49,12 +50,15 @@ def training_clip(batch: int, frames: int, per_frame: int, device: torch.device)
 
 
 def fastest(run: Callable[[], None], device: torch.device, repeats: int) -> float:
-    """Shortest time of several runs, milliseconds.
+    """Shortest time of several runs.
 
     Args:
         run: the call to time.
-        device: waited for after each run.
+        device: synchronised after each run.
         repeats: number of runs.
+
+    Returns:
+        Milliseconds, of processor time on the CPU and wall time elsewhere.
     """
     clock = time.process_time if device.type == "cpu" else time.perf_counter
     best = float("inf")
@@ -68,7 +72,7 @@ def fastest(run: Callable[[], None], device: torch.device, repeats: int) -> floa
 
 
 def main() -> None:
-    """Print the table."""
+    """Run the benchmark and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 4])
     parser.add_argument("--frames", type=int, default=8)
@@ -88,7 +92,7 @@ def main() -> None:
 
             def layer(leaves: list[Tensor] = leaves, backward: bool = backward) -> None:
                 a, b, c, d, e = leaves
-                result = bundle_adjust(a, b, c, d, e, ii, jj, kk, plan=plan)  # noqa: B023 (called in this turn)
+                result = bundle_adjust(a, b, c, d, e, ii, jj, kk, plan=plan)  # noqa: B023 (called in this iteration)
                 if backward:
                     (result.poses_cw.sum() + result.patches.sum()).backward()
 

@@ -1,11 +1,11 @@
-"""Speed and results of this checkout against an earlier commit.
+"""Speed and results of this checkout compared with an earlier commit.
 
 ``python -m eval.benchmarks.compare_commits --base REV [--pairs 5] [--what tracking,ba,training]``
 
-REV is checked out into a temporary git worktree. Each measurement then runs in fresh processes of one thread, base and
-current by turns, so that a change of the machine's load meets both; printed are all pairs and the median of their
-ratios (current over base; below 1 the current tree is faster). Seconds are processor time. For tracking, each tree also
-runs ``dvo run`` on the real clips once, and their ``trajectory.txt`` are compared byte by byte.
+REV is checked out into a temporary git worktree. Each measurement then runs in new single-threaded processes, base and
+current alternately, so that varying load of the machine affects both equally; the output is every pair and the median
+of their ratios (current over base; below 1 the current tree is faster). Seconds are processor time. For tracking, each
+tree also runs ``dvo run`` on the real clips once, and their ``trajectory.txt`` are compared byte by byte.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Settings:
 
     Attributes:
         data: folder of the real clips.
-        clip, frames: clip whose tracking is timed, and how many of its frames; None for all.
+        clip, frames: clip of the tracking benchmark, and number of its frames; None for all.
         steps: training steps of one measurement.
-        clips: whose trajectories are compared.
+        clips: clips whose trajectories are compared.
     """
 
     data: Path
@@ -52,14 +52,17 @@ class Settings:
 
 @contextmanager
 def worktree(revision: str, repository: Path = ROOT) -> Iterator[Path]:
-    """A temporary checkout of a commit, removed at the end.
+    """Temporary checkout of a commit, removed at the end.
 
     Args:
         revision: commit, branch or tag.
-        repository: checkout whose history has it.
+        repository: checkout with the commit in its history.
+
+    Returns:
+        Context manager that yields the root of the checkout.
 
     Raises:
-        DvoError: git is not there, or does not find the commit.
+        DvoError: git is not installed, or does not find the commit.
     """
     with tempfile.TemporaryDirectory(prefix="dvo-base-") as folder:
         place = Path(folder) / "tree"
@@ -71,12 +74,15 @@ def worktree(revision: str, repository: Path = ROOT) -> Iterator[Path]:
 
 
 def seconds(what: str, tree: Path, settings: Settings) -> float:
-    """One measurement in a fresh process.
+    """Run one measurement in a new process.
 
     Args:
         what: ``tracking``, ``ba`` (one call with backward) or ``training`` (one step).
-        tree: checkout that is measured.
+        tree: checkout to measure.
         settings: sizes.
+
+    Returns:
+        Processor time, seconds.
 
     Raises:
         DvoError: the process failed, or printed no time.
@@ -91,16 +97,16 @@ def seconds(what: str, tree: Path, settings: Settings) -> float:
         output = _run([sys.executable, script, what, *clip, *frames], tree)
         found = re.search(r"SECONDS ([0-9.]+)", output)
     if found is None:
-        raise DvoError("printed no time", file=tree, field=what, remedy="run the measurement by hand")
+        raise DvoError("output without a time", file=tree, field=what, remedy="run the measurement by hand")
     return float(found[1])
 
 
 def paired(measure: Callable[[Path], float], base: Path, current: Path, pairs: int) -> list[tuple[float, float]]:
-    """Measure two trees by turns: base, current, base, current, ...
+    """Measure two trees alternately: base, current, base, current, ...
 
     Args:
-        measure: gives the seconds of a tree.
-        base, current: the trees.
+        measure: seconds of a tree.
+        base, current: roots of the checkouts.
         pairs: number of pairs.
 
     Returns:
@@ -110,22 +116,45 @@ def paired(measure: Callable[[Path], float], base: Path, current: Path, pairs: i
 
 
 def median_ratio(pairs: list[tuple[float, float]]) -> float:
-    """Median over the pairs of current over base."""
+    """Median of the ratios current over base.
+
+    Args:
+        pairs: seconds of base and current.
+
+    Returns:
+        Ratio; below 1 the current tree is faster.
+    """
     return statistics.median(current / base for base, current in pairs)
 
 
 def trajectory(tree: Path, clip: Path, out: Path) -> bytes:
-    """Content of ``trajectory.txt`` of ``dvo run`` on a clip, seed 0, on the CPU."""
+    """Run ``dvo run`` on a clip, with seed 0 on the CPU.
+
+    Args:
+        tree: checkout to run.
+        clip: folder of the clip.
+        out: results folder to write.
+
+    Returns:
+        Content of ``trajectory.txt``.
+
+    Raises:
+        DvoError: the run failed.
+    """
     command = [sys.executable, "-m", "dvo", "run", str(clip), "--out", str(out), "--seed", "0", "--device", "cpu"]
     _run(command, tree)
     return (out / "trajectory.txt").read_bytes()
 
 
 def same_trajectories(base: Path, current: Path, settings: Settings) -> dict[str, bool]:
-    """Compare the trajectories of both trees byte by byte.
+    """Compare the trajectories of two trees byte by byte.
+
+    Args:
+        base, current: roots of the checkouts.
+        settings: the clips and their folder.
 
     Returns:
-        True where they are equal, by clip.
+        Clip name to True if the trajectories are equal.
     """
     found = {}
     with tempfile.TemporaryDirectory(prefix="dvo-tracks-") as folder:
@@ -158,21 +187,28 @@ def _git(repository: Path, *arguments: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Print the comparison.
+    """Run the comparison and print it.
+
+    Args:
+        arguments: of the command line; None for those of the process.
 
     Returns:
-        Exit code: 0, or 2 for an input that the user can fix.
+        Exit code: 0, or 2 for invalid input.
     """
     line = argparse.ArgumentParser(prog="python -m eval.benchmarks.compare_commits", description=__doc__,
                                    formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     line.add_argument("--base", required=True, metavar="REV", help="commit to compare with")
-    line.add_argument("--pairs", type=int, default=5, metavar="N", help="pairs of each measurement (5)")
-    line.add_argument("--what", default=",".join(WHAT), help=f"names with commas between ({','.join(WHAT)})")
+    line.add_argument("--pairs", type=int, default=5, metavar="N", help="number of pairs of each measurement (5)")
+    line.add_argument("--what", default=",".join(WHAT), help=f"measurements, separated by commas ({','.join(WHAT)})")
     line.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings ($DVO_DATA, ../shared/data)")
     line.add_argument("--clip", default=Settings.clip, help=f"clip whose tracking is timed ({Settings.clip})")
-    line.add_argument("--frames", type=int, metavar="N", help="of it (all)")
+    line.add_argument("--frames", type=int, metavar="N", help="number of its frames (all)")
     line.add_argument("--steps", type=int, default=Settings.steps, help="training steps of a measurement (5)")
-    line.add_argument("--clips", default=",".join(CLIPS), help="clips whose trajectories are compared; '' for none")
+    line.add_argument(
+        "--clips",
+        default=",".join(CLIPS),
+        help="clips whose trajectories are compared, separated by commas; '' for none",
+    )
     given = line.parse_args(arguments)
     try:
         names = [name for name in given.what.split(",") if name]

@@ -1,8 +1,8 @@
 """Time and peak memory of global bundle adjustment: ``python -m eval.benchmarks.global_ba [--frames 1000]``.
 
-A camera drives two laps of a circle; patches are seen in the neighbouring frames and, on the second lap, in those of
-the first. Targets have noise and some are wrong; the first estimate drifts. Prints edges, seconds, peak memory, and
-cost and position error before and after.
+A synthetic camera moves along two laps of a circle; patches have edges into the neighbouring frames and, between the
+laps, into the frames around the same place. Targets have noise and outliers; the initial poses drift. Prints edges,
+seconds, peak memory, and cost and position error before and after.
 """
 
 from __future__ import annotations
@@ -28,7 +28,17 @@ RADIUS = 10.0
 
 @dataclass(frozen=True)
 class Graph:
-    """Arguments of :func:`dvo.ba.global_adjust.global_bundle_adjust`, and the poses that the targets were made with."""
+    """Arguments of :func:`dvo.ba.global_adjust.global_bundle_adjust`, and the true poses.
+
+    Attributes:
+        poses_cw: ``(N, 7)`` initial world-to-camera poses.
+        patches: ``(K, 3, 1, 1)`` x, y (pixels), initial inverse depth (1/m).
+        intrinsics: ``(N, 4)`` fx fy cx cy, pixels.
+        targets: ``(E, 2)`` measured positions, pixels.
+        weights: ``(E, 2)``.
+        ii, jj, kk: ``(E,)`` source frame, target frame and patch.
+        true_poses_cw: ``(N, 7)``.
+    """
 
     poses_cw: Tensor
     patches: Tensor
@@ -41,7 +51,11 @@ class Graph:
     true_poses_cw: Tensor
 
     def arguments(self) -> tuple[Tensor, ...]:
-        """Poses, patches, intrinsics, targets, weights, ii, jj, kk."""
+        """Positional arguments of :func:`dvo.ba.global_adjust.global_bundle_adjust`.
+
+        Returns:
+            Poses, patches, intrinsics, targets, weights, ii, jj, kk.
+        """
         return (self.poses_cw, self.patches, self.intrinsics, self.targets, self.weights, self.ii, self.jj, self.kk)
 
 
@@ -55,17 +69,20 @@ def make_graph(
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> Graph:
-    """Two laps of a circle, the camera looking outwards.
+    """Two laps of a circle with the camera facing outwards.
 
     Args:
-        frames: of both laps together.
+        frames: number of frames of both laps together.
         per_frame: patches of each frame.
-        reach: patches are seen this many frames earlier and later.
-        loop_reach: and so many around the frame one lap away, from the second lap to the first and back.
-        noise: of the targets, pixels.
-        wrong: fraction of targets that are anywhere in the image.
+        reach: largest distance in frames of the edges of a patch.
+        loop_reach: largest distance in frames of its edges around the frame one lap away.
+        noise: standard deviation of the targets, pixels.
+        wrong: fraction of targets that are uniform over the image.
         seed: of the random numbers.
         dtype: of all tensors.
+
+    Returns:
+        The problem, with a drifting initial estimate.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -107,7 +124,7 @@ def make_graph(
     outlier = rand(len(target)) < wrong
     target[outlier] = rand(int(outlier.sum()), 2) * size
 
-    # Drift: each motion to the next frame is a little wrong.
+    # Drift: each motion to the next frame has a small error.
     motions = se3.relative(true[:-1], true[1:])
     motions = se3.retract(motions, randn(frames - 1, 6) * torch.tensor([2e-3] * 3 + [4e-4] * 3, dtype=torch.float64))
     start = [true[0]]
@@ -121,7 +138,14 @@ def make_graph(
 
 
 def position_error(poses_cw: Tensor, true_poses_cw: Tensor) -> float:
-    """Root mean square distance of camera centres, with the one scale that fits best; the first pose is shared."""
+    """Root mean square distance of camera centres at the best common scale, with the first pose shared.
+
+    Args:
+        poses_cw, true_poses_cw: ``(N, 7)`` world to camera.
+
+    Returns:
+        Distance, in the unit of the true poses.
+    """
     a, b = (se3.inverse(x)[:, :3] for x in (poses_cw, true_poses_cw))
     a, b = a - a[0], b - b[0]
     scale = (a * b).sum() / (a * a).sum()
@@ -129,7 +153,7 @@ def position_error(poses_cw: Tensor, true_poses_cw: Tensor) -> float:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Run the benchmark and print its results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--patches", type=int, default=48, help="per frame")

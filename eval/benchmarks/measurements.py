@@ -1,7 +1,7 @@
 """Single measurements for :mod:`eval.benchmarks.compare_commits`: ``python measurements.py tracking CLIP``.
 
-Run as a file, with the tree to be measured on PYTHONPATH. Only names that every version of dvo has are used, so that
-one file measures them all. Seconds are those of the processor in this process, which other work on the machine hardly
+Run as a file, with the tree to be measured on PYTHONPATH. The file uses only names that exist in every version of dvo,
+so that it can measure all of them. Seconds are processor time of this process, which other load of the machine hardly
 changes.
 """
 
@@ -19,7 +19,15 @@ import dvo
 
 
 def tracking(clip: str, frames: int | None) -> float:
-    """Seconds to track and finish a clip with the weights ``small``; reading is not counted."""
+    """Track and finish a clip with the weights ``small``.
+
+    Args:
+        clip: folder of the clip.
+        frames: number of its frames; None for all.
+
+    Returns:
+        Processor time without reading, seconds.
+    """
     images = list(islice(dvo.open(clip), frames))
     odometry = dvo.load("small", seed=0)
     start = time.process_time()
@@ -30,13 +38,16 @@ def tracking(clip: str, frames: int | None) -> float:
 
 
 def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: int = 24) -> float:
-    """Seconds of one bundle adjustment with its backward pass, the fastest of some.
+    """One bundle adjustment with its backward pass, on a problem as in training.
 
-    The problem is that of a training clip: every patch is seen in every other frame.
+    Every patch has an edge into every other frame.
 
     Args:
-        repeats: runs.
+        repeats: number of runs.
         batch, frames, per_frame: clips, frames of each and patches of a frame.
+
+    Returns:
+        Processor time of the fastest run, seconds.
     """
     generator = torch.Generator().manual_seed(0)
     count = frames * per_frame
@@ -65,7 +76,15 @@ def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: 
 
 
 def edge_plan(ii: torch.Tensor, jj: torch.Tensor, kk: torch.Tensor, frames: int, count: int) -> Any:
-    """Plan of the edges, as training makes one for a graph that stays; None in a version that has no such function."""
+    """Plan of the edges, as training makes it once for a fixed graph.
+
+    Args:
+        ii, jj, kk: ``(E,)`` source frame, target frame and patch.
+        frames, count: numbers of frames and patches.
+
+    Returns:
+        The plan; None in a version without this function.
+    """
     try:
         from dvo.ba.edges import plan_edges
 
@@ -75,7 +94,7 @@ def edge_plan(ii: torch.Tensor, jj: torch.Tensor, kk: torch.Tensor, frames: int,
 
 
 def main() -> None:
-    """Print the seconds."""
+    """Run one measurement and print its seconds."""
     line = argparse.ArgumentParser(description=__doc__)
     line.add_argument("what", choices=("tracking", "ba"))
     line.add_argument("clip", nargs="?")

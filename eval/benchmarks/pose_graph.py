@@ -1,7 +1,7 @@
-"""Pose graphs from g2o files, and a generated one: ``python -m eval.benchmarks.pose_graph [FILE...] [--poses 10000]``.
+"""Benchmark of pose graph optimisation: ``python -m eval.benchmarks.pose_graph [FILE...] [--poses 10000]``.
 
-Prints for each file poses, edges, chi2 before and after (as g2o defines it), iterations and seconds; likewise for laps
-of a circle in Sim(3) whose scale drifts.
+Prints poses, edges, chi2 before and after (as defined by g2o), iterations and seconds for each g2o file, and for a
+synthetic graph of laps of a circle in Sim(3) with drifting scale.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class PoseGraph:
     """Arguments of :func:`dvo.ba.pose_graph.optimise_pose_graph`, float64.
 
     Attributes:
-        poses_cw: ``(N, 7)``, in the order of the file.
-        ii, jj: ``(E,)``.
-        measurements: ``(E, 7)`` of ``T_j T_i^-1``.
+        poses_cw: ``(N, 7)`` world to camera, in the order of the file.
+        ii, jj: ``(E,)`` indices of the poses of each edge.
+        measurements: ``(E, 7)`` measured ``T_j T_i^-1``.
         information: ``(E, 6, 6)`` in the coordinates of ``chart``.
         chart: "quaternion" for a 3-D graph, "split" for a planar one.
     """
@@ -49,10 +49,13 @@ def read_g2o(path: Path | str) -> PoseGraph:
     """Read ``VERTEX_SE3:QUAT`` and ``EDGE_SE3:QUAT``, or ``VERTEX_SE2`` and ``EDGE_SE2`` embedded in SE(3).
 
     Args:
-        path: text file. Lines of other kinds are passed over.
+        path: text file; lines of other kinds are ignored.
+
+    Returns:
+        The graph.
 
     Raises:
-        DvoError: no such file, no edges, wrong numbers, 2-D mixed with 3-D, or an edge to a vertex that is not there.
+        DvoError: no such file, no edges, invalid numbers, 2-D mixed with 3-D, or an edge to a missing vertex.
     """
     path = Path(path)
     if not path.is_file():
@@ -64,7 +67,7 @@ def read_g2o(path: Path | str) -> PoseGraph:
             rows.setdefault(word, []).append(numbers)
     planar = "EDGE_SE2" in rows
     if planar == ("EDGE_SE3:QUAT" in rows):
-        raise DvoError("no edges, or edges of 2-D and 3-D", file=path, remedy="give a graph with one kind of edges")
+        raise DvoError("no edges, or both 2-D and 3-D edges", file=path, remedy="give a graph with one kind of edges")
     kind, size, upper = ("SE2", 3, 3) if planar else ("SE3:QUAT", 7, 6)
     try:
         vertices = np.array(rows.get(f"VERTEX_{kind}", []), dtype=np.float64).reshape(-1, 1 + size)
@@ -79,7 +82,7 @@ def read_g2o(path: Path | str) -> PoseGraph:
     ends = edges[:, :2].astype(np.int64)
     at = np.searchsorted(names, ends).clip(max=max(len(names) - 1, 0))
     if not len(names) or (names[at] != ends).any():
-        raise DvoError("an edge of a vertex that is not there", file=path, remedy="check that the file is complete")
+        raise DvoError("an edge to a missing vertex", file=path, remedy="check that the file is complete")
     index = torch.from_numpy(order[at])
     poses, relative = (_poses(x, planar) for x in (vertices[:, 1:], edges[:, 2 : 2 + size]))
     row, column = np.triu_indices(upper)
@@ -108,12 +111,12 @@ def _poses(numbers: np.ndarray, planar: bool) -> Tensor:
 def make_laps(
     count: int, lap: int = 500, every: int = 5, seed: int = 0
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Similarities along laps of a circle: noisy motions, and loops to the lap before.
+    """Synthetic pose graph in Sim(3): noisy motions along laps of a circle, and loop edges to the lap before.
 
     Args:
-        count: poses.
-        lap: poses of a lap.
-        every: so many poses apart are the loops.
+        count: number of poses.
+        lap: number of poses of a lap.
+        every: distance, in poses, of the loop edges.
         seed: of the noise.
 
     Returns:
@@ -137,7 +140,7 @@ def make_laps(
 
 
 def main() -> None:
-    """Print a row for each graph."""
+    """Run the benchmark and print a row for each graph."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--poses", type=int, default=0, help="of the generated graph")

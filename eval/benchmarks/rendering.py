@@ -1,12 +1,12 @@
-"""Speed of the renderer, and whether training waits for it.
+"""Speed of the renderer, alone and relative to a training step.
 
 ``python -m eval.benchmarks.rendering [--frames 8] [--clips 5] [--steps 3] [--threads 1]``
 
-Prints frames per second of clean frames at three sizes, on the CPU and on the accelerator where there is one, for a
-scene of each family; then the time to draw one training clip beside that of one training step of the small recipe
-(configs/train/small.yaml), both with the same threads, one after the other. In training a worker process renders on a
-core of its own, so that training waits only where the ratio exceeds 1. On the CPU, time is processor time of this
-process (with several threads, their sum), so that other work on the machine does not spoil the figures.
+Prints frames per second without sensor effects at three sizes, on the CPU and on the accelerator if there is one, for a
+scene of each family; then the time to generate one training clip and that of one training step of the small
+configuration (configs/train/small.yaml), with the same number of threads, one after the other. In training a worker
+process renders on a core of its own, so training waits only if the ratio exceeds 1. On the CPU, time is processor time
+of this process (summed over threads), so that other load of the machine does not affect the results.
 """
 
 from __future__ import annotations
@@ -32,7 +32,15 @@ RECIPE = Path(__file__).resolve().parents[2] / "configs" / "train" / "small.yaml
 
 
 def frames_per_second(device: torch.device, frames: int) -> list[tuple[str, list[float]]]:
-    """For each family (and their mean time, last), frames a second at ``SIZES``."""
+    """Rendering speed for each family of scenes.
+
+    Args:
+        device: to render on.
+        frames: number of frames rendered together.
+
+    Returns:
+        For each family, and last for their mean time, the frames per second at each of :data:`SIZES`.
+    """
     rows, seconds = [], np.zeros((len(SHARES), len(SIZES)))
     for i, family in enumerate(SHARES):
         scene = random_scene(0, family, pool=texture_pool(0))
@@ -53,10 +61,18 @@ def frames_per_second(device: torch.device, frames: int) -> list[tuple[str, list
 
 
 def clip_seconds(count: int, recipe: dict[str, Any]) -> tuple[float, list[dict[str, torch.Tensor]]]:
-    """Mean seconds to draw a clip of the recipe (planning, scene, rendering, sensor), and the clips."""
+    """Time to generate a training clip: planning, scene, rendering and sensor effects.
+
+    Args:
+        count: number of clips.
+        recipe: training configuration.
+
+    Returns:
+        Mean processor time, seconds, and the clips as training batches.
+    """
     data = recipe["data"]
     options = {"frames": data.get("frames", 8), "flow_range": (data["flow_low"], data["flow_high"])}
-    make_clip(0, 2**20, **options)  # textures are drawn when first used: not the state of a running training
+    make_clip(0, 2**20, **options)  # textures are generated on first use, which is no part of a running training
     batches = []
     start = time.process_time()
     for index in range(count):
@@ -68,7 +84,16 @@ def clip_seconds(count: int, recipe: dict[str, Any]) -> tuple[float, list[dict[s
 
 
 def step_seconds(count: int, recipe: dict[str, Any], batches: list[dict[str, torch.Tensor]]) -> float:
-    """Mean seconds of a training step: loss, backward, clipping, optimiser; the phase with bundle adjustment."""
+    """Time of a training step with bundle adjustment: loss, backward, clipping, optimiser.
+
+    Args:
+        count: number of timed steps.
+        recipe: training configuration.
+        batches: training batches, used in turn.
+
+    Returns:
+        Mean processor time, seconds.
+    """
     from train.engine.build import make_program
 
     module = make_program(**{**recipe["model"], "warmup_until": 0.0})
@@ -84,11 +109,11 @@ def step_seconds(count: int, recipe: dict[str, Any], batches: list[dict[str, tor
             module.on_before_optimizer_step(optimizer)
             optimizer.step()
         spent.append(time.process_time() - start)
-    return float(np.mean(spent[1:]))  # the first one builds schedules
+    return float(np.mean(spent[1:]))  # without the first one, which builds schedules
 
 
 def main() -> None:
-    """Print the tables."""
+    """Run the benchmark and print its tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=8, help="frames rendered together")
     parser.add_argument("--clips", type=int, default=5)

@@ -1,4 +1,4 @@
-"""Frames per second, stage by stage, and peak memory of the tracker on 320x240 video.
+"""Speed by stage and peak memory of the tracker on 320x240 video.
 
 ``python -m eval.benchmarks.tracking_speed [--weights small] [--threads 2] [--frames 150]``
 """
@@ -24,7 +24,7 @@ STAGES = {
     "graph index": ("edges.py", "build_graph"),
     "reprojection": ("projection.py", "reproject"),
     "correlation": ("edge_correlation.py", "lookup"),
-    "  of it fetching new windows": ("edge_correlation.py", "_refresh"),
+    "  refresh of cached windows": ("edge_correlation.py", "_refresh"),
     "update operator": ("update.py", "forward"),
     "bundle adjustment": ("layer.py", "bundle_adjust"),
     "keyframes": ("tracker.py", "_reduce"),
@@ -33,11 +33,11 @@ STAGES = {
 
 def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
     rows = [row for (path, _, name), row in stats.stats.items() if path.endswith(file) and name == function]  # type: ignore[attr-defined]
-    return max((row[3] for row in rows), default=math.nan)  # nan: no such function ran
+    return max((row[3] for row in rows), default=math.nan)  # nan: the function was not called
 
 
 def main() -> None:
-    """Print the table."""
+    """Run the benchmark and print its results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--weights", default="small")
     parser.add_argument("--threads", type=int, default=2)
@@ -74,7 +74,7 @@ def main() -> None:
     profile.disable()
     stats = pstats.Stats(profile)
     whole = _cumulative(stats, "tracker.py", "track")
-    print("share of a frame, under the profiler:")
+    print("share of the time of a frame, under the profiler:")
     for stage, (file, function) in STAGES.items():
         print(f"  {stage:30s} {100 * _cumulative(stats, file, function) / whole:5.1f} %")
 

@@ -1,4 +1,4 @@
-"""What leaves the window is archived: within a bound, with the measurements, ready for a global bundle adjustment."""
+"""Archive of a keyframe graph: its memory bound, its measurements, and global bundle adjustment from it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Decisions and means over the processes of a distributed run; with one process they change nothing."""
+"""Means and decisions over the processes of a distributed run; identities with one process."""
 
 from __future__ import annotations
 
@@ -7,12 +7,20 @@ from torch import Tensor, distributed
 
 
 def world_size() -> int:
-    """Number of training processes."""
+    """Number of training processes.
+
+    Returns:
+        1 without a distributed run.
+    """
     return distributed.get_world_size() if distributed.is_available() and distributed.is_initialized() else 1
 
 
 def rank() -> int:
-    """Number of this process, 0 without a distributed run."""
+    """Index of this process.
+
+    Returns:
+        0 without a distributed run.
+    """
     return distributed.get_rank() if world_size() > 1 else 0
 
 
@@ -21,6 +29,9 @@ def mean_over_ranks(value: Tensor) -> Tensor:
 
     Args:
         value: of this process, any shape.
+
+    Returns:
+        The mean, equal in all processes; detached with more than one.
     """
     if world_size() == 1:
         return value
@@ -30,10 +41,13 @@ def mean_over_ranks(value: Tensor) -> Tensor:
 
 
 def all_agree(good: Tensor) -> bool:
-    """Whether a boolean scalar is true in every process.
+    """Logical and over the processes.
 
     Args:
-        good: of this process.
+        good: boolean scalar of this process.
+
+    Returns:
+        True if ``good`` is true in every process.
     """
     if world_size() > 1:
         least = good.to(torch.int32)

@@ -50,3 +50,30 @@ def test_pictures_exist():
 def test_the_ci_runs_the_test_command():
     """``.ci/run`` finds the command in the README by this pattern."""
     assert re.search(r"^pip install -e .* && pytest", README.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/architecture.md"])
+def test_rooms_named_are_the_rooms_there(page):
+    """The tree in the text lists every folder of the library, and no other."""
+    text = (README.parent / page).read_text(encoding="utf-8")
+    tree = text[text.index("    dvo/ ") : text.index("      viz/")].splitlines()[1:]
+    named = {found.group(1) for line in tree if (found := re.match(r"      (\w+)/ ", line))} | {"viz"}
+    there = {path.parent.name for path in (README.parent / "dvo").glob("*/__init__.py")}
+    assert named | {"commands"} == there
+
+
+@pytest.mark.parametrize("top", ["train", "eval"])
+def test_rooms_of_the_programs_are_named(top):
+    text = (README.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    line = next(line for line in text.splitlines() if line.startswith(f"    {top}/"))
+    there = {path.parent.name for path in (README.parent / top).glob("*/__init__.py")}
+    assert set(re.findall(r"(\w+)/", line)) - {top} == there
+
+
+def test_files_that_the_architecture_page_touches_exist():
+    """In the table of changes, files without emphasis are there; those to be added are not."""
+    text = (README.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = text[text.index("## Where a change goes") :]
+    for bold, name in re.findall(r"(\*\*)?`((?:dvo|train|eval|configs)/[\w/]+\.\w+)`", table):
+        exists = (README.parent / name).is_file()
+        assert exists != bool(bold) or "NAME" in name, name

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from dvo.data.registry import READERS
+from dvo.registry import Registry
 from eval.suites.suite import ROOT
 from eval.systems import plugin
 from eval.systems.system import System
@@ -38,6 +39,13 @@ def source_files(system: System) -> list[Path]:
                 _follow(name, found)
     else:
         _follow(place, found, (*_OWN, place.split(".")[0]))
+    if "dvo.odometry.load" in found:  # weights name a network, which other packages may bring
+        from dvo.models.registry import ARCHITECTURES
+        from dvo.nets.update import UPDATE_OPERATORS
+        from dvo.odometry.registry import ODOMETRIES
+
+        for registry in (ARCHITECTURES, ODOMETRIES, UPDATE_OPERATORS):
+            _follow_registered(registry, found)
     return sorted(found.values())
 
 
@@ -56,8 +64,8 @@ def code_digest(system: System) -> str:
 def reader_digest() -> str:
     """Hash of the code that turns files into frames."""
     found: dict[str, Path] = {}
-    for module in ("dvo.data.source", *(READERS.target(name).partition(":")[0] for name in READERS)):
-        _follow(module, found)
+    _follow("dvo.data.source", found)
+    _follow_registered(READERS, found)
     return _digest(sorted(found.values()))
 
 
@@ -110,6 +118,13 @@ def _follow(module: str, found: dict[str, Path], tops: tuple[str, ...] = _OWN) -
     found[module] = file
     for name in _imports_of(file, module, tops):
         _follow(name, found, tops)
+
+
+def _follow_registered(registry: Registry, found: dict[str, Path]) -> None:
+    """Follow the modules of all parts of a registry, those of other packages included."""
+    for name in registry:
+        module = registry.target(name).partition(":")[0]
+        _follow(module, found, (*_OWN, module.split(".")[0]))
 
 
 def _imports_of(file: Path, module: str, tops: tuple[str, ...]) -> tuple[str, ...]:

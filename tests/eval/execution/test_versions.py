@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from dvo.data.registry import READERS
+from dvo.odometry.registry import ODOMETRIES
 from eval.execution import versions
 from eval.execution.cache import system_facts
-from eval.execution.versions import code_digest, depends_on_threads, source_files
+from eval.execution.versions import code_digest, depends_on_threads, reader_digest, source_files
 from eval.suites.suite import ROOT
 from eval.systems.registry import CATALOGUE, find_system
 
@@ -61,3 +63,22 @@ def test_code_of_a_file_and_of_a_package(tmp_path, monkeypatch):
     system = find_system("own_slam.system:Own")
     assert {package / "system.py", package / "parts.py", ROOT / "dvo/data/frame.py"} <= set(source_files(system))
     assert not depends_on_threads(system)
+
+
+def test_networks_and_readers_of_other_packages_are_followed(tmp_path, monkeypatch):
+    """What weights may name counts for the learned systems, not for the classical ones; readers count for the data."""
+    (tmp_path / "brought_along.py").write_text("import brought_further\n")
+    (tmp_path / "brought_further.py").write_text("VALUE = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = reader_digest()
+    ODOMETRIES.register("brought", "brought_along:build")
+    READERS.register("brought", "brought_further:READER")
+    try:
+        learned = source_files(find_system("dvo-small"))
+        assert tmp_path / "brought_along.py" in learned
+        assert tmp_path / "brought_along.py" not in source_files(find_system("klt-pnp"))
+        assert reader_digest() != before
+    finally:
+        ODOMETRIES.unregister("brought")
+        READERS.unregister("brought")
+    assert reader_digest() == before

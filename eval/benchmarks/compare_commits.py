@@ -3,8 +3,9 @@
 ``python -m eval.benchmarks.compare_commits --base REV [--pairs 5] [--what tracking,ba,training]``
 
 REV is checked out into a temporary git worktree. Each measurement then runs in new single-threaded processes, base and
-current alternately, so that varying load of the machine affects both equally; the output is every pair and the median
-of their ratios (current over base; below 1 the current tree is faster). Seconds are processor time. For tracking, each
+current alternately, so that varying load of the machine affects both equally; of training, the two processes of a pair
+take turns step by step, and the median of their steps counts. The output is every pair and the median of their ratios
+(current over base; below 1 the current tree is faster). Seconds are processor time. For tracking, each
 tree also runs ``dvo run`` on the real clips once, and their ``trajectory.txt`` are compared byte by byte.
 """
 
@@ -18,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +30,8 @@ from eval.suites.suite import ROOT
 CLIPS = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr1_rpy_60")
 WHAT = ("tracking", "ba", "training")
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-_STEP = re.compile(r"^step\s+([0-9.]+) s$", re.MULTILINE)  # of the table of `python -m train profile`
+_SCRIPT = str(Path(__file__).with_name("measurements.py"))
+_SECONDS = re.compile(r"SECONDS ([0-9.]+)")
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Settings:
     data: Path
     clip: str = "tartanair_v1_60"
     frames: int | None = None
-    steps: int = 5
+    steps: int = 15
     clips: tuple[str, ...] = CLIPS
 
 
@@ -77,7 +79,7 @@ def seconds(what: str, tree: Path, settings: Settings) -> float:
     """Run one measurement in a new process.
 
     Args:
-        what: ``tracking``, ``ba`` (one call with backward) or ``training`` (one step).
+        what: ``tracking`` or ``ba`` (one call with backward).
         tree: checkout to measure.
         settings: sizes.
 
@@ -87,18 +89,64 @@ def seconds(what: str, tree: Path, settings: Settings) -> float:
     Raises:
         DvoError: the process failed, or printed no time.
     """
-    if what == "training":
-        output = _run([sys.executable, "-m", "train", "profile", "--steps", str(settings.steps), "--cpu-time"], tree)
-        found = _STEP.search(output)
-    else:
-        script = str(Path(__file__).with_name("measurements.py"))
-        clip = [str(settings.data / settings.clip)] if what == "tracking" else []
-        frames = ["--frames", str(settings.frames)] if settings.frames else []
-        output = _run([sys.executable, script, what, *clip, *frames], tree)
-        found = re.search(r"SECONDS ([0-9.]+)", output)
+    clip = [str(settings.data / settings.clip)] if what == "tracking" else []
+    frames = ["--frames", str(settings.frames)] if settings.frames else []
+    output = _run([sys.executable, _SCRIPT, what, *clip, *frames], tree)
+    found = _SECONDS.search(output)
     if found is None:
         raise DvoError("output without a time", file=tree, field=what, remedy="run the measurement by hand")
     return float(found[1])
+
+
+class _Steps:
+    """Process that takes a training step when it is asked for one."""
+
+    def __init__(self, tree: Path) -> None:
+        self.tree = tree
+        command = [sys.executable, _SCRIPT, "training"]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, cwd=tree, env=_environment(tree), text=True, stdin=pipe, stdout=pipe)
+        self._answer("READY")
+
+    def step(self) -> float:
+        """Take a step; returns its processor time in seconds."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        return float(self._answer("SECONDS").split()[1])
+
+    def _answer(self, start: str) -> str:
+        assert self.process.stdout is not None
+        answer = self.process.stdout.readline()
+        if not answer.startswith(start):
+            raise DvoError("training failed", file=self.tree, remedy=f"run 'python {_SCRIPT} training' there")
+        return answer
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.communicate()  # end of its input
+
+
+def alternate_steps(base: Path, current: Path, count: int) -> tuple[float, float]:
+    """Run training steps of two trees by turns, in a new process each.
+
+    Args:
+        base, current: roots of the checkouts.
+        count: steps of each, after two that do not count.
+
+    Returns:
+        Median processor time of a step of each tree, seconds.
+
+    Raises:
+        DvoError: a process failed.
+    """
+    with ExitStack() as stack:
+        processes = [_Steps(tree) for tree in (base, current)]
+        for process in processes:
+            stack.callback(process.close)
+        rounds = [[process.step() for process in processes] for _ in range(count + 2)]
+    one, two = (statistics.median(steps[2:]) for steps in zip(*rounds, strict=True))
+    return one, two
 
 
 def paired(measure: Callable[[Path], float], base: Path, current: Path, pairs: int) -> list[tuple[float, float]]:
@@ -166,12 +214,15 @@ def same_trajectories(base: Path, current: Path, settings: Settings) -> dict[str
 
 
 def _run(command: list[str], tree: Path) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(tree), "OMP_WAIT_POLICY": "PASSIVE"} | dict.fromkeys(_THREADS, "1")
-    done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=tree, env=_environment(tree), capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
         raise DvoError(f"{' '.join(command[1:4])} failed: {last}", file=tree, remedy="run it there by hand")
     return done.stdout
+
+
+def _environment(tree: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(tree), "OMP_WAIT_POLICY": "PASSIVE"} | dict.fromkeys(_THREADS, "1")
 
 
 def _git(repository: Path, *arguments: str) -> None:
@@ -203,7 +254,7 @@ def main(arguments: list[str] | None = None) -> int:
     line.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings ($DVO_DATA, ../shared/data)")
     line.add_argument("--clip", default=Settings.clip, help=f"clip whose tracking is timed ({Settings.clip})")
     line.add_argument("--frames", type=int, metavar="N", help="number of its frames (all)")
-    line.add_argument("--steps", type=int, default=Settings.steps, help="training steps of a measurement (5)")
+    line.add_argument("--steps", type=int, default=Settings.steps, help=f"training steps of a pair ({Settings.steps})")
     line.add_argument(
         "--clips",
         default=",".join(CLIPS),
@@ -231,7 +282,10 @@ def main(arguments: list[str] | None = None) -> int:
 def _compare(name: str, base: Path, settings: Settings, pairs: int) -> None:
     measured = []
     for number in range(pairs):
-        measured += paired(lambda tree: seconds(name, tree, settings), base, ROOT, 1)
+        if name == "training":
+            measured.append(alternate_steps(base, ROOT, settings.steps))
+        else:
+            measured += paired(lambda tree: seconds(name, tree, settings), base, ROOT, 1)
         one, two = measured[-1]
         print(f"{name:9} pair {number + 1}: base {one:.4f} s, current {two:.4f} s, ratio {two / one:.3f}", flush=True)
     print(f"{name:9} median ratio current / base of {pairs} pairs: {median_ratio(measured):.3f}", flush=True)

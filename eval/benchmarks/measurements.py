@@ -8,7 +8,9 @@ changes.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from collections.abc import Callable
 from itertools import islice
 from typing import Any
 
@@ -75,6 +77,42 @@ def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: 
     return best
 
 
+def training() -> Callable[[], float]:
+    """A training step of ``small``: forward pass of a rendered clip, pose and flow loss, backward pass.
+
+    Returns:
+        Function that takes one step, the same every time, and returns its processor time in seconds.
+    """
+    from dvo.geometry import se3
+    from dvo.losses.pose import pose_errors
+    from dvo.synth.clip import make_clip
+
+    try:
+        from dvo.models.schedule import training_schedule
+    except ImportError:  # before networks had a room of their own
+        from dvo.nets.schedule import training_schedule  # type: ignore[no-redef]
+
+    clip = make_clip(0, 1, frames=8, height=120, width=160, flow_range=(1.0, 14.0))
+    model = dvo.load_model("small").train()
+    stages = training_schedule(8, model.config.training_patches, 10, 4, 4, model.config.self_edges)
+
+    def step() -> float:
+        start = time.process_time()
+        states = model.unroll(
+            clip.images[None], clip.intrinsics[None], stages, poses_cw=se3.identity(1, 8),
+            generator=torch.Generator().manual_seed(0), correlation_gradient=0.3,
+        )  # fmt: skip
+        loss = torch.zeros(())
+        for state in states:
+            errors = pose_errors(state.poses_cw, clip.poses_cw[None, : state.frames])
+            loss = loss + (errors.translation + errors.rotation).mean() + 0.1 * (state.targets - 20).abs().mean()
+        loss.backward()
+        model.zero_grad()
+        return time.process_time() - start
+
+    return step
+
+
 def edge_plan(ii: torch.Tensor, jj: torch.Tensor, kk: torch.Tensor, frames: int, count: int) -> Any:
     """Plan of the edges, as training makes it once for a fixed graph.
 
@@ -96,7 +134,7 @@ def edge_plan(ii: torch.Tensor, jj: torch.Tensor, kk: torch.Tensor, frames: int,
 def main() -> None:
     """Run one measurement and print its seconds."""
     line = argparse.ArgumentParser(description=__doc__)
-    line.add_argument("what", choices=("tracking", "ba"))
+    line.add_argument("what", choices=("tracking", "ba", "training"))
     line.add_argument("clip", nargs="?")
     line.add_argument("--frames", type=int)
     line.add_argument("--repeats", type=int, default=30)
@@ -109,6 +147,12 @@ def main() -> None:
         reuse_freed_memory()
     except ImportError:
         pass
+    if given.what == "training":
+        step = training()
+        print("READY", flush=True)
+        for _ in sys.stdin:  # one step for every line, so that two processes can take turns
+            print(f"SECONDS {step():.9f}", flush=True)
+        return
     seconds = tracking(given.clip, given.frames) if given.what == "tracking" else bundle_adjustment(given.repeats)
     print(f"SECONDS {seconds:.9f}")
 

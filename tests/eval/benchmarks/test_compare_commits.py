@@ -9,7 +9,16 @@ import pytest
 
 from dvo.errors import DvoError
 from eval.benchmarks import compare_commits
-from eval.benchmarks.compare_commits import Settings, main, median_ratio, paired, same_trajectories, seconds, worktree
+from eval.benchmarks.compare_commits import (
+    Settings,
+    alternate_steps,
+    main,
+    median_ratio,
+    paired,
+    same_trajectories,
+    seconds,
+    worktree,
+)
 from eval.suites.suite import ROOT
 
 
@@ -71,10 +80,23 @@ def test_one_measurement_of_bundle_adjustment():
     assert 1e-4 < seconds("ba", ROOT, Settings(Path())) < 10
 
 
-def test_a_step_is_read_from_the_profile(monkeypatch):
-    table = "encoder   0.100 s  50.0 %\nstep                   1.234 s\nrender (in its own process)   9.000 s\n"
-    monkeypatch.setattr(compare_commits, "_run", lambda command, tree: table)
-    assert seconds("training", ROOT, Settings(Path())) == 1.234
+def test_training_steps_of_two_trees_take_turns(tmp_path, monkeypatch):
+    """Each process takes as many steps as asked for; the two first of each do not count."""
+    script = tmp_path / "steps.py"
+    script.write_text(
+        "import sys, pathlib\nprint('READY', flush=True)\n"
+        "for number, _ in enumerate(sys.stdin):\n"
+        "    with open('../turns', 'a') as file: file.write(pathlib.Path.cwd().name)\n"
+        "    print('SECONDS', 99 if number < 2 else 1 + ('b' == pathlib.Path.cwd().name), flush=True)\n"
+    )
+    monkeypatch.setattr(compare_commits, "_SCRIPT", str(script))
+    for name in "ab":
+        (tmp_path / name).mkdir()
+    assert alternate_steps(tmp_path / "a", tmp_path / "b", 3) == (1.0, 2.0)
+    assert (tmp_path / "turns").read_text() == "ababababab"
+    script.write_text("print('no')")
+    with pytest.raises(DvoError, match="training failed"):
+        alternate_steps(tmp_path / "a", tmp_path / "b", 1)
 
 
 def test_failures_are_told(tmp_path, capsys):

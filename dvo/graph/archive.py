@@ -4,7 +4,7 @@ A keyframe keeps its pose, its patches with their inverse depths (points are rel
 it), their colours, float16 features and the working image as JPEG, from which feature maps can be computed again. An
 edge keeps its target and weight. The archive serves global bundle adjustment, loop edges, export and saving.
 
-With the ``small`` network a keyframe takes about 34 kB of features, 15 to 25 kB of JPEG and 8 kB of edges. When the
+With the ``small`` network a keyframe takes about 34 kB of features, 15 to 25 kB of JPEG and 11 kB of edges. When the
 total exceeds :attr:`ArchiveConfig.max_bytes`, features and images of the oldest keyframes are released first, then the
 oldest edges, then the oldest patches; poses (56 bytes a keyframe) stay.
 """

@@ -1,10 +1,9 @@
 """Training task of :class:`distance_vo.network.DistanceNet`."""
 
-from train.tasks.task import StepLoss, Task
-
 from distance_vo.network import DistanceConfig, DistanceNet
 from dvo.geometry import se3
 from train.data.clips import Renderings
+from train.tasks.task import StepLoss, Task
 
 
 class DistanceTask(Task):

@@ -64,7 +64,7 @@ def parse_settings(items: Iterable[str]) -> dict[str, Any]:
         name, _, text = (part.strip() for part in item.partition("="))
         try:
             value = yaml.safe_load(text)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: dates, digits
             value = None
         if not name.isidentifier() or value is None:
             raise DvoError(f"not a setting: {item!r}", field=name or None, remedy="give NAME=VALUE, such as patches=48")
@@ -91,7 +91,7 @@ def read_settings(file: str | Path) -> dict[str, Any]:
         raise DvoError("no such file", file=path, remedy="give a YAML file with one 'name: value' a line")
     try:
         table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: encoding, dates, digits
         raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="fix the file") from error
     if not isinstance(table, dict) or not all(isinstance(name, str) for name in table):
         raise DvoError("not a table of settings", file=path, remedy="give one 'name: value' a line")

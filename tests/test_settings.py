@@ -31,7 +31,7 @@ def test_text_and_values_agree(patches, damping):
     assert TrackerConfig.from_dict(found).patches == patches
 
 
-@pytest.mark.parametrize("text", ["patches", "patches=", "=3", "a b=3", "a=[", ""])
+@pytest.mark.parametrize("text", ["patches", "patches=", "=3", "a b=3", "a=[", "", "a=2026-13-45", "a=" + "9" * 5000])
 def test_text_that_is_no_setting(text):
     with pytest.raises(DvoError, match="NAME=VALUE"):
         parse_settings([text])
@@ -47,7 +47,7 @@ def test_settings_of_a_file(tmp_path):
     file = tmp_path / "tracker.yaml"
     file.write_text("patches: 48\nupdates: 2\n")
     assert read_settings(file) == {"patches": 48, "updates": 2}
-    for text, message in (("- 1\n", "table"), ("a: [\n", "YAML"), ("3: 4\n", "table")):
+    for text, message in (("- 1\n", "table"), ("a: [\n", "YAML"), ("3: 4\n", "table"), ("a: " + "9" * 5000, "YAML")):
         file.write_text(text)
         with pytest.raises(DvoError, match=message) as error:
             read_settings(file)

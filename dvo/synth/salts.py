@@ -1,4 +1,4 @@
-"""Salts: the second number of every seed, one for each thing that is drawn.
+"""Salts: the second number of every seed, one for each random draw.
 
 ``numpy.random.default_rng([seed, SALT])`` gives streams that are independent of each other, so that an option that
 draws more numbers from one stream leaves the others as they are. A salt belongs to one stream: changing it changes the

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from dvo.nets.config import ModelConfig
     from dvo.odometry.config import TrackerConfig
     from dvo.odometry.load import load
-    from dvo.odometry.protocol import Estimate, Odometry, Result, SparseMap, Status
+    from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
     from dvo.odometry.session import run
     from dvo.synth.dataset import ClipDataset
 
@@ -39,6 +39,7 @@ _LAZY = {
     "BADamping": ("dvo.ba.options", "BADamping"),
     "BAOptions": ("dvo.ba.options", "BAOptions"),
     "BAResult": ("dvo.ba.options", "BAResult"),
+    "Break": ("dvo.odometry.protocol", "Break"),
     "Camera": ("dvo.geometry.camera", "Camera"),
     "ClipDataset": ("dvo.synth.dataset", "ClipDataset"),
     "Estimate": ("dvo.odometry.protocol", "Estimate"),
@@ -47,6 +48,7 @@ _LAZY = {
     "ModelConfig": ("dvo.nets.config", "ModelConfig"),
     "Odometry": ("dvo.odometry.protocol", "Odometry"),
     "Result": ("dvo.odometry.protocol", "Result"),
+    "Segment": ("dvo.odometry.protocol", "Segment"),
     "SparseMap": ("dvo.odometry.protocol", "SparseMap"),
     "Status": ("dvo.odometry.protocol", "Status"),
     "TrackerConfig": ("dvo.odometry.config", "TrackerConfig"),
@@ -62,8 +64,8 @@ _LAZY = {
 }
 
 __all__ = [
-    "BADamping", "BAOptions", "BAResult", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "Metrics",
-    "ModelConfig", "Odometry", "Result", "SparseMap", "Status", "TrackerConfig", "Trajectory", "__version__",
+    "BADamping", "BAOptions", "BAResult", "Break", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "Metrics",
+    "ModelConfig", "Odometry", "Result", "Segment", "SparseMap", "Status", "TrackerConfig", "Trajectory", "__version__",
     "bundle_adjust", "evaluate", "load", "load_model", "losses", "open", "run", "se3",
 ]  # fmt: skip
 

@@ -30,15 +30,21 @@ class Estimate:
 
     Attributes:
         timestamp: seconds, of the frame.
-        pose_wc: ``(7,)`` float64 camera to world ``T_wc`` (x y z, quaternion x y z w), or None if there is none yet.
+        pose_wc: ``(7,)`` float64 camera to world ``T_wc`` (x y z, quaternion x y z w), or None if there is none: before
+            the first one, and while the status is ``lost``.
         status: state of the tracker.
         confidence: in [0, 1]; comparable within one run only.
+        segment: number of the segment that the pose belongs to, from 0. Poses of two segments have different worlds and
+            different scales.
+        reason: cause of the status ``lost``, such as ``"black image"``; empty otherwise.
     """
 
     timestamp: float
     pose_wc: np.ndarray | None
     status: Status
     confidence: float = 0.0
+    segment: int = 0
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,16 +61,56 @@ class SparseMap:
 
 
 @dataclass(frozen=True)
+class Segment:
+    """Uninterrupted part of a trajectory, with a world and a scale of its own.
+
+    Attributes:
+        trajectory: camera-to-world pose of every tracked frame of the segment.
+        start, end: timestamps of its first and last row, seconds.
+        joined_to: number of the segment whose world and scale it shares; None for its own.
+    """
+
+    trajectory: Trajectory
+    start: float
+    end: float
+    joined_to: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.trajectory)
+
+
+@dataclass(frozen=True)
+class Break:
+    """Interval without poses, or a change of segment between two frames.
+
+    Attributes:
+        start: timestamp of the last frame with a pose before it, seconds; None if there is none.
+        end: timestamp of the first frame with a pose after it, seconds; None if there is none.
+        frames: number of input frames without a pose.
+        reason: cause, such as ``"black image"``.
+        new_segment: True if the poses after it belong to another segment than those before it.
+    """
+
+    start: float | None
+    end: float | None
+    frames: int
+    reason: str
+    new_segment: bool = True
+
+
+@dataclass(frozen=True)
 class Result:
     """Result for a sequence, available after the last frame.
 
     Attributes:
-        trajectory: camera-to-world pose of every tracked frame, those before initialisation included; lost frames have
-            no row.
-        map: sparse coloured map, empty for systems without one.
+        trajectory: camera-to-world pose of every tracked frame of the longest segment, those before initialisation
+            included; lost frames have no row.
+        map: sparse coloured map in the world of ``trajectory``, empty for systems without one.
         frames_read: number of input frames.
-        frames_lost: number of input frames without a row.
+        frames_lost: number of input frames without a row in any segment.
         info: JSON-able metadata for run.json: working resolution, intrinsics, number of keyframes.
+        segments: all segments in order of time; given none, the trajectory is the only one.
+        breaks: intervals without poses, and changes of segment, in order of time.
     """
 
     trajectory: Trajectory
@@ -72,6 +118,19 @@ class Result:
     frames_read: int
     frames_lost: int
     info: dict[str, Any] = field(default_factory=dict)
+    segments: tuple[Segment, ...] = ()
+    breaks: tuple[Break, ...] = ()
+
+    def __post_init__(self) -> None:
+        times = self.trajectory.timestamps
+        if not self.segments and len(times):
+            only = Segment(self.trajectory, float(times[0]), float(times[-1]))
+            object.__setattr__(self, "segments", (only,))
+
+    @property
+    def frames_tracked(self) -> int:
+        """Number of rows of all segments."""
+        return sum(len(segment) for segment in self.segments)
 
 
 @runtime_checkable

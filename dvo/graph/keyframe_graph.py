@@ -7,6 +7,7 @@ measurements are archived), and :meth:`KeyframeGraph.discard` for a frame of whi
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,6 +64,7 @@ class KeyframeGraph:
         window: active keyframes and edges.
         archive: keyframes and edges that have left the window.
         log: every frame that was read, relative to a keyframe.
+        segment: number of the current segment, from 0; keyframes of two segments share no edge, world or scale.
 
     Example:
         Global bundle adjustment of everything that a tracker has archived:
@@ -83,6 +85,37 @@ class KeyframeGraph:
         self.window = Window.empty(per_frame, patch_size, hidden, device)
         self.archive = Archive(archive)
         self.log = KeyframeLog()
+        self.segment = 0
+        self._first: list[tuple[int, int]] = [
+            (0, 0)
+        ]  # first keyframe and number of each segment; -1 for a rejected one
+
+    def begin_segment(self, first: int, keep: bool = True, reason: str = "") -> None:
+        """Begin a segment. The window must be empty.
+
+        Args:
+            first: identifier of its first keyframe; those from it on belong to the new segment.
+            keep: keep the segment before it; otherwise its frames are lost, and the new one takes its number.
+            reason: cause of the loss, if it is not kept.
+        """
+        if not keep:
+            for record in self.log.frames:
+                if record.segment == self.segment and not record.lost:
+                    record.lost, record.reason = True, record.reason or reason
+            self._first[-1] = (self._first[-1][0], -1)
+        self.segment += int(keep)
+        self._first.append((first, self.segment))
+
+    def segment_of(self, identifier: int) -> int:
+        """Segment of a keyframe.
+
+        Args:
+            identifier: of the keyframe.
+
+        Returns:
+            Its number; -1 for a keyframe of a rejected segment.
+        """
+        return self._first[bisect_right(self._first, identifier, key=lambda entry: entry[0]) - 1][1]
 
     def keep_edges(self, mask: Tensor) -> None:
         """Move edges from the window to the archive.
@@ -137,8 +170,11 @@ class KeyframeGraph:
         self.archive.set_pose(identifier, pose_cw, inverse_depth)
         self.log.set_pose(identifier, np.asarray(pose_cw, np.float64))
 
-    def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Map points of the archived keyframes, from the current poses of these.
+    def points(self, segment: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Map points of the archived keyframes of a segment, from the current poses of these.
+
+        Args:
+            segment: its number.
 
         Returns:
             ``(P, 3)`` float32 in the world, in the unit of the poses; ``(P, 3)`` uint8 RGB.
@@ -146,6 +182,8 @@ class KeyframeGraph:
         points, colors = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
         for keyframe in self.archive:
             if keyframe.anchor is not None or not len(keyframe.inverse_depth):
+                continue
+            if self.segment_of(keyframe.identifier) != segment:
                 continue
             depth = torch.from_numpy(keyframe.inverse_depth)
             x, y = torch.from_numpy(keyframe.centres).unbind(-1)
@@ -158,11 +196,12 @@ class KeyframeGraph:
             colors.append(keyframe.colors[near])
         return np.concatenate(points), np.concatenate(colors)
 
-    def problem(self, dropped: bool = True) -> GraphProblem:
-        """Bundle adjustment problem of the archived keyframes and edges.
+    def problem(self, dropped: bool = True, segment: int = 0) -> GraphProblem:
+        """Bundle adjustment problem of the archived keyframes and edges of a segment.
 
         Args:
             dropped: include dropped keyframes.
+            segment: its number.
 
         Returns:
             The problem, on the CPU; keyframes whose patches have been released are left out.
@@ -170,6 +209,8 @@ class KeyframeGraph:
         poses: dict[int, Tensor] = {}
         frames = []
         for keyframe in self.archive:
+            if self.segment_of(keyframe.identifier) != segment:
+                continue
             pose = torch.from_numpy(keyframe.pose_cw)
             if keyframe.anchor is not None:
                 if keyframe.anchor not in poses:

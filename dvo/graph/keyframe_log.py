@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,12 +21,16 @@ class FrameRecord:
         anchor: keyframe that carries the frame; None while the frame has no pose.
         relative: pose of the frame relative to its anchor, ``T_cw = relative T_cw[anchor]``; None for the identity.
         lost: tracking was lost; the frame gets no row in the trajectory.
+        segment: number of the segment of the frame; means nothing for a lost frame.
+        reason: cause of a loss, or of a break before the frame.
     """
 
     timestamp: float
     anchor: int | None
     relative: np.ndarray | None = None
     lost: bool = False
+    segment: int = 0
+    reason: str = ""
 
 
 class KeyframeLog:
@@ -76,6 +81,20 @@ class KeyframeLog:
         record = self.frames[frame]
         record.anchor, record.relative = anchor, _compose(T_cw, _inverse(self._poses[anchor]))
         record.lost = False
+
+    def lose(self, keyframe: int, reason: str) -> None:
+        """Mark the frames of a keyframe that is given up as lost.
+
+        Args:
+            keyframe: its number; the keyframes after it may still have frames.
+            reason: cause.
+        """
+        for record in reversed(self.frames):
+            if record.anchor == keyframe:
+                record.anchor, record.relative, record.lost, record.reason = None, None, True, reason
+            elif record.anchor is not None and record.anchor < keyframe:
+                break
+        self._poses.pop(keyframe, None)
 
     def reanchor(self, gone: int, anchor: int, relative: np.ndarray | None = None, oldest: int | None = None) -> None:
         """Remove keyframe ``gone``; its frames are relative to ``anchor`` from now on and stay where they are.
@@ -134,12 +153,21 @@ class KeyframeLog:
         anchor = None if record.anchor is None else self._poses.get(record.anchor)
         return None if anchor is None else _compose(record.relative, anchor)
 
-    def trajectory(self) -> Trajectory:
-        """Trajectory of every frame that has a pose and was not lost, camera to world."""
-        kept = [record for record in self.frames if not record.lost and record.anchor in self._poses]
+    def trajectory(self, segment: int | None = None, poses: Mapping[int, np.ndarray] | None = None) -> Trajectory:
+        """Trajectory of every frame that has a pose and was not lost, camera to world.
+
+        Args:
+            segment: frames of this segment only; None for all.
+            poses: ``T_cw`` by keyframe, in place of those of the log or in addition to them.
+
+        Returns:
+            The trajectory.
+        """
+        known = {**self._poses, **(poses or {})}
+        kept = [r for r in self.frames if not r.lost and r.anchor in known and segment in (None, r.segment)]
         rows = np.zeros((0, 7))
         if kept:
-            anchors = np.stack([self._poses[record.anchor] for record in kept])  # type: ignore[index]
+            anchors = np.stack([known[record.anchor] for record in kept])  # type: ignore[index]
             identity = _identity(anchors)
             relative = np.stack([identity if record.relative is None else record.relative for record in kept])
             rows = _rows(_inverse(_compose(relative, anchors)))

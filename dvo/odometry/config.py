@@ -24,8 +24,11 @@ _RANGES = {
     "keyframe_index": (2, 1000),
     "motion_damping": (0, 1),
     "lost_confidence": (0, 1),
-    "patience": (0, 10**9),
+    "patience": (1, 10**9),
     "search_updates": (1, 1000),
+    "min_inliers": (0, 1),
+    "join_inliers": (0, 1),
+    "max_gap": (1, math.inf),
 }
 
 
@@ -49,10 +52,12 @@ class TrackerConfig:
             below this.
         keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
         motion_damping: factor of the last motion in the prediction of the next pose, in [0, 1].
-        patience: number of consecutive lost frames that are kept out of the graph, so that the first frame tracked
-            after them is joined with those before them; later lost frames are added to the graph.
-        search_updates: recurrent updates of a frame after a lost one, to track it again.
+        patience: number of frames with content that are tried after a loss before a new segment begins with them.
+        search_updates: recurrent updates of a frame after a lost one or a gap in time, to join it with the window.
         lost_confidence: mean confidence of the newest frame's edges below which the status is ``lost``.
+        min_inliers: share of the window's patches found in the newest frame below which the status is ``lost``.
+        join_inliers: the same share for a frame after a lost one or a gap in time.
+        max_gap: time between frames above which they are separated by a gap, in medians of the recent intervals.
 
     Raises:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
@@ -77,8 +82,11 @@ class TrackerConfig:
     keyframe_index: int = 4
     motion_damping: float = 0.5
     lost_confidence: float = 0.01
-    patience: int = 15
+    patience: int = 8
     search_updates: int = 8
+    min_inliers: float = 0.02
+    join_inliers: float = 0.1
+    max_gap: float = 4.5
 
     def __post_init__(self) -> None:
         check_settings(self, _RANGES)

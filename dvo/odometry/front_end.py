@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.data.frame import Frame
+from dvo.geometry.camera import Camera
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.patchifier import normalise_images, random_centres
-from dvo.odometry.working_image import working_image
 
 
 @dataclass(frozen=True)
@@ -60,25 +59,21 @@ def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Ten
 
 
 def observe(
-    model: PatchVO, frame: Frame, pixels: int, patches: int, generator: torch.Generator, device: torch.device
+    model: PatchVO, image: np.ndarray, camera: Camera, patches: int, generator: torch.Generator, device: torch.device
 ) -> Observation:
-    """Resize a frame, encode it and draw its patches.
+    """Encode a working image and draw its patches.
 
     Args:
         model: the network.
-        frame: without lens distortion.
-        pixels: pixel budget of the working image, see :func:`dvo.odometry.working_image.working_image`.
+        image: ``(H, W, 3)`` uint8 RGB, see :func:`dvo.odometry.working_image.working_image`.
+        camera: of the image.
         patches: number of patches.
         generator: of the patch centres, on the CPU.
         device: of the network.
 
     Returns:
         Features and patches.
-
-    Raises:
-        DvoError: the camera of the frame has distortion.
     """
-    image, camera = working_image(frame, pixels)
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
     features = model.patchify.encode(normalise_images(rgb)[None, None])
     h, w = features.matching.shape[-2:]

@@ -26,6 +26,21 @@ def median_revision(revision: Revision, window: Window) -> float:
     return float(revision.delta[0][edges].norm(dim=-1).median())
 
 
+def newest_confidence(revision: Revision, window: Window) -> float:
+    """Mean confidence of the flow from the last keyframe to the newest frame.
+
+    Args:
+        revision: output of the network for the edges of the window.
+        window: keyframes, the newest frame last.
+
+    Returns:
+        In [0, 1].
+    """
+    n = len(window)
+    edges = (window.ii == n - 2) & (window.jj == n - 1)
+    return float(revision.weights[0][edges].mean())
+
+
 def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
     """Optimise the first window.
 

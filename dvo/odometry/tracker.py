@@ -7,30 +7,44 @@ keyframe. Keyframes that leave the window are archived (:mod:`dvo.graph.keyframe
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
 
 from dvo.ba.cold_start import COLD_UPDATES, damping_at
 from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.archive import ArchiveConfig
 from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.keyframe_log import FrameRecord
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions, recent_depth
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.front_end import observe
-from dvo.odometry.initialisation import initialise, median_revision
+from dvo.odometry.evidence import NO_MATCH, last_unrelated, missing_content, newest_evidence, window_inliers
+from dvo.odometry.frame_sequence import FrameSequence
+from dvo.odometry.front_end import Observation, observe
+from dvo.odometry.initialisation import initialise, median_revision, newest_confidence
 from dvo.odometry.motion import flow_magnitude, predict_pose
-from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.segments import result_of
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
+from dvo.odometry.working_image import working_image
 
 _DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a new frame
+
+
+@dataclass(frozen=True)
+class _View:
+    """Frame with content that is not part of the window yet."""
+
+    record: FrameRecord
+    seen: Observation
 
 
 class PatchOdometry:
@@ -77,8 +91,13 @@ class PatchOdometry:
         self._step = WindowStep(self.model, self.window, self.correlation)
         self._count = 0
         self._initialised = False
-        self._lost_in_a_row = 0
-        self._size: tuple[int, int] | None = None
+        self._ever_initialised = False
+        self._finished = False
+        self._sequence = FrameSequence(config.max_gap)
+        self._waiting: list[_View] = []  # frames with content since tracking was lost
+        self._joining = ""  # cause of the interruption that the next frame has to be joined across
+        self._skipped = False  # the interruption is a gap in time
+        self._last: tuple[np.ndarray, Estimate] | None = None  # last image and its estimate
         self._info: dict[str, object] = {}
 
     @property
@@ -92,100 +111,211 @@ class PatchOdometry:
     def track(self, frame: Frame) -> Estimate:
         """Process the next frame.
 
+        A frame whose image has no content, or whose pose its measurements do not bear out
+        (:mod:`dvo.odometry.evidence`), is lost and leaves the graph. The frames after it are joined with the window if
+        there is evidence for it; after ``config.patience`` frames with content that could not be joined, these begin
+        the next segment.
+
         Args:
             frame: of the same size as the first, later than the one before, without lens distortion.
 
         Returns:
-            Pose ``T_wc`` of the frame in the world of the first keyframe, up to scale, and the state of the tracker.
+            Pose ``T_wc`` of the frame in the world of the first keyframe of its segment, up to scale, and the state of
+            the tracker; no pose while the tracker is initialising or lost.
 
         Raises:
-            DvoError: a timestamp that does not increase, an image of another size than the first, or a camera with
-                distortion.
+            DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
+                increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        self._check(frame)
-        window, config = self.window, self.config
-        keyframe = self._append(frame)
-        self._connect()
-        if not self._initialised and len(window) > 1 and self._is_still():
-            return self._skip(frame)
-        record = self.graph.log.add(frame.timestamp, keyframe.identifier)
-        before = window.snapshot()
-        if self._initialised:
-            searching = 0 < self._lost_in_a_row <= config.patience
-            for _ in range(config.search_updates if searching else config.updates):
-                self._update()
-        elif len(window) >= config.initial_frames:
-            self._initialised = initialise(window, self._step, config)
-        confidence = self._confidence()
-        record.lost = lost = self._initialised and confidence < config.lost_confidence
-        pose_wc = self._pose_wc(len(window) - 1)
-        self._lost_in_a_row = self._lost_in_a_row + 1 if lost else 0
-        if 0 < self._lost_in_a_row <= config.patience:
-            # The pose of a lost frame is unreliable: without it, the next frames are joined with those before it.
-            window.restore(before)
-            self.graph.discard(len(window) - 1)
-            record.anchor = window.frames[-1].identifier
+        if self._finished:
+            raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
+        frame = checked_frame(frame)
+        self._sequence.check(frame)
+        image, camera = working_image(frame, self.config.pixels)
+        record = self.graph.log.add(frame.timestamp)
+        if self._last is not None and np.array_equal(image, self._last[0]):
+            self._sequence.repeat(frame.timestamp)
+            return self._repeat(record)
+        gap = self._sequence.tick(frame.timestamp)
+        problem = missing_content(image)
+        if problem:
+            estimate = self._lose(record, problem)
         else:
-            self._reduce()
-        status = Status.LOST if lost else Status.TRACKING if self._initialised else Status.INITIALISING
-        return Estimate(frame.timestamp, pose_wc, status, confidence)
+            if gap and self._initialised and not self._joining:
+                self._joining, self._skipped = str(gap), not gap.frozen
+            seen = observe(self.model, image, camera, self.config.patches, self._generator, self.device)
+            height, width = image.shape[:2]
+            self._info = {"working_size": [width, height], "working_intrinsics": seen.image_intrinsics.tolist()}
+            estimate = self._take(_View(record, seen))
+            if len(self._waiting) >= self.config.patience:
+                estimate = self._begin_segment()
+        self._last = image, estimate
+        return estimate
 
     @torch.inference_mode()
     def finish(self) -> Result:
-        """Refine the last window and archive it.
+        """Refine the last window and archive it. Frames are refused afterwards; a second call gives the same result.
 
         Returns:
-            Trajectory ``T_wc`` of all tracked frames and sparse map, in the world of the first keyframe, up to scale.
+            Trajectories ``T_wc`` of all segments and the sparse map of the longest, each in the world of its first
+            keyframe, up to scale.
         """
-        window, config, log = self.window, self.config, self.graph.log
-        if len(window) > 1:
-            for age in range(config.final_updates if self._initialised else config.initial_updates):
-                self._update(COLD_UPDATES if self._initialised else age)
-        while len(window):
-            self.graph.archive_oldest()
-        trajectory, read = log.trajectory(), len(log.frames)
+        if not self._finished:
+            if len(self._waiting) >= self.config.initial_frames:
+                self._begin_segment()
+            self._close_segment(last=True)
+            self._finished = True
+        return self._result({})
+
+    @torch.inference_mode()
+    def current(self) -> Result:
+        """Result so far, without the final optimisation; tracking goes on.
+
+        Returns:
+            As :meth:`finish`; the map has no points of the keyframes in the window.
+        """
+        poses = self.window.poses_cw.double().cpu().numpy()
+        known = {frame.identifier: pose for frame, pose in zip(self.window.frames, poses, strict=True)}
+        return self._result(known if self._initialised else {})
+
+    def _result(self, poses: dict[int, np.ndarray]) -> Result:
         info = {
-            **self._info, "keyframes": log.keyframes, "seed": self.seed, "initialised": self._initialised,
-            "config": asdict(config),
+            **self._info, "keyframes": self.graph.log.keyframes, "seed": self.seed,
+            "initialised": self._ever_initialised, "config": asdict(self.config),
         }  # fmt: skip
-        return Result(trajectory, SparseMap(*self.graph.points()), read, read - len(trajectory), info)
+        return result_of(self.graph, info, poses)
 
     # -- parts of a frame ----------------------------------------------------------------------------------------
 
-    def _check(self, frame: Frame) -> None:
-        past = self.graph.log.frames
-        if past and frame.timestamp <= past[-1].timestamp:
-            raise DvoError(
-                f"time {frame.timestamp} does not come after {past[-1].timestamp}",
-                field=f"frame {frame.index}",
-                remedy="give frames in order of time",
-            )
-        size = (frame.image.shape[1], frame.image.shape[0])
-        if self._size is not None and self._size != size:
-            raise DvoError(
-                f"is {size[0]}x{size[1]}, the frames before are {self._size[0]}x{self._size[1]}",
-                field=f"frame {frame.index}",
-                remedy="give frames of one size",
-            )
-        self._size = size
+    def _take(self, view: _View) -> Estimate:
+        """Add a frame with content to the window, and estimate its pose."""
+        window, config, record = self.window, self.config, view.record
+        keyframe = self._append(view)
+        self._connect()
+        if not self._initialised:
+            return self._initialise(view, keyframe)
+        before = window.snapshot()
+        for _ in range(config.search_updates if self._joining else config.updates):
+            self._update()
+        evidence = newest_evidence(self._step)
+        if not evidence.supports(config, joining=bool(self._joining)):
+            # The frame leaves the graph, so that the next ones are joined with the frames before it.
+            window.restore(before)
+            self.graph.discard(len(window) - 1)
+            self._waiting.append(view)
+            return self._lose(record, NO_MATCH)
+        self._place(record, keyframe.identifier)
+        record.reason = self._joining if self._skipped else ""
+        self._joining, self._skipped = "", False
+        self._waiting.clear()
+        pose_wc = self._pose_wc(len(window) - 1)
+        self._reduce()
+        return self._estimate(record, pose_wc, Status.TRACKING, evidence.confidence)
 
-    def _append(self, frame: Frame) -> Keyframe:
+    def _initialise(self, view: _View, keyframe: Keyframe) -> Estimate:
+        """Add a frame to a window that is not initialised yet, and try to initialise it."""
+        window, config, record = self.window, self.config, view.record
+        self._joining = ""
+        confidence = 0.0
+        if len(window) > 1:
+            revision = self._step.revise()
+            confidence = newest_confidence(revision, window)
+            if confidence >= config.lost_confidence and median_revision(revision, window) < config.initial_motion:
+                # Too little motion for initialisation: the frame shares the pose of the keyframe before it.
+                self.graph.discard(len(window) - 1)
+                self._place(record, window.frames[-1].identifier)
+                return self._estimate(record, None, Status.INITIALISING, confidence)
+        self._place(record, keyframe.identifier)
+        if len(window) >= config.initial_frames:
+            enough = initialise(window, self._step, config)
+            self._drop_unrelated()
+            evidence = newest_evidence(self._step)
+            supported = len(window) >= config.initial_frames and evidence.supports(config)
+            self._initialised = enough and supported
+            self._ever_initialised |= self._initialised
+            confidence = evidence.confidence
+        pose_wc = self._pose_wc(len(window) - 1) if self._initialised else None
+        self._reduce()
+        return self._estimate(
+            record, pose_wc, Status.TRACKING if self._initialised else Status.INITIALISING, confidence
+        )
+
+    def _drop_unrelated(self) -> None:
+        """Remove the frames of a window that is not initialised which do not show the scene of the newest ones."""
+        for _ in range(last_unrelated(self._step, self.config)):
+            self.graph.log.lose(self.graph.discard(0).identifier, NO_MATCH)
+
+    def _repeat(self, record: FrameRecord) -> Estimate:
+        """Give a frame with the image of the frame before it the same pose and state."""
+        assert self._last is not None
+        image, estimate = self._last
+        past = self.graph.log.frames[-2]
+        record.anchor, record.relative, record.lost = past.anchor, past.relative, past.lost
+        record.segment, record.reason = past.segment, past.reason if past.lost else ""
+        estimate = replace(estimate, timestamp=record.timestamp)
+        self._last = image, estimate
+        return estimate
+
+    def _place(self, record: FrameRecord, anchor: int) -> None:
+        record.anchor, record.lost, record.segment, record.reason = anchor, False, self.graph.segment, ""
+
+    def _lose(self, record: FrameRecord, reason: str) -> Estimate:
+        """Mark a frame as lost; the next frame of an initialised segment has to be joined across it."""
+        record.anchor, record.lost = None, True
+        if self._initialised and not self._joining:
+            self._joining = reason
+        record.reason = self._joining or reason
+        return self._estimate(record, None, Status.LOST, 0.0)
+
+    def _begin_segment(self) -> Estimate:
+        """Close the segment, and begin the next one with the frames that could not be joined with it."""
+        waiting, self._waiting = self._waiting, []
+        reason = self._joining
+        self._close_segment()
+        for view in waiting:
+            estimate = self._take(view)
+        first = waiting[0].record
+        if not first.lost:
+            first.reason = reason
+        return estimate
+
+    def _close_segment(self, last: bool = False) -> None:
+        """Refine the window and archive it, and decide if the rows of the segment are kept.
+
+        A segment that was never initialised is kept if its frames agree with each other, and are as many as an
+        initialisation needs or the only ones of the sequence.
+        """
+        window, config = self.window, self.config
+        supported = self._initialised
+        if len(window) > 1:
+            for age in range(config.final_updates if self._initialised else config.initial_updates):
+                self._update(COLD_UPDATES if self._initialised else age)
+            if not self._initialised:
+                self._drop_unrelated()
+        if not supported and len(window):
+            rows = sum(not r.lost and r.segment == self.graph.segment for r in self.graph.log.frames)
+            only = last and self.graph.segment == 0
+            agree = len(window) == 1 or window_inliers(self._step) >= config.min_inliers
+            supported = agree and (only or rows >= config.initial_frames)
+        while len(window):
+            self.graph.archive_oldest()
+        self.graph.begin_segment(self._count, supported, "too few frames with content")
+        self._initialised, self._joining, self._skipped = False, "", False
+
+    def _append(self, view: _View) -> Keyframe:
         """Add a frame to the window, with predicted pose and the median depth of the frames before it."""
-        config, window, net = self.config, self.window, self.model.config
-        seen = observe(self.model, frame, config.pixels, config.patches, self._generator, self.device)
-        height, width = seen.image.shape[:2]
-        self._info = {"working_size": [width, height], "working_intrinsics": seen.image_intrinsics.tolist()}
+        config, window, net, seen = self.config, self.window, self.model.config, view.seen
         self._step.bounds = seen.bounds
         slot = window.free_map_slot()
         self.correlation.keep_maps(slot, seen.maps)
-        keyframe = Keyframe(self._count, frame.timestamp, slot, seen.matching, seen.context, seen.colors,
+        keyframe = Keyframe(self._count, view.record.timestamp, slot, seen.matching, seen.context, seen.colors,
                             seen.intrinsics, seen.image)  # fmt: skip
         self._count += 1
         depth = torch.ones(1, config.patches, device=self.device)
         if self._initialised:
             depth *= recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES)
         times = [f.timestamp for f in window.frames]
-        pose = predict_pose(window.poses_cw, times, frame.timestamp, config.motion_damping)
+        pose = predict_pose(window.poses_cw, times, keyframe.timestamp, config.motion_damping)
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, net.patch_size)[0])
         return keyframe
 
@@ -206,16 +336,6 @@ class PatchOdometry:
         fixed = max(1, len(self.window) - self.config.optimisation) if self._initialised else 1
         self._step(StepOptions(fixed=fixed, damping=damping_at(age)))
 
-    def _is_still(self) -> bool:
-        """True if the motion from the last keyframe to the newest frame is too small for initialisation."""
-        return median_revision(self._step.revise(), self.window) < self.config.initial_motion
-
-    def _skip(self, frame: Frame) -> Estimate:
-        """Discard a frame with too little motion for initialisation; it shares the pose of the keyframe before it."""
-        self.graph.discard(len(self.window) - 1)
-        self.graph.log.add(frame.timestamp, self.window.frames[-1].identifier)
-        return Estimate(frame.timestamp, self._pose_wc(len(self.window) - 1), Status.INITIALISING)
-
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
         window, config = self.window, self.config
@@ -230,10 +350,9 @@ class PatchOdometry:
         while len(window) > limit:
             self.graph.archive_oldest()
 
-    def _confidence(self) -> float:
-        """Mean confidence of the edges into the newest frame."""
-        newest = self.window.weights[self.window.jj == len(self.window) - 1]
-        return float(newest.mean()) if len(newest) else 0.0
+    def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status, confidence: float) -> Estimate:
+        reason = record.reason if status is Status.LOST else ""
+        return Estimate(record.timestamp, pose_wc, status, confidence, self.graph.segment, reason)
 
     def _pose_wc(self, position: int) -> np.ndarray:
         return se3.inverse(self.window.poses_cw[position]).double().cpu().numpy()

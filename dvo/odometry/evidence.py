@@ -1,0 +1,146 @@
+"""Evidence for the pose of a frame: content of its image, and agreement of its measurements with the window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from dvo.geometry.projection import reproject
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.window_step import WindowStep
+
+CONFIDENT = 0.1
+"""Confidence of a measurement above which it can be an inlier."""
+AGREEMENT = 0.5
+"""Largest distance of an inlier from the reprojection of its patch after bundle adjustment, feature pixels."""
+
+NO_MATCH = "no match with the frames before"
+
+_BLOCK = 8  # side of the blocks whose means show structure, pixels of the working image
+_CONTRAST = 1.5  # least difference of neighbouring blocks that counts as structure without noise, grey levels
+_NOISE = 6.0  # and its share of the expected difference of blocks of independent noise
+_STRONG_NOISE = 10.0  # difference of neighbouring pixels that sensor noise stays below, grey levels
+_DARK, _BRIGHT = 64.0, 192.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Agreement of the measurements of the newest frame with the window.
+
+    Attributes:
+        confidence: mean confidence of the edges into the frame, in [0, 1].
+        inliers: share of the patches of earlier frames that are found in it: confident, and where bundle adjustment
+            reprojects them, in [0, 1].
+    """
+
+    confidence: float
+    inliers: float
+
+    def supports(self, config: TrackerConfig, joining: bool = False) -> bool:
+        """Decide if the images bear out the pose.
+
+        Args:
+            config: thresholds.
+            joining: the frame follows frames without a pose, or a gap in time: its pose relative to the window cannot
+                be checked by continuity, so that more agreement is required.
+
+        Returns:
+            True if they do.
+        """
+        inliers = config.join_inliers if joining else config.min_inliers
+        return self.confidence >= config.lost_confidence and self.inliers >= inliers
+
+
+def missing_content(image: np.ndarray) -> str:
+    """Find out if an image shows nothing: its blocks differ no more than those of uniform light and sensor noise would.
+
+    Noise is estimated from the median difference of neighbouring pixels. The mean of an ``8x8`` block averages
+    independent noise to an eighth, while differences of a view grow with the distance. Strong noise could be a fine
+    texture; only the measurements in several images tell them apart.
+
+    Args:
+        image: ``(H, W, 3)`` uint8 RGB working image.
+
+    Returns:
+        Description, such as ``"black image"``; empty for an image with content.
+
+    Example:
+        >>> missing_content(np.zeros((240, 320, 3), np.uint8))
+        'black image'
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    height, width = (max(2, side // _BLOCK) for side in grey.shape)
+    blocks = cv2.resize(grey.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    steps = np.concatenate([np.abs(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
+    structure = float(np.percentile(steps, 99))
+    noise = float(np.median(cv2.absdiff(grey[::4, 1:], grey[::4, :-1])))
+    if noise > _STRONG_NOISE or structure > _CONTRAST + _NOISE * noise / _BLOCK:
+        return ""
+    mean = float(blocks.mean())
+    return "black image" if mean < _DARK else "white image" if mean > _BRIGHT else "image without content"
+
+
+def newest_evidence(step: WindowStep) -> Evidence:
+    """Evidence for the pose of the newest frame of a window, after a step.
+
+    Args:
+        step: of the model on the window.
+
+    Returns:
+        Evidence; zero for a window of one frame.
+    """
+    window = step.window
+    newest = len(window) - 1
+    into = window.jj == newest
+    if not bool(into.any()):
+        return Evidence(0.0, 0.0)
+    confidence = float(window.weights[into].mean())
+    earlier = into & (window.ii < newest)
+    if not bool(earlier.any()):
+        return Evidence(confidence, 0.0)
+    return Evidence(confidence, _inliers(step, earlier))
+
+
+def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
+    """Position after the last pair of consecutive frames of a window that do not show the same scene.
+
+    Args:
+        step: of the model on the window, after some steps.
+        config: thresholds.
+
+    Returns:
+        Position of the first frame that all later ones are related to; 0 if all frames are.
+    """
+    window = step.window
+    found = 0
+    for position in range(1, len(window)):
+        pair = (window.ii == position - 1) & (window.jj == position)
+        if not float(window.weights[pair].mean()) >= config.lost_confidence:
+            found = position
+    return found
+
+
+def window_inliers(step: WindowStep) -> float:
+    """Share of the edges between different frames of a window that are inliers.
+
+    Args:
+        step: of the model on the window.
+
+    Returns:
+        In [0, 1].
+    """
+    edges = step.window.ii != step.window.jj
+    return _inliers(step, edges) if bool(edges.any()) else 0.0
+
+
+def _inliers(step: WindowStep, edges: Tensor) -> float:
+    w = step.window
+    ii, jj, kk = w.ii[edges], w.jj[edges], w.kk[edges]
+    coords = reproject(w.poses_cw[None], w.patches[None], w.intrinsics[None], ii, jj, kk).coords
+    centre = coords.shape[2] // 2
+    residual = (w.targets[edges] - coords[0, :, centre, centre]).norm(dim=-1)
+    found = (w.weights[edges].mean(dim=-1) > CONFIDENT) & (residual < AGREEMENT)
+    return float(found.float().mean())

@@ -1,0 +1,1 @@
+"""Trials of a tracker on interrupted sequences: `python -m eval.benchmarks.interruptions`."""

@@ -20,6 +20,7 @@ _RANGES = {
     "updates": (1, 1000),
     "initial_motion": (0, math.inf),
     "initial_parallax": (0, math.inf),
+    "initial_inliers": (0, 1),
     "keyframe_motion": (0, math.inf),
     "keyframe_index": (2, 1000),
     "motion_damping": (0, 1),
@@ -48,6 +49,8 @@ class TrackerConfig:
         initial_motion: median revision of the flow, in feature pixels, above which a frame becomes a keyframe before
             initialisation.
         initial_parallax: median parallax without rotation, in feature pixels, above which the status is ``tracking``.
+        initial_inliers: share of the patches of two consecutive keyframes found in each other, at initialisation, below
+            which they do not show the same scene.
         keyframe_motion: a keyframe is dropped again if the mean flow between its neighbours, in feature pixels, is
             below this.
         keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
@@ -78,13 +81,14 @@ class TrackerConfig:
     updates: int = 1
     initial_motion: float = 0.5
     initial_parallax: float = 1.0
+    initial_inliers: float = 0.2
     keyframe_motion: float = 5.0
     keyframe_index: int = 4
     motion_damping: float = 0.5
     lost_confidence: float = 0.01
     patience: int = 8
     search_updates: int = 8
-    min_inliers: float = 0.02
+    min_inliers: float = 0.04
     join_inliers: float = 0.1
     max_gap: float = 4.5
 

@@ -20,7 +20,7 @@ AGREEMENT = 0.5
 NO_MATCH = "no match with the frames before"
 
 _BLOCK = 8  # side of the blocks whose means show structure, pixels of the working image
-_CONTRAST = 1.5  # least difference of neighbouring blocks that counts as structure without noise, grey levels
+_CONTRAST = 2.5  # least difference of neighbouring blocks that counts as structure without noise, grey levels
 _NOISE = 6.0  # and its share of the expected difference of blocks of independent noise
 _STRONG_NOISE = 10.0  # difference of neighbouring pixels that sensor noise stays below, grey levels
 _DARK, _BRIGHT = 64.0, 192.0
@@ -118,7 +118,9 @@ def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
     found = 0
     for position in range(1, len(window)):
         pair = (window.ii == position - 1) & (window.jj == position)
-        if not float(window.weights[pair].mean()) >= config.lost_confidence:
+        pair |= (window.ii == position) & (window.jj == position - 1)
+        confidence, inliers = float(window.weights[pair].mean()), _inliers(step, pair)
+        if confidence < config.lost_confidence or inliers < config.initial_inliers:
             found = position
     return found
 

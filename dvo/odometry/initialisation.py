@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dvo.ba.cold_start import damping_at, robust_cost, solve_from_nothing
 from dvo.geometry import se3
+from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.evidence import NO_MATCH, last_unrelated
 from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
 
@@ -75,3 +77,15 @@ def _solve_again(window: Window, step: WindowStep) -> None:
     if cost < robust_cost(window.poses_cw[None], window.patches[None], intrinsics, *measured):
         window.poses_cw = se3.normalise(se3.compose(poses[0], window.poses_cw[0]))
         window.patches = patches[0]
+
+
+def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> None:
+    """Remove the frames of the first window that do not show the scene of the newest ones; they are lost.
+
+    Args:
+        graph: of the sequence; the window is not initialised yet.
+        step: of the model on the window, after some steps.
+        config: settings of the tracker.
+    """
+    for _ in range(last_unrelated(step, config)):
+        graph.log.lose(graph.discard(0).identifier, NO_MATCH)

@@ -25,10 +25,10 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions, recent_depth
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.evidence import NO_MATCH, last_unrelated, missing_content, newest_evidence, window_inliers
+from dvo.odometry.evidence import NO_MATCH, missing_content, newest_evidence, window_inliers
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import Observation, observe
-from dvo.odometry.initialisation import initialise, median_revision, newest_confidence
+from dvo.odometry.initialisation import drop_unrelated, initialise, median_revision, newest_confidence
 from dvo.odometry.motion import flow_magnitude, predict_pose
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
@@ -228,7 +228,7 @@ class PatchOdometry:
         self._place(record, keyframe.identifier)
         if len(window) >= config.initial_frames:
             enough = initialise(window, self._step, config)
-            self._drop_unrelated()
+            drop_unrelated(self.graph, self._step, config)
             evidence = newest_evidence(self._step)
             supported = len(window) >= config.initial_frames and evidence.supports(config)
             self._initialised = enough and supported
@@ -236,14 +236,7 @@ class PatchOdometry:
             confidence = evidence.confidence
         pose_wc = self._pose_wc(len(window) - 1) if self._initialised else None
         self._reduce()
-        return self._estimate(
-            record, pose_wc, Status.TRACKING if self._initialised else Status.INITIALISING, confidence
-        )
-
-    def _drop_unrelated(self) -> None:
-        """Remove the frames of a window that is not initialised which do not show the scene of the newest ones."""
-        for _ in range(last_unrelated(self._step, self.config)):
-            self.graph.log.lose(self.graph.discard(0).identifier, NO_MATCH)
+        return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING, confidence)
 
     def _repeat(self, record: FrameRecord) -> Estimate:
         """Give a frame with the image of the frame before it the same pose and state."""
@@ -269,8 +262,7 @@ class PatchOdometry:
 
     def _begin_segment(self) -> Estimate:
         """Close the segment, and begin the next one with the frames that could not be joined with it."""
-        waiting, self._waiting = self._waiting, []
-        reason = self._joining
+        waiting, self._waiting, reason = self._waiting, [], self._joining
         self._close_segment()
         for view in waiting:
             estimate = self._take(view)
@@ -291,10 +283,11 @@ class PatchOdometry:
             for age in range(config.final_updates if self._initialised else config.initial_updates):
                 self._update(COLD_UPDATES if self._initialised else age)
             if not self._initialised:
-                self._drop_unrelated()
+                drop_unrelated(self.graph, self._step, config)
         if not supported and len(window):
-            rows = sum(not r.lost and r.segment == self.graph.segment for r in self.graph.log.frames)
-            only = last and self.graph.segment == 0
+            records = self.graph.log.frames
+            rows = sum(not r.lost and r.segment == self.graph.segment for r in records)
+            only = last and self.graph.segment == 0 and not any(r.reason == NO_MATCH for r in records)
             agree = len(window) == 1 or window_inliers(self._step) >= config.min_inliers
             supported = agree and (only or rows >= config.initial_frames)
         while len(window):

@@ -1,0 +1,125 @@
+"""Interrupted sequences with the shipped weights: poses where there is a view, and only there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dvo
+from dvo.errors import DvoError
+from dvo.metrics import evaluate
+from dvo.odometry.protocol import Status
+from dvo.synth.sequence import make_sequence
+
+CUT, FPS = 18, 15.0
+SIZE = {"height": 120, "width": 160, "fps": FPS, "sensor": False}
+
+
+@pytest.fixture(scope="module")
+def film():
+    return make_sequence(61, frames=54, family="room", kind="handheld", speed=3.0, **SIZE)
+
+
+@pytest.fixture(scope="module")
+def clear(film):
+    return list(film)
+
+
+def with_images(frames, images, start):
+    """The frames with other images from position ``start`` on."""
+    changed = list(frames)
+    for position, image in enumerate(images, start):
+        changed[position] = replace(frames[position], image=image)
+    return changed
+
+
+def track(frames, seed=0):
+    odometry = dvo.load("small", device="cpu", seed=seed)
+    return [odometry.track(frame) for frame in frames], odometry.finish(), odometry
+
+
+def noise(count, shape, seed=0):
+    return list(np.random.default_rng(seed).integers(0, 256, (count, *shape), np.uint8))
+
+
+@pytest.mark.parametrize("kind", ["black", "white", "noise"])
+def test_no_pose_without_a_view_and_a_segment_of_its_own_after_it(film, clear, kind):
+    shape, dark = clear[0].image.shape, 18
+    images = {
+        "black": [np.random.default_rng(k).poisson(2, shape).astype(np.uint8) for k in range(dark)],
+        "white": [np.full(shape, 255, np.uint8)] * dark,
+        "noise": noise(dark, shape),
+    }[kind]
+    estimates, result, odometry = track(with_images(clear, images, CUT))
+    during, after = estimates[CUT : CUT + dark], estimates[CUT + dark :]
+    assert all(e.pose_wc is None and e.status is not Status.TRACKING for e in during)
+    assert any(e.status is Status.TRACKING for e in after[:15])
+    times = np.array([frame.timestamp for frame in clear])
+    rows = np.concatenate([segment.trajectory.timestamps for segment in result.segments])
+    assert not np.isin(times[CUT : CUT + dark], rows).any()
+    assert np.isin(np.delete(times, slice(CUT, CUT + dark)), rows).mean() >= 0.95
+    assert len(result.breaks) == 1 and result.breaks[0].frames == dark and result.breaks[0].reason
+    assert result.breaks[0].start == times[CUT - 1] and result.breaks[0].end == times[CUT + dark]
+    assert {e.segment for e in estimates if e.pose_wc is not None} == set(range(len(result.segments)))
+    assert len(result.trajectory) == max(len(segment) for segment in result.segments)
+    # The segment after the interruption is as good as a start with its frames.
+    _, fresh, _ = track(clear[CUT + dark :])
+    errors = [evaluate(rows, film.groundtruth).ate_rmse for rows in (result.segments[1].trajectory, fresh.trajectory)]
+    assert errors[0] < 1.3 * errors[1]
+    # Lost frames leave the graph: no keyframe of the archive is one of them.
+    archived = [keyframe.timestamp for keyframe in odometry.graph.archive]
+    assert not np.isin(times[CUT : CUT + dark], archived).any()
+
+
+def test_another_scene_never_shares_a_segment(clear):
+    foreign = list(make_sequence(62, frames=18, family="corridor", kind="handheld", speed=3.0, **SIZE))
+    estimates, result, _ = track(with_images(clear, [frame.image for frame in foreign], CUT))
+    other = {frame.timestamp for frame in clear[CUT : CUT + 18]}
+    for segment in result.segments:
+        inside = [time in other for time in segment.trajectory.timestamps]
+        assert all(inside) or not any(inside)
+    assert len(result.breaks) == 2 and all(gap.new_segment for gap in result.breaks)
+
+
+def test_a_frozen_image_is_a_view_with_one_pose(clear):
+    frozen = with_images(clear, [clear[CUT - 1].image] * 12, CUT)
+    estimates, result, _ = track(frozen[: CUT + 12])
+    assert all(e.status is Status.TRACKING for e in estimates[CUT:])
+    poses = np.array([e.pose_wc for e in estimates[CUT - 1 :]])
+    assert (poses == poses[0]).all()
+    assert result.frames_lost == 0 and not result.breaks
+
+
+def test_a_gap_in_time_is_told(clear):
+    later = [replace(frame, timestamp=frame.timestamp + 5.0) for frame in clear[CUT + 14 :]]
+    _, result, _ = track([*clear[:CUT], *later])
+    assert len(result.breaks) == 1
+    assert result.breaks[0].start == clear[CUT - 1].timestamp
+
+
+def test_noise_alone_has_no_pose(clear):
+    shape = clear[0].image.shape
+    frames = with_images(clear, noise(24, shape), 0)[:24]
+    estimates, result, _ = track(frames)
+    assert all(e.pose_wc is None for e in estimates)
+    assert len(result.segments) == 0 and result.frames_lost == result.frames_read == 24
+    assert len(result.breaks) == 1 and result.breaks[0].start is result.breaks[0].end is None
+
+
+def test_the_sequence_ends_with_finish(clear):
+    _, result, odometry = track(clear[:8])
+    with pytest.raises(DvoError, match="finished"):
+        odometry.track(clear[8])
+    assert odometry.finish().trajectory.poses_wc.tobytes() == result.trajectory.poses_wc.tobytes()
+
+
+def test_results_so_far_agree_with_the_estimates(clear):
+    odometry = dvo.load("small", device="cpu", seed=0)
+    estimates = [odometry.track(frame) for frame in clear[:20]]
+    rows = odometry.current().trajectory
+    assert len(rows) == 20
+    np.testing.assert_allclose(rows.poses_wc[-1], estimates[-1].pose_wc, atol=1e-6)
+    again = dvo.load("small", device="cpu", seed=0)
+    for frame in clear[:20]:
+        again.track(frame)
+    assert odometry.finish().trajectory.poses_wc.tobytes() == again.finish().trajectory.poses_wc.tobytes()

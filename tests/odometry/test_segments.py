@@ -1,0 +1,60 @@
+"""Segments and breaks from the log of the frames."""
+
+import numpy as np
+
+from dvo.graph.keyframe_log import KeyframeLog
+from dvo.odometry.protocol import Break, Result, SparseMap
+from dvo.odometry.segments import breaks_of, segments_of
+
+
+def log_of(text):
+    """A log from a character a frame: the number of its segment, or ``x`` for a lost frame; times are positions."""
+    log = KeyframeLog()
+    for position, sign in enumerate(text):
+        record = log.add(float(position), anchor=position)
+        log.set_pose(position, np.array([position, 0, 0, 0, 0, 0, 1.0]))
+        if sign == "x":
+            record.lost, record.anchor, record.reason = True, None, "black image"
+        else:
+            record.segment = int(sign)
+    return log
+
+
+def test_segments_in_order_with_their_own_rows():
+    found = segments_of(log_of("00xx1110"))
+    assert [len(segment) for segment in found] == [3, 3]
+    assert (found[1].start, found[1].end) == (4.0, 6.0)
+    assert [len(segment) for segment in segments_of(log_of("000"))] == [3]
+    assert segments_of(log_of("xx")) == ()
+
+
+def test_breaks_tell_from_when_until_when_and_why():
+    assert breaks_of(log_of("000")) == ()
+    assert breaks_of(log_of("00xx11")) == (Break(1.0, 4.0, 2, "black image", True),)
+    assert breaks_of(log_of("0x00x1")) == (
+        Break(0.0, 2.0, 1, "black image", False),
+        Break(3.0, 5.0, 1, "black image", True),
+    )
+    assert breaks_of(log_of("x0")) == (Break(None, 1.0, 1, "black image", False),)
+    assert breaks_of(log_of("0x")) == (Break(0.0, None, 1, "black image", False),)
+    assert breaks_of(log_of("0011")) == (Break(1.0, 2.0, 0, "", True),)
+
+
+def test_a_frame_joined_across_a_gap_is_a_break_without_lost_frames():
+    log = log_of("000")
+    log.frames[2].reason = "gap of 5.00 s"
+    assert breaks_of(log) == (Break(1.0, 2.0, 0, "gap of 5.00 s", False),)
+
+
+def test_a_result_without_segments_has_its_trajectory_as_the_only_one():
+    rows = segments_of(log_of("000"))[0].trajectory
+    result = Result(rows, SparseMap(), 4, 1)
+    assert [len(segment) for segment in result.segments] == [3] and result.frames_tracked == 3
+
+
+def test_frames_of_a_keyframe_that_is_given_up_are_lost():
+    log = log_of("0000")
+    log.frames[2].anchor = 1
+    log.lose(1, "no match")
+    assert [record.lost for record in log.frames] == [False, True, True, False]
+    assert log.frames[2].reason == "no match"

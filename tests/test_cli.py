@@ -158,7 +158,9 @@ def test_second_ctrl_c_gives_up(given, image_folder, tmp_path, capsys):
     odometry = given(at_frame={3: twice})
     odometry.finish = lambda: pytest.fail("must not be asked to finish")
     assert main(arguments(image_folder, tmp_path / "out")) == 130
-    assert not (tmp_path / "out").exists()
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 3, "rows written so far stay"
+    written = summary(tmp_path / "out")
+    assert (written["finished"], written["interrupted"]) == (False, True) and written["frames"]["tracked"] == 3
     assert "interrupted" in capsys.readouterr().err
 
 

@@ -228,7 +228,7 @@ def _flush(code: int) -> int:
         except OSError as error:
             with contextlib.suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-            if stream is sys.stdout and not isinstance(error, BrokenPipeError):
+            if stream is sys.stdout and code != BAD_INPUT and not isinstance(error, BrokenPipeError):
                 code = _complain(DvoError(error.strerror or str(error), file="standard output"), code or BAD_INPUT)
     return code
 

@@ -75,10 +75,14 @@ def say(text: str) -> None:
         text: the line.
 
     Raises:
-        OSError: another failure of stdout, such as a full disk.
+        DvoError: another failure of stdout, such as a full disk.
     """
-    with contextlib.suppress(BrokenPipeError):
+    try:
         print(text, flush=True)
+    except BrokenPipeError:
+        pass
+    except OSError as error:
+        raise DvoError(error.strerror or str(error), file="standard output") from error
 
 
 def warn(text: str) -> None:

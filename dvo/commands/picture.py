@@ -43,13 +43,14 @@ def _longest(result: Result) -> list[int]:
 
 
 def _label(number: int, segment: Segment, alone: bool, label: str) -> str:
-    return label if alone else f"segment {number}: {segment.start:.2f}-{segment.end:.2f} s"
+    return label if alone else f"segment {number}, {len(segment)} frames"
 
 
 def _panels_with_truth(result: Result, chosen: list[int], groundtruth: Trajectory, label: str) -> list[Panel]:
     """One panel in the world of the ground truth; none if no segment can be aligned."""
-    tracks, points, spans = [], result.map.points, []
-    for number in chosen:
+    tracks, spans = [], []
+    points = np.zeros((0, 3))  # the map lives in the world of the longest segment
+    for colour, number in enumerate(chosen):
         segment = result.segments[number]
         trajectory = segment.trajectory
         if evaluate(trajectory, groundtruth, align="sim3").reason is not None:
@@ -58,13 +59,11 @@ def _panels_with_truth(result: Result, chosen: list[int], groundtruth: Trajector
         spans += [j.min(), j.max()]
         if number == result.longest:
             scale, rotation, shift = fit_alignment(trajectory.positions[i], groundtruth.positions[j], "sim3")
-            points = scale * points @ rotation.T + shift
+            points = scale * result.map.points @ rotation.T + shift
         aligned = align_trajectory(trajectory, groundtruth, "sim3")
-        tracks.append(Track(aligned, _label(number, segment, len(result.segments) == 1, label), number))
+        tracks.append(Track(aligned, _label(number, segment, len(result.segments) == 1, label), colour))
     if not tracks:
         return []
-    if result.longest not in [track.number for track in tracks]:  # the map lives in a world that is not shown
-        points = np.zeros((0, 3))
     span = slice(min(spans), max(spans) + 1)  # ground truth may be longer than the clip
     truth = Trajectory(groundtruth.timestamps[span], groundtruth.poses_wc[span])
     return [Panel(tuple(tracks), points, truth)]
@@ -73,9 +72,9 @@ def _panels_with_truth(result: Result, chosen: list[int], groundtruth: Trajector
 def _panels(result: Result, chosen: list[int], label: str) -> list[Panel]:
     """A panel for each world; segments that were joined share one."""
     worlds: dict[int, list[Track]] = {}
-    for number in chosen:
+    for colour, number in enumerate(chosen):
         segment = result.segments[number]
-        track = Track(segment.trajectory, _label(number, segment, len(result.segments) == 1, label), number)
+        track = Track(segment.trajectory, _label(number, segment, len(result.segments) == 1, label), colour)
         worlds.setdefault(_root(result, number), []).append(track)
     longest = None if result.longest is None else _root(result, result.longest)
     none = np.zeros((0, 3))

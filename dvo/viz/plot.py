@@ -59,12 +59,12 @@ class Track:
     Attributes:
         trajectory: camera to world.
         label: name in the legend.
-        number: of its colour.
+        colour: number of its colour.
     """
 
     trajectory: Trajectory
     label: str = "dvo"
-    number: int = 0
+    colour: int = 0
 
 
 @dataclass(frozen=True)
@@ -119,20 +119,30 @@ def plot_panels(path: Path | str, panels: Sequence[Panel], *, title: str = "", s
     figure = Figure(figsize=SIZE_INCHES, dpi=DPI, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
     if len(panels) == 1:
-        _draw_panel(figure.add_subplot(), panels[0], SIZE_INCHES[0] / SIZE_INCHES[1], title, subtitle)
+        (panel,) = panels
+        plot = figure.add_subplot()
+        _draw_panel(plot, panel, SIZE_INCHES[0] / SIZE_INCHES[1])
+        _add_title(plot, title, subtitle)
+        if len(panel.tracks) > 1:  # too many names for the room above the axes
+            figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9.5)
+        elif plot.get_legend_handles_labels()[0]:
+            place = {"loc": "lower right", "bbox_to_anchor": (1, 1.05), "borderaxespad": 0}
+            plot.legend(**place, ncols=3, frameon=False, fontsize=9.5)
     else:
         columns = 2 if len(panels) <= 4 else 3
         rows = -(-len(panels) // columns)
         for place, panel in enumerate(panels, 1):
             plot = figure.add_subplot(rows, columns, place)
-            _draw_panel(plot, panel, SIZE_INCHES[0] / columns / (SIZE_INCHES[1] / rows), "", "")
-        note = f"{subtitle}\nevery panel has a world and a scale of its own"
+            _draw_panel(plot, panel, SIZE_INCHES[0] / columns / (SIZE_INCHES[1] / rows))
+            handles = [line for line in plot.get_lines() if line.get_label() in [t.label for t in panel.tracks]]
+            plot.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
         figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
-        figure.supxlabel(note.strip(), x=0.01, ha="left", fontsize=9.5, color=INK)
+        note = "every panel has a world and a scale of its own; a dot marks a start"
+        figure.supxlabel(f"{subtitle}\n{note}".strip(), x=0.01, ha="left", fontsize=9.5, color=INK)
     figure.savefig(path, metadata={"Software": None} if str(path).endswith(".png") else None)
 
 
-def _draw_panel(plot: Axes, panel: Panel, ratio: float, title: str, subtitle: str) -> None:
+def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:
     truth = panel.reference if panel.reference is not None and len(panel.reference) else None
     lines = [track.trajectory for track in panel.tracks if len(track.trajectory)]
     shown = lines if truth is None else [truth]
@@ -145,12 +155,12 @@ def _draw_panel(plot: Axes, panel: Panel, ratio: float, title: str, subtitle: st
         plot.plot(*with_gaps(truth)[:, axes].T, color=TRUTH, lw=2.6, alpha=0.75, label="ground truth", zorder=2)
     for track in panel.tracks:
         if len(track.trajectory):
-            colour = COLOURS[track.number % len(COLOURS)]
+            colour = COLOURS[track.colour % len(COLOURS)]
             plot.plot(*with_gaps(track.trajectory)[:, axes].T, color=colour, lw=1.5, label=track.label, zorder=3)
             x, y = track.trajectory.positions[0, axes]
             label = "start" if track is panel.tracks[-1] else None
             plot.plot(x, y, "o", ms=7, color=START, mec=PAPER, mew=1.2, ls="none", label=label, zorder=4)
-    _decorate(plot, axes, "m" if truth is not None else "unit free", title, subtitle)
+    _decorate(plot, axes, "m" if truth is not None else "unit free")
 
 
 def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int], ratio: float) -> None:
@@ -164,7 +174,7 @@ def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int], ratio: 
     plot.set_ylim(middle[1] - height / 2, middle[1] + height / 2)
 
 
-def _decorate(plot: Axes, axes: tuple[int, int], unit: str, title: str, subtitle: str) -> None:
+def _decorate(plot: Axes, axes: tuple[int, int], unit: str) -> None:
     plot.set_aspect("equal", adjustable="box")
     plot.set_xlabel(f"{'xyz'[axes[0]]} ({unit})", color=INK)
     plot.set_ylabel(f"{'xyz'[axes[1]]} ({unit})", color=INK)
@@ -174,8 +184,9 @@ def _decorate(plot: Axes, axes: tuple[int, int], unit: str, title: str, subtitle
     for side, spine in plot.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color("#b8bec6")
-    if plot.get_legend_handles_labels()[0]:
-        plot.legend(loc="lower right", bbox_to_anchor=(1, 1.05), ncols=3, frameon=False, fontsize=9.5, borderaxespad=0)
+
+
+def _add_title(plot: Axes, title: str, subtitle: str) -> None:
     plot.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=22 if subtitle else 8)
     if subtitle:
         plot.annotate(

@@ -118,25 +118,35 @@ class Recorder:
         return "".join(tum_row(rows[cell : cell + _COLUMNS]) for cell in cells).encode("ascii")
 
     def _write_rows(self, *, durable: bool) -> None:
-        """Append rows that no file has yet; replace a file that gets another segment."""
+        """Bring every file up to date; one that fails does not keep the others from it."""
         wanted = {TRAJECTORY: self._longest}
         if len(self._rows) > 1:
             wanted |= {segment_file(segment): segment for segment in sorted(self._rows)}
+        failures = []
         for name, segment in wanted.items():
-            count = len(self._rows.get(segment, ())) // _COLUMNS
-            known = self._files.get(name)
-            if known is None or known.segment != segment:
-                content = TUM_HEADER.encode("ascii") + self._lines(segment)
-                with replaced(self.folder / name) as part:
-                    part.write_bytes(content)
-                self._files[name] = _RowFile(segment, count, len(content))
-            elif known.rows < count:
-                lines = self._lines(segment, known.rows)
-                _append(self.folder / name, known.size, lines)
-                known.rows, known.size = count, known.size + len(lines)
-            if durable:
-                with open(self.folder / name, "rb+") as file:
-                    os.fsync(file.fileno())
+            try:
+                self._write_segment(name, segment, durable=durable)
+            except OSError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0]
+
+    def _write_segment(self, name: str, segment: int, *, durable: bool) -> None:
+        """Append the rows that a file does not have yet; replace a file that held another segment."""
+        path, count = self.folder / name, len(self._rows.get(segment, ())) // _COLUMNS
+        known = self._files.get(name)
+        if known is None or known.segment != segment:
+            content = TUM_HEADER.encode("ascii") + self._lines(segment)
+            with replaced(path) as part:
+                part.write_bytes(content)
+            self._files[name] = _RowFile(segment, count, len(content))
+        elif known.rows < count:
+            lines = self._lines(segment, known.rows)
+            _append(path, known.size, lines)
+            known.rows, known.size = count, known.size + len(lines)
+        if durable:
+            with open(path, "rb+") as file:
+                os.fsync(file.fileno())
 
     # -- everything else -----------------------------------------------------------------------------------------
 

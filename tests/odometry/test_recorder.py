@@ -236,8 +236,20 @@ def test_a_full_disk_when_another_segment_begins(tmp_path, small_files):
     assert run.rows() == [0, 1, 2, 3] and len(run.warned) == 1, "a replacement that fails leaves the old rows"
     small_files(None)
     run.feed(1)
+    assert len(run.warned) == 1
     assert run.rows() == run.rows("trajectory-1.txt") == list(range(4, 11))
     assert run.rows("trajectory-0.txt") == [0, 1, 2, 3]
+
+
+def test_a_file_that_fails_does_not_keep_the_others_from_their_rows(tmp_path):
+    run = Run(tmp_path, interval=1e9)
+    for segment in (0, 0, 1):
+        run.feed(segment)
+    (tmp_path / "trajectory.txt").unlink()
+    (tmp_path / "trajectory.txt").mkdir()
+    for _ in range(3):
+        run.feed(1)
+    assert run.rows("trajectory-1.txt") == [2, 3, 4, 5] and len(run.warned) == 1
 
 
 def test_no_file_handle_is_free(tmp_path):

@@ -252,6 +252,16 @@ def test_a_file_that_fails_does_not_keep_the_others_from_their_rows(tmp_path):
     assert run.rows("trajectory-1.txt") == [2, 3, 4, 5] and len(run.warned) == 1
 
 
+def test_a_row_that_was_cut_off_is_overwritten(tmp_path):
+    """As after an interruption in the middle of a write."""
+    run = Run(tmp_path)
+    run.feed()
+    with open(tmp_path / "trajectory.txt", "a") as file:
+        file.write("0.100000000 1.00")
+    run.feed()
+    assert run.rows() == [0, 1]
+
+
 def test_no_file_handle_is_free(tmp_path):
     """EMFILE: other parts of the program hold all of them; then they are released."""
     run = Run(tmp_path)

@@ -192,3 +192,10 @@ def test_a_replacement_reaches_the_disk_before_it_takes_the_name(tmp_path, monke
         part.write_text("new")
         assert not (tmp_path / "a.txt").exists()
     assert calls == ["fsync", "replace"] and (tmp_path / "a.txt").read_text() == "new"
+
+
+def test_a_replacement_that_is_interrupted_leaves_nothing_behind(tmp_path):
+    with pytest.raises(KeyboardInterrupt), files.replaced(tmp_path / "a.txt") as part:
+        part.write_text("half")
+        raise KeyboardInterrupt
+    assert names(tmp_path) == []

@@ -6,10 +6,9 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from rich.console import Console
 from rich.progress import Progress
 
-from dvo.commands.console import device_of, say, seed_everything
+from dvo.commands.console import StderrConsole, device_of, say, seed_everything
 from dvo.commands.run import load_odometry, track
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
@@ -53,7 +52,7 @@ def render_clip(frames: int) -> RenderedClip:
     Returns:
         The clip, with ground truth.
     """
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=StderrConsole(), transient=True) as progress:
         task = progress.add_task("rendering", total=frames)
         sequence = make_sequence(SCENE, frames=frames, family=FAMILY, kind="handheld", fps=FPS)
         rendered = []

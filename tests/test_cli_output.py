@@ -307,7 +307,7 @@ class Unread(io.TextIOWrapper):
     def __init__(self, *, write_through: bool) -> None:
         reader, writer = os.pipe()
         os.close(reader)
-        super().__init__(os.fdopen(writer, "wb"), write_through=write_through)
+        super().__init__(os.fdopen(writer, "wb", 0 if write_through else -1), write_through=write_through)
 
 
 @pytest.mark.parametrize("write_through", [False, True])
@@ -317,10 +317,12 @@ def test_a_reader_that_closes_the_pipe(given, image_folder, tmp_path, monkeypatc
     """``dvo run ... | true``, and with ``2>&1``: the results are there and the exit code is that of the run."""
     given(at_frame={9: lambda: os.kill(os.getpid(), signal.SIGTERM)} if code else {})
     (image_folder / "0003.png").write_bytes(b"not an image")  # a warning on stderr
+    (image_folder.parent / "times.txt").unlink()  # another one, before tracking
     streams = [Unread(write_through=write_through) for _ in range(1 + both)]
     for name, stream in zip(("stdout", "stderr"), streams, strict=False):
         monkeypatch.setattr(sys, name, stream)
-    assert main(arguments(image_folder, tmp_path / "out")) == code
+    line = ["run", str(image_folder), "--calib", str(image_folder.parent / "calib.txt"), "--out", str(tmp_path / "out")]
+    assert main([*line, "--device", "cpu"]) == code
     for stream in streams:
         stream.close()  # as the interpreter does at its end
     monkeypatch.undo()

@@ -85,14 +85,15 @@ def say(text: str) -> None:
         raise DvoError(error.strerror or str(error), file="standard output") from error
 
 
-def warn(text: str) -> None:
+def warn(text: str, kind: str = "warning") -> None:
     """Print a warning to stderr, if it can be written.
 
     Args:
         text: a sentence.
+        kind: word before it.
     """
     with contextlib.suppress(OSError):
-        print(f"dvo: warning: {text}", file=sys.stderr, flush=True)
+        print(f"dvo: {kind}: {text}", file=sys.stderr, flush=True)
 
 
 class InterruptSwitch:
@@ -125,7 +126,7 @@ class InterruptSwitch:
         self.pressed = signal.Signals(number)
 
 
-class _StderrConsole(Console):
+class StderrConsole(Console):
     """Console on stderr that falls silent when the reader of stderr is gone."""
 
     def __init__(self) -> None:
@@ -154,7 +155,7 @@ class TrackingProgress:
             TextColumn("{task.fields[rate]:5.1f} frames/s"),
             TextColumn("{task.fields[status]}"),
             TimeRemainingColumn(),
-            console=_StderrConsole(),
+            console=StderrConsole(),
         )
         self._task = self._progress.add_task("", total=total, rate=0.0, status="")
         self._moments: deque[float] = deque([time.perf_counter()], maxlen=30)

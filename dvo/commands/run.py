@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import signal
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -74,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         groundtruth=arguments.groundtruth,
     )
     for warning in source.warnings:
-        print(f"dvo: note: {warning}", file=sys.stderr)
+        warn(warning, "note")
     facts = {
         "source": str(arguments.source),
         "kind": getattr(source, "kind", None),

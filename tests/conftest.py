@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 from hypothesis import settings
 
+import dvo
 from dvo.data.frame import Frame
 from dvo.data.root import data_root as find_data_root
 from dvo.data.trajectory import Trajectory, write_tum
@@ -64,6 +66,7 @@ class FakeOdometry:
         self.motion, self.lost, self.at_frame = motion, lost, at_frame or {}
         self.new_segment, self.reason = new_segment, reason
         self.frames: list[Frame] = []
+        self.asked: dict[str, Any] = {}
 
     def segment_of(self, frame: Frame) -> int:
         return sum(frame.index >= first for first in self.new_segment)
@@ -112,6 +115,26 @@ def curve(seconds: float) -> np.ndarray:
 def fake_odometry() -> Callable[..., FakeOdometry]:
     """``fake_odometry(lost=..., at_frame=..., new_segment=...)`` on :func:`curve` (or ``motion=...``)."""
     return lambda motion=curve, **options: FakeOdometry(motion, **options)
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch, fake_odometry: Callable[..., FakeOdometry]) -> Callable[..., FakeOdometry]:
+    """``given(**options)`` makes ``dvo.load`` return a fake odometry with these options, and returns it.
+
+    Its ``asked`` holds the arguments of ``dvo.load``, and is empty before the call.
+    """
+
+    def use(**options: Any) -> FakeOdometry:
+        odometry = fake_odometry(**options)
+
+        def load(weights: str, **asked: Any) -> FakeOdometry:
+            odometry.asked = {"weights": weights, **asked}
+            return odometry
+
+        monkeypatch.setitem(vars(dvo), "load", load)
+        return odometry
+
+    return use
 
 
 @pytest.fixture

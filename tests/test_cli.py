@@ -22,24 +22,6 @@ from dvo.data.trajectory import read_tum
 FILES = ["map.ply", "run.json", "trajectory.png", "trajectory.txt"]
 
 
-@pytest.fixture
-def given(monkeypatch, fake_odometry):
-    """``given(**options)`` makes ``dvo.load`` return a fake odometry with these options, and returns it."""
-
-    def use(**options):
-        odometry = fake_odometry(**options)
-        odometry.asked = {}
-
-        def load(weights, **asked):
-            odometry.asked = {"weights": weights, **asked}
-            return odometry
-
-        monkeypatch.setitem(vars(dvo), "load", load)
-        return odometry
-
-    return use
-
-
 def arguments(images: Path, out: Path, *more: str) -> list[str]:
     beside = images.parent
     return ["run", str(images), "--calib", str(beside / "calib.txt"), "--times", str(beside / "times.txt"),

@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         "stride": arguments.stride,
     }
     seed_everything(arguments.seed)
-    with results.results_folder(arguments.out, source.name) as folder:
+    with results.results_folder(arguments.out, source.name) as folder:  # checked before the weights load
         odometry = load_odometry(arguments, device)
         return track(odometry, source, folder, stride=arguments.stride, facts=facts)
 
@@ -111,7 +111,7 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     return dvo.load(arguments.weights, device=device, seed=arguments.seed, **settings)
 
 
-def track(odometry: Odometry, clip: Clip, folder: Path, *, stride: int = 1, facts: dict[str, Any]) -> int:
+def track(odometry: Odometry, clip: Clip, out: Path | str | None, *, stride: int = 1, facts: dict[str, Any]) -> int:
     """Track a clip, write the results folder and print a summary.
 
     Results are written from the first frame on (:class:`dvo.odometry.recorder.Recorder`) and replaced at the end. The
@@ -121,7 +121,7 @@ def track(odometry: Odometry, clip: Clip, folder: Path, *, stride: int = 1, fact
     Args:
         odometry: newly built.
         clip: frames in order of time, with or without ground truth.
-        folder: an existing folder for the results.
+        out: results folder; None for ``runs/NAME-TIME``.
         stride: distance of tracked frames, in frames of the clip.
         facts: metadata to write into run.json.
 
@@ -131,6 +131,11 @@ def track(odometry: Odometry, clip: Clip, folder: Path, *, stride: int = 1, fact
     Raises:
         DvoError: no frame could be read, or a result cannot be written.
     """
+    with results.results_folder(out, clip.name) as folder:
+        return _track(odometry, clip, folder, stride, facts)
+
+
+def _track(odometry: Odometry, clip: Clip, folder: Path, stride: int, facts: dict[str, Any]) -> int:
     printed = set(clip.warnings)
     facts = {"odometry": odometry.name, **facts}
     recorder = Recorder(folder, odometry, facts, warn=warn)

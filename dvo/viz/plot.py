@@ -13,6 +13,7 @@ from dvo.data.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, ACCENT, TRUTH, START, PAPER = "#22272e", "#e4572e", "#4a6fa5", "#2a9d5c", "#ffffff"
 COLOURS = (ACCENT, "#8e4ec6", "#b08900", "#00838f", "#c2185b", "#5d4037")  # of segments
@@ -119,27 +120,34 @@ def plot_panels(path: Path | str, panels: Sequence[Panel], *, title: str = "", s
     figure = Figure(figsize=SIZE_INCHES, dpi=DPI, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
     if len(panels) == 1:
-        (panel,) = panels
-        plot = figure.add_subplot()
-        _draw_panel(plot, panel, SIZE_INCHES[0] / SIZE_INCHES[1])
-        _add_title(plot, title, subtitle)
-        if len(panel.tracks) > 1:  # too many names for the room above the axes
-            figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9.5)
-        elif plot.get_legend_handles_labels()[0]:
-            place = {"loc": "lower right", "bbox_to_anchor": (1, 1.05), "borderaxespad": 0}
-            plot.legend(**place, ncols=3, frameon=False, fontsize=9.5)
+        _draw_alone(figure, panels[0], title, subtitle)
     else:
-        columns = 2 if len(panels) <= 4 else 3
-        rows = -(-len(panels) // columns)
-        for place, panel in enumerate(panels, 1):
-            plot = figure.add_subplot(rows, columns, place)
-            _draw_panel(plot, panel, SIZE_INCHES[0] / columns / (SIZE_INCHES[1] / rows))
-            handles = [line for line in plot.get_lines() if line.get_label() in [t.label for t in panel.tracks]]
-            plot.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
-        figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
-        note = "every panel has a world and a scale of its own; a dot marks a start"
-        figure.supxlabel(f"{subtitle}\n{note}".strip(), x=0.01, ha="left", fontsize=9.5, color=INK)
+        _draw_side_by_side(figure, panels, title, subtitle)
     figure.savefig(path, metadata={"Software": None} if str(path).endswith(".png") else None)
+
+
+def _draw_alone(figure: Figure, panel: Panel, title: str, subtitle: str) -> None:
+    plot = figure.add_subplot()
+    _draw_panel(plot, panel, SIZE_INCHES[0] / SIZE_INCHES[1])
+    _add_title(plot, title, subtitle)
+    if len(panel.tracks) > 1:  # too many names for the room above the axes
+        figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9.5)
+    elif plot.get_legend_handles_labels()[0]:
+        plot.legend(loc="lower right", bbox_to_anchor=(1, 1.05), ncols=3, frameon=False, fontsize=9.5, borderaxespad=0)
+
+
+def _draw_side_by_side(figure: Figure, panels: Sequence[Panel], title: str, subtitle: str) -> None:
+    columns = 2 if len(panels) <= 4 else 3
+    rows = -(-len(panels) // columns)
+    for place, panel in enumerate(panels, 1):
+        plot = figure.add_subplot(rows, columns, place)
+        _draw_panel(plot, panel, SIZE_INCHES[0] / columns / (SIZE_INCHES[1] / rows))
+        names = [track.label for track in panel.tracks]
+        handles = [line for line in plot.get_lines() if line.get_label() in names]
+        plot.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
+    note = "every panel has a world and a scale of its own; a dot marks a start"
+    figure.supxlabel(f"{subtitle}\n{note}".strip(), x=0.01, ha="left", fontsize=9.5, color=INK)
 
 
 def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:

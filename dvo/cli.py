@@ -6,17 +6,23 @@ Heavy modules are imported only for the command in use, so that ``dvo --help`` i
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
+from types import FrameType
 from typing import NoReturn
 
 from dvo import __version__
-from dvo.commands import BAD_INPUT, INTERRUPTED
+from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
 from dvo.errors import DvoError
 
 EXIT_CODES = (
-    "exit codes: 0 done, 1 no frame could be tracked, 2 bad input, 130 interrupted (results so far are written)"
+    "exit codes: 0 done, 1 no frame could be tracked, 2 bad input or results that cannot be written, 130 interrupted, "
+    "143 terminated (results so far are written)"
 )
 
 
@@ -150,7 +156,7 @@ def _positive_float(text: str) -> float:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run a command. Invalid input and every failure of the system (``OSError``) end in one line on stderr.
 
     Args:
         argv: arguments without the program's name; None for those of the process.
@@ -158,6 +164,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit code, see :mod:`dvo.commands`.
     """
+    with _terminable():
+        code = _run(argv)
+    return _flush(code)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     try:
         arguments = build_parser().parse_args(argv)
         module, function = arguments.run.split(":")
@@ -166,11 +178,59 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as exit_:  # argparse: --help, --version, or a wrong option
         return exit_.code if isinstance(exit_.code, int) else BAD_INPUT
     except DvoError as error:
-        print("dvo: error:", " ".join(str(error).split()), file=sys.stderr)
-        return BAD_INPUT
+        return _complain(error, BAD_INPUT)
+    except Terminated:
+        return _complain("terminated", TERMINATED)
     except KeyboardInterrupt:
-        print("dvo: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return _complain("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # the reader of stdout has seen enough
+        return OK
+    except OSError as error:
+        return _complain(_as_input_error(error), BAD_INPUT)
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Raise :class:`Terminated` at SIGTERM, so that a command can clean up; unless the caller handles or ignores it."""
+    default = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM)
+
+    def terminate(number: int, frame: FrameType | None) -> NoReturn:
+        raise Terminated
+
+    if default is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _as_input_error(error: OSError) -> DvoError:
+    return DvoError(error.strerror or str(error) or type(error).__name__, file=error.filename)
+
+
+def _complain(problem: DvoError | str, code: int) -> int:
+    """Print a line to stderr, if it can be written, and return the exit code."""
+    text = problem if isinstance(problem, str) else f"error: {' '.join(str(problem).split())}"
+    with contextlib.suppress(OSError):
+        print(f"dvo: {text}", file=sys.stderr)
+    return code
+
+
+def _flush(code: int) -> int:
+    """Flush both streams; one that cannot be written is replaced, because the interpreter flushes it again at exit."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None and not stream.closed:
+                stream.flush()
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+            if stream is sys.stdout and code != BAD_INPUT and not isinstance(error, BrokenPipeError):
+                code = _complain(DvoError(error.strerror or str(error), file="standard output"), code or BAD_INPUT)
+    return code
 
 
 if __name__ == "__main__":

@@ -6,16 +6,16 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from rich.console import Console
 from rich.progress import Progress
 
-from dvo.commands.console import device_of, seed_everything
+from dvo.commands.console import StderrConsole, device_of, say, seed_everything
 from dvo.commands.run import load_odometry, track
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
+from dvo.odometry.results import results_folder
 from dvo.synth.sequence import make_sequence
 
-SCENE, FAMILY, FPS = 0, "room", 30.0
+NAME, SCENE, FAMILY, FPS = "demo", 0, "room", 30.0
 
 
 @dataclass
@@ -52,14 +52,14 @@ def render_clip(frames: int) -> RenderedClip:
     Returns:
         The clip, with ground truth.
     """
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=StderrConsole(), transient=True) as progress:
         task = progress.add_task("rendering", total=frames)
         sequence = make_sequence(SCENE, frames=frames, family=FAMILY, kind="handheld", fps=FPS)
         rendered = []
         for frame in sequence:
             rendered.append(frame)
             progress.advance(task)
-    return RenderedClip("demo", rendered, sequence.groundtruth)
+    return RenderedClip(NAME, rendered, sequence.groundtruth)
 
 
 def demo(arguments: argparse.Namespace) -> int:
@@ -76,8 +76,6 @@ def demo(arguments: argparse.Namespace) -> int:
     """
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
-    odometry = load_odometry(arguments, device)  # before rendering, so that errors appear early
-    clip = render_clip(arguments.frames)
     facts = {
         "source": f"rendered: {FAMILY}, seed {SCENE}",
         "weights": arguments.weights,
@@ -85,6 +83,8 @@ def demo(arguments: argparse.Namespace) -> int:
         "seed": arguments.seed,
         "stride": 1,
     }
-    code = track(odometry, clip, arguments.out, facts=facts)
-    print("to track your own video: dvo run VIDEO --calib FILE")
+    with results_folder(arguments.out, NAME) as folder:
+        odometry = load_odometry(arguments, device)  # before rendering, so that errors appear early
+        code = track(odometry, render_clip(arguments.frames), folder, facts=facts)
+    say("to track your own video: dvo run VIDEO --calib FILE")
     return code

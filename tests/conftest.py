@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,10 +12,11 @@ import pytest
 import torch
 from hypothesis import settings
 
+import dvo
 from dvo.data.frame import Frame
 from dvo.data.root import data_root as find_data_root
 from dvo.data.trajectory import Trajectory, write_tum
-from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.protocol import Estimate, Result, Segment, SparseMap, Status
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -46,7 +48,10 @@ def data_root() -> Path:
 
 
 class FakeOdometry:
-    """Knows the answer: pose ``motion(t)``, with optional lost frames and a frame at which it stops the run."""
+    """Knows the answer: pose ``motion(t)``, with optional lost frames and frames at which it calls something.
+
+    From each frame of ``new_segment`` on, poses belong to a further segment, with a world and a scale of its own.
+    """
 
     name = "fake"
 
@@ -55,27 +60,47 @@ class FakeOdometry:
         motion: Callable[[float], np.ndarray],
         lost: tuple[int, ...] = (),
         at_frame: dict[int, Callable[[], None]] | None = None,
+        new_segment: tuple[int, ...] = (),
+        reason: str = "black image",
     ) -> None:
         self.motion, self.lost, self.at_frame = motion, lost, at_frame or {}
+        self.new_segment, self.reason = new_segment, reason
         self.frames: list[Frame] = []
+        self.asked: dict[str, Any] = {}
+
+    def segment_of(self, frame: Frame) -> int:
+        return sum(frame.index >= first for first in self.new_segment)
+
+    def pose_wc(self, frame: Frame) -> np.ndarray:
+        pose = np.array(self.motion(frame.timestamp), float)
+        segment = self.segment_of(frame)
+        pose[:3] = pose[:3] * (1 + segment) + 10 * segment
+        return pose
 
     def track(self, frame: Frame) -> Estimate:
         self.at_frame.get(frame.index, lambda: None)()
         self.frames.append(frame)
-        status = Status.LOST if frame.index in self.lost else Status.TRACKING
-        return Estimate(frame.timestamp, self.motion(frame.timestamp), status, 1.0)
+        if frame.index in self.lost:
+            return Estimate(frame.timestamp, None, Status.LOST, 0.0, self.segment_of(frame), self.reason)
+        return Estimate(frame.timestamp, self.pose_wc(frame), Status.TRACKING, 1.0, self.segment_of(frame))
 
     def finish(self) -> Result:
-        kept = [frame.timestamp for frame in self.frames if frame.index not in self.lost]
-        poses = np.array([self.motion(stamp) for stamp in kept]).reshape(-1, 7)
-        points = np.linspace(-1, 1, 30, dtype=np.float32).reshape(10, 3)
-        colors = np.arange(30, dtype=np.uint8).reshape(10, 3)
+        kept = [frame for frame in self.frames if frame.index not in self.lost]
+        segments = []
+        for number in sorted({self.segment_of(frame) for frame in kept}):
+            part = [frame for frame in kept if self.segment_of(frame) == number]
+            times, poses = np.array([f.timestamp for f in part]), np.array([self.pose_wc(f) for f in part])
+            segments.append(Segment(Trajectory(times, poses), float(times[0]), float(times[-1])))
+        nothing = Trajectory(np.zeros(0), np.zeros((0, 7)))
         return Result(
-            Trajectory(np.array(kept), poses),
-            SparseMap(points, colors),
+            max(segments, key=len).trajectory if segments else nothing,
+            SparseMap(
+                np.linspace(-1, 1, 30, dtype=np.float32).reshape(10, 3), np.arange(30, dtype=np.uint8).reshape(10, 3)
+            ),
             len(self.frames),
             len(self.frames) - len(kept),
             {"config": {"patches": 3}, "working_size": (64, 48)},
+            tuple(segments),
         )
 
 
@@ -88,8 +113,28 @@ def curve(seconds: float) -> np.ndarray:
 
 @pytest.fixture
 def fake_odometry() -> Callable[..., FakeOdometry]:
-    """``fake_odometry(lost=..., at_frame=...)`` on :func:`curve` (or ``motion=...``)."""
+    """``fake_odometry(lost=..., at_frame=..., new_segment=...)`` on :func:`curve` (or ``motion=...``)."""
     return lambda motion=curve, **options: FakeOdometry(motion, **options)
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch, fake_odometry: Callable[..., FakeOdometry]) -> Callable[..., FakeOdometry]:
+    """``given(**options)`` makes ``dvo.load`` return a fake odometry with these options, and returns it.
+
+    Its ``asked`` holds the arguments of ``dvo.load``, and is empty before the call.
+    """
+
+    def use(**options: Any) -> FakeOdometry:
+        odometry = fake_odometry(**options)
+
+        def load(weights: str, **asked: Any) -> FakeOdometry:
+            odometry.asked = {"weights": weights, **asked}
+            return odometry
+
+        monkeypatch.setitem(vars(dvo), "load", load)
+        return odometry
+
+    return use
 
 
 @pytest.fixture

@@ -2,5 +2,10 @@
 
 OK = 0
 NOTHING_TRACKED = 1
-BAD_INPUT = 2
+BAD_INPUT = 2  # or results that cannot be written
 INTERRUPTED = 130
+TERMINATED = 143
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, at a time when it ends the program at once."""

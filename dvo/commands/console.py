@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 import signal
+import sys
 import threading
 import time
 from collections import deque
@@ -13,8 +15,10 @@ from typing import Any
 import cv2
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+from dvo.commands import Terminated
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Estimate, Status
@@ -64,37 +68,79 @@ def seed_everything(seed: int) -> None:
     cv2.setRNGSeed(seed)
 
 
+def say(text: str) -> None:
+    """Print a line to stdout, unless its reader has closed the pipe: what it says is in the results folder too.
+
+    Args:
+        text: the line.
+
+    Raises:
+        DvoError: another failure of stdout, such as a full disk.
+    """
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        pass
+    except OSError as error:
+        raise DvoError(error.strerror or str(error), file="standard output") from error
+
+
+def warn(text: str, kind: str = "warning") -> None:
+    """Print a warning to stderr, if it can be written.
+
+    Args:
+        text: a sentence.
+        kind: word before it.
+    """
+    with contextlib.suppress(OSError):
+        print(f"dvo: {kind}: {text}", file=sys.stderr, flush=True)
+
+
 class InterruptSwitch:
-    """Context in which the first Ctrl-C only sets :attr:`pressed`; the second raises KeyboardInterrupt.
+    """Context in which the first Ctrl-C or SIGTERM only sets :attr:`pressed`; the second raises KeyboardInterrupt.
 
     An interrupt in the middle of an update would leave the tracker in an inconsistent state; the caller checks
     :attr:`pressed` between frames instead.
 
     Attributes:
-        pressed: True after the first Ctrl-C.
+        pressed: the first signal, None before it.
     """
 
     def __init__(self) -> None:
-        self.pressed = False
-        self._before: Any = None
+        self.pressed: signal.Signals | None = None
+        self._before: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> InterruptSwitch:
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._press)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._press)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _press(self, number: int, frame: FrameType | None) -> None:
-        if self.pressed:
-            raise KeyboardInterrupt
-        self.pressed = True
+        if self.pressed is not None:
+            raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+        self.pressed = signal.Signals(number)
+
+
+class StderrConsole(Console):
+    """Console on stderr that falls silent when the reader of stderr is gone."""
+
+    def __init__(self) -> None:
+        super().__init__(stderr=True)
+
+    def on_broken_pipe(self) -> None:
+        """Stop printing; rich would end the program."""
+        self.quiet = True
 
 
 class TrackingProgress:
     """Progress bar on stderr, with the rate over the last frames and the state of the tracker.
+
+    A failure of stderr (closed pipe, full disk) ends the display, not the run.
 
     Args:
         total: number of frames, or None if unknown.
@@ -109,19 +155,21 @@ class TrackingProgress:
             TextColumn("{task.fields[rate]:5.1f} frames/s"),
             TextColumn("{task.fields[status]}"),
             TimeRemainingColumn(),
-            console=Console(stderr=True),
+            console=StderrConsole(),
         )
         self._task = self._progress.add_task("", total=total, rate=0.0, status="")
         self._moments: deque[float] = deque([time.perf_counter()], maxlen=30)
 
     def __enter__(self) -> TrackingProgress:
-        self._progress.start()
+        with contextlib.suppress(OSError):
+            self._progress.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._progress.stop()
+        with contextlib.suppress(OSError):
+            self._progress.stop()
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
         """Advance by a frame; callback of :func:`dvo.odometry.session.run`.
@@ -134,5 +182,21 @@ class TrackingProgress:
         rate = (len(self._moments) - 1) / max(self._moments[-1] - self._moments[0], 1e-9)
         fields: dict[str, Any] = {"rate": rate}
         if estimate is not None:
-            fields["status"] = f"[{_COLOURS[estimate.status]}]{estimate.status.value}"
-        self._progress.update(self._task, advance=1, **fields)
+            fields["status"] = f"[{_COLOURS[estimate.status]}]{describe_status(estimate)}"
+        with contextlib.suppress(OSError):
+            self._progress.update(self._task, advance=1, **fields)
+
+
+def describe_status(estimate: Estimate) -> str:
+    """Describe the state of the tracker, with the cause of a loss and the segment from the second one on.
+
+    Args:
+        estimate: of the last frame.
+
+    Returns:
+        Text such as ``lost: black image, segment 1``, as rich markup.
+    """
+    text = estimate.status.value
+    if estimate.status is Status.LOST and estimate.reason:
+        text += f": {escape(estimate.reason)}"
+    return f"{text}, segment {estimate.segment}" if estimate.segment else text

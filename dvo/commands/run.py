@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import sys
+import signal
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
 import dvo
-from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK
-from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, seed_everything
+from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
+from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, seed_everything, warn
+from dvo.commands.picture import draw
+from dvo.commands.report import Scores, headline, print_report, score
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from dvo.metrics import Metrics, align_trajectory, associate, evaluate, fit_alignment
 from dvo.odometry import results, session
-from dvo.odometry.protocol import Odometry
+from dvo.odometry.protocol import Estimate, Odometry
+from dvo.odometry.recorder import Recorder
 from dvo.settings import parse_settings, read_settings
-from dvo.viz.plot import plot_trajectory
+
+_ABORTED = "aborted by a second Ctrl-C or SIGTERM"
 
 
 class Clip(Protocol):
@@ -70,9 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         groundtruth=arguments.groundtruth,
     )
     for warning in source.warnings:
-        print(f"dvo: note: {warning}", file=sys.stderr)
-    seed_everything(arguments.seed)
-    odometry = load_odometry(arguments, device)
+        warn(warning, "note")
     facts = {
         "source": str(arguments.source),
         "kind": getattr(source, "kind", None),
@@ -83,7 +84,10 @@ def run(arguments: argparse.Namespace) -> int:
         "seed": arguments.seed,
         "stride": arguments.stride,
     }
-    return track(odometry, source, arguments.out, stride=arguments.stride, facts=facts)
+    seed_everything(arguments.seed)
+    with results.results_folder(arguments.out, source.name) as folder:  # checked before the weights load
+        odometry = load_odometry(arguments, device)
+        return track(odometry, source, folder, stride=arguments.stride, facts=facts)
 
 
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
@@ -107,10 +111,12 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     return dvo.load(arguments.weights, device=device, seed=arguments.seed, **settings)
 
 
-def track(odometry: Odometry, clip: Clip, out: str | None, *, stride: int = 1, facts: dict[str, Any]) -> int:
+def track(odometry: Odometry, clip: Clip, out: Path | str | None, *, stride: int = 1, facts: dict[str, Any]) -> int:
     """Track a clip, write the results folder and print a summary.
 
-    The first Ctrl-C ends tracking and still writes all results; a second one aborts.
+    Results are written from the first frame on (:class:`dvo.odometry.recorder.Recorder`) and replaced at the end. The
+    first Ctrl-C or SIGTERM ends tracking and still writes all results; a second one aborts, and what the recorder has
+    written stays.
 
     Args:
         odometry: newly built.
@@ -120,85 +126,65 @@ def track(odometry: Odometry, clip: Clip, out: str | None, *, stride: int = 1, f
         facts: metadata to write into run.json.
 
     Returns:
-        Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C.
+        Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C, 143 after SIGTERM.
 
     Raises:
-        DvoError: no frame could be read, or the folder cannot be written.
+        DvoError: no frame could be read, or a result cannot be written.
     """
-    is_new = out is None or not Path(out).exists()
-    folder = results.make_folder(out, clip.name)
+    with results.results_folder(out, clip.name) as folder:
+        return _track(odometry, clip, folder, stride, facts)
+
+
+def _track(odometry: Odometry, clip: Clip, folder: Path, stride: int, facts: dict[str, Any]) -> int:
     printed = set(clip.warnings)
-    try:
-        with InterruptSwitch() as switch, TrackingProgress(clip.frame_count) as progress:
+    facts = {"odometry": odometry.name, **facts}
+    recorder = Recorder(folder, odometry, facts, warn=warn)
+
+    def on_frame(frame: Frame, estimate: Estimate | None) -> None:
+        recorder.update(frame, estimate)
+        progress.update(frame, estimate)
+
+    with InterruptSwitch() as switch, TrackingProgress(clip.frame_count) as progress:
+        try:
             done = session.run(
-                odometry, clip, stride=stride, on_frame=progress.update, should_stop=lambda: switch.pressed
+                odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None
             )
-            metrics = _score(done, clip.groundtruth)
-            facts = {"odometry": odometry.name, **facts, "metrics": None if metrics is None else asdict(metrics)}
-            results.write_results(folder, done, facts)
-            _draw(folder, done, clip, odometry.name, metrics)
-    except BaseException:
-        if is_new:
-            with contextlib.suppress(OSError):  # not empty
-                folder.rmdir()
-        raise
-    for warning in done.warnings:
-        if warning not in printed:
-            print(f"dvo: warning: {warning}", file=sys.stderr)
-    _report(folder, done, metrics)
+        except KeyboardInterrupt:
+            recorder.stop(interrupted=True, reason=_ABORTED)
+            raise
+        except Exception as error:
+            recorder.stop(interrupted=False, reason=f"ended by {type(error).__name__}: {error}")
+            raise
+        new_warnings = [warning for warning in done.warnings if warning not in printed]
+        done = replace(done, warnings=(*done.warnings, *recorder.warnings))
+        scores = score(done, clip.groundtruth)
+        _write(folder, done, scores, clip, facts)
+    for warning in new_warnings:
+        warn(warning)
+    print_report(folder, done, scores)
     if done.interrupted:
-        return INTERRUPTED
-    return OK if len(done.result.trajectory) else NOTHING_TRACKED
+        return TERMINATED if switch.pressed is signal.SIGTERM else INTERRUPTED
+    return OK if done.result.frames_tracked else NOTHING_TRACKED
 
 
-def _score(done: session.Run, groundtruth: Trajectory | None) -> Metrics | None:
-    return None if groundtruth is None else evaluate(done.result.trajectory, groundtruth, align="sim3")
+def _write(folder: Path, done: session.Run, scores: Scores, clip: Clip, facts: dict[str, Any]) -> None:
+    """Replace the files of the recorder with the final ones."""
+    facts = {**facts, "metrics": None if scores.longest is None else asdict(scores.longest)}
 
+    def picture(path: Path) -> None:
+        draw(
+            path,
+            done.result,
+            clip.groundtruth,
+            title=clip.name,
+            subtitle=headline(done, scores),
+            label=facts["odometry"],
+        )
 
-def _draw(folder: Path, done: session.Run, clip: Clip, name: str, metrics: Metrics | None) -> None:
-    """Write the plot, in the frame of the ground truth if there is one."""
-    trajectory, points, reference = done.result.trajectory, done.result.map.points, clip.groundtruth
-    if reference is not None:
-        i, j = associate(trajectory, reference)
-        if metrics is not None and metrics.reason is None:
-            scale, rotation, shift = fit_alignment(trajectory.positions[i], reference.positions[j], "sim3")
-            points = scale * points @ rotation.T + shift
-            trajectory = align_trajectory(trajectory, reference, "sim3")
-        else:  # without an alignment the two frames are unrelated
-            reference = None
-        if reference is not None:  # ground truth may be longer than the clip
-            span = slice(j.min(), j.max() + 1)
-            reference = Trajectory(reference.timestamps[span], reference.poses_wc[span])
-    plot_trajectory(
-        folder / results.PICTURE,
-        trajectory,
-        reference=reference,
-        points=points,
-        title=clip.name,
-        subtitle=_headline(done, metrics),
-        label=name,
-    )
-
-
-def _headline(done: session.Run, metrics: Metrics | None) -> str:
-    counts = f"{len(done.result.trajectory)} of {done.result.frames_read} frames tracked"
-    return counts if metrics is None or metrics.reason else f"{_ate(metrics)}, {counts}"
-
-
-def _ate(metrics: Metrics) -> str:
-    return f"ATE {metrics.ate_rmse:.3g} m ({metrics.ate_percent:.2f} % of {metrics.path_length:.3g} m)"
-
-
-def _report(folder: Path, done: session.Run, metrics: Metrics | None) -> None:
-    result = done.result
-    print(
-        f"tracked {len(result.trajectory)} of {result.frames_read} frames, {done.frames_per_second:.1f} frames/s, "
-        f"{len(result.map.points)} map points"
-    )
-    if metrics is not None and metrics.reason:
-        print(f"no error against ground truth: {metrics.reason}")
-    elif metrics is not None:
-        relative = f"RPE {metrics.rpe_trans:.3g} m and {metrics.rpe_rot_deg:.3g} deg a frame"
-        print(f"{_ate(metrics)} after Sim(3) alignment, {relative}")
-    files = (results.TRAJECTORY, results.MAP, results.PICTURE, results.SUMMARY)
-    print(f"results in {folder}/: {', '.join(files)}")
+    try:
+        results.write_results(folder, done, facts, draw=picture, segment_facts=scores.segment_facts)
+    except KeyboardInterrupt:
+        aborted = replace(done, interrupted=True, warnings=(*done.warnings, _ABORTED))
+        with contextlib.suppress(OSError):
+            results.write_summary(folder, {**facts, **results.summary(aborted), "finished": False})
+        raise

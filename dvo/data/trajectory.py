@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 
 from dvo.errors import DvoError
 from dvo.geometry.poses import pose_matrices, poses_from_matrices, slerp
+
+TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,25 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
         trajectory: camera-to-world poses.
     """
     rows = np.column_stack([trajectory.timestamps, trajectory.poses_wc])
-    with open(path, "w", encoding="utf-8") as file:
-        file.write("# timestamp tx ty tz qx qy qz qw (camera to world)\n")
-        for row in rows:
-            file.write(f"{row[0]:.9f} " + " ".join(f"{value:.9f}" for value in row[1:]) + "\n")
+    with open(path, "w", encoding="utf-8", newline="\n") as file:
+        file.write(TUM_HEADER)
+        file.writelines(tum_row(row) for row in rows)
+
+
+def tum_row(values: Iterable[float]) -> str:
+    """Row of a TUM file.
+
+    Args:
+        values: timestamp in seconds and camera-to-world pose, ``timestamp tx ty tz qx qy qz qw``.
+
+    Returns:
+        The values with nine decimals, and the end of the line.
+
+    Example:
+        >>> tum_row([0.5, 1, 2, 3, 0, 0, 0, 1])[:23]
+        '0.500000000 1.000000000'
+    """
+    return " ".join(f"{value:.9f}" for value in values) + "\n"
 
 
 def read_tum(path: Path | str) -> Trajectory:

@@ -132,6 +132,15 @@ class Result:
         """Number of rows of all segments."""
         return sum(len(segment) for segment in self.segments)
 
+    @property
+    def longest(self) -> int | None:
+        """Number of the segment that ``trajectory`` is; None without segments."""
+        if not self.segments:
+            return None
+        times = self.trajectory.timestamps
+        same = (k for k, s in enumerate(self.segments) if np.array_equal(s.trajectory.timestamps, times))
+        return next(same, max(range(len(self.segments)), key=lambda k: len(self.segments[k])))
+
 
 @runtime_checkable
 class Odometry(Protocol):
@@ -175,5 +184,18 @@ class Odometry(Protocol):
 
         Returns:
             Trajectory and map of the sequence.
+        """
+        ...
+
+
+@runtime_checkable
+class Interim(Protocol):
+    """Interface of an odometry that gives its result so far between two frames."""
+
+    def current(self) -> Result:
+        """Compute the result of the frames so far, without a final optimisation; tracking goes on unchanged.
+
+        Returns:
+            Trajectory and map so far.
         """
         ...

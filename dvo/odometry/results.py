@@ -1,13 +1,20 @@
-"""Output files of a run: trajectory.txt, map.ply and run.json. (:mod:`dvo.viz.plot` draws trajectory.png.)"""
+"""Results folder of a run: trajectory.txt, a trajectory file for each of several segments, map.ply and run.json.
+
+:mod:`dvo.odometry.recorder` writes them while a run goes on, :mod:`dvo.viz.plot` draws trajectory.png.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
+import itertools
 import json
 import math
 import platform
+import re
 import sys
-from dataclasses import asdict, is_dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import asdict, is_dataclass, replace
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
@@ -17,17 +24,45 @@ import numpy as np
 
 from dvo.data.trajectory import write_tum
 from dvo.errors import DvoError
-from dvo.odometry.protocol import SparseMap
+from dvo.odometry.files import PART, check_writable, replaced, write_error, write_ply
 from dvo.odometry.session import Run
 
-TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
+FILES = TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
+SEGMENT_FILE = re.compile(r"trajectory-\d+\.txt")
 
 
-def make_folder(out: Path | str | None, name: str) -> Path:
-    """Create the results folder.
+@contextlib.contextmanager
+def results_folder(out: Path | str | None, name: str) -> Iterator[Path]:
+    """Create and check the results folder, for the time of a run.
+
+    If the run ends with an exception, a new folder that is still empty is removed.
 
     Args:
         out: the folder; None for ``runs/<name>-<time>``.
+        name: of the sequence.
+
+    Yields:
+        The folder.
+
+    Raises:
+        DvoError: the path is a file or cannot be written.
+    """
+    before = None if out is None else Path(out).exists()
+    folder = make_folder(out, name)
+    try:
+        yield folder
+    except BaseException:
+        if not before:
+            with contextlib.suppress(OSError):  # not empty
+                folder.rmdir()
+        raise
+
+
+def make_folder(out: Path | str | None, name: str) -> Path:
+    """Create the results folder and check that files can be written into it.
+
+    Args:
+        out: the folder; None for ``runs/<name>-<time>``, a new one.
         name: of the sequence.
 
     Returns:
@@ -36,40 +71,132 @@ def make_folder(out: Path | str | None, name: str) -> Path:
     Raises:
         DvoError: the path is a file or cannot be written.
     """
-    if out is None:
-        base = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
-        folder, number = base, 2
-        while folder.exists():
-            folder, number = base.with_name(f"{base.name}-{number}"), number + 1
-    else:
-        folder = Path(out)
+    folder = Path(out) if out is not None else Path("runs") / f"{name[:50]}-{datetime.now():%Y%m%d-%H%M%S}"
+    is_new = False
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        if out is None:
+            folder = _new_folder(folder)
+            is_new = True
+        else:
+            is_new = not folder.exists()
+            folder.mkdir(parents=True, exist_ok=True)
+        check_writable(folder)
     except OSError as error:
-        reason = "is not a folder" if folder.exists() else error.strerror or str(error)
+        if is_new:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        reason = "is not a folder" if folder.exists() and not folder.is_dir() else error.strerror or str(error)
         raise DvoError(reason, file=folder, field="--out", remedy="give a folder that can be written") from error
     return folder
 
 
-def write_results(folder: Path, run: Run, facts: dict[str, Any]) -> None:
-    """Write trajectory.txt, map.ply and run.json.
+def _new_folder(base: Path) -> Path:
+    """Create a folder that did not exist, with a number after its name if necessary."""
+    for number in itertools.count(1):
+        folder = base if number == 1 else base.with_name(f"{base.name}-{number}")
+        with contextlib.suppress(FileExistsError):  # of another run that began in the same second
+            folder.mkdir(parents=True)
+            return folder
+    raise AssertionError
+
+
+def segment_file(number: int) -> str:
+    """Name of the trajectory file of a segment, in a run with more than one.
 
     Args:
-        folder: an existing folder; files of these names in it are replaced.
+        number: of the segment, from 0.
+
+    Returns:
+        Name of the file.
+    """
+    return f"trajectory-{number}.txt"
+
+
+def remove_files(folder: Path, *, keep: Collection[str] = ()) -> None:
+    """Remove the results of an earlier run from a folder; other files stay.
+
+    Args:
+        folder: the folder.
+        keep: names of files that stay.
+
+    Raises:
+        OSError: a file cannot be removed.
+    """
+    for file in folder.iterdir():
+        ours = file.name in FILES or SEGMENT_FILE.fullmatch(file.name) or file.name.startswith(PART)
+        if ours and file.name not in keep:
+            file.unlink(missing_ok=True)
+
+
+def write_results(
+    folder: Path,
+    run: Run,
+    facts: dict[str, Any],
+    *,
+    draw: Callable[[Path], None] | None = None,
+    segment_facts: Sequence[dict[str, Any]] = (),
+) -> None:
+    """Write trajectory.txt, a trajectory file for each segment if there are several, map.ply, the plot and run.json.
+
+    Every file is replaced as a whole. After a failure the other files are written nevertheless, and run.json says that
+    the results are not finished.
+
+    Args:
+        folder: an existing folder; results in it are replaced, those of segments that the run does not have removed.
         run: record of the session.
         facts: metadata of the caller (source, seed, device, config, metrics), the first entries of run.json.
+        draw: writes the plot to the file that it is given.
+        segment_facts: further entries for each segment in run.json.
+
+    Raises:
+        DvoError: a file cannot be written.
     """
-    write_tum(folder / TRAJECTORY, run.result.trajectory)
-    write_ply(folder / MAP, run.result.map)
-    text = json.dumps(jsonable({**facts, **summary(run)}), indent=2, allow_nan=False)
-    (folder / SUMMARY).write_text(text + "\n", encoding="utf-8")
+    result = run.result
+    writers: dict[str, Callable[[Path], None]] = {TRAJECTORY: lambda path: write_tum(path, result.trajectory)}
+    if len(result.segments) > 1:
+        for number, segment in enumerate(result.segments):
+            writers[segment_file(number)] = lambda path, rows=segment.trajectory: write_tum(path, rows)  # type: ignore
+    writers[MAP] = lambda path: write_ply(path, result.map)
+    if draw is not None:
+        writers[PICTURE] = draw
+    failures: list[DvoError] = []
+    for name, write in writers.items():
+        try:
+            with replaced(folder / name) as part:
+                write(part)
+        except OSError as error:
+            failures.append(write_error(folder / name, error))
+    try:
+        remove_files(folder, keep={*FILES, *writers})
+        warned = replace(run, warnings=(*run.warnings, *map(str, failures)))
+        write_summary(folder, {**facts, **summary(warned, segment_facts), "finished": not failures})
+    except OSError as error:
+        failures.append(write_error(folder / SUMMARY, error))
+    if failures:
+        raise failures[0]
 
 
-def summary(run: Run) -> dict[str, Any]:
-    """Measured part of run.json: counts, speed, memory, versions, warnings and the odometry's own metadata.
+def write_summary(folder: Path, values: dict[str, Any]) -> None:
+    """Write run.json.
+
+    Args:
+        folder: an existing folder.
+        values: for :func:`jsonable`.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    text = json.dumps(jsonable(values), indent=2, allow_nan=False)
+    with replaced(folder / SUMMARY) as part:
+        part.write_text(text + "\n", encoding="utf-8")
+
+
+def summary(run: Run, segment_facts: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
+    """Measured part of run.json: counts, segments, breaks, speed, memory, versions, warnings, the odometry's metadata.
 
     Args:
         run: record of the session.
+        segment_facts: further entries for each segment.
 
     Returns:
         Values for :func:`jsonable`.
@@ -79,9 +206,31 @@ def summary(run: Run) -> dict[str, Any]:
         "frames": {
             "read": result.frames_read,
             "fed": run.frames_fed,
-            "tracked": len(result.trajectory),
+            "tracked": result.frames_tracked,
             "lost": result.frames_lost,
         },
+        "segments": [
+            {
+                "number": number,
+                "start": segment.start,
+                "end": segment.end,
+                "frames": len(segment),
+                "joined_to": segment.joined_to,
+                "file": segment_file(number) if len(result.segments) > 1 else TRAJECTORY,
+                **(segment_facts[number] if segment_facts else {}),
+            }
+            for number, segment in enumerate(result.segments)
+        ],
+        "breaks": [
+            {
+                "from": found.start,
+                "to": found.end,
+                "frames": found.frames,
+                "reason": found.reason,
+                "new_segment": found.new_segment,
+            }
+            for found in result.breaks
+        ],
         "fps": round(run.frames_per_second, 3),
         "seconds": {name: round(value, 3) for name, value in run.seconds.items()},
         "peak_memory_mb": peak_memory_mb(),
@@ -92,28 +241,6 @@ def summary(run: Run) -> dict[str, Any]:
         "info": {name: value for name, value in result.info.items() if name != "config"},
         "versions": versions(),
     }
-
-
-def write_ply(path: Path | str, sparse_map: SparseMap) -> None:
-    """Write a map as binary little-endian PLY with ``x y z`` float and ``red green blue`` uchar.
-
-    Args:
-        path: file to write.
-        sparse_map: the points.
-    """
-    layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    vertices = np.zeros(len(sparse_map.points), dtype=layout)
-    for column, name in enumerate(("x", "y", "z")):
-        vertices[name] = sparse_map.points[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        vertices[name] = sparse_map.colors[:, column]
-    header = ["ply", "format binary_little_endian 1.0", "comment dvo sparse map", f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in "xyz"]
-    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    header += ["end_header\n"]
-    with open(path, "wb") as file:
-        file.write("\n".join(header).encode("ascii"))
-        file.write(vertices.tobytes())
 
 
 def versions() -> dict[str, str]:

@@ -11,7 +11,7 @@ import numpy as np
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.errors import DvoError
-from dvo.odometry.protocol import Estimate, Odometry, Result
+from dvo.odometry.protocol import Break, Estimate, Odometry, Result
 
 FrameCallback = Callable[[Frame, Estimate | None], None]
 
@@ -53,8 +53,9 @@ def run(
 ) -> Run:
     """Run an odometry over a source.
 
-    Every ``stride``-th frame and the last one are tracked; frames between them get interpolated poses. After an
-    interruption, or a frame that cannot be read, the frames tracked so far are finished and returned with a warning.
+    Every ``stride``-th frame and the last one are tracked; frames between them get interpolated poses, within a segment
+    only. After an interruption, or a frame that cannot be read, the frames tracked so far are finished and returned
+    with a warning.
 
     Args:
         odometry: newly built; an odometry tracks one sequence.
@@ -107,18 +108,78 @@ def run(
     started = time.perf_counter()
     result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
-    trajectory = result.trajectory
-    if feeding.skipped:
-        trajectory = fill_skipped(trajectory, np.array(feeding.fed), np.array(feeding.skipped))
-    read = feeding.frames_read
     return Run(
-        result=replace(result, trajectory=trajectory, frames_read=read, frames_lost=read - len(trajectory)),
+        result=over_source(result, np.array(feeding.fed), np.array(feeding.skipped), feeding.reasons),
         frames_fed=len(feeding.fed),
         interrupted=interrupted,
         warnings=(*getattr(source, "warnings", ()), *warnings),
         seconds=feeding.seconds,
         frame_seconds=tuple(feeding.frame_seconds),
     )
+
+
+def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: dict[float, str]) -> Result:
+    """Describe a result in frames of the source instead of frames of the odometry.
+
+    Args:
+        result: of the odometry.
+        fed: ``(F,)`` increasing timestamps of the frames passed to the odometry, seconds.
+        skipped: ``(S,)`` timestamps of the skipped frames, seconds.
+        reasons: causes of lost frames by timestamp, for an odometry that reports no breaks.
+
+    Returns:
+        The result with rows for skipped frames, each between two frames of one segment; with counts and breaks in
+        frames of the source; and with the breaks that the rows show if the odometry reports none.
+    """
+    longest, segments = result.longest, result.segments
+    if len(skipped):
+        segments = tuple(replace(s, trajectory=fill_skipped(s.trajectory, fed, skipped)) for s in segments)
+    times = np.sort(np.concatenate([fed, skipped]))
+    owner = np.full(len(times), -1)
+    for number, segment in enumerate(segments):
+        owner[np.isin(times, segment.trajectory.timestamps)] = number
+    breaks = result.breaks or find_breaks(times, owner, reasons)
+    if len(skipped):
+        lost = times[owner < 0]
+        breaks = tuple(replace(b, frames=_count_between(lost, b.start, b.end)) for b in breaks)
+    return replace(
+        result,
+        trajectory=result.trajectory if longest is None else segments[longest].trajectory,
+        frames_read=len(times),
+        frames_lost=len(times) - sum(len(segment) for segment in segments),
+        segments=segments,
+        breaks=breaks,
+    )
+
+
+def find_breaks(times: np.ndarray, owner: np.ndarray, reasons: dict[float, str]) -> tuple[Break, ...]:
+    """Find the intervals without poses, and the changes of segment.
+
+    Args:
+        times: ``(N,)`` increasing timestamps of all frames, seconds.
+        owner: ``(N,)`` number of the segment of each frame, -1 for a frame without a pose.
+        reasons: causes by timestamp.
+
+    Returns:
+        The breaks in order of time.
+    """
+    posed = np.flatnonzero(owner >= 0)
+    breaks = []
+    for before, after in zip([-1, *posed.tolist()], [*posed.tolist(), len(times)], strict=True):
+        inside = before >= 0 and after < len(times)
+        new_segment = inside and bool(owner[before] != owner[after])
+        if after - before > 1 or new_segment:
+            causes = (reasons[t] for t in times[before + 1 : after].tolist() if t in reasons)
+            start = float(times[before]) if before >= 0 else None
+            end = float(times[after]) if after < len(times) else None
+            default = "no pose" if after - before > 1 else "change of segment"
+            breaks.append(Break(start, end, after - before - 1, next(causes, default), new_segment))
+    return tuple(breaks)
+
+
+def _count_between(times: np.ndarray, start: float | None, end: float | None) -> int:
+    after = times > (-np.inf if start is None else start)
+    return int((after & (times < (np.inf if end is None else end))).sum())
 
 
 def fill_skipped(trajectory: Trajectory, fed: np.ndarray, skipped: np.ndarray) -> Trajectory:
@@ -153,6 +214,7 @@ class _Feeding:
         self.skipped: list[float] = []
         self.seconds = {"reading": 0.0, "tracking": 0.0, "finishing": 0.0}
         self.frame_seconds: list[float] = []
+        self.reasons: dict[float, str] = {}
         self.pending: Frame | None = None  # last skipped frame, tracked after all if the source ends with it
 
     @property
@@ -181,6 +243,8 @@ class _Feeding:
         self.frame_seconds.append(time.perf_counter() - started)
         self.seconds["tracking"] += self.frame_seconds[-1]
         self.fed.append(frame.timestamp)
+        if estimate.reason:
+            self.reasons[frame.timestamp] = estimate.reason
         return estimate
 
     def _report(self, frame: Frame, estimate: Estimate | None) -> None:

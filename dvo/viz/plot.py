@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +13,10 @@ from dvo.data.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 INK, ACCENT, TRUTH, START, PAPER = "#22272e", "#e4572e", "#4a6fa5", "#2a9d5c", "#ffffff"
+COLOURS = (ACCENT, "#8e4ec6", "#b08900", "#00838f", "#c2185b", "#5d4037")  # of segments
 SIZE_INCHES, DPI = (7.6, 6.0), 150
 
 
@@ -49,6 +53,36 @@ def with_gaps(trajectory: Trajectory) -> np.ndarray:
     return np.insert(trajectory.positions, holes, np.nan, axis=0)
 
 
+@dataclass(frozen=True)
+class Track:
+    """Line of a plot.
+
+    Attributes:
+        trajectory: camera to world.
+        label: name in the legend.
+        colour: number of its colour.
+    """
+
+    trajectory: Trajectory
+    label: str = "dvo"
+    colour: int = 0
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Part of a plot with a world of its own.
+
+    Attributes:
+        tracks: lines in one world; aligned with the reference if there is one.
+        points: ``(M, 3)`` map points in that world, drawn faintly behind the lines.
+        reference: ground truth, camera to world, metres.
+    """
+
+    tracks: tuple[Track, ...]
+    points: np.ndarray | None = None
+    reference: Trajectory | None = None
+
+
 def plot_trajectory(
     path: Path | str,
     estimate: Trajectory,
@@ -69,41 +103,86 @@ def plot_trajectory(
         title, subtitle: texts above the plot.
         label: name of the estimate in the legend.
     """
+    plot_panels(path, [Panel((Track(estimate, label),), points, reference)], title=title, subtitle=subtitle)
+
+
+def plot_panels(path: Path | str, panels: Sequence[Panel], *, title: str = "", subtitle: str = "") -> None:
+    """Draw the plan views of several worlds side by side, each with axes and a scale of its own.
+
+    Args:
+        path: image to write; the extension selects the format.
+        panels: one or more.
+        title, subtitle: texts above the plot.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    truth = reference if reference is not None and len(reference) else None
-    shown = estimate if truth is None else truth
-    axes = plan_axes(shown.positions)
     figure = Figure(figsize=SIZE_INCHES, dpi=DPI, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
+    if len(panels) == 1:
+        _draw_alone(figure, panels[0], title, subtitle)
+    else:
+        _draw_side_by_side(figure, panels, title, subtitle)
+    figure.savefig(path, metadata={"Software": None} if str(path).endswith(".png") else None)
+
+
+def _draw_alone(figure: Figure, panel: Panel, title: str, subtitle: str) -> None:
     plot = figure.add_subplot()
-    _limits(plot, [part.positions for part in (estimate, truth) if part is not None and len(part)], axes)
+    _draw_panel(plot, panel, SIZE_INCHES[0] / SIZE_INCHES[1])
+    _add_title(plot, title, subtitle)
+    if len(panel.tracks) > 1:  # too many names for the room above the axes
+        figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9.5)
+    elif plot.get_legend_handles_labels()[0]:
+        plot.legend(loc="lower right", bbox_to_anchor=(1, 1.05), ncols=3, frameon=False, fontsize=9.5, borderaxespad=0)
+
+
+def _draw_side_by_side(figure: Figure, panels: Sequence[Panel], title: str, subtitle: str) -> None:
+    columns = 2 if len(panels) <= 4 else 3
+    rows = -(-len(panels) // columns)
+    for place, panel in enumerate(panels, 1):
+        plot = figure.add_subplot(rows, columns, place)
+        _draw_panel(plot, panel, SIZE_INCHES[0] / columns / (SIZE_INCHES[1] / rows))
+        names = [track.label for track in panel.tracks]
+        handles = [line for line in plot.get_lines() if line.get_label() in names]
+        plot.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
+    note = "every panel has a world and a scale of its own; a dot marks a start"
+    figure.supxlabel(f"{subtitle}\n{note}".strip(), x=0.01, ha="left", fontsize=9.5, color=INK)
+
+
+def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:
+    truth = panel.reference if panel.reference is not None and len(panel.reference) else None
+    lines = [track.trajectory for track in panel.tracks if len(track.trajectory)]
+    shown = lines if truth is None else [truth]
+    axes = plan_axes(np.concatenate([line.positions for line in shown]) if shown else np.zeros((0, 3)))
+    _limits(plot, [line.positions for line in (*lines, truth) if line is not None], axes, ratio)
+    points = panel.points
     if points is not None and len(points):
         plot.scatter(points[:, axes[0]], points[:, axes[1]], s=1.2, color=INK, alpha=0.16, linewidths=0, zorder=1)
     if truth is not None:
         plot.plot(*with_gaps(truth)[:, axes].T, color=TRUTH, lw=2.6, alpha=0.75, label="ground truth", zorder=2)
-    if len(estimate):
-        plot.plot(*with_gaps(estimate)[:, axes].T, color=ACCENT, lw=1.5, label=label, zorder=3)
-        x, y = estimate.positions[0, axes]
-        plot.plot(x, y, "o", ms=7, color=START, mec=PAPER, mew=1.2, ls="none", label="start", zorder=4)
-    _decorate(plot, axes, "m" if truth is not None else "unit free", title, subtitle)
-    figure.savefig(path, metadata={"Software": None} if str(path).endswith(".png") else None)
+    for track in panel.tracks:
+        if len(track.trajectory):
+            colour = COLOURS[track.colour % len(COLOURS)]
+            plot.plot(*with_gaps(track.trajectory)[:, axes].T, color=colour, lw=1.5, label=track.label, zorder=3)
+            x, y = track.trajectory.positions[0, axes]
+            label = "start" if track is panel.tracks[-1] else None
+            plot.plot(x, y, "o", ms=7, color=START, mec=PAPER, mew=1.2, ls="none", label=label, zorder=4)
+    _decorate(plot, axes, "m" if truth is not None else "unit free")
 
 
-def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int]) -> None:
+def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int], ratio: float) -> None:
     """Set limits by the trajectories, not by the map: a few far points would make the path invisibly small."""
     if not tracks:
         return
     both = np.concatenate(tracks)[:, axes]
     middle, size = (both.min(axis=0) + both.max(axis=0)) / 2, np.ptp(both, axis=0)
-    ratio = SIZE_INCHES[0] / SIZE_INCHES[1]
     height = 1.2 * max(float(size[1]), float(size[0]) / ratio, 1e-6)
     plot.set_xlim(middle[0] - height * ratio / 2, middle[0] + height * ratio / 2)
     plot.set_ylim(middle[1] - height / 2, middle[1] + height / 2)
 
 
-def _decorate(plot: Axes, axes: tuple[int, int], unit: str, title: str, subtitle: str) -> None:
+def _decorate(plot: Axes, axes: tuple[int, int], unit: str) -> None:
     plot.set_aspect("equal", adjustable="box")
     plot.set_xlabel(f"{'xyz'[axes[0]]} ({unit})", color=INK)
     plot.set_ylabel(f"{'xyz'[axes[1]]} ({unit})", color=INK)
@@ -113,8 +192,9 @@ def _decorate(plot: Axes, axes: tuple[int, int], unit: str, title: str, subtitle
     for side, spine in plot.spines.items():
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color("#b8bec6")
-    if plot.get_legend_handles_labels()[0]:
-        plot.legend(loc="lower right", bbox_to_anchor=(1, 1.05), ncols=3, frameon=False, fontsize=9.5, borderaxespad=0)
+
+
+def _add_title(plot: Axes, title: str, subtitle: str) -> None:
     plot.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=22 if subtitle else 8)
     if subtitle:
         plot.annotate(

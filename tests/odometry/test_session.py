@@ -1,19 +1,19 @@
-"""A session: strides, interruptions, broken frames, and the files of the results folder."""
+"""A session: strides, interruptions, broken frames, segments and breaks."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dvo.data.frame import Frame
-from dvo.data.trajectory import Trajectory, read_tum
+from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.odometry import results, session
-from dvo.odometry.protocol import SparseMap
+from dvo.odometry import session
+from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
 CAMERA = Camera(50, 50, 31.5, 23.5, 64, 48)
 
@@ -96,43 +96,6 @@ def test_a_bug_is_not_swallowed(fake_odometry):
         session.run(fake_odometry(at_frame={3: fail}), frames(5))
 
 
-def test_results_folder(fake_odometry, tmp_path):
-    done = session.run(fake_odometry(lost=(2,)), frames(8))
-    results.write_results(tmp_path, done, {"seed": 3, "metrics": {"ate_rmse": float("nan")}})
-    back = read_tum(tmp_path / "trajectory.txt")
-    np.testing.assert_allclose(back.poses_wc, done.result.trajectory.poses_wc, atol=1e-8)
-    summary = json.loads((tmp_path / "run.json").read_text())
-    assert summary["frames"] == {"read": 8, "fed": 8, "tracked": 7, "lost": 1}
-    assert summary["seed"] == 3 and summary["config"] == {"patches": 3} and summary["metrics"]["ate_rmse"] is None
-    assert {"python", "torch", "dvo", "opencv-python-headless"} <= set(summary["versions"])
-    assert summary["fps"] > 0 and 10 < summary["peak_memory_mb"] < 100_000
-    assert summary["info"] == {"working_size": [64, 48]}
-
-
-def test_ply_holds_points_and_colours(tmp_path):
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(17, 3)).astype(np.float32)
-    colors = rng.integers(0, 255, (17, 3), dtype=np.uint8)
-    results.write_ply(tmp_path / "map.ply", SparseMap(points, colors))
-    header, body = (tmp_path / "map.ply").read_bytes().split(b"end_header\n")
-    assert b"element vertex 17" in header and header.startswith(b"ply\nformat binary_little_endian 1.0\n")
-    assert len(body) == 17 * 15
-    first = np.frombuffer(body[:12], "<f4")
-    np.testing.assert_array_equal(first, points[0])
-    np.testing.assert_array_equal(np.frombuffer(body[12:15], np.uint8), colors[0])
-
-
-def test_results_folder_that_is_a_file(tmp_path):
-    (tmp_path / "taken").write_text("")
-    with pytest.raises(DvoError, match="not a folder"):
-        results.make_folder(tmp_path / "taken", "clip")
-
-
-def test_default_folders_do_not_collide(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert results.make_folder(None, "clip") != results.make_folder(None, "clip")
-
-
 def test_interpolation_does_not_reach_out_of_the_trajectory():
     trajectory = Trajectory(np.array([1.0, 2.0]), np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1)))
     filled = session.fill_skipped(trajectory, np.array([1.0, 2.0]), np.array([0.5, 1.5, 2.5]))
@@ -154,3 +117,75 @@ def test_every_frame_fed_has_its_time(fake_odometry):
     done = session.run(fake_odometry(), frames(12), stride=4)
     assert len(done.frame_seconds) == done.frames_fed == 4 and min(done.frame_seconds) >= 0
     assert sum(done.frame_seconds) == pytest.approx(done.seconds["tracking"])
+
+
+def test_frames_are_interpolated_within_segments_only(fake_odometry):
+    """Frames 9 to 11 lie between a tracked frame of one segment and one of the next: they have no pose."""
+    odometry = fake_odometry(new_segment=(12,))
+    result = session.run(odometry, frames(25), stride=4).result
+    rows = [np.round(segment.trajectory.timestamps * 10).astype(int).tolist() for segment in result.segments]
+    assert rows == [list(range(9)), list(range(12, 25))]
+    assert result.longest == 1 and len(result.trajectory) == 13
+    assert (result.frames_read, result.frames_tracked, result.frames_lost) == (25, 22, 3)
+    (found,) = result.breaks
+    assert (found.start, found.end, found.frames, found.new_segment) == (
+        pytest.approx(0.8),
+        pytest.approx(1.2),
+        3,
+        True,
+    )
+    second = result.segments[1]
+    truth = np.array([2 * odometry.motion(t)[:3] + 10 for t in second.trajectory.timestamps])
+    assert np.abs(second.trajectory.positions - truth).max() < 0.05, "of its own world and scale"
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_counts_and_breaks_cover_every_frame(fake_odometry, stride):
+    lost = (0, 1, 2, 12, 13, 14, 15, 30)
+    result = session.run(fake_odometry(lost=lost, new_segment=(15,)), frames(31), stride=stride).result
+    assert result.frames_read == 31 == result.frames_tracked + result.frames_lost
+    assert sum(found.frames for found in result.breaks) == result.frames_lost >= 8
+    first, middle, last = result.breaks
+    assert first.start is None and last.end is None
+    assert [found.new_segment for found in result.breaks] == [False, True, False]
+    assert {found.reason for found in result.breaks} == {"black image"}
+    assert middle.start == pytest.approx(1.1 if stride == 1 else 0.9)
+    assert middle.end == pytest.approx(1.6 if stride == 1 else 1.8)
+
+
+def test_breaks_of_the_odometry_are_kept_and_counted_in_frames_of_the_source(fake_odometry):
+    odometry = fake_odometry(lost=(8, 12))
+    told = odometry.finish
+
+    def finish() -> Result:
+        result = told()
+        times = [frame.timestamp for frame in odometry.frames]
+        return replace(result, breaks=(Break(times[1], times[4], 2, "covered lens", new_segment=False),))
+
+    odometry.finish = finish
+    (found,) = session.run(odometry, frames(21), stride=4).result.breaks
+    assert found.reason == "covered lens" and found.frames == 11, "5 to 15"
+
+
+def test_a_change_of_segment_without_a_lost_frame_is_a_break(fake_odometry):
+    (found,) = session.run(fake_odometry(new_segment=(4,)), frames(9)).result.breaks
+    assert found.frames == 0 and found.new_segment and found.end == pytest.approx(0.4)
+
+
+def test_the_trajectory_stays_that_of_the_odometry():
+    """Of two segments with the same number of rows, the map belongs to the one that the odometry chose."""
+
+    class Chooses:
+        name = "chooses"
+
+        def track(self, frame: Frame) -> Estimate:
+            return Estimate(frame.timestamp, None, Status.INITIALISING)
+
+        def finish(self) -> Result:
+            poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (3, 1))
+            first, second = (Trajectory(0.1 * np.arange(start, start + 3), poses) for start in (0, 3))
+            segments = tuple(Segment(t, float(t.timestamps[0]), float(t.timestamps[-1])) for t in (first, second))
+            return Result(second, SparseMap(), 6, 0, segments=segments)
+
+    result = session.run(Chooses(), frames(6)).result
+    assert result.longest == 1 and result.trajectory.timestamps[0] == pytest.approx(0.3)

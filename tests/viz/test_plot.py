@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dvo.data.trajectory import Trajectory
-from dvo.viz.plot import plan_axes, plot_trajectory, with_gaps
+from dvo.viz.plot import COLOURS, Panel, Track, plan_axes, plot_panels, plot_trajectory, with_gaps
 
 
 def line(count: int, step: tuple[float, float, float]) -> Trajectory:
@@ -58,3 +58,35 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
     for name in ("a.png", "b.png"):
         plot_trajectory(tmp_path / name, line(30, (1, 0, 2)), points=np.random.default_rng(0).normal(size=(50, 3)))
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def colour_of(picture: np.ndarray, number: int) -> np.ndarray:
+    """Mask of the pixels of a colour in a picture as OpenCV reads it."""
+    wanted = [int(COLOURS[number][k : k + 2], 16) for k in (5, 3, 1)]
+    return np.abs(picture.astype(int) - wanted).max(axis=2) < 30
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])  # the sixth colour resembles blurred text
+def test_every_panel_fills_its_part_of_the_picture(tmp_path, count):
+    """Worlds of very different size and place: each line is long, because its panel has limits of its own."""
+    lines = [line(40, (10.0**k, 0, 0.5 * 10.0**k)) for k in range(count)]
+    plot_panels(tmp_path / "p.png", [Panel((Track(one, f"segment {k}", k),)) for k, one in enumerate(lines)])
+    picture = cv2.imread(str(tmp_path / "p.png"))
+    columns = 2 if count <= 4 else 3
+    for number in range(count):
+        pixels = np.argwhere(colour_of(picture, number)[200 if number < columns else 560 :])
+        assert np.ptp(pixels[:, 1]) > 60, "across its panel"
+        centre = pixels[:, 1].mean() / picture.shape[1] * columns
+        assert number % columns < centre < number % columns + 1, "in its column"
+
+
+def test_segments_in_one_world_share_a_panel(tmp_path):
+    """Two halves of a track: in one panel each covers its half."""
+    whole = line(60, (1, 0, 0.3))
+    halves = [Trajectory(whole.timestamps[part], whole.poses_wc[part]) for part in (slice(0, 30), slice(30, 60))]
+    tracks = tuple(Track(half, f"segment {k}", k) for k, half in enumerate(halves))
+    plot_panels(tmp_path / "p.png", [Panel(tracks, None, whole)], title="t", subtitle="s")
+    picture = cv2.imread(str(tmp_path / "p.png"))
+    picture = picture[: 6 * len(picture) // 8]  # without the legend
+    left, right = (np.argwhere(colour_of(picture, k))[:, 1] for k in range(2))
+    assert left.max() < right.min() + 20 and min(np.ptp(left), np.ptp(right)) > 200

@@ -1,0 +1,146 @@
+"""Errors and summary of a tracked clip, as numbers and as printed lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dvo.commands.console import say
+from dvo.data.trajectory import Trajectory
+from dvo.metrics import Metrics, evaluate
+from dvo.odometry import results
+from dvo.odometry.protocol import Break
+from dvo.odometry.session import Run
+
+_SHOWN = 5  # breaks and segments that are printed one by one
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Errors against the ground truth after Sim(3) alignment.
+
+    Attributes:
+        longest: of the longest segment, which is the trajectory of the run; None without ground truth.
+        segments: of each segment, aligned on its own; empty without ground truth or with a single segment.
+    """
+
+    longest: Metrics | None = None
+    segments: tuple[Metrics, ...] = ()
+
+    @property
+    def segment_facts(self) -> list[dict[str, Any]]:
+        """Entries of the segments in run.json."""
+        return [
+            {"ate_rmse": m.ate_rmse, "ate_percent": m.ate_percent, "matched": m.matched, "reason": m.reason}
+            for m in self.segments
+        ]
+
+
+def score(run: Run, groundtruth: Trajectory | None) -> Scores:
+    """Compare a run with the ground truth.
+
+    Args:
+        run: record of the session.
+        groundtruth: camera to world, metres; None if there is none.
+
+    Returns:
+        The errors.
+    """
+    if groundtruth is None:
+        return Scores()
+    segments = run.result.segments if len(run.result.segments) > 1 else ()
+    return Scores(
+        evaluate(run.result.trajectory, groundtruth, align="sim3"),
+        tuple(evaluate(segment.trajectory, groundtruth, align="sim3") for segment in segments),
+    )
+
+
+def headline(run: Run, scores: Scores) -> str:
+    """Write the error, if there is one, and the number of tracked frames.
+
+    Args:
+        run: record of the session.
+        scores: its errors.
+
+    Returns:
+        One line.
+    """
+    counts = f"{run.result.frames_tracked} of {run.result.frames_read} frames tracked"
+    if len(run.result.segments) > 1:
+        counts += f" in {len(run.result.segments)} segments"
+    metrics = scores.longest
+    return counts if metrics is None or metrics.reason else f"{error_text(metrics)}, {counts}"
+
+
+def error_text(metrics: Metrics) -> str:
+    """Write the absolute trajectory error.
+
+    Args:
+        metrics: with a defined error.
+
+    Returns:
+        Text such as ``ATE 0.0123 m (0.45 % of 2.7 m)``.
+    """
+    return f"ATE {metrics.ate_rmse:.3g} m ({metrics.ate_percent:.2f} % of {metrics.path_length:.3g} m)"
+
+
+def describe_breaks(breaks: tuple[Break, ...]) -> str:
+    """Describe the breaks of a trajectory.
+
+    Args:
+        breaks: one or more.
+
+    Returns:
+        One line, such as ``1 break: 2.00-7.03 s black image (150 frames), new segment at 7.03 s``.
+    """
+    parts = [_describe_break(found) for found in breaks[:_SHOWN]]
+    if len(breaks) > _SHOWN:
+        parts.append(f"{len(breaks) - _SHOWN} more in {results.SUMMARY}")
+    return f"{len(breaks)} {'break' if len(breaks) == 1 else 'breaks'}: {'; '.join(parts)}"
+
+
+def _describe_break(found: Break) -> str:
+    if found.start is None and found.end is None:
+        when = "all of the time"
+    elif found.start is None:
+        when = f"until {found.end:.2f} s"
+    elif found.end is None:
+        when = f"from {found.start:.2f} s to the end"
+    else:
+        when = f"{found.start:.2f}-{found.end:.2f} s"
+    text = f"{when} {found.reason} ({found.frames} {'frame' if found.frames == 1 else 'frames'})"
+    return f"{text}, new segment at {found.end:.2f} s" if found.new_segment and found.end is not None else text
+
+
+def print_report(folder: Path, run: Run, scores: Scores) -> None:
+    """Print counts, breaks, segments, errors and the names of the files.
+
+    Args:
+        folder: of the results.
+        run: record of the session.
+        scores: its errors.
+    """
+    result, metrics = run.result, scores.longest
+    several = len(result.segments) > 1
+    say(
+        f"tracked {result.frames_tracked} of {result.frames_read} frames, {run.frames_per_second:.1f} frames/s, "
+        f"{len(result.map.points)} map points"
+    )
+    if result.breaks:
+        say(describe_breaks(result.breaks))
+    if several:
+        say(
+            f"{len(result.segments)} segments, each with a world and a scale of its own; {results.TRAJECTORY} and "
+            f"{results.MAP} hold the longest, segment {result.longest}"
+        )
+    if metrics is not None and metrics.reason:
+        say(f"no error against ground truth: {metrics.reason}")
+    elif metrics is not None:
+        relative = f"RPE {metrics.rpe_trans:.3g} m and {metrics.rpe_rot_deg:.3g} deg a frame"
+        say(f"{error_text(metrics)} after Sim(3) alignment{' of the longest segment' if several else ''}, {relative}")
+    files = [results.TRAJECTORY, results.MAP, results.PICTURE, results.SUMMARY]
+    if several:
+        last = len(result.segments) - 1
+        files.insert(1, f"{results.segment_file(0)}{',' if last == 1 else ' ...'} {results.segment_file(last)}")
+    say(f"results in {folder}/: {', '.join(files)}")

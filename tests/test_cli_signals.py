@@ -1,0 +1,180 @@
+"""What a run leaves behind when it is killed, terminated or interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dvo
+from dvo.cli import main
+from dvo.data.trajectory import read_tum
+
+# A program that is `dvo` with an odometry that knows the answer, several times over in processes of their own: imports
+# take longer than all runs. Each logs a line when the odometry is asked for a frame, at which moment the frame before
+# has been recorded, and gets a signal when the log has the given number of lines.
+PROGRAM = """
+import importlib.util, json, os, sys, time
+images, out, signals = sys.argv[1], sys.argv[2], json.loads(sys.argv[3])
+spec = importlib.util.spec_from_file_location("fakes", sys.argv[4])
+fakes = importlib.util.module_from_spec(spec); spec.loader.exec_module(fakes)
+import dvo, dvo.commands.run
+from dvo.cli import main
+
+class Logged(fakes.FakeOdometry):
+    def track(self, frame):
+        log.write(f"{frame.index}\\n")
+        log.flush()
+        time.sleep(0.01)
+        return super().track(frame)
+
+dvo.load = lambda *args, **kwargs: Logged(fakes.curve, new_segment=(7,))
+codes = []
+for run, (lines, signal) in enumerate(signals):
+    log = open(f"{out}{run}.log", "w")
+    child = os.fork()
+    if child == 0:
+        os._exit(main(["run", images, "--out", f"{out}{run}", "--device", "cpu", *sys.argv[5:]]))
+    while len(open(f"{out}{run}.log").readlines()) < lines:
+        time.sleep(0.001)
+    os.kill(child, signal)
+    codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print(json.dumps(codes))
+"""
+
+
+def arguments(images: Path, out: Path | str, *more: str) -> list[str]:
+    beside = images.parent
+    return ["run", str(images), "--calib", str(beside / "calib.txt"), "--times", str(beside / "times.txt"),
+            "--out", str(out), "--device", "cpu", *more]  # fmt: skip
+
+
+def summary(out: Path) -> dict:
+    return json.loads((out / "run.json").read_text())
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def errors(text: str) -> list[str]:
+    """Lines of stderr without those of the progress bar."""
+    assert "Traceback" not in text
+    return [line for line in text.splitlines() if line.startswith("dvo: ")]
+
+
+def test_kill_loses_no_tracked_frame(image_folder, tmp_path, repository):
+    """What had been recorded when the process was killed is there; no frame is missing, so no second is. SIGTERM, the
+    last of the signals, ends with all results."""
+    (tmp_path / "program.py").write_text(PROGRAM)
+    draw = random.Random(0)
+    signals = [(draw.randrange(2, 18), signal.SIGKILL) for _ in range(5)] + [(3, signal.SIGTERM)]
+    out, fakes = str(tmp_path / "out"), str(repository / "tests" / "conftest.py")
+    command = [sys.executable, "program.py", str(image_folder), out, json.dumps(signals), fakes,
+               "--calib", str(image_folder.parent / "calib.txt")]  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(repository)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == 5 * [-signal.SIGKILL] + [143]
+    for run, (lines, number) in enumerate(signals):
+        folder = tmp_path / f"out{run}"
+        last = int((tmp_path / f"out{run}.log").read_text().split()[-1])
+        assert last >= lines - 1
+        several = (folder / "trajectory-0.txt").exists()
+        parts = [folder / f"trajectory-{k}.txt" for k in range(2)] if several else [folder / "trajectory.txt"]
+        stamps = np.concatenate([read_tum(part).timestamps for part in parts if part.exists()])
+        rows = np.round(stamps * 10 - 100).astype(int).tolist()
+        assert rows == list(range(len(rows))) and len(rows) >= last, "frames before the last one asked for"
+        assert summary(folder)["finished"] is (number == signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_kill_at_ten_moments_of_a_real_clip(data_root, tmp_path, repository):
+    """The real command with the shipped weights, killed at random times; no more than a second of work is missing."""
+    script = tmp_path / "timed.py"
+    script.write_text(
+        "import sys, time, dvo\n"
+        "from dvo.cli import main\n"
+        "from dvo.odometry.tracker import PatchOdometry\n"
+        "track, log = PatchOdometry.track, open(sys.argv[1], 'w')\n"
+        "def timed(self, frame):\n"
+        "    estimate = track(self, frame)\n"
+        "    row = estimate.pose_wc is not None and estimate.status.value != 'lost'\n"
+        "    log.write(f'{time.monotonic()} {int(row)}\\n'); log.flush()\n"
+        "    return estimate\n"
+        "PatchOdometry.track = timed\n"
+        "sys.exit(main(sys.argv[2:]))\n"
+    )
+    clip, draw = data_root / "tum_fr1_rpy_60", random.Random(1)
+    for number in range(10):
+        out, log = tmp_path / f"out{number}", tmp_path / f"log{number}"
+        process = subprocess.Popen(
+            [sys.executable, str(script), str(log), "run", str(clip), "--out", str(out), "--device", "cpu"],
+            cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(repository)}, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        while not log.exists() or not log.read_text():
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(draw.uniform(0.0, 2.0))
+        process.kill()
+        assert process.wait() == -signal.SIGKILL, "the clip must be longer than the wait"
+        tracked = np.array([[float(part) for part in line.split()] for line in log.read_text().splitlines()])
+        recorded = tracked[:-1]  # the last one may have been logged but not yet recorded
+        old = recorded[(recorded[:, 0] <= tracked[-1, 0] - 1.0) & (recorded[:, 1] == 1)]
+        lines = (out / "trajectory.txt").read_text().splitlines()
+        assert len(lines) - 1 >= len(old) and summary(out)["finished"] is False
+        assert len(lines) - 1 >= recorded[:, 1].sum(), "every row is written at once"
+
+
+def test_sigterm_finishes_and_exits_143(given, image_folder, tmp_path, capsys):
+    given(at_frame={8: lambda: os.kill(os.getpid(), signal.SIGTERM)})
+    assert main(arguments(image_folder, tmp_path / "out")) == 143
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 9
+    written = summary(tmp_path / "out")
+    assert written["interrupted"] is True and written["finished"] is True
+    assert names(tmp_path / "out") == ["map.ply", "run.json", "trajectory.png", "trajectory.txt"]
+    assert "interrupted after 9 frames" in capsys.readouterr().err
+
+
+def test_second_sigterm_aborts(given, image_folder, tmp_path, capsys):
+    def twice() -> None:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    given(at_frame={5: twice})
+    assert main(arguments(image_folder, tmp_path / "out")) == 143
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 5
+    assert summary(tmp_path / "out")["interrupted"] is True and summary(tmp_path / "out")["finished"] is False
+    assert errors(capsys.readouterr().err)[-1] == "dvo: terminated"
+
+
+def test_sigterm_before_tracking_leaves_no_folder(monkeypatch, image_folder, tmp_path, capsys):
+    monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: os.kill(os.getpid(), signal.SIGTERM))
+    assert main(arguments(image_folder, tmp_path / "out")) == 143
+    assert not (tmp_path / "out").exists()
+    assert errors(capsys.readouterr().err) == ["dvo: terminated"]
+
+
+def test_second_ctrl_c_while_the_results_are_written(given, image_folder, tmp_path, monkeypatch):
+    """Each file is then the old or the new one, and run.json says so."""
+
+    def interrupted(*args: object, **options: object) -> None:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    given()
+    monkeypatch.setattr("dvo.commands.run.draw", interrupted)
+    assert main(arguments(image_folder, tmp_path / "out")) == 130
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 20
+    written = summary(tmp_path / "out")
+    assert (written["interrupted"], written["finished"], written["frames"]["tracked"]) == (True, False, 20)
+    assert names(tmp_path / "out") == ["map.ply", "run.json", "trajectory.txt"]

@@ -94,6 +94,8 @@ def worlds_of(segments: Sequence[Segment]) -> list[tuple[int, ...]]:
 def match_worlds(segments: Sequence[Segment], reference: Trajectory, max_dt: float = 0.01) -> list[World]:
     """Match the frames of all segments with a reference, each frame of the reference at most once.
 
+    Poses that are not finite are left out.
+
     Args:
         segments: of a result.
         reference: camera to world, seconds.
@@ -107,6 +109,8 @@ def match_worlds(segments: Sequence[Segment], reference: Trajectory, max_dt: flo
         np.concatenate([np.zeros(0), *(s.trajectory.timestamps for s in segments)]),
         np.concatenate([np.zeros((0, 7)), *(s.trajectory.poses_wc for s in segments)]),
     )
+    finite = np.isfinite(rows.poses_wc).all(axis=1)
+    labels, rows = labels[finite], rows_of(rows, finite)
     i, j = associate(rows, reference, max_dt)
     order = np.argsort(reference.timestamps[j], kind="stable")
     i, j = i[order], j[order]
@@ -185,7 +189,7 @@ def evaluate_segments(
         count = len(segments)
         share = 1.0 if whole.matched else float("nan")
         return SegmentMetrics(whole, (whole,) * count, (True,) * count, count, share)
-    worlds = [_finite(world) for world in match_worlds(segments, reference, max_dt)]
+    worlds = match_worlds(segments, reference, max_dt)
     scored = scored_worlds(worlds, most)
     matched = sum(map(len, worlds))
     numbers = {number for world in scored for number in world.numbers}
@@ -238,7 +242,7 @@ def _combine(worlds: list[World], scored: list[World], frames: int, align: Align
             scale, rotation, shift = fitted
             off = scale * world.estimate.positions @ rotation.T + shift - world.reference.positions
             squares.append((off**2).sum(axis=1))
-            path += world.reference.path_length
+            path += sum(world.part(number)[1].path_length for number in world.numbers)
         both = world.pairs(gap)
         errors, true_turns, wrong = relative_errors(
             world.estimate.poses_wc, world.reference.poses_wc, gap, 1.0 if fitted is None else fitted[0]
@@ -323,9 +327,3 @@ def _of_segments(world: World, frames: int, align: Alignment, gap: int) -> dict[
         share = {"completeness": metrics.matched / frames if frames else float("nan")}
         found[number] = replace(metrics, **shared, **share)  # type: ignore[arg-type]
     return found
-
-
-def _finite(world: World) -> World:
-    """Without the poses that are not finite."""
-    rows = np.isfinite(world.estimate.poses_wc).all(axis=1)
-    return World(world.numbers, rows_of(world.estimate, rows), rows_of(world.reference, rows), world.labels[rows])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from eval.execution.predict import predict, predict_here, read_prediction, read_trajectory
+from eval.execution.predict import predict, predict_here, read_prediction, read_segments
 
 
 def test_a_run_in_its_own_process(job):
@@ -15,7 +15,8 @@ def test_a_run_in_its_own_process(job):
     assert prediction.status == "ok" and prediction.tracked == len(prediction.stamps) == 20
     assert prediction.resolution == "64x48" and prediction.fps and prediction.fps > 0
     assert prediction.peak_memory_mb and 10 < prediction.peak_memory_mb < 2000
-    assert len(read_trajectory(job.folder)) == 20
+    (segment,) = read_segments(job.folder)
+    assert len(segment) == 20 and segment.joined_to is None
     assert read_prediction(job.folder) == prediction
 
 
@@ -45,14 +46,14 @@ def test_exception_of_a_system(job, fake_odometry, systems, boom):
     systems(bad=fake_odometry(at_frame={7: boom}))
     prediction = predict_here(replace(job, system="bad"))
     assert prediction.status == "crashed" and prediction.reason.startswith("RuntimeError: boom")
-    assert len(read_trajectory(job.folder)) == 0
+    assert read_segments(job.folder) == ()
 
 
 def test_poses_that_are_not_finite(job, fake_odometry, systems):
     systems(bad=fake_odometry(motion=lambda t: np.full(7, np.nan if t > 11 else 0.5)))
     prediction = predict_here(replace(job, system="bad"))
     assert prediction.status == "invalid" and "9 poses are not finite" in prediction.reason
-    assert len(read_trajectory(job.folder)) == 0
+    assert read_segments(job.folder) == ()
 
 
 def test_missing_data_is_a_status(job):

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from dvo.data.trajectory import Trajectory
+from dvo.odometry.protocol import Segment
 from eval.__main__ import main
 from eval.execution.plan import read_manifest
 from eval.reporting.plots import OURS, plot_axis, plot_sequence, plot_speed, styles
@@ -24,6 +25,11 @@ from eval.suites.suite import Suite
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 VOID_TAGS = {"meta", "img", "br", "link"}
+
+
+def segments(*trajectories: Trajectory) -> list[Segment]:
+    """A segment of each that has rows."""
+    return [Segment(t, float(t.timestamps[0]), float(t.timestamps[-1])) for t in trajectories if len(t)]
 
 
 class Outline(HTMLParser):
@@ -145,7 +151,9 @@ def test_figures_survive_what_runs_leave_behind():
     none = Trajectory(np.zeros(0), np.zeros((0, 7)))
     one = Trajectory(s[:1], truth.poses_wc[:1])
     for judge in ("ate_percent", "rpe_rot_deg"):
-        tracks = {"dvo-x": truth, "far": far, "none": none, "one": one}
+        tracks = {
+            name: segments(track) for name, track in (("dvo-x", truth), ("far", far), ("none", none), ("one", one))
+        }
         svg = plot_sequence(Suite("s", "l", ()), judge, truth, tracks, [[1.0, 2.0]])
         ElementTree.fromstring(svg)
         assert "none: no trajectory" in svg and len(svg) < 120_000

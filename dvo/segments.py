@@ -19,6 +19,7 @@ from dvo.metrics import Alignment, Metrics, associate, evaluate, fit_alignment, 
 from dvo.odometry.protocol import Segment
 
 SEGMENT_POSES = 10  # matched poses that a world needs to be scored beside others; a Sim(3) has 7 degrees of freedom
+FRAMES_PER_WORLD = 100  # of the sequence, for each world that is scored after the first
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,16 @@ def scored_worlds(worlds: Sequence[World], most: int | None = None) -> list[Worl
     return [world for world in ranked if len(world) >= SEGMENT_POSES][:most]
 
 
+def most_worlds(frames: int, gaps: int = 0) -> int:
+    """Number of worlds of a run that are scored: one, one more for each gap, and one more for every hundred frames.
+
+    Args:
+        frames: number of frames that were fed.
+        gaps: number of stretches of frames without a view.
+    """
+    return 1 + gaps + frames // FRAMES_PER_WORLD
+
+
 def evaluate_segments(
     segments: Sequence[Segment],
     reference: Trajectory,
@@ -164,7 +175,7 @@ def evaluate_segments(
         align: transformation to fit to each world first: ``none``, ``scale``, ``se3`` or ``sim3``.
         rpe_gap: frame gap of the relative errors; no pair has its frames in two segments.
         max_dt: largest difference of matched timestamps, seconds.
-        most: largest number of worlds that are scored, the longest first; None for any.
+        most: largest number of worlds that are scored, the longest first (:func:`most_worlds`); None for any.
 
     Returns:
         Combined errors and those of each segment; an undefined value is nan.

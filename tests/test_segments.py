@@ -13,7 +13,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.metrics import evaluate, transform
 from dvo.odometry.protocol import Segment
-from dvo.segments import SEGMENT_POSES, evaluate_segments, match_worlds, rows_of
+from dvo.segments import SEGMENT_POSES, evaluate_segments, match_worlds, most_worlds, rows_of
 
 
 def walk(count: int = 120, seed: int = 0) -> Trajectory:
@@ -162,3 +162,7 @@ def test_without_segments_nothing_is_defined():
     assert math.isnan(found.metrics.ate_rmse) and found.segments == () and found.worlds == 0
     with pytest.raises(DvoError, match="alignment"):
         evaluate_segments([], walk(), "sim4")  # type: ignore[arg-type]
+
+
+def test_number_of_scored_worlds():
+    assert [most_worlds(*args) for args in ((0,), (99,), (120, 1), (1000, 2))] == [1, 1, 3, 13]

@@ -8,9 +8,8 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
-from dvo.segments import SEGMENT_POSES
+from dvo.segments import FRAMES_PER_WORLD, SEGMENT_POSES
 from eval.execution.plan import Manifest
-from eval.scoring.errors import FRAMES_PER_WORLD
 from eval.scoring.score import COLUMNS, Row
 from eval.scoring.summary import (
     FIGURES,

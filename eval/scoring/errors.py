@@ -1,9 +1,9 @@
 """All errors of one run: its segments, aligned world by world, against the reference.
 
-Rules for a run of several segments (:mod:`dvo.segments` says how values are combined). Cutting a trajectory lowers its
-ATE, so of the worlds of a run only as many are scored as :func:`most_worlds` allows, the longest first, each of ten
-poses or more; a run whose scored part is too small fails (:func:`eval.scoring.score.score`). Pairs of frames of a
-relative error never lie in two segments; the relative-pose AUC counts such pairs as missed.
+Rules for a run of several segments (:mod:`dvo.segments` says how values are combined): cutting a trajectory lowers its
+ATE, so only as many worlds are scored as :func:`dvo.segments.most_worlds` allows, the longest first, each of ten poses
+or more, and a run whose scored part is too small fails (:func:`eval.scoring.score.score`). Pairs of frames of a
+relative error never lie in two segments; the relative-pose AUC counts those in two worlds as missed.
 """
 
 from __future__ import annotations
@@ -40,8 +40,6 @@ from eval.scoring.metrics import (
 )
 from eval.scoring.protocols import SegmentErrors, kitti_errors, per_frame_scale, relative_pose_auc
 from eval.suites.suite import Suite
-
-FRAMES_PER_WORLD = 100
 
 
 @dataclass(frozen=True)
@@ -82,16 +80,6 @@ class Pieces:
     worlds: tuple[tuple[Trajectory, Trajectory], ...]
     scaled: tuple[tuple[Trajectory, float], ...]
     whole: SegmentMetrics
-
-
-def most_worlds(frames: int, gaps: int) -> int:
-    """Number of worlds of a run that are scored: one, one more for each gap, and one more for every hundred frames.
-
-    Args:
-        frames: number of frames that were fed.
-        gaps: number of stretches of frames without a view.
-    """
-    return 1 + gaps + frames // FRAMES_PER_WORLD
 
 
 def all_errors(

@@ -11,11 +11,11 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.odometry.protocol import Segment
-from dvo.segments import worlds_of
+from dvo.segments import most_worlds, worlds_of
 from eval.execution.plan import Manifest, Run, groundtruth_file
 from eval.execution.predict import RECORD, Prediction, read_prediction, read_segments
 from eval.scoring.blackout import dark_spans
-from eval.scoring.errors import Errors, all_errors, most_worlds
+from eval.scoring.errors import Errors, all_errors
 from eval.suites.suite import Sequence as Recording
 from eval.suites.suite import Suite, reference_for
 

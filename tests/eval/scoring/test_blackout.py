@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import transform
 from dvo.odometry.protocol import Segment
-from eval.scoring.blackout import blackout_errors, dark_spans, is_dark
+from eval.scoring.blackout import blackout_errors, dark_spans, is_dark, without_view
 
 
 def curve(count: int = 120, rate: float = 20.0) -> Trajectory:
@@ -61,3 +61,44 @@ def test_blackout_errors_of_three_kinds_of_system():
     gone = blackout_errors([whole(kept(np.arange(40)))], truth, spans, "sim3")
     assert gone.segment_ate_percent == np.inf and gone.recovery_s == np.inf
     assert np.isnan(blackout_errors([whole(truth)], truth, [], "sim3").recovery_s)
+
+
+def test_images_without_a_view():
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    black = rng.normal(6, 3, (48, 64, 3)).clip(0, 255).astype(np.uint8)
+    white = 255 - black
+    wall = black + 120  # grey without texture is a view: a camera may look at a wall
+    scene = np.broadcast_to(np.linspace(30, 220, 64)[None, :, None], (48, 64, 3)).astype(np.uint8)
+    dim = (scene / 8 + rng.normal(0, 4, scene.shape)).clip(0, 255).astype(np.uint8)
+    found = [without_view(image) for image in (noise, black, white, wall, scene, dim)]
+    assert found == [True, True, True, False, False, False]
+
+
+def test_segments_are_judged_in_their_own_worlds():
+    truth = curve(100)
+    spans = [(float(truth.timestamps[40]), float(truth.timestamps[59]))]
+    turn = Rotation.from_rotvec([0, 2, 0]).as_matrix()
+
+    def part(start: int, stop: int, scale: float = 1.0) -> Trajectory:
+        rows = Trajectory(truth.timestamps[start:stop], truth.poses_wc[start:stop])
+        return transform(rows, scale, turn, np.array([90.0, 0, 0])) if scale != 1 else rows
+
+    before, after = whole(part(0, 40)), whole(part(60, 100, 2.0))
+    errors = blackout_errors([before, after], truth, spans, "sim3")
+    assert errors.segment_ate_percent < 1e-6 and errors.recovery_s == np.inf  # another world is not found again
+
+    back = whole(part(60, 100), joined_to=0)
+    errors = blackout_errors([before, back], truth, spans, "sim3")
+    assert errors.segment_ate_percent < 1e-6 and errors.recovery_s == pytest.approx(0.05)
+
+    early = blackout_errors([whole(part(0, 45)), whole(part(45, 100, 2.0))], truth, spans, "sim3")
+    assert early.segment_ate_percent < 1e-6  # wherever in the dark the segment begins
+
+    lit = [whole(part(60, 72, 2.0)), whole(part(72, 100, 3.0))]
+    errors = blackout_errors([before, *lit], truth, spans, "sim3")
+    assert errors.segment_ate_percent < 1e-6  # the longer of the two has more than half
+
+    tiny = [whole(part(start, start + 10, 2.0)) for start in (60, 70, 80, 90)]
+    assert blackout_errors([before, *tiny], truth, spans, "sim3").segment_ate_percent == np.inf
+    assert blackout_errors([], truth, spans, "sim3").segment_ate_percent == np.inf

@@ -29,6 +29,7 @@ NULL_COLOR, TRUTH_COLOR = "#8a8f98", "#c3c9d1"
 LINES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 MARKERS = "osD^vP*X"
 RING: dict[str, Any] = {"mfc": PAPER, "ms": 7, "mew": 1.8, "zorder": 6}  # start of a segment after the first
+GAP_STEPS = 4  # median steps of time that are a gap in a curve
 MOST_POINTS = 400  # of a curve
 LOG_SPREAD = 8.0  # largest over smallest typical error, from which an axis is logarithmic
 
@@ -108,7 +109,7 @@ def plot_sequence(
                 values = np.linalg.norm(aligned.positions[i] - groundtruth.positions[j], axis=1)
             if len(values):
                 medians.append(values)
-                curve = _thin(np.column_stack([stamps - start, values]))
+                curve = _with_breaks(_thin(np.column_stack([stamps - start, values])))
                 error.plot(*curve.T, **{**look, "lw": style.width * 0.8})
             if position:
                 plan.plot(*aligned.positions[0, [first, second]], "o", color=style.color, **RING)
@@ -253,6 +254,13 @@ def _left_out(count: int) -> str:
 def _thin(rows: np.ndarray) -> np.ndarray:
     step = -(-len(rows) // MOST_POINTS)
     return rows[::step] if step > 1 and not np.isnan(rows).any() else rows
+
+
+def _with_breaks(curve: np.ndarray) -> np.ndarray:
+    """Rows of time and value, with a row of nan where no frame has a value for a while: no line across the gap."""
+    steps = np.diff(curve[:, 0])
+    gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
+    return np.insert(curve, gaps, np.nan, axis=0)
 
 
 def _frame(plot: Any, truth: np.ndarray) -> None:

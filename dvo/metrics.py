@@ -162,7 +162,7 @@ def align_trajectory(
         DvoError: an unknown alignment.
     """
     i, j = associate(estimate, reference, max_dt)
-    if len(i) < MINIMUM_MATCHES or _stands_still(estimate.positions[i]):
+    if len(i) < MINIMUM_MATCHES or stands_still(estimate.positions[i]):
         return estimate
     return transform(estimate, *fit_alignment(estimate.positions[i], reference.positions[j], align))
 
@@ -181,7 +181,7 @@ def relative_rotation_errors(
         ``(P,)`` time of the second frame of each pair, seconds, and ``(P,)`` error, degrees.
     """
     i, j = associate(estimate, reference, max_dt)
-    errors, _, _ = _relative_errors(estimate.poses_wc[i], reference.poses_wc[j], gap, 1.0)
+    errors, _, _ = relative_errors(estimate.poses_wc[i], reference.poses_wc[j], gap, 1.0)
     return estimate.timestamps[i][gap:], errors
 
 
@@ -232,15 +232,15 @@ def evaluate(
     aligned = None
     if len(est) < MINIMUM_MATCHES:
         reasons.append(f"{len(est)} matched frames, {MINIMUM_MATCHES} are needed")
-    elif align != "none" and (_stands_still(est[:, :3]) or _stands_still(ref[:, :3])):
-        still = "estimate" if _stands_still(est[:, :3]) else "reference"
+    elif align != "none" and (stands_still(est[:, :3]) or stands_still(ref[:, :3])):
+        still = "estimate" if stands_still(est[:, :3]) else "reference"
         reasons.append(f"the {still} stands still, nothing to align")
     else:
         scale, rotation, translation = fit_alignment(est[:, :3], ref[:, :3], align)
         aligned = scale * est[:, :3] @ rotation.T + translation
         ate = float(np.sqrt(((aligned - ref[:, :3]) ** 2).sum(axis=1).mean()))
 
-    rotation_errors, turned, moved_wrong = _relative_errors(est, ref, rpe_gap, 1.0 if np.isnan(scale) else scale)
+    rotation_errors, turned, moved_wrong = relative_errors(est, ref, rpe_gap, 1.0 if np.isnan(scale) else scale)
     if aligned is not None and len(moved_wrong):
         rpe_trans, rpe_trans_rmse = float(np.median(moved_wrong)), _rms(moved_wrong)
     if len(est) >= MINIMUM_MATCHES and not len(rotation_errors):
@@ -265,12 +265,20 @@ def evaluate(
     )
 
 
-def _relative_errors(
+def relative_errors(
     est: np.ndarray, ref: np.ndarray, gap: int, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rotation error and reference rotation (degrees) and translation error (metres) of the pairs ``(i, i + gap)``.
 
     With ``P = inverse(T_i) T_{i+gap}``, the error is ``inverse(P_ref) P_est`` (Sturm 2012, eq. 2).
+
+    Args:
+        est, ref: ``(N, 7)`` matched poses, camera to world.
+        gap: distance of the frames of a pair.
+        scale: factor on the translations of ``est``.
+
+    Returns:
+        Three vectors ``(N - gap,)``, empty without a pair.
     """
     if len(est) <= gap:
         return np.zeros(0), np.zeros(0), np.zeros(0)
@@ -301,7 +309,8 @@ def _spread(points: np.ndarray) -> float:
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-def _stands_still(points: np.ndarray) -> bool:
+def stands_still(points: np.ndarray) -> bool:
+    """Return True if positions ``(N, 3)`` do not spread, up to rounding."""
     return _spread(points) <= _STILL * max(1.0, float(np.abs(points).max()))
 
 

@@ -4,6 +4,9 @@
 
 An odometry is any class with `name`, `track(frame)` and `finish()`. This one turns the camera by the shift between two
 images (phase correlation) and moves it ahead at constant speed.
+
+It never loses track. One that does returns `Estimate(time, None, Status.LOST, reason=...)` for such a frame, and gives
+`Result` the parts with a world of their own as `segments`; the evaluation aligns each on its own.
 """
 
 import cv2

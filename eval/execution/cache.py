@@ -30,6 +30,7 @@ KEY = "key.json"
 CONTENT_LIMIT = 64 * 2**20  # bytes of a sequence up to which its files are hashed; beyond, names, sizes and times
 # Fields of a sequence that change tables, or whose content is in the fingerprint; what is left chooses images.
 NOT_IN_KEY = ("name", "about", "judged_by", "path", "calib", "times", "groundtruth")
+FORMAT = 3  # of a stored prediction: 3 has segments, and the frames without a view
 PASSING = ("unavailable", "no data")  # states that can change while the key stays
 
 
@@ -127,7 +128,7 @@ def job_key(job: Job, facts: SystemFacts, fingerprint: str, suite: dict[str, Any
     """
     sequence = {name: value for name, value in jsonable(asdict(job.sequence)).items() if name not in NOT_IN_KEY}
     return {
-        "format": 2,
+        "format": FORMAT,
         **facts.identity,
         "version": facts.version,
         "code": facts.code,

@@ -1,7 +1,8 @@
 """First half of an evaluation: run a system on a sequence and store its trajectory, without the ground truth.
 
 Each run has its own process (:func:`predict`), so that peak memory is its own, a hang meets the time limit, and a crash
-of native code stays outside; its folder then holds ``trajectory.txt`` and ``prediction.json``.
+of native code stays outside; its folder then holds ``trajectory.txt`` and ``prediction.json``. The trajectory holds the
+rows of all segments in order, a TUM file like any other; the record, which is written last, says where it is cut.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ import json
 import os
 import shutil
 import sys
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +22,14 @@ from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory, read_tum, write_tum
 from dvo.errors import DvoError
-from dvo.odometry.protocol import Estimate, Odometry
+from dvo.odometry.protocol import Estimate, Odometry, Segment
 from dvo.odometry.results import jsonable, peak_memory_mb
 from dvo.odometry.session import run
+from dvo.segments import worlds_of
 from eval.execution.process import run_limited
-from eval.scoring.blackout import dark_spans, is_dark
-from eval.suites.suite import ROOT, Sequence, open_sequence
+from eval.scoring.blackout import dark_spans, is_dark, without_view
+from eval.suites.suite import ROOT, open_sequence
+from eval.suites.suite import Sequence as Recording
 from eval.systems.registry import find_system
 
 RECORD, TRAJECTORY, LOG = "prediction.json", "trajectory.txt", "log.txt"
@@ -44,7 +48,7 @@ class Job:
     """
 
     system: str
-    sequence: Sequence
+    sequence: Recording
     data: str
     folder: str
     seed: int = 0
@@ -66,13 +70,16 @@ class Prediction:
         reason: message, where the status is not ok.
         version: of the system.
         stamps: times of the frames that were fed, seconds.
-        tracked: rows of the trajectory.
+        tracked: rows of the trajectory, all segments together.
         resolution: size at which the system worked, else of the images: ``WIDTHxHEIGHT``.
         fps: frames fed per second inside ``track`` and ``finish``; reading is not counted.
         latency_p95_ms: 95th percentile of the time of one ``track``.
         peak_memory_mb: of the whole process.
         threads, device, parallel, time_limit: of the job, under which the resources were measured.
         dark: stretches of frames that show nothing, between lit ones: first and last stamp of each.
+        unseen: stamps of the frames without a view, see :func:`eval.scoring.blackout.without_view`, seconds.
+        segments: ``rows`` and ``joined_to`` of each segment; empty for a trajectory of one.
+        breaks: :attr:`dvo.odometry.protocol.Result.breaks` of the system.
         info: :attr:`dvo.odometry.protocol.Result.info` of the system.
     """
 
@@ -90,6 +97,9 @@ class Prediction:
     parallel: int = 1
     time_limit: float | None = None
     dark: list[list[float]] = field(default_factory=list)
+    unseen: list[float] = field(default_factory=list)
+    segments: list[dict[str, Any]] = field(default_factory=list)
+    breaks: list[dict[str, Any]] = field(default_factory=list)
     info: dict[str, Any] = field(default_factory=dict)
 
 
@@ -140,16 +150,16 @@ def predict_here(job: Job) -> Prediction:
         return write_prediction(job, Prediction("no data", str(error)))
     try:
         version = system.version()
-        prediction, trajectory = drive(system.build(job.seed, job.device), source)
+        prediction, segments = drive(system.build(job.seed, job.device), source)
     except Exception as error:  # an error of a system is its result, and becomes a row
         return write_prediction(job, Prediction("crashed", f"{type(error).__name__}: {error}", version))
     prediction.version = version
     if prediction.status == "ok":
-        write_tum(folder / TRAJECTORY, trajectory)
+        write_segments(folder, segments)
     return write_prediction(job, prediction)
 
 
-def drive(odometry: Odometry, source: Source) -> tuple[Prediction, Trajectory]:
+def drive(odometry: Odometry, source: Source) -> tuple[Prediction, tuple[Segment, ...]]:
     """Feed every frame of a source to an odometry, with a clock.
 
     Args:
@@ -157,37 +167,48 @@ def drive(odometry: Odometry, source: Source) -> tuple[Prediction, Trajectory]:
         source: of the sequence.
 
     Returns:
-        The record, and the trajectory, camera to world.
+        The record, and the segments of the trajectory, camera to world.
     """
     stamps: list[float] = []
     dark: list[bool] = []
+    unseen: list[float] = []
     resolution = ""
 
     def look(frame: Frame, _: Estimate | None) -> None:
         nonlocal resolution
         stamps.append(frame.timestamp)
         dark.append(is_dark(frame.image))
+        if without_view(frame.image):
+            unseen.append(frame.timestamp)
         resolution = f"{frame.camera.width}x{frame.camera.height}"
 
     done = run(odometry, source, on_frame=look, strict=True)
     result, seconds = done.result, done.frame_seconds
+    segments = without_empty(result.segments)
     total = done.seconds["tracking"] + done.seconds["finishing"]
     worked = result.info.get("working_size")
     prediction = Prediction(
         status="ok",
         stamps=stamps,
-        tracked=len(result.trajectory),
+        tracked=result.frames_tracked,
         resolution=f"{worked[0]}x{worked[1]}" if worked else resolution,
         fps=len(stamps) / max(total, 1e-9),
         latency_p95_ms=1000 * float(np.percentile(seconds, 95)) if seconds else None,
         peak_memory_mb=process_peak_mb(),
         dark=[list(span) for span in dark_spans(np.array(stamps), np.array(dark, dtype=bool))],
+        unseen=unseen,
+        segments=[{"rows": len(segment), "joined_to": segment.joined_to} for segment in segments],
+        breaks=[asdict(gap) for gap in result.breaks],
         info=result.info,
     )
-    broken = int((~np.isfinite(result.trajectory.poses_wc)).any(axis=1).sum())
+    broken = sum(int((~np.isfinite(segment.trajectory.poses_wc)).any(axis=1).sum()) for segment in segments)
+    rows = _all_rows(segments).timestamps
+    twice = len(rows) - len(np.unique(rows))
     if broken:
         prediction.status, prediction.reason = "invalid", f"{broken} poses are not finite"
-    return prediction, result.trajectory
+    elif twice:
+        prediction.status, prediction.reason = "invalid", f"{twice} frames have more than one pose"
+    return prediction, segments
 
 
 def read_prediction(folder: Path | str) -> Prediction:
@@ -205,16 +226,69 @@ def read_prediction(folder: Path | str) -> Prediction:
     return Prediction(**json.loads(path.read_text(encoding="utf-8")))
 
 
-def read_trajectory(folder: Path | str) -> Trajectory:
-    """The trajectory of a run, without rows where it left none.
+def without_empty(segments: Sequence[Segment]) -> tuple[Segment, ...]:
+    """Segments that have rows; those that share a world are joined to the first of it.
+
+    Args:
+        segments: of a result.
+    """
+    kept = [number for number, segment in enumerate(segments) if len(segment)]
+    if len(kept) == len(segments):
+        return tuple(segments)
+    first = {
+        number: min(n for n in world if n in kept)
+        for world in worlds_of(segments)
+        for number in world
+        if number in kept
+    }
+    joined = {number: None if first[number] == number else kept.index(first[number]) for number in kept}
+    return tuple(replace(segments[number], joined_to=joined[number]) for number in kept)
+
+
+def write_segments(folder: Path | str, segments: Sequence[Segment]) -> None:
+    """Write the rows of all segments in order; :attr:`Prediction.segments` says where they are cut.
 
     Args:
         folder: of a run.
+        segments: of its trajectory.
+    """
+    path = Path(folder) / TRAJECTORY
+    part = path.with_suffix(".part")
+    write_tum(part, _all_rows(segments))
+    os.replace(part, path)
+
+
+def read_segments(folder: Path | str) -> tuple[Segment, ...]:
+    """Segments of the trajectory of a run; none where it left no rows. A record of one segment need not name it.
+
+    Args:
+        folder: of a run.
+
+    Raises:
+        DvoError: the record and the trajectory do not agree, or name a segment that is not there.
     """
     path = Path(folder) / TRAJECTORY
     if not path.is_file() or path.read_text(encoding="utf-8").count("\n") < 2:
-        return Trajectory(np.zeros(0), np.zeros((0, 7)))
-    return read_tum(path)
+        return ()
+    rows = read_tum(path)
+    record = Path(folder) / RECORD
+    parts = read_prediction(folder).segments if record.is_file() else []
+    parts = parts or [{"rows": len(rows), "joined_to": None}]
+    ends = np.cumsum([part["rows"] for part in parts])
+    if ends[-1] != len(rows):
+        raise DvoError(
+            f"{len(rows)} rows, but the record has {ends[-1]}", file=path, remedy="remove the folder and run it again"
+        )
+    starts = [0, *ends[:-1]]
+    return tuple(
+        Segment(
+            Trajectory(rows.timestamps[first:end], rows.poses_wc[first:end]),
+            float(rows.timestamps[first]),
+            float(rows.timestamps[end - 1]),
+            part["joined_to"],
+        )
+        for first, end, part in zip(starts, ends, parts, strict=True)
+    )
 
 
 def process_peak_mb() -> float | None:
@@ -247,3 +321,10 @@ def write_prediction(job: Job, prediction: Prediction) -> Prediction:
     part.write_text(json.dumps(jsonable(prediction), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     os.replace(part, path)
     return prediction
+
+
+def _all_rows(segments: Sequence[Segment]) -> Trajectory:
+    return Trajectory(
+        np.concatenate([np.zeros(0), *(segment.trajectory.timestamps for segment in segments)]),
+        np.concatenate([np.zeros((0, 7)), *(segment.trajectory.poses_wc for segment in segments)]),
+    )

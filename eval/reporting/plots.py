@@ -17,6 +17,8 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import align_trajectory, associate, relative_rotation_errors
+from dvo.odometry.protocol import Segment
+from dvo.segments import World, match_worlds, scored_worlds
 from dvo.viz.plot import INK, PAPER, plan_axes, with_gaps
 from eval.scoring.summary import quartiles
 from eval.suites.suite import Suite
@@ -26,6 +28,8 @@ PALETTE = ("#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a3f", "#8
 NULL_COLOR, TRUTH_COLOR = "#8a8f98", "#c3c9d1"
 LINES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 MARKERS = "osD^vP*X"
+RING: dict[str, Any] = {"mfc": PAPER, "ms": 7, "mew": 1.8, "zorder": 6}  # start of a segment after the first
+GAP_STEPS = 4  # median steps of time that are a gap in a curve
 MOST_POINTS = 400  # of a curve
 LOG_SPREAD = 8.0  # largest over smallest typical error, from which an axis is logarithmic
 
@@ -61,14 +65,19 @@ def plot_sequence(
     suite: Suite,
     judged_by: str,
     groundtruth: Trajectory,
-    estimates: Mapping[str, Trajectory],
+    estimates: Mapping[str, Sequence[Segment]],
     dark: Sequence[Sequence[float]] = (),
 ) -> str:
     """Plan view (the plane of ground truth's two longest axes) and error over time.
 
+    A segment with a world of its own is aligned on its own. Where one begins after another, it has a ring; those too
+    short to be scored are counted in the legend, not drawn.
+
     Args:
+        suite: alignment and frame gap.
+        judged_by: field of the row; decides which error is drawn.
         groundtruth: camera to world, metres.
-        estimates: by the name in the legend; aligned here by the alignment of the suite.
+        estimates: segments by the name in the legend; aligned here by the alignment of the suite.
         dark: stretches without light, shaded.
     """
     figure = _figure(10.4, 4.3)
@@ -81,23 +90,33 @@ def plot_sequence(
     by_rotation = judged_by == "rpe_rot_deg"
     typical = []
     for name, style in styles(list(estimates)).items():
-        estimate = estimates[name]
         look: dict[str, Any] = {"color": style.color, "lw": style.width, "ls": style.line}
-        if len(estimate) < 2:
+        worlds = match_worlds(estimates[name], groundtruth)
+        tracks = drawn_tracks(estimates[name], worlds)
+        if not tracks:
             plan.plot([], [], **look, label=f"{name}: no trajectory")
             continue
-        aligned = align_trajectory(estimate, groundtruth, suite.alignment)
-        plan.plot(*_thin(with_gaps(aligned))[:, [first, second]].T, **look, label=name)
-        if by_rotation:
-            stamps, values = relative_rotation_errors(estimate, groundtruth, suite.rpe_gap)
-        else:
-            i, j = associate(aligned, groundtruth)
-            stamps = aligned.timestamps[i]
-            values = np.linalg.norm(aligned.positions[i] - groundtruth.positions[j], axis=1)
-        if len(values):
-            typical.append(float(np.median(values)))
-            curve = _thin(np.column_stack([stamps - start, values]))
-            error.plot(*curve.T, **{**look, "lw": style.width * 0.8})
+        label = name if len(worlds) == 1 else f"{name} ({len(worlds)} segments{_left_out(len(worlds) - len(tracks))})"
+        medians = []
+        for position, track in enumerate(tracks):
+            aligned = align_trajectory(track, groundtruth, suite.alignment)
+            plan.plot(*_thin(with_gaps(aligned))[:, [first, second]].T, **look, label="" if position else label)
+            if by_rotation:
+                stamps, values = relative_rotation_errors(track, groundtruth, suite.rpe_gap)
+            else:
+                i, j = associate(aligned, groundtruth)
+                stamps = aligned.timestamps[i]
+                values = np.linalg.norm(aligned.positions[i] - groundtruth.positions[j], axis=1)
+            if len(values):
+                medians.append(values)
+                curve = _with_breaks(_thin(np.column_stack([stamps - start, values])))
+                error.plot(*curve.T, **{**look, "lw": style.width * 0.8})
+            if position:
+                plan.plot(*aligned.positions[0, [first, second]], "o", color=style.color, **RING)
+                if len(values):
+                    error.plot(stamps[0] - start, values[0], "o", color=style.color, **RING)
+        if medians:
+            typical.append(float(np.median(np.concatenate(medians))))
     _frame(plan, groundtruth.positions[:, [first, second]])
     plan.set_xlabel(f"{'xyz'[first]} (m)")
     plan.set_ylabel(f"{'xyz'[second]} (m)")
@@ -115,6 +134,22 @@ def plot_sequence(
     _tidy(plan, error)
     figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     return _svg(figure)
+
+
+def drawn_tracks(segments: Sequence[Segment], worlds: Sequence[World]) -> list[Trajectory]:
+    """Rows of each world that is drawn, in order of time: those that are long enough to be scored.
+
+    Args:
+        segments: of a run.
+        worlds: of them, see :func:`dvo.segments.match_worlds`.
+    """
+    tracks = []
+    for world in scored_worlds(worlds):
+        parts = [segments[number].trajectory for number in world.numbers]
+        poses = np.concatenate([part.poses_wc for part in parts])
+        if len(poses) >= 2:
+            tracks.append(Trajectory(np.concatenate([part.timestamps for part in parts]), poses))
+    return sorted(tracks, key=lambda track: track.timestamps[0])
 
 
 def plot_axis(title: str, unit: str, values: Mapping[str, Sequence[float]], null: float) -> str:
@@ -212,9 +247,20 @@ def _svg(figure: Any) -> str:
     return text[text.index("<svg") :]
 
 
+def _left_out(count: int) -> str:
+    return f", {count} too short" if count else ""
+
+
 def _thin(rows: np.ndarray) -> np.ndarray:
     step = -(-len(rows) // MOST_POINTS)
     return rows[::step] if step > 1 and not np.isnan(rows).any() else rows
+
+
+def _with_breaks(curve: np.ndarray) -> np.ndarray:
+    """Rows of time and value, with a row of nan where no frame has a value for a while: no line across the gap."""
+    steps = np.diff(curve[:, 0])
+    gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
+    return np.insert(curve, gaps, np.nan, axis=0)
 
 
 def _frame(plot: Any, truth: np.ndarray) -> None:

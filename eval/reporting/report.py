@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from dvo.data.trajectory import Trajectory, read_tum
+from dvo.data.trajectory import read_tum
 from dvo.errors import DvoError
+from dvo.odometry.protocol import Segment
 from eval.execution.cache import slug
 from eval.execution.plan import Manifest, groundtruth_file
-from eval.execution.predict import RECORD, read_prediction, read_trajectory
+from eval.execution.predict import RECORD, read_prediction, read_segments
 from eval.reporting.plots import plot_axis, plot_sequence, plot_speed, styles
-from eval.reporting.tables import axis_table, markdown, one_line, speed_note, write_csv
+from eval.reporting.tables import MADE_UP_NOTE, SEGMENTS_NOTE, axis_table, markdown, one_line, speed_note, write_csv
 from eval.reporting.verdict import verdicts
 from eval.scoring.score import Row
 from eval.scoring.summary import (
@@ -33,10 +34,12 @@ from eval.scoring.summary import (
     axis_cell,
     axis_cells,
     axis_rows,
+    count_cell,
     error_cell,
     errors_of,
     judged_cells,
     resource_cell,
+    segment_columns,
     summarise,
 )
 from eval.suites.suite import Sequence, Suite
@@ -150,8 +153,9 @@ def content(out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str],
         "axis_figures": [axis_figure(axis, manifest, rows, figures) for axis in axes],
         "speed_figures": speed_figures(axes, manifest, rows, figures),
         "speed_note": speed_note(manifest, rows),
-        "overall_titles": [title for title, _, _ in OVERALL] + [title for title, _, _ in RESOURCES],
+        "overall_titles": [column[0] for column in (*OVERALL, *segment_columns(rows), *RESOURCES)],
         "overall": [(name, overall(name, rows)) for name in manifest.systems],
+        "notes": {"segments": SEGMENTS_NOTE, "made-up poses": MADE_UP_NOTE},
         "failures": [(row, one_line(row.reason)) for row in rows if row.failed],
         "sections": sections,
         "open_sections": len(sections) <= 6,
@@ -256,16 +260,25 @@ def overall(system: str, rows: list[Row]) -> list[str]:
         values = [float(getattr(row, field)) for row in mine]
         if field == "completeness":
             values = [100 * value for value in values]
-        cells.append(f"{found:.{digits}f}" if math.isfinite(found := _overall(field, values)) else NOTHING)
+        cells.append(_text(_overall(field, values), digits))
+    for _, field, digits, factor in segment_columns(rows):  # means: most runs have one segment
+        values = [factor * float(getattr(row, field)) for row in mine if row.tracked]
+        cells.append(_text(_mean(values), max(digits, 1)))
     return cells + [resource_cell(mine, field).middle(digits) for _, field, digits in RESOURCES]
 
 
 def _overall(field: str, values: list[float]) -> float:
     """Mean of an area, median of everything else; values without a meaning are left out."""
-    if field not in AREAS:
-        return summarise(values).median
+    return _mean(values) if field in AREAS else summarise(values).median
+
+
+def _mean(values: list[float]) -> float:
     known = [value for value in values if not math.isnan(value)]
     return float(np.mean(known)) if known else math.nan
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else NOTHING
 
 
 def sequence_section(
@@ -276,6 +289,7 @@ def sequence_section(
     groups = {name: [row for row in mine if row.system == name] for name in manifest.systems}
     dark = any(row.blackouts for row in mine)
     columns = [*FIGURES, *(BLACKOUT if dark else ()), *RESOURCES]
+    extra = segment_columns(mine)
     judged = judged_cells(sequence, groups)
     lines = []
     for name, group in groups.items():
@@ -284,10 +298,11 @@ def sequence_section(
             resource = any(field == other for _, other, _ in RESOURCES)
             found = resource_cell(group, field) if resource else error_cell(group, field)
             texts.append((found.text(digits), field == sequence.judged_by and judged[name].best))
-        complete = summarise([100 * row.completeness for row in group]).text(0)
+        shares = [summarise([100 * row.completeness for row in group]).text(0)]
+        shares += [count_cell(group, field, factor).text(digits) for _, field, digits, factor in extra]
         failed = sum(row.failed for row in group)
         states = ", ".join(dict.fromkeys(row.status for row in group if row.failed))
-        lines.append((name, f"{failed}/{len(group)}" + (f" {states}" if states else ""), complete, texts))
+        lines.append((name, f"{failed}/{len(group)}" + (f" {states}" if states else ""), shares, texts))
     truth_file = groundtruth_file(out, suite.name, sequence.name)
     figure = None
     if truth_file.is_file():
@@ -301,7 +316,7 @@ def sequence_section(
         "sequence": sequence,
         "frames": max((row.frames for row in mine), default=0),
         "length": max(known, default=math.nan),
-        "columns": [title for title, _, _ in columns],
+        "columns": ["complete %", *(column[0] for column in (*extra, *columns))],
         "lines": lines,
         "figure": figure,
         "reason": next((one_line(row.reason) for row in mine if row.status == "no data"), ""),
@@ -310,16 +325,16 @@ def sequence_section(
 
 def _tracks(
     out: Path, manifest: Manifest, suite: Suite, sequence: Sequence, groups: dict[str, list[Row]]
-) -> tuple[dict[str, Trajectory], list[list[float]]]:
+) -> tuple[dict[str, tuple[Segment, ...]], list[list[float]]]:
     folders = {(run.system, run.suite, run.sequence, run.seed): out / run.folder for run in manifest.runs}
-    tracks: dict[str, Trajectory] = {}
+    tracks: dict[str, tuple[Segment, ...]] = {}
     dark: list[list[float]] = []
     for name, group in groups.items():
         ranked = sorted(group, key=lambda row: errors_of([row], sequence.judged_by)[0])
         if not ranked:
             continue
         folder = folders[name, suite.name, sequence.name, ranked[(len(ranked) - 1) // 2].seed]
-        tracks[name] = read_trajectory(folder)
+        tracks[name] = read_segments(folder)
         if (folder / RECORD).is_file():
             dark = dark or read_prediction(folder).dark
     return tracks, dark

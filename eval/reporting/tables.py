@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
+from dvo.segments import FRAMES_PER_WORLD, SEGMENT_POSES
 from eval.execution.plan import Manifest
 from eval.scoring.score import COLUMNS, Row
 from eval.scoring.summary import (
@@ -15,12 +16,22 @@ from eval.scoring.summary import (
     RESOURCES,
     axes_of,
     axis_cells,
+    count_cell,
     error_cell,
     judged_cells,
     resource_cell,
+    segment_columns,
     summarise,
 )
 from eval.suites.suite import Suite
+
+SEGMENTS_NOTE = (
+    f"Each segment of a trajectory is aligned on its own; errors are taken over the frames of all that are scored. Of "
+    f"several, those with {SEGMENT_POSES} poses are scored, the longest first, at most one and one more for each gap "
+    f"without a view and each {FRAMES_PER_WORLD} frames; a run fails if the scored part is too small. Compare ATE of "
+    f"different numbers of segments with care: cutting lowers it."
+)
+MADE_UP_NOTE = "Made-up poses: share of the frames without a view (black, white, noise) that have a pose nevertheless."
 
 
 def axis_table(manifest: Manifest, rows: list[Row]) -> str:
@@ -69,7 +80,9 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     """
     rows = [row for row in rows if row.suite == suite.name]
     systems = list(dict.fromkeys(row.system for row in rows))
+    extra = segment_columns(rows)
     names = ["sequence", "system", "runs failed", *(title for title, _, _ in FIGURES), "complete %"]
+    names += [title for title, _, _, _ in extra]
     names += [title for title, _, _ in RESOURCES]
     lines = [protocol(manifest, suite, rows), "", _line(names), _line(["---"] * 2 + ["--:"] * (len(names) - 2))]
     for sequence in suite.sequences:
@@ -82,6 +95,7 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
                 text = error_cell(group, field).text(digits)
                 cells.append(f"**{text}**" if field == sequence.judged_by and judged[name].best else text)
             cells.append(summarise([100 * row.completeness for row in group]).text(0))
+            cells += [count_cell(group, field, factor).text(digits) for _, field, digits, factor in extra]
             cells += [resource_cell(group, field).text(digits) for _, field, digits in RESOURCES]
             failed = sum(row.failed for row in group)
             title = f"{sequence.name} ({sequence.about})" if sequence.about else sequence.name
@@ -125,6 +139,8 @@ def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
         f"Sequences are judged {said} (bold: best).",
         f"A run fails if it crashes, takes over {suite.time_limit:g} s, leaves poses that are not finite or poses for "
         f"fewer than {100 * suite.lost_below:g} % of the frames; failed runs count as infinite errors.",
+        SEGMENTS_NOTE if any(row.segments > 1 for row in rows) else "",
+        MADE_UP_NOTE if any(row.unseen for row in rows) else "",
         f"Working resolution: {worked}." if worked else "",
         speed_note(manifest, rows),
     ]

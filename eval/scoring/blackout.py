@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, associate, fit_alignment, transform
+from dvo.odometry.protocol import Segment
+from dvo.segments import worlds_of
 
 DARK_MEAN, DARK_SPREAD = 20.0, 6.0  # grey levels of 255
+WHITE_MEAN = 235.0
+NOISE_CORRELATION = 0.1  # of neighbouring pixels; images of a scene have more, also in low light
 SHORTEST = 5  # frames; a flicker is no blackout
 SEGMENT_FRAMES = 10  # frames with a pose that a lit part needs to be judged
 NEAR_PERCENT, NEAR_DEGREES = 10.0, 10.0  # found again: within this part of the path before, and this angle
@@ -23,9 +28,11 @@ class BlackoutErrors:
     Attributes:
         blackouts: number of stretches.
         segment_ate_percent: every lit part aligned on its own; root mean square error in percent of the lit path; inf
-            if a lit part has no trajectory. Low if tracking works again after the dark, in any world frame.
+            if a lit part has no trajectory, or none of its segments holds half of its poses. Of several segments in a
+            lit part, the one with the most poses is judged. Low if tracking works again after the dark, in any world.
         recovery_s: mean time from the return of light until the pose is right again in the world of before the dark.
-            inf if it never is: only a system that relocalises has a number here, or one that has guessed the motion.
+            inf if it never is: only a system that relocalises has a number here, or one that has guessed the motion;
+            a new segment has another world.
     """
 
     blackouts: int = 0
@@ -41,6 +48,20 @@ def is_dark(image: np.ndarray) -> bool:
     """
     sample = image[::4, ::4].astype(np.float32)
     return float(sample.mean()) < DARK_MEAN and float(sample.std()) < DARK_SPREAD
+
+
+def without_view(image: np.ndarray) -> bool:
+    """Return True if a ``(H, W, 3)`` uint8 image is black, white, or noise: no pose can be found from it.
+
+    Args:
+        image: RGB.
+    """
+    rows = image[::4, :, 1].astype(np.float32)
+    if float(rows.std()) < DARK_SPREAD:
+        return is_dark(image) or float(image[::4, ::4].mean()) > WHITE_MEAN
+    left, right = rows[:, :-1] - rows[:, :-1].mean(), rows[:, 1:] - rows[:, 1:].mean()
+    power = float(np.sqrt((left**2).mean() * (right**2).mean()))
+    return abs(float((left * right).mean())) < NOISE_CORRELATION * power
 
 
 def dark_spans(stamps: np.ndarray, dark: np.ndarray) -> list[tuple[float, float]]:
@@ -60,35 +81,39 @@ def dark_spans(stamps: np.ndarray, dark: np.ndarray) -> list[tuple[float, float]
 
 
 def blackout_errors(
-    estimate: Trajectory, reference: Trajectory, spans: list[tuple[float, float]], align: Alignment
+    segments: Sequence[Segment], reference: Trajectory, spans: list[tuple[float, float]], align: Alignment
 ) -> BlackoutErrors:
     """Judge a run on a sequence with stretches of dark (``spans``, from :func:`dark_spans`).
 
     Args:
-        estimate, reference: camera to world, metres and seconds.
+        segments: of the run; a system that keeps its world has one.
+        reference: camera to world, metres and seconds.
         spans: first and last dark stamp of each stretch, seconds.
         align: alignment of each lit part.
     """
     if not spans or not len(reference):
         return BlackoutErrors()
+    worlds = [_joined([segments[number].trajectory for number in numbers]) for numbers in worlds_of(segments)]
     return BlackoutErrors(
         len(spans),
-        _segment_ate(estimate, reference, spans, align),
-        float(np.mean([_recovery(estimate, reference, spans, number, align) for number in range(len(spans))])),
+        _segment_ate(worlds, reference, spans, align),
+        float(np.mean([_recovery(worlds, reference, spans, number, align) for number in range(len(spans))])),
     )
 
 
 def _segment_ate(
-    estimate: Trajectory, reference: Trajectory, spans: list[tuple[float, float]], align: Alignment
+    worlds: list[Trajectory], reference: Trajectory, spans: list[tuple[float, float]], align: Alignment
 ) -> float:
     bounds = [-math.inf, *(edge for span in spans for edge in span), math.inf]
     squares, path = [], 0.0
     for begin, end in zip(bounds[::2], bounds[1::2], strict=True):
-        truth, track = _between(reference, begin, end), _between(estimate, begin, end)
+        truth = _between(reference, begin, end)
         if len(truth) < SEGMENT_FRAMES:
             continue
+        parts = [_between(world, begin, end) for world in worlds]
+        track = max(parts, key=len, default=Trajectory(np.zeros(0), np.zeros((0, 7))))
         i, j = associate(track, truth)
-        if len(i) < SEGMENT_FRAMES:
+        if len(i) < SEGMENT_FRAMES or 2 * len(track) < sum(map(len, parts)):
             return math.inf
         scale, rotation, shift = fit_alignment(track.positions[i], truth.positions[j], align)
         aligned = scale * track.positions[i] @ rotation.T + shift
@@ -100,25 +125,38 @@ def _segment_ate(
 
 
 def _recovery(
-    estimate: Trajectory, reference: Trajectory, spans: list[tuple[float, float]], number: int, align: Alignment
+    worlds: list[Trajectory], reference: Trajectory, spans: list[tuple[float, float]], number: int, align: Alignment
 ) -> float:
-    """Seconds from the end of a span; inf if the pose is never right again before the next span or the end."""
+    """Seconds from the end of a span; inf if the pose is never right again before the next span or the end.
+
+    The pose must be right in the world that holds most of the lit part before the span.
+    """
     light = spans[number][1]
     until = spans[number + 1][0] if number + 1 < len(spans) else math.inf
     since = spans[number - 1][1] if number else -math.inf
     before, lit = _between(reference, since, spans[number][0]), _between(reference, light, until)
-    i, j = associate(estimate, before)
+    pairs = [(world, *associate(world, before)) for world in worlds]
+    if not pairs:
+        return math.inf
+    world, i, j = max(pairs, key=lambda pair: len(pair[1]))
     if len(i) < SEGMENT_FRAMES:
         return math.inf
-    world = transform(estimate, *fit_alignment(estimate.positions[i], before.positions[j], align))
-    i, j = associate(world, lit)
+    placed = transform(world, *fit_alignment(world.positions[i], before.positions[j], align))
+    i, j = associate(placed, lit)
     if not len(i):
         return math.inf
-    off = np.linalg.norm(world.positions[i] - lit.positions[j], axis=1)
-    cosine = np.abs((world.poses_wc[i, 3:] * lit.poses_wc[j, 3:]).sum(axis=1))
+    off = np.linalg.norm(placed.positions[i] - lit.positions[j], axis=1)
+    cosine = np.abs((placed.poses_wc[i, 3:] * lit.poses_wc[j, 3:]).sum(axis=1))
     turned = np.degrees(2 * np.arccos(np.clip(cosine, 0, 1)))
     near = (off <= NEAR_PERCENT / 100 * before.path_length) & (turned <= NEAR_DEGREES)
     return float(lit.timestamps[j][near][0] - light) if near.any() else math.inf
+
+
+def _joined(parts: Sequence[Trajectory]) -> Trajectory:
+    """Rows of segments that share a world."""
+    return Trajectory(
+        np.concatenate([part.timestamps for part in parts]), np.concatenate([part.poses_wc for part in parts])
+    )
 
 
 def _between(trajectory: Trajectory, begin: float, end: float) -> Trajectory:

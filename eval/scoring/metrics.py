@@ -1,25 +1,20 @@
-"""Errors by evo, and protocols that evo does not have: KITTI's segments, relative-pose AUC, per-frame scale.
+"""Errors by evo: ATE, RPE over frames and over distances.
 
-Each function takes an estimate and a reference as camera-to-world trajectories in metres and seconds; a value without a
-meaning is nan.
+An estimate and a reference are camera-to-world trajectories in metres and seconds; a value without a meaning is nan. A
+trajectory in segments comes in pieces (:mod:`eval.scoring.errors`), whose errors are taken together.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from dvo.data.trajectory import Trajectory
-from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.metrics import Alignment, Metrics, associate, evaluate, fit_alignment, transform
-
-KITTI_LENGTHS = tuple(range(100, 801, 100))  # metres
-KITTI_STEP = 10  # frames between the starts of two segments
-AUC_DEGREES = (1.0, 2.0, 5.0, 10.0)
-STILL_SHARE = 0.1  # of the median step: a pair that moves less has no direction to judge
 
 
 @dataclass(frozen=True)
@@ -38,21 +33,6 @@ class PathErrors:
 
 
 @dataclass(frozen=True)
-class SegmentErrors:
-    """KITTI odometry's errors, averaged over all segments of 100 to 800 m that fit the sequence.
-
-    Attributes:
-        t_rel: translation, percent of the segment's length.
-        r_rel: rotation, degrees per 100 m.
-        longest_m: longest segment that entered; nan where the path is under 100 m and the two others are nan too.
-    """
-
-    t_rel: float = math.nan
-    r_rel: float = math.nan
-    longest_m: float = math.nan
-
-
-@dataclass(frozen=True)
 class Aligned:
     """The matched frames of a reference and of an estimate after alignment, as evo's trajectories.
 
@@ -66,6 +46,9 @@ class Aligned:
     track: Any
     scale: float
     ours: Metrics
+
+    def __len__(self) -> int:
+        return len(self.truth.timestamps)
 
 
 def align_pair(
@@ -87,7 +70,7 @@ def align_pair(
     from evo.core import sync
     from evo.core.geometry import GeometryException
 
-    truth, track = sync.associate_trajectories(_evo(reference), _evo(estimate), max_diff=max_dt)
+    truth, track = sync.associate_trajectories(evo_trajectory(reference), evo_trajectory(estimate), max_diff=max_dt)
     scale = 1.0
     try:
         if align != "none":
@@ -96,7 +79,7 @@ def align_pair(
         i, j = associate(estimate, reference, max_dt)
         scale, rotation, shift = fit_alignment(estimate.positions[i], reference.positions[j], align)
         matched = Trajectory(estimate.timestamps[i], estimate.poses_wc[i])
-        track = _evo(transform(matched, scale, rotation, shift))
+        track = evo_trajectory(transform(matched, scale, rotation, shift))
     return Aligned(truth, track, float(scale), ours)
 
 
@@ -117,159 +100,104 @@ def evo_metrics(
     return metrics_of(pair) if isinstance(pair, Aligned) else pair
 
 
-def metrics_of(pair: Aligned) -> Metrics:
-    """See :func:`evo_metrics`; the rotation ratio and the scale drift, which evo has not, are dvo's."""
+def metrics_of(*pieces: Aligned, unscored: Sequence[Aligned] = ()) -> Metrics:
+    """See :func:`evo_metrics`; of several pieces, the errors of all their frames and pairs together.
+
+    The rotation ratio and the scale drift, which evo has not, are dvo's, as are the counts.
+
+    Args:
+        pieces: one or more, each with the same ``ours``, that of the whole.
+        unscored: pieces of which only the relative rotations count, as they need no alignment.
+    """
+    from evo.core.metrics import PoseRelation
+
+    ours = pieces[0].ours
+    ate, path = absolute_rmse(*pieces), float(sum(piece.truth.path_length for piece in pieces))
+    values = {"ate_rmse": ate, "path_length": path, "scale": max(pieces, key=len).scale}
+    if path > 0:
+        values["ate_percent"] = 100 * ate / path
+    for name, relation, counted in (
+        ("rpe_trans", PoseRelation.translation_part, pieces),
+        ("rpe_rot_deg", PoseRelation.rotation_angle_deg, (*pieces, *unscored)),
+    ):
+        errors = relative_errors(counted, relation, ours.rpe_gap)
+        if len(errors):
+            values[name], values[f"{name}_rmse"] = float(np.median(errors)), _rms(errors)
+    return replace(ours, **values)  # type: ignore[arg-type]
+
+
+def relative_errors(pieces: Sequence[Aligned], relation: Any, gap: int) -> np.ndarray:
+    """evo's RPE of all pairs of frames of a piece, metres or degrees; no pair has its frames in two pieces.
+
+    Args:
+        pieces: from :func:`align_pair`.
+        relation: evo's ``PoseRelation``.
+        gap: frames between the two of a pair.
+    """
     from evo.core import metrics
-    from evo.core.metrics import PoseRelation, Unit
+    from evo.core.metrics import Unit
 
-    ate, gap = absolute_rmse(pair), pair.ours.rpe_gap
-    values = {"ate_rmse": ate, "scale": pair.scale, "path_length": float(pair.truth.path_length)}
-    if values["path_length"] > 0:
-        values["ate_percent"] = 100 * ate / values["path_length"]
-    if pair.ours.matched > gap:
-        for name, relation in (
-            ("rpe_trans", PoseRelation.translation_part),
-            ("rpe_rot_deg", PoseRelation.rotation_angle_deg),
-        ):
+    found = [np.zeros(0)]
+    for piece in pieces:
+        if len(piece) > gap:
             rpe = metrics.RPE(relation, delta=gap, delta_unit=Unit.frames, all_pairs=True)
-            rpe.process_data((pair.truth, pair.track))
-            values[name] = float(rpe.get_statistic(metrics.StatisticsType.median))
-            values[f"{name}_rmse"] = float(rpe.get_statistic(metrics.StatisticsType.rmse))
-    return replace(pair.ours, **values)  # type: ignore[arg-type]
+            rpe.process_data((piece.truth, piece.track))
+            found.append(rpe.error)
+    return np.concatenate(found)
 
 
-def absolute_rmse(pair: Aligned, angle: bool = False) -> float:
+def absolute_rmse(*pieces: Aligned, angle: bool = False) -> float:
     """Root mean square distance to the reference, metres; or the angle between orientations, degrees (evo's APE).
 
     Args:
-        pair: from :func:`align_pair`.
+        pieces: from :func:`align_pair`; the mean is over the frames of all.
         angle: orientations in place of positions.
     """
     from evo.core import metrics
 
     relation = metrics.PoseRelation.rotation_angle_deg if angle else metrics.PoseRelation.translation_part
-    ape = metrics.APE(relation)
-    ape.process_data((pair.truth, pair.track))
-    return float(ape.get_statistic(metrics.StatisticsType.rmse))
+    errors = []
+    for piece in pieces:
+        ape = metrics.APE(relation)
+        ape.process_data((piece.truth, piece.track))
+        errors.append(ape.error)
+    return _rms(np.concatenate(errors))
 
 
-def path_errors(pair: Aligned, distance_m: float | None = None) -> PathErrors:
+def path_errors(*pieces: Aligned, distance_m: float | None = None) -> PathErrors:
     """evo's RPE with a distance in place of a number of frames, pairs chosen on the reference (tolerance 10 %).
 
     Args:
+        pieces: from :func:`align_pair`; no pair has its frames in two of them.
         distance_m: a tenth of the matched reference's path by default.
     """
     from evo.core import filters, metrics
     from evo.core.metrics import PoseRelation, Unit
 
-    distance = float(pair.truth.path_length) / 10 if distance_m is None else distance_m
+    whole = float(sum(piece.truth.path_length for piece in pieces))
+    distance = whole / 10 if distance_m is None else distance_m
     if not distance > 0:
         return PathErrors()
     values = []
     for relation in (PoseRelation.translation_part, PoseRelation.rotation_angle_deg):
-        rpe = metrics.RPE(relation, delta=distance, delta_unit=Unit.meters, all_pairs=True, pairs_from_reference=True)
-        try:
-            rpe.process_data((pair.truth, pair.track))
-        except filters.FilterException:  # no pair of frames is that far apart
+        errors = []
+        for piece in pieces:
+            rpe = metrics.RPE(
+                relation, delta=distance, delta_unit=Unit.meters, all_pairs=True, pairs_from_reference=True
+            )
+            try:
+                rpe.process_data((piece.truth, piece.track))
+            except filters.FilterException:  # no pair of its frames is that far apart
+                continue
+            errors.append(rpe.error)
+        if not errors:
             return PathErrors(distance)
-        values.append(float(rpe.get_statistic(metrics.StatisticsType.median)))
+        values.append(float(np.median(np.concatenate(errors))))
     return PathErrors(distance, 100 * values[0] / distance, values[1])
 
 
-def kitti_errors(
-    estimate: Trajectory, reference: Trajectory, scale: float = 1.0, max_dt: float = 0.01
-) -> SegmentErrors:
-    """Translation and rotation error over segments of 100, 200, ... 800 m of the reference (Geiger et al., CVPR 2012).
-
-    A segment starts at every tenth frame of the reference and ends at the first frame beyond its length; it counts if
-    the estimate has both ends. Lengths that the sequence does not reach are left out, as in KITTI's own tool.
-
-    Args:
-        scale: factor on the estimate's translations, from the alignment.
-    """
-    distances = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference.positions, axis=0), axis=1))])
-    i, j = associate(estimate, reference, max_dt)
-    rows = np.full(len(reference), -1)
-    rows[j] = i
-    truth, track = pose_matrices(reference.poses_wc), pose_matrices(estimate.poses_wc)
-    track[:, :3, 3] *= scale
-    found = []
-    for first in range(0, len(reference), KITTI_STEP):
-        for length in KITTI_LENGTHS:
-            last = int(np.searchsorted(distances, distances[first] + length, side="right"))
-            if last >= len(reference) or rows[first] < 0 or rows[last] < 0:
-                continue
-            step = np.linalg.inv(truth[first]) @ truth[last]
-            error = np.linalg.inv(np.linalg.inv(track[rows[first]]) @ track[rows[last]]) @ step
-            angle = math.acos(min(1.0, max(-1.0, (float(np.trace(error[:3, :3])) - 1) / 2)))
-            found.append((float(np.linalg.norm(error[:3, 3])) / length, math.degrees(angle) / length, length))
-    if not found:
-        return SegmentErrors()
-    table = np.array(found)
-    return SegmentErrors(100 * table[:, 0].mean(), 100 * table[:, 1].mean(), table[:, 2].max())
-
-
-def relative_pose_auc(
-    estimate: Trajectory, reference: Trajectory, gap: int = 1, max_dt: float = 0.01
-) -> dict[float, float]:
-    """Area under the recall curve of relative poses up to 1, 2, 5 and 10 degrees, in [0, 1]; scale plays no part.
-
-    The error of a pair ``i, i + gap`` of reference frames is the larger of its rotation error and the angle between the
-    translations' directions (rotation alone where the reference hardly moves: under a tenth of its median step). The
-    area under a curve of steps is ``mean(max(0, 1 - error / threshold))``. A pair that the estimate lacks fails.
-
-    Args:
-        estimate, reference: camera to world, seconds.
-        gap: frames between the two of a pair.
-        max_dt: largest difference of matched stamps, seconds.
-
-    Returns:
-        Area by threshold, degrees; nan for a reference that is too short.
-    """
-    if len(reference) <= gap:
-        return dict.fromkeys(AUC_DEGREES, math.nan)
-    i, j = associate(estimate, reference, max_dt)
-    rows = np.full(len(reference), -1)
-    rows[j] = i
-    starts = np.arange(len(reference) - gap)
-    true_turn, true_step = _steps(reference.poses_wc, starts, starts + gap)
-    errors = np.full(len(starts), np.inf)
-    has = (rows[starts] >= 0) & (rows[starts + gap] >= 0)
-    turn, step = _steps(estimate.poses_wc, rows[starts[has]], rows[starts[has] + gap])
-    errors[has] = _angles(np.swapaxes(true_turn[has], 1, 2) @ turn)
-    lengths = np.linalg.norm(true_step, axis=1)
-    moves = has & (lengths > max(1e-9, STILL_SHARE * float(np.median(lengths))))
-    errors[moves] = np.maximum(errors[moves], _between(step[moves[has]], true_step[moves]))
-    return {limit: float(np.maximum(0, 1 - errors / limit).mean()) for limit in AUC_DEGREES}
-
-
-def per_frame_scale(estimate: Trajectory, reference: Trajectory, max_dt: float = 0.01) -> Trajectory:
-    """The estimate with every frame-to-frame translation rescaled to the reference's length, chained anew.
-
-    This is how TartanVO and its heirs report; it hands the estimate one true number per frame, so its ATE stands in a
-    column of its own and is never compared with an ordinary one. A step without a direction stays at zero.
-
-    Args:
-        estimate, reference: camera to world, seconds.
-        max_dt: largest difference of matched stamps, seconds.
-
-    Returns:
-        Camera to world at the matched stamps of the reference.
-    """
-    i, j = associate(estimate, reference, max_dt)
-    track = pose_matrices(estimate.poses_wc[i])
-    truth = reference.positions[j]
-    if len(i) < 2:
-        return Trajectory(reference.timestamps[j], estimate.poses_wc[i])
-    steps = np.diff(track[:, :3, 3], axis=0)
-    have = np.linalg.norm(steps, axis=1, keepdims=True)
-    want = np.linalg.norm(np.diff(truth, axis=0), axis=1, keepdims=True)
-    steps = np.where(have > 1e-12, steps * want / np.maximum(have, 1e-12), 0.0)
-    track[1:, :3, 3] = track[0, :3, 3] + np.cumsum(steps, axis=0)
-    return Trajectory(reference.timestamps[j], poses_from_matrices(track))
-
-
-def _evo(trajectory: Trajectory) -> Any:
+def evo_trajectory(trajectory: Trajectory) -> Any:
+    """A trajectory as evo's."""
     from evo.core.trajectory import PoseTrajectory3D
 
     return PoseTrajectory3D(
@@ -279,20 +207,5 @@ def _evo(trajectory: Trajectory) -> Any:
     )
 
 
-def _steps(poses_wc: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    matrices = pose_matrices(poses_wc)
-    step = np.linalg.inv(matrices[first]) @ matrices[last]
-    return step[:, :3, :3], step[:, :3, 3]
-
-
-def _angles(rotations: np.ndarray) -> np.ndarray:
-    """Angle of rotation matrices, degrees; exact for small angles, where the arc cosine is not."""
-    axis = np.stack([rotations[:, a, b] - rotations[:, b, a] for a, b in ((2, 1), (0, 2), (1, 0))], axis=1)
-    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=1), np.trace(rotations, axis1=1, axis2=2) - 1))
-
-
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between vectors, degrees; 90 where the first has no length, as a guess at random has on average."""
-    lengths = np.linalg.norm(a, axis=1)
-    angles = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
-    return np.where(lengths > 1e-12, angles, 90.0)
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).mean()))

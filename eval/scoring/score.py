@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from dvo.data.trajectory import Trajectory, read_tum
-from dvo.metrics import Metrics
+from dvo.odometry.protocol import Segment
+from dvo.segments import most_worlds, worlds_of
 from eval.execution.plan import Manifest, Run, groundtruth_file
-from eval.execution.predict import RECORD, Prediction, read_prediction, read_trajectory
-from eval.scoring.blackout import BlackoutErrors, blackout_errors
-from eval.scoring.metrics import (
-    Aligned,
-    PathErrors,
-    SegmentErrors,
-    absolute_rmse,
-    align_pair,
-    kitti_errors,
-    metrics_of,
-    path_errors,
-    per_frame_scale,
-    relative_pose_auc,
-)
-from eval.suites.suite import Sequence, Suite, reference_for
+from eval.execution.predict import RECORD, Prediction, read_prediction, read_segments
+from eval.scoring.blackout import dark_spans
+from eval.scoring.errors import Errors, all_errors
+from eval.suites.suite import Sequence as Recording
+from eval.suites.suite import Suite, reference_for
 
+SAME_FRAME = 1e-4  # seconds between the stamps of a frame and of its pose
 AUC_METRES = 1.0  # DPVO's "AUC" of a run is max(0, 1 - ATE / 1 m); a table's is the mean over runs, failed ones 0
 
 
@@ -46,6 +39,10 @@ class Row:
         ate_rot_deg: root mean square angle to the truth after the alignment.
         rpe_distance_m, rpe_distance_percent, rpe_distance_deg: see :class:`eval.scoring.metrics.PathErrors`.
         blackouts, segment_ate_percent, recovery_s: see :class:`eval.scoring.blackout.BlackoutErrors`.
+        segments: number of segments of the trajectory, those that share a world counted once.
+        scored: share of the frames fed that have a pose in a segment that counts for the ATE.
+        unseen: number of frames without a view, see :func:`eval.scoring.blackout.without_view`.
+        made_up: share of them that carry a pose; nan without such a frame.
         threads, parallel, device: how the resources were measured; ``parallel`` above 1 means on a shared machine.
     """
 
@@ -89,6 +86,10 @@ class Row:
     blackouts: int
     segment_ate_percent: float
     recovery_s: float
+    segments: int
+    scored: float
+    unseen: int
+    made_up: float
     threads: int
     parallel: int
     device: str
@@ -136,25 +137,30 @@ def score_run(out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory |
     sequence = next(sequence for sequence in suite.sequences if sequence.name == run.sequence)
     folder = out / run.folder
     if (folder / RECORD).is_file():
-        prediction, estimate = read_prediction(folder), read_trajectory(folder)
+        prediction, segments = read_prediction(folder), read_segments(folder)
     else:
-        prediction, estimate = Prediction("not run", "the evaluation was stopped before"), read_trajectory(folder)
-    return score(prediction, estimate, groundtruth, system=run.system, suite=suite, sequence=sequence, seed=run.seed)
+        prediction, segments = Prediction("not run", "the evaluation was stopped before"), ()
+    return score(prediction, segments, groundtruth, system=run.system, suite=suite, sequence=sequence, seed=run.seed)
 
 
 def score(
     prediction: Prediction,
-    estimate: Trajectory,
+    segments: Sequence[Segment],
     groundtruth: Trajectory | None,
     *,
     system: str,
     suite: Suite,
-    sequence: Sequence,
+    sequence: Recording,
     seed: int,
 ) -> Row:
     """One row of the table. A run that failed is a row too.
 
+    A run is lost if it has poses for less than :attr:`Suite.lost_below` of the frames, or for less than that in the
+    segments that are scored (:mod:`eval.scoring.errors`).
+
     Args:
+        prediction: record of the run.
+        segments: of its trajectory.
         groundtruth: of the whole sequence; None where the data are not there.
     """
     stamps = np.array(prediction.stamps, dtype=np.float64)
@@ -162,15 +168,20 @@ def score(
     frames = len(stamps)
     errors = Errors()
     if groundtruth is not None and frames:
-        errors = all_errors(estimate, reference_for(groundtruth, stamps), suite, prediction.dark)
+        unseen = np.isin(stamps, prediction.unseen)
+        most = most_worlds(frames, len(dark_spans(stamps, unseen)))
+        errors = all_errors(segments, reference_for(groundtruth, stamps), suite, prediction.dark, most)
     metrics = errors.metrics
     completeness = prediction.tracked / frames if frames else math.nan
+    scored = completeness if math.isnan(errors.scored) else completeness * errors.scored
 
     def value(name: str) -> float:
         return math.nan if metrics is None else float(getattr(metrics, name))
 
     if status == "ok" and not completeness >= suite.lost_below:
         status, reason = "lost", f"{prediction.tracked} of {frames} frames have a pose"
+    elif status == "ok" and not scored >= suite.lost_below and metrics is not None:
+        status, reason = "lost", metrics.reason or "too little of it is scored"
     elif status == "ok" and metrics is not None and metrics.reason:
         reason = metrics.reason
         judged = getattr(metrics, sequence.judged_by, value("ate_percent"))
@@ -217,6 +228,10 @@ def score(
         blackouts=errors.blackout.blackouts,
         segment_ate_percent=errors.blackout.segment_ate_percent,
         recovery_s=errors.blackout.recovery_s,
+        segments=len(worlds_of(segments)),
+        scored=scored,
+        unseen=len(prediction.unseen),
+        made_up=made_up_share(prediction.unseen, segments) if prediction.status == "ok" else math.nan,
         threads=prediction.threads,
         parallel=prediction.parallel,
         device=prediction.device,
@@ -224,37 +239,17 @@ def score(
     )
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Everything that a trajectory and its reference give."""
-
-    metrics: Metrics | None = None
-    path: PathErrors = PathErrors()
-    kitti: SegmentErrors = SegmentErrors()
-    blackout: BlackoutErrors = BlackoutErrors()
-    pose_auc: dict[float, float] = field(default_factory=dict)
-    rotation: float = math.nan
-    per_frame_scale: float = math.nan
-
-
-def all_errors(estimate: Trajectory, reference: Trajectory, suite: Suite, dark: list[list[float]]) -> Errors:
-    """Compare an estimate with the reference of the frames that were fed, under the protocol of a suite.
+def made_up_share(unseen: Sequence[float], segments: Sequence[Segment]) -> float:
+    """Share of the frames without a view that carry a pose; nan without such a frame.
 
     Args:
-        dark: stretches without light, see :func:`eval.scoring.blackout.dark_spans`.
+        unseen: timestamps of the frames without a view, seconds.
+        segments: of the run.
     """
-    align = suite.alignment
-    pair = align_pair(estimate, reference, align, rpe_gap=suite.rpe_gap)
-    rescaled = align_pair(per_frame_scale(estimate, reference), reference, align)
-    return Errors(
-        metrics=metrics_of(pair) if isinstance(pair, Aligned) else pair,
-        path=path_errors(pair) if isinstance(pair, Aligned) else PathErrors(),
-        kitti=kitti_errors(estimate, reference, pair.scale) if isinstance(pair, Aligned) else SegmentErrors(),
-        blackout=blackout_errors(estimate, reference, [(begin, end) for begin, end in dark], align),
-        pose_auc=relative_pose_auc(estimate, reference, suite.rpe_gap),
-        rotation=absolute_rmse(pair, angle=True) if isinstance(pair, Aligned) else math.nan,
-        per_frame_scale=absolute_rmse(rescaled) if isinstance(rescaled, Aligned) else math.nan,
-    )
+    if not unseen:
+        return math.nan
+    stamps = np.concatenate([np.zeros(0), *(segment.trajectory.timestamps for segment in segments)])
+    return sum(bool((np.abs(stamps - stamp) < SAME_FRAME).any()) for stamp in unseen) / len(unseen)
 
 
 def _area(status: str, found: float) -> float:

@@ -27,6 +27,9 @@ FIGURES = (
     ("rot. error / rot.", "rotation_error_ratio", 2),
     ("scale drift", "scale_drift", 2),
 )
+# Column, field, digits, factor; shown where a run has several segments, or frames without a view.
+SEGMENTS = (("segments", "segments", 0, 1.0), ("scored %", "scored", 0, 100.0))
+MADE_UP = (("made-up poses %", "made_up", 0, 100.0),)
 RESOURCES = (("frames/s", "fps", 1), ("p95 ms", "latency_p95_ms", 0), ("MB", "peak_memory_mb", 0))
 UNITS = {"ate_percent": "ATE %", "rpe_rot_deg": "RPE °", "segment_ate_percent": "segment ATE %", "recovery_s": "s"}
 DIGITS = {field: digits for _, field, digits in FIGURES}
@@ -172,6 +175,29 @@ def resource_cell(rows: Sequence[Row], field: str) -> Cell:
         field: column of results.csv.
     """
     return summarise([float(getattr(row, field)) for row in rows], failed=sum(row.failed for row in rows))
+
+
+def segment_columns(rows: Iterable[Row]) -> list[tuple[str, str, int, float]]:
+    """Columns on segments and on frames without a view that a table of some runs needs: title, field, digits, factor.
+
+    Args:
+        rows: of the table.
+    """
+    rows = list(rows)
+    unseen = any(row.unseen for row in rows)
+    several = any(row.segments > 1 for row in rows)
+    return [*(SEGMENTS if several or any(row.blackouts for row in rows) else ()), *(MADE_UP if unseen else ())]
+
+
+def count_cell(rows: Iterable[Row], field: str, factor: float = 1.0) -> Cell:
+    """Summary of a count or a share over the runs that left a trajectory.
+
+    Args:
+        rows: of some runs.
+        field: column of results.csv.
+        factor: on the values, 100 for percent.
+    """
+    return summarise([factor * float(getattr(row, field)) for row in rows if row.tracked])
 
 
 def best_of(cells: Mapping[str, Cell], digits: int | None = None) -> set[str]:

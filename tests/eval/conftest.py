@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Many
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
-from dvo.odometry.protocol import Odometry
+from dvo.metrics import transform
+from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
 from eval.execution.plan import Plan, read_manifest
 from eval.execution.predict import Job, Prediction, predict, predict_here
 from eval.execution.runner import predict_all
@@ -154,6 +156,54 @@ def systems(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
     yield register
     for name in names:
         remove_system(name)
+
+
+class Pieces:
+    """Knows the answer, in segments ``[start, stop)`` of frames, each in a world and a scale of its own."""
+
+    name = "pieces"
+
+    def __init__(
+        self,
+        motion: Callable[[float], np.ndarray],
+        bounds: Many[tuple[int, int]],
+        joined: dict[int, int],
+        breaks: tuple[Break, ...],
+    ) -> None:
+        self.motion, self.bounds, self.joined, self.breaks = motion, bounds, joined, breaks
+        self.times: list[float] = []
+
+    def track(self, frame: Frame) -> Estimate:
+        if frame.index == 0:
+            self.times = []
+        self.times.append(frame.timestamp)
+        inside = [n for n, (start, stop) in enumerate(self.bounds) if start <= frame.index < stop]
+        if not inside:
+            return Estimate(frame.timestamp, None, Status.LOST)
+        return Estimate(frame.timestamp, self._pose(frame.timestamp, inside[0]), Status.TRACKING, 1.0, inside[0])
+
+    def finish(self) -> Result:
+        segments = []
+        for number, (start, stop) in enumerate(self.bounds):
+            times = np.array(self.times[start:stop])
+            track = Trajectory(times, np.array([self._pose(time, number) for time in times]))
+            segments.append(Segment(track, times[0], times[-1], self.joined.get(number)))
+        longest = max(segments, key=len).trajectory
+        lost = len(self.times) - sum(map(len, segments))
+        return Result(longest, SparseMap(), len(self.times), lost, {}, tuple(segments), self.breaks)
+
+    def _pose(self, seconds: float, number: int) -> np.ndarray:
+        world = self.joined.get(number, number)
+        one = Trajectory(np.zeros(1), self.motion(seconds)[None])
+        turn = Rotation.from_rotvec([0, 0.7 * world, 0.1]).as_matrix()
+        return transform(one, 1.0 + world, turn, np.full(3, 2.0 * world)).poses_wc[0]
+
+
+@pytest.fixture
+def pieces(fake_odometry) -> Callable[..., Pieces]:
+    """``pieces((start, stop), ..., joined={segment: world}, breaks=())``, see :class:`Pieces`."""
+    motion = fake_odometry().motion
+    return lambda *bounds, joined=None, breaks=(): Pieces(motion, bounds, joined or {}, breaks)
 
 
 @pytest.fixture

@@ -19,10 +19,11 @@ from dvo.data.root import data_root
 from dvo.data.source import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from dvo.metrics import Metrics, evaluate
+from dvo.metrics import Metrics
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.session import FrameCallback, Run, run
+from dvo.segments import evaluate_segments, most_worlds, worlds_of
 from dvo.settings import parse_settings
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from train.engine.checkpoint import SUFFIXES, facts_of, load_any, read_state
@@ -34,7 +35,7 @@ SEQUENCES = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr
 def track_sequence(
     odometry: Odometry, frames: Iterable[Frame], truth: Trajectory, on_frame: FrameCallback | None = None
 ) -> tuple[Metrics, Run]:
-    """Track a clip and compare it with its ground truth.
+    """Track a clip and compare it with its ground truth, each segment aligned on its own (:mod:`dvo.segments`).
 
     Ctrl-C is passed on: a part of a clip is no measurement.
 
@@ -48,7 +49,8 @@ def track_sequence(
         metrics after Sim(3) alignment, with relative errors over a gap of 2 frames; and the run.
     """
     done = run(odometry, frames, on_frame=on_frame, should_stop=lambda: False)
-    return evaluate(done.result.trajectory, truth, rpe_gap=2), done
+    most = most_worlds(done.frames_fed)
+    return evaluate_segments(done.result.segments, truth, rpe_gap=2, most=most).metrics, done
 
 
 def rendered_clip(index: int, frames: int, size: tuple[int, int], fps: float) -> SyntheticSequence:
@@ -97,9 +99,12 @@ def main(arguments: list[str]) -> None:
             print(
                 f"{name:24s} seed {seed} ATE {m.ate_percent:7.2f} % of {m.path_length:6.2f} m  RPE rot "
                 f"{m.rpe_rot_deg:6.3f} deg  rotation error/motion {m.rotation_error_ratio:5.3f}  scale drift "
-                f"{m.scale_drift:+.2f}  lost {done.result.frames_lost}  {done.frames_per_second:5.1f} fps",
+                f"{m.scale_drift:+.2f}  lost {done.result.frames_lost}  segments "
+                f"{len(worlds_of(done.result.segments))}  {done.frames_per_second:5.1f} fps",
                 flush=True,
             )
+            if m.reason:
+                print(f"{name}: note: {m.reason}", file=sys.stderr)
             for warning in done.warnings:
                 print(f"{name}: note: {warning}", file=sys.stderr)
     found = []

@@ -66,8 +66,8 @@ class FrameLog:
         return next((T.copy() for T in found if T is not None), np.eye(4))
 
     def estimate(self, status: Status, confidence: float = 0.0) -> Estimate:
-        """Estimate of the newest frame."""
-        T = self.keyframes.pose(-1)
+        """Estimate of the newest frame; a lost one has no pose."""
+        T = None if status is Status.LOST else self.keyframes.pose(-1)
         pose = None if T is None else poses_from_matrices(np.linalg.inv(T))
         return Estimate(self.keyframes.frames[-1].timestamp, pose, status, confidence)
 

@@ -16,7 +16,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import poses_from_matrices
 from dvo.geometry.undistort import Undistorter
-from dvo.odometry.protocol import Result, SparseMap
+from dvo.odometry.protocol import Result, Segment, SparseMap
 
 WIDE = 560  # smaller images are doubled: these systems expect VGA, and do not even start on 320x240
 
@@ -67,26 +67,24 @@ class Row:
     part: int
 
 
-def longest_part(rows: list[Row]) -> list[Row]:
-    """The rows of the map that holds most frames; each map has a world and a scale of its own, so they cannot mix."""
-    if not rows:
-        return []
-    parts = [row.part for row in rows]
-    best = max(dict.fromkeys(parts), key=parts.count)
-    return [row for row in rows if row.part == best]
-
-
 def result(rows: list[Row], frames: int, info: dict[str, Any]) -> Result:
-    """A result without a map.
+    """A result without points, one segment for each map that holds frames: each has a world and a scale of its own.
 
     Args:
-        rows: frames with a pose.
+        rows: frames with a pose, in order of time.
         frames: number of frames fed.
         info: for :class:`dvo.odometry.protocol.Result`.
     """
+    parts = dict.fromkeys(row.part for row in rows)
+    trajectories = [_trajectory([row for row in rows if row.part == part]) for part in parts]
+    segments = tuple(Segment(one, float(one.timestamps[0]), float(one.timestamps[-1])) for one in trajectories)
+    longest = max(trajectories, key=len, default=_trajectory([]))
+    return Result(longest, SparseMap(), frames, frames - len(rows), info, segments)
+
+
+def _trajectory(rows: list[Row]) -> Trajectory:
     matrices = np.array([row.T_wc for row in rows]).reshape(-1, 4, 4)
-    trajectory = Trajectory(np.array([row.timestamp for row in rows]), poses_from_matrices(matrices))
-    return Result(trajectory, SparseMap(), frames, frames - len(rows), info)
+    return Trajectory(np.array([row.timestamp for row in rows], np.float64), poses_from_matrices(matrices))
 
 
 def version_of(package: str) -> Callable[[], str]:

@@ -25,7 +25,7 @@ from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.odometry.protocol import Estimate, Result, Status
-from eval.systems.peers.common import Pictures, Row, longest_part, missing_module, result, version_of
+from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of
 
 VOCABULARY = "DVO_ORB_VOCABULARY"
 FEATURES = 1500
@@ -59,7 +59,10 @@ def missing() -> str | None:
 
 
 class OrbSlam3:
-    """See the module. Frames before its initialisation and lost ones have no row; not deterministic (threads)."""
+    """See the module. Frames before its initialisation and lost ones have no row; not deterministic (threads).
+
+    A map that is begun after a loss is a segment of its own. The binding does not tell of merged maps.
+    """
 
     name = "orbslam3"
 
@@ -100,11 +103,10 @@ class OrbSlam3:
         self._was_tracking = True
         T_wc = np.array(said.pose_wc, np.float64)
         self._rows.append(Row(frame.timestamp, T_wc, self._part))
-        return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5)
+        return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5, self._part)
 
     def finish(self) -> Result:
-        rows = longest_part(self._rows)
-        moved = 0
+        rows, moved = self._rows, 0
         if self._slam is not None:
             self._slam.shutdown()
             rows, moved = self._refine(rows)
@@ -123,10 +125,12 @@ class OrbSlam3:
         """Move frames along with the last keyframe at or before each; only the last map has keyframes to offer."""
         file = Path(self._folder.name) / "keyframes.txt"
         self._slam.save_keyframe_trajectory_tum(str(file))
-        if not rows or rows[-1].part != self._part or not file.is_file() or not file.read_text().strip():
+        last = [row for row in rows if row.part == self._part]
+        if not last or not file.is_file() or not file.read_text().strip():
             return rows, 0
         keyframes = read_tum(file)
-        return follow_keyframes(rows, keyframes.timestamps, pose_matrices(keyframes.poses_wc))
+        moved, count = follow_keyframes(last, keyframes.timestamps, pose_matrices(keyframes.poses_wc))
+        return [row for row in rows if row.part != self._part] + moved, count
 
 
 def follow_keyframes(rows: list[Row], stamps: np.ndarray, T_wk: np.ndarray) -> tuple[list[Row], int]:

@@ -16,7 +16,7 @@ from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.odometry.protocol import Estimate, Result, Status
-from eval.systems.peers.common import Pictures, Row, longest_part, missing_module, result, version_of
+from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of
 
 version = version_of("svo-cpp")
 
@@ -27,7 +27,7 @@ def missing() -> str | None:
 
 
 class Svo:
-    """See the module. Frames without a pose (start, relocalisation) have no row."""
+    """See the module. Frames without a pose (start, relocalisation) have no row; a map begun anew is a segment."""
 
     name = "svo"
 
@@ -63,11 +63,10 @@ class Svo:
         self._was_tracking = True
         T_wc = np.linalg.inv(read_se3(self._system.lastFrame().T_f_w))
         self._rows.append(Row(frame.timestamp, T_wc, self._part))
-        return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5)
+        return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5, self._part)
 
     def finish(self) -> Result:
-        rows = longest_part(self._rows)
-        return result(rows, self._frames, {**self._pictures.facts(), "maps_started": self._part + 1})
+        return result(self._rows, self._frames, {**self._pictures.facts(), "maps_started": self._part + 1})
 
 
 def read_se3(pose: Any) -> np.ndarray:

@@ -43,6 +43,12 @@ def test_key_changes_with_everything_that_matters(job, tmp_path):
     assert digest(job, threaded) != digest(replace(job, threads=7), threaded)
 
 
+def test_predictions_of_an_older_format_are_made_again(job, monkeypatch):
+    now = digest_of(job_key(job, system_facts("null"), "1234", {}))
+    monkeypatch.setattr(cache, "FORMAT", cache.FORMAT - 1)
+    assert digest_of(job_key(job, system_facts("null"), "1234", {})) != now
+
+
 def test_fingerprint_follows_images_and_calibration(job, tmp_path, image_folder):
     def now() -> str:
         source, _ = open_sequence(job.sequence, tmp_path, 1)

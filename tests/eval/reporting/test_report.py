@@ -14,16 +14,24 @@ import numpy as np
 import pytest
 
 from dvo.data.trajectory import Trajectory
+from dvo.odometry.protocol import Segment
 from eval.__main__ import main
 from eval.execution.plan import read_manifest
-from eval.reporting.plots import OURS, plot_axis, plot_sequence, plot_speed, styles
+from eval.reporting.plots import OURS, RING, _with_breaks, plot_axis, plot_sequence, plot_speed, styles
 from eval.reporting.report import overall, shade, write_report, write_tables
+from eval.reporting.tables import markdown
 from eval.reporting.verdict import verdicts
 from eval.scoring.summary import Cell
 from eval.suites.suite import Suite
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
+CUTS = ((0, 80, 1.0), (90, 195, 3.0), (195, 200, 2.0))  # rows and scale of three segments
 VOID_TAGS = {"meta", "img", "br", "link"}
+
+
+def segments(*trajectories: Trajectory) -> list[Segment]:
+    """A segment of each that has rows."""
+    return [Segment(t, float(t.timestamps[0]), float(t.timestamps[-1])) for t in trajectories if len(t)]
 
 
 class Outline(HTMLParser):
@@ -145,7 +153,9 @@ def test_figures_survive_what_runs_leave_behind():
     none = Trajectory(np.zeros(0), np.zeros((0, 7)))
     one = Trajectory(s[:1], truth.poses_wc[:1])
     for judge in ("ate_percent", "rpe_rot_deg"):
-        tracks = {"dvo-x": truth, "far": far, "none": none, "one": one}
+        tracks = {
+            name: segments(track) for name, track in (("dvo-x", truth), ("far", far), ("none", none), ("one", one))
+        }
         svg = plot_sequence(Suite("s", "l", ()), judge, truth, tracks, [[1.0, 2.0]])
         ElementTree.fromstring(svg)
         assert "none: no trajectory" in svg and len(svg) < 120_000
@@ -153,3 +163,45 @@ def test_figures_survive_what_runs_leave_behind():
     assert "2 failed" in plot_axis("t", "u", {"a": [1.0, 2.0, math.inf, math.inf], "b": [math.inf], "c": []}, 3.0)
     ElementTree.fromstring(plot_axis("t", "u", {"a": [math.inf]}, math.nan))
     assert "1 of 2 without a figure" in plot_speed({"a": [(3.0, 1.0), (3.0, math.inf)]}, "ATE %")
+
+
+def test_segments_are_told_apart_in_the_figure():
+    """Each in its own world and scale; drawn on the truth, a ring at the start of the second, tiny ones left out."""
+    s = np.linspace(0, 5, 200)
+    truth = Trajectory(s, np.column_stack([np.cos(s), 0.1 * np.sin(3 * s), s, 0 * s, 0 * s, 0 * s, 1 + 0 * s]))
+    parts = [Trajectory(s[a:b], truth.poses_wc[a:b] * [k, k, k, 1, 1, 1, 1]) for a, b, k in CUTS]
+    one, two = ({"dvo-x": segments(*tracks)} for tracks in ([truth], parts))
+    alone, cut = (plot_sequence(Suite("s", "l", ()), "ate_percent", truth, tracks) for tracks in (one, two))
+    assert "dvo-x (3 segments, 1 too short)" in cut and "segments" not in alone
+    ring = re.compile(rf"<use [^>]*stroke: {OURS}; stroke-width: {RING['mew']}")
+    assert (len(ring.findall(alone)), len(ring.findall(cut))) == (0, 2)  # in the plan, and in the errors over time
+    joined = [segments(parts[0])[0], replace(segments(parts[1])[0], joined_to=0)]
+    assert not ring.search(plot_sequence(Suite("s", "l", ()), "ate_percent", truth, {"dvo-x": joined}))
+
+
+def test_curves_break_where_there_are_no_frames():
+    stamps = np.r_[0:10, 20:30] / 10
+    curve = _with_breaks(np.column_stack([stamps, stamps]))
+    assert np.isnan(curve[:, 0]).tolist() == [row == 10 for row in range(21)]
+    assert len(_with_breaks(curve[:1])) == 1 and len(_with_breaks(curve[:0])) == 0
+
+
+def test_tables_and_page_tell_segments_and_made_up_poses(plan, rows):
+    manifest, suite = read_manifest(plan.out), plan.suites[0]
+    plain = [replace(row, unseen=0, made_up=math.nan) for row in rows]
+    titles = markdown(manifest, suite, plain).splitlines()[2]
+    assert "segments" not in titles and "made-up" not in titles
+    good = [replace(r, segments=3, scored=0.8, unseen=4, made_up=0.25) if r.system == "good" else r for r in plain]
+    table = markdown(manifest, suite, good)
+    titles, _, first = table.splitlines()[2:5]
+    cells = dict(zip(titles.split("|"), first.split("|"), strict=True))
+    assert [cells[f" {name} "].strip() for name in ("segments", "scored %", "made-up poses %")] == ["3", "80", "25"]
+    assert "aligned on its own" in table and "Made-up poses: share" in table
+    page = write_report(plan.out, manifest, good).read_text(encoding="utf-8")
+    for title in ("segments", "scored %", "made-up poses %"):
+        assert page.count(f"<th>{title}</th>") == 2, title  # systems, and the sequence
+    page = write_report(plan.out, manifest, plain).read_text(encoding="utf-8")
+    assert "<th>segments</th>" not in page
+    dark = [replace(row, blackouts=1, unseen=20, made_up=0.0) for row in plain]
+    page = write_report(plan.out, manifest, dark).read_text(encoding="utf-8")
+    assert "<th>segments</th>" in page and "<th>made-up poses %</th>" in page  # always, where it goes dark

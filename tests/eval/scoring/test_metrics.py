@@ -17,18 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.metrics import fit_alignment, transform
-from eval.scoring.metrics import (
-    AUC_DEGREES,
-    Aligned,
-    absolute_rmse,
-    align_pair,
-    evo_metrics,
-    kitti_errors,
-    metrics_of,
-    path_errors,
-    per_frame_scale,
-    relative_pose_auc,
-)
+from eval.scoring.metrics import Aligned, absolute_rmse, align_pair, evo_metrics, metrics_of, path_errors
+from eval.scoring.protocols import AUC_DEGREES, kitti_errors, per_frame_scale, relative_pose_auc
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 MODES = ("none", "scale", "se3", "sim3")
@@ -111,8 +101,8 @@ def test_known_drift_over_distance():
     assert errors.distance_m == pytest.approx(30, abs=0.01)
     assert errors.trans_percent == pytest.approx(10, abs=0.01) and errors.rot_deg == pytest.approx(0, abs=1e-6)
     assert path_errors(aligned(longer, truth, "sim3")).trans_percent == pytest.approx(0, abs=1e-6)
-    assert path_errors(aligned(longer, truth, "none"), 17.0).trans_percent == pytest.approx(10, abs=0.01)
-    assert np.isnan(path_errors(aligned(longer, truth, "none"), 5000.0).trans_percent)
+    assert path_errors(aligned(longer, truth, "none"), distance_m=17.0).trans_percent == pytest.approx(10, abs=0.01)
+    assert np.isnan(path_errors(aligned(longer, truth, "none"), distance_m=5000.0).trans_percent)
 
 
 def test_known_drift_over_kitti_segments():
@@ -249,7 +239,7 @@ def test_agrees_with_evos_commands(trajectories, tmp_path, names):
         rpe = next(stats)
         assert metrics.rpe_rot_deg == pytest.approx(rpe["median"], abs=1e-6)
         assert metrics.rpe_rot_deg_rmse == pytest.approx(rpe["rmse"], abs=1e-6)
-        assert path_errors(pair, 0.5).trans_percent / 200 == pytest.approx(next(stats)["median"], abs=1e-6)
+        assert path_errors(pair, distance_m=0.5).trans_percent / 200 == pytest.approx(next(stats)["median"], abs=1e-6)
 
 
 @pytest.mark.slow

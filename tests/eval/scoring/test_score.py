@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
-from eval.scoring.score import COLUMNS
+from dvo.data.trajectory import read_tum
+from eval.execution.predict import predict_here, read_segments
+from eval.scoring.score import COLUMNS, Row, made_up_share, score
 
 REQUIRED_COLUMNS = [
     *("system", "version", "suite", "sequence", "seed", "status", "frames", "tracked", "alignment"),
@@ -41,3 +47,52 @@ def test_columns():
     assert list(COLUMNS)[:16] == REQUIRED_COLUMNS
     assert list(COLUMNS)[16:18] == ["stride", "resolution"]
     assert {"scale_drift", "t_rel", "r_rel", "auc", "pose_auc_5", "ate_per_frame_scale", "recovery_s"} <= set(COLUMNS)
+    assert {"segments", "scored", "unseen", "made_up"} <= set(COLUMNS)
+
+
+@pytest.fixture
+def scored(job, suite, sequence, systems, image_folder):
+    """``scored(odometry)``: the row of its run."""
+
+    def make(odometry, **changes) -> Row:
+        name = f"system{len(list(Path(job.folder).parent.glob('run*')))}"
+        systems(**{name: odometry})
+        folder = Path(job.folder).with_name(f"run-{name}")
+        folder.mkdir()
+        prediction = replace(predict_here(replace(job, system=name, folder=str(folder))), **changes)
+        truth = read_tum(image_folder.parent / "truth.txt")
+        return score(prediction, read_segments(folder), truth, system=name, suite=suite, sequence=sequence, seed=0)
+
+    return make
+
+
+def test_two_segments_are_scored_together(scored, pieces):
+    row = scored(pieces((0, 10), (10, 20)))
+    # Twenty frames allow one segment, and half of the frames are enough.
+    assert (row.segments, row.tracked, row.completeness, row.scored) == (2, 20, 1.0, 0.5)
+    assert row.status == "ok" and row.ate_rmse < 1e-6 and "1 of 2 segments not scored" in row.reason
+    joined = scored(pieces((0, 10), (12, 20), joined={1: 0}))
+    assert (joined.segments, joined.completeness, joined.scored) == (1, 0.9, 0.9) and joined.ate_rmse < 1e-6
+
+
+def test_tiny_segments_are_a_failure(scored, pieces):
+    row = scored(pieces(*((start, start + 4) for start in range(0, 20, 4))))
+    assert (row.segments, row.completeness, row.scored, row.status) == (5, 1.0, 0.0, "lost")
+    assert row.reason == "5 of 5 segments not scored (20 of 20 poses)" and row.auc == 0 and row.failed
+
+
+def test_poses_in_the_dark_are_counted(scored, pieces, image_folder):
+    scene = np.full((48, 64, 3), 255, np.uint8) * np.linspace(0.2, 0.8, 64)[None, :, None]
+    for number in range(20):
+        image = np.zeros((48, 64, 3)) if 8 <= number < 13 else scene
+        cv2.imwrite(str(image_folder / f"{number:04d}.png"), image.astype(np.uint8))
+    rows = [scored(pieces(*bounds)) for bounds in (((0, 20),), ((0, 8), (13, 20)), ((0, 10), (12, 20)))]
+    assert [row.unseen for row in rows] == [5, 5, 5]
+    assert [row.made_up for row in rows] == pytest.approx([1.0, 0.0, 3 / 5])
+    assert np.isnan(scored(pieces((0, 20)), unseen=[]).made_up)
+    assert np.isnan(scored(pieces((0, 20)), status="crashed").made_up)
+    assert scored(pieces((0, 10), (10, 20))).scored == 1.0  # the dark in the middle allows a second segment
+
+
+def test_share_of_made_up_poses():
+    assert np.isnan(made_up_share([], [])) and made_up_share([1.0, 2.0], []) == 0

@@ -13,6 +13,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights
 from dvo.nets.config import preset
 from dvo.odometry.load import build_odometry
+from dvo.odometry.protocol import Result, Segment, SparseMap
 from dvo.settings import parse_settings
 from dvo.synth.clip import make_clip
 from train.validation.pictures import draw, image_at, patch_flow
@@ -48,6 +49,21 @@ def test_any_odometry_is_measured(clip, fake_odometry):
     metrics, done = track_sequence(odometry, frames, truth)
     assert metrics.ate_percent < 1e-6 and done.result.frames_lost == 1 and done.result.frames_read == 8
     assert track_with_flow(fake_odometry(), frames, truth)[2] is None
+
+
+def test_segments_are_aligned_one_by_one(fake_odometry):
+    s = np.arange(120) / 10
+    poses = np.column_stack([np.sin(s), 0.2 * np.sin(3 * s), s, 0 * s, 0 * s, 0 * s, 1 + 0 * s])
+    truth = Trajectory(s, poses)
+    image = np.zeros((8, 8, 3), np.uint8)
+    frames = [Frame(k, float(time), image, Camera(8.0, 8.0, 3.5, 3.5, 8, 8)) for k, time in enumerate(s)]
+    odometry = fake_odometry()
+    parts = [Trajectory(s[a:b], poses[a:b] * [k, k, k, 1, 1, 1, 1]) for a, b, k in ((0, 50, 1.0), (60, 120, 3.0))]
+    segments = tuple(Segment(part, part.timestamps[0], part.timestamps[-1]) for part in parts)
+    odometry.finish = lambda: Result(parts[1], SparseMap(), 120, 10, segments=segments)
+    metrics, done = track_sequence(odometry, frames, truth)
+    assert metrics.ate_percent < 1e-6 and metrics.completeness == pytest.approx(110 / 120)
+    assert done.result.segments == segments
 
 
 def test_ctrl_c_ends_a_validation(clip, fake_odometry):

@@ -11,6 +11,7 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import evaluate
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
+from eval.systems.baselines.frame_log import FrameLog
 from eval.systems.baselines.klt_pnp import KltPnp, KltPnpConfig
 from eval.systems.baselines.null import NullMotion
 
@@ -54,7 +55,7 @@ def test_start_is_back_filled(film, path):
 
 def test_short_blackout_is_lost_and_found(film, path, dark):
     estimates, result = run(dark(film(path(60)), 25, 28))
-    assert [e.status for e in estimates[25:28]] == [Status.LOST] * 3
+    assert [(e.status, e.pose_wc) for e in estimates[25:28]] == [(Status.LOST, None)] * 3
     assert all(e.status is Status.TRACKING for e in estimates[28:])
     assert result.frames_lost == 3 and result.info["maps_started"] == 1
     metrics = evaluate(result.trajectory, path(60))
@@ -70,6 +71,12 @@ def test_long_blackout_starts_a_second_map(film, path, dark):
     second = Trajectory(result.trajectory.timestamps[after], result.trajectory.poses_wc[after])
     metrics = evaluate(second, path(80), rpe_gap=5)
     assert after.sum() >= 28 and metrics.ate_percent < 4 and metrics.rotation_error_ratio < 0.25
+
+
+def test_a_log_gives_a_lost_frame_no_pose():
+    log = FrameLog()
+    log.set_pose(log.begin(0.5), np.eye(4))
+    assert log.estimate(Status.TRACKING).pose_wc is not None and log.estimate(Status.LOST).pose_wc is None
 
 
 def test_null_moves_straight_and_never_turns(film, path):

@@ -249,7 +249,7 @@ def test_relocalises_without_a_prediction(film, path):
 
 def test_short_blackout_is_lost_and_found(film, path, dark):
     estimates, result = run(dark(film(path(40))[:28], 18, 20))
-    assert [e.status for e in estimates[18:20]] == [Status.LOST] * 2
+    assert [(e.status, e.pose_wc) for e in estimates[18:20]] == [(Status.LOST, None)] * 2
     assert all(e.status is Status.TRACKING for e in estimates[20:])
     assert result.info["maps_started"] == 1 and result.frames_lost == 2
     metrics = evaluate(result.trajectory, path(40))

@@ -8,16 +8,18 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from dvo.data.frame import Frame
+from dvo.data.trajectory import Trajectory, write_tum
 from dvo.geometry.camera import Camera
 from dvo.odometry.protocol import SparseMap
 from eval.systems.peers import colmap, orbslam3, svo
-from eval.systems.peers.common import Pictures, Row, longest_part
+from eval.systems.peers.common import Pictures, Row, result
 from eval.systems.registry import find_system
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -117,9 +119,33 @@ def test_distorted_pictures_are_straightened():
     assert pictures.camera is not None and not pictures.camera.is_distorted
 
 
-def test_longest_part():
-    rows = [Row(float(k), np.eye(4), part) for k, part in enumerate([0, 0, 1, 1, 1, 2])]
-    assert [row.timestamp for row in longest_part(rows)] == [2, 3, 4] and longest_part([]) == []
+def test_every_map_is_a_segment():
+    rows = [Row(float(k), np.eye(4), part) for k, part in enumerate([0, 0, 2, 2, 2, 3])]
+    found = result(rows, 9, {})
+    assert [(len(one), one.start, one.end, one.joined_to) for one in found.segments] == [
+        (2, 0, 1, None),
+        (3, 2, 4, None),
+        (1, 5, 5, None),
+    ]
+    assert found.trajectory.timestamps.tolist() == [2, 3, 4]
+    assert (found.frames_tracked, found.frames_lost) == (6, 3)
+    nothing = result([], 9, {})
+    assert len(nothing.trajectory) == 0 and nothing.segments == () and nothing.frames_lost == 9
+
+
+def test_only_the_last_map_follows_its_keyframes(tmp_path):
+    """What ORB-SLAM3 says of its keyframes at the end is in the world of its last map."""
+
+    class Slam:
+        def save_keyframe_trajectory_tum(self, file: str) -> None:
+            write_tum(file, Trajectory(np.array([3.0]), np.array([[7.0, 0, 0, 0, 0, 0, 1]])))
+
+    system = object.__new__(orbslam3.OrbSlam3)
+    system._slam, system._part, system._folder = Slam(), 1, SimpleNamespace(name=str(tmp_path))
+    rows = [Row(float(k), np.eye(4), part) for k, part in enumerate([0, 0, 1, 1])]
+    moved, count = system._refine(rows)
+    assert count == 1 and [row.T_wc[0, 3] for row in moved] == [0, 0, 7, 7]
+    assert [row.part for row in moved] == [0, 0, 1, 1]
 
 
 def test_frames_follow_their_keyframes():

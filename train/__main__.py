@@ -1,7 +1,9 @@
 """Training programs, run from a checkout:
 
 - ``python -m train fit --config configs/train/small.yaml`` trains the network of the task that the configuration names
-  (LightningCLI). Ctrl-C stops after the running step and saves; the same command goes on.
+  (LightningCLI). ``--name RUN`` names the folder of everything that it writes, ``--from FILE`` starts a new run from a
+  training state or from weights, ``--steps N`` takes N steps from there. Ctrl-C stops after the running step and saves;
+  ``--resume`` goes on.
 - ``export CHECKPOINT FILE`` writes the weights; ``validate CHECKPOINT`` tracks real sequences with them.
 - ``state CHECKPOINT FILE`` copies a training state without the paths of the machine that it comes from.
 - ``snr CHECKPOINT`` measures the signal-to-noise ratio of gradients, for ``patch_vo`` of the plain and the weighted

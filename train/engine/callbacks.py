@@ -63,8 +63,12 @@ class RefuseStandstill(L.Callback):
 
     def __init__(self, steps: int = 20) -> None:
         self.steps = steps
-        self.taken = 0
+        self.start = 0
         self.learns = False
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take the step of the state."""
+        self.start = trainer.global_step
 
     def on_before_optimizer_step(self, trainer: L.Trainer, pl_module: L.LightningModule, optimizer: Any) -> None:
         """Look for a gradient, until one is found."""
@@ -73,11 +77,11 @@ class RefuseStandstill(L.Callback):
             self.learns = bool(gradients) and any(bool(torch.count_nonzero(g)) for g in gradients)
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        """Count."""
-        self.taken += 1
-        if not self.learns and (self.taken == self.steps or trainer.global_step == trainer.max_steps):
+        """End the run if it is time."""
+        taken = trainer.global_step - self.start  # several batches make a step if gradients are accumulated
+        if not self.learns and (taken >= self.steps or trainer.global_step == trainer.max_steps):
             raise DvoError(
-                f"the gradient is zero or the step is skipped at each of {self.taken} steps, so nothing is trained",
+                f"the gradient is zero or the step is skipped at each of {taken} steps, so nothing is trained",
                 field="model.loss",
                 remedy="raise the weights of the loss; for recordings without depth, which train poses only, leave out "
                 "the warm-up (model.warmup_until 0)",

@@ -15,7 +15,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from dvo.errors import DvoError
 from train.engine.build import program_factory
-from train.engine.callbacks import RefuseStandstill
+from train.engine.callbacks import RefuseStandstill, StopGently
 from train.engine.parser import OneLineParser
 from train.engine.progress import StepBar
 from train.engine.run import ROOT, describe, find_start, place_outputs, prepare, run_folder, stop_step
@@ -86,10 +86,13 @@ class TaskCLI(LightningCLI):
         """
         prepare(self.model, self.start, self.stop)
         given = self._get(self.config_init, "trainer")
+        theirs = list(given["callbacks"] or [])
         own: list[L.Callback] = [RefuseStandstill()]
         if given["enable_progress_bar"] is not False and not given["barebones"]:
             own.append(StepBar())
-        changes |= {"callbacks": [*(given["callbacks"] or []), *own]}
+        if given["enable_checkpointing"] is not False and not any(isinstance(c, StopGently) for c in theirs):
+            own.append(StopGently())  # every run leaves a state
+        changes |= {"callbacks": [*theirs, *own]}
         changes |= {"default_root_dir": self.folder, "max_steps": self.stop}
         if given["logger"] in (None, True) and not given["barebones"]:
             changes["logger"] = default_loggers(self.folder)

@@ -7,10 +7,12 @@ import pytest
 import yaml
 
 import dvo.models.registry
+from dvo.data.root import data_root
 from dvo.models.weights import load_weights
 from train.__main__ import main
 from train.engine.checkpoint import read_state
 
+ROOT = Path(__file__).resolve().parents[3]
 NAME = "two_frame_rotation"
 SETTINGS = {
     "task": "rotation_task:RotationTask",
@@ -20,7 +22,6 @@ SETTINGS = {
         "callbacks": [
             {"class_path": "lightning.pytorch.callbacks.ModelCheckpoint",
              "init_args": {"save_last": True, "every_n_train_steps": 1, "enable_version_counter": False}},
-            {"class_path": "train.engine.callbacks.StopGently"},
         ],
     },
     "model": {"learning_rate": 1e-2},
@@ -87,6 +88,8 @@ def test_a_run_is_begun_resumed_and_the_start_of_another(fit, refused, capsys, t
     fit("runs/train/b/last.ckpt", "w.safetensors", verb=["export"])
     fit("--name", "c", "--from", "w.safetensors", "--steps", 1, "--trainer.default_root_dir", "elsewhere")
     assert "step 0 + 1; new run from the weights w.safetensors" in capsys.readouterr().out
+    fit("--name", "d", "--steps", 1, "--trainer.callbacks", "null")  # every run leaves a state
+    assert read_state("runs/train/d/last.ckpt")["global_step"] == 1
     fit("elsewhere/c/last.ckpt", "v.safetensors", verb=["export"])
     card = load_weights("v.safetensors").info.card
     assert card["steps"] == 1 and card["started_from"]["card"]["steps"] == 5 and card["licence"] == "MIT"
@@ -120,3 +123,23 @@ def test_a_folder_of_recordings_needs_no_brackets(fit, given, capsys):
     with pytest.raises(SystemExit):
         fit("--steps", 1, "--data.real.folders", given, "--trainer.logger", "false")
     assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: nowhere: no such file or folder")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (data_root(required=False) / "tartanair_v2_10").is_dir(), reason="set DVO_DATA")
+def test_fine_tuning_as_the_readme_says(fit, capsys):
+    """Its command trains, and the card tells on what; one step on small images instead of many."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    block = next(block for block in text.split("```bash\n")[1:] if "--name tuned" in block).split("```")[0]
+    lines = block.replace("\\\n", " ").strip().splitlines()
+    training, exporting = (line.removeprefix("python -m train ").split() for line in lines)
+    training[training.index("DIR")] = str(data_root() / "tartanair_v2_10")
+    training[training.index("--steps") + 1] = "1"
+    training = [str(ROOT / word) if word.startswith(("configs/", "train/")) else word for word in training]
+    quick = ["--data.workers=0", "--data.sizes=[[48,64]]", "--data.frames=4", "--trainer.log_every_n_steps=1"]
+    fit(*quick, verb=training)
+    assert " + 1 of 1" in capsys.readouterr().out
+    fit(verb=exporting)
+    card = load_weights("tuned.safetensors").info.card
+    assert card["recordings"] == ["tartanair_v2_10"] and card["recorded_clips"] == 1 < card["rendered_clips"]
+    assert card["licence"] == "as the recordings allow" and "recordings tartanair_v2_10 (1 clip)" in card["data"]

@@ -39,12 +39,24 @@ def main() -> None:
 
 
 def run() -> None:
-    """Run the command that the command line names; whatever is none of :data:`COMMANDS` is for LightningCLI."""
+    """Run the command that the command line names; ``fit`` is for LightningCLI.
+
+    Raises:
+        DvoError: no such command.
+    """
+    from dvo.errors import DvoError
+
     command, rest = (sys.argv[1:2] or [""])[0], sys.argv[2:]
     if command in COMMANDS:
         module, _, function = COMMANDS[command].partition(":")
         getattr(importlib.import_module(module), function)(rest)
         return
+    if command in ("-h", "--help"):
+        print(__doc__)
+        return
+    if command != "fit":
+        remedy = f"give one of fit, {', '.join(COMMANDS)}"
+        raise DvoError(f"no command '{command}'" if command else "a command is missing", remedy=remedy)
     from dvo.allocator import reuse_freed_memory
     from train.engine.cli import train
 

@@ -72,9 +72,8 @@ class TaskCLI(LightningCLI):
             )
         trainer = settings["trainer"]
         self.folder = run_folder(settings["name"], trainer["default_root_dir"], settings["task"])
-        loggers = trainer["logger"] if isinstance(trainer["logger"], list) else [trainer["logger"]]
-        parts = [*loggers, *(trainer["callbacks"] or [])]
-        place_outputs([part for part in parts if hasattr(part, "get")], self.folder)
+        parts = [*_as_list(trainer["logger"]), *_as_list(trainer["callbacks"])]
+        place_outputs([part for part in parts if not isinstance(part, bool)], self.folder)
         self.start = find_start(self.folder, settings["from"], settings["resume"])
         self.stop = stop_step(self.start, settings["steps"], trainer["max_steps"])
 
@@ -86,7 +85,7 @@ class TaskCLI(LightningCLI):
         """
         prepare(self.model, self.start, self.stop)
         given = self._get(self.config_init, "trainer")
-        theirs = list(given["callbacks"] or [])
+        theirs = _as_list(given["callbacks"])
         own: list[L.Callback] = [RefuseStandstill()]
         if given["enable_progress_bar"] is not False and not given["barebones"]:
             own.append(StepBar())
@@ -115,6 +114,10 @@ class TaskCLI(LightningCLI):
                 file=self.folder,
                 remedy="look at trainer.max_epochs, trainer.max_time, trainer.limit_train_batches and for empty data",
             )
+
+
+def _as_list(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list) else [] if value is None else [value]
 
 
 def default_loggers(folder: Path) -> list[Logger]:

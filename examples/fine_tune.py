@@ -3,7 +3,7 @@
     python examples/fine_tune.py --steps 20 --out tuned.safetensors
 
 The clips are rendered while it trains; replace them by batches of your own with the same entries. The full recipe
-(moving average, recovery, schedules, resume) is `python -m train fit`.
+(moving average, recovery, schedules, resuming, recordings) is `python -m train fit --from small --steps 20 ...`.
 """
 
 import argparse
@@ -38,7 +38,10 @@ def main() -> None:
         torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
         optimizer.step()
         print(f"step {step}: loss {loss.item():.3f}, rotation error {errors.rotation.mean().rad2deg().item():.2f} deg")
-    save_weights(options.out, model, {"origin": "examples/fine_tune.py", "steps": options.steps})
+    # The card tells what the weights have seen and under which licence they are: adapt it to clips of your own.
+    card = {"origin": "examples/fine_tune.py", "steps": options.steps, "licence": "MIT"}
+    card |= {"data": "renderings of dvo.synth only", "started_from": {"name": "small"}}
+    save_weights(options.out, model, card)
     print(f"dvo.load('{options.out}') gives", dvo.load(options.out, device="cpu").name)
 
 

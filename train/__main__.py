@@ -1,7 +1,9 @@
 """Training programs, run from a checkout:
 
 - ``python -m train fit --config configs/train/small.yaml`` trains the network of the task that the configuration names
-  (LightningCLI). Ctrl-C stops after the running step and saves; the same command goes on.
+  (LightningCLI). ``--name RUN`` names the folder of everything that it writes, ``--from FILE`` starts a new run from a
+  training state or from weights, ``--steps N`` takes N steps from there. Ctrl-C stops after the running step and saves;
+  ``--resume`` goes on.
 - ``export CHECKPOINT FILE`` writes the weights; ``validate CHECKPOINT`` tracks real sequences with them.
 - ``state CHECKPOINT FILE`` copies a training state without the paths of the machine that it comes from.
 - ``snr CHECKPOINT`` measures the signal-to-noise ratio of gradients, for ``patch_vo`` of the plain and the weighted
@@ -37,12 +39,24 @@ def main() -> None:
 
 
 def run() -> None:
-    """Run the command that the command line names; whatever is none of :data:`COMMANDS` is for LightningCLI."""
+    """Run the command that the command line names; ``fit`` is for LightningCLI.
+
+    Raises:
+        DvoError: no such command.
+    """
+    from dvo.errors import DvoError
+
     command, rest = (sys.argv[1:2] or [""])[0], sys.argv[2:]
     if command in COMMANDS:
         module, _, function = COMMANDS[command].partition(":")
         getattr(importlib.import_module(module), function)(rest)
         return
+    if command in ("-h", "--help"):
+        print(__doc__)
+        return
+    if command != "fit":
+        remedy = f"give one of fit, {', '.join(COMMANDS)}"
+        raise DvoError(f"no command '{command}'" if command else "a command is missing", remedy=remedy)
     from dvo.allocator import reuse_freed_memory
     from train.engine.cli import train
 

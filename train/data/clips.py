@@ -16,6 +16,7 @@ from dvo.errors import DvoError
 from dvo.synth.dataset import ClipDataset
 from train.data.real import RealClips, RealData
 from train.data.stream import ClipStream, StreamSampler
+from train.engine.provenance import Material, names_of
 
 
 def _start_worker(_: int) -> None:
@@ -80,10 +81,19 @@ class MixedClips(Dataset[dict[str, torch.Tensor]]):
         batch = index // self.batch_size
         first = batch * self.batch_size
         stage = max(i for i, s in enumerate(self.stages) if s.from_clip <= first)
-        clips = self.rendered[stage]
-        if self.real is not None and np.random.default_rng([self.seed, 9109, batch]).random() < self.real.share:
-            clips = self.recorded[stage]
+        clips = self.recorded[stage] if is_recorded(self.seed, batch, self.real) else self.rendered[stage]
         return clips[batch % len(clips)][index]
+
+
+def is_recorded(seed: int, batch: int, real: RealData | None) -> bool:
+    """Whether a batch is cut from recordings and not rendered.
+
+    Args:
+        seed: of the stream of clips.
+        batch: index, over all processes.
+        real: recordings that are mixed in; None: none.
+    """
+    return real is not None and bool(np.random.default_rng([seed, 9109, batch]).random() < real.share)
 
 
 class Renderings(ClipStream):
@@ -102,7 +112,7 @@ class Renderings(ClipStream):
         courses: former name of ``stages``.
 
     Raises:
-        DvoError: ``stages`` under both names.
+        DvoError: ``stages`` under both names, sizes of no batch and no clip, or no recordings where there should be.
     """
 
     def __init__(
@@ -122,6 +132,11 @@ class Renderings(ClipStream):
         super().__init__()
         if stages and courses:
             raise DvoError("is the former name of 'stages'", field="data.courses", remedy="give one of the two")
+        for name, value, least in (("batch_size", batch_size, 1), ("frames", frames, 2), ("workers", workers, 0)):
+            if value < least:
+                raise DvoError(f"{value} is too small", field=f"data.{name}", remedy=f"give {least} or more")
+        if real is not None:
+            real.check()
         self.save_hyperparameters(
             ignore=["stages", "courses", "real"], logger=False
         )  # its seed need not be that of the module
@@ -134,6 +149,21 @@ class Renderings(ClipStream):
         """The clips, in batches that span so many processes."""
         options = {"frames": self.frames, "textures": self.textures}
         return MixedClips(self.seed, self.stages, self.batch_size * processes, self.real, **options)
+
+    def summary(self) -> str:
+        """Description of the clips in a few words: rendered, or from which recordings."""
+        if self.real is None or self.real.share == 0:
+            return "rendered"
+        names = ", ".join(names_of(self.real.folders))
+        return f"from the recordings {names}" + (
+            f" in {self.real.share:.0%} of the batches" if self.real.share < 1 else ""
+        )
+
+    def material(self, clip: int, processes: int = 1) -> Material:
+        """Source of the batch that holds a clip: recordings, or renderings."""
+        if self.real is not None and is_recorded(self.seed, clip // (self.batch_size * processes), self.real):
+            return Material(recordings=names_of(self.real.folders))
+        return Material(photographs=names_of([self.textures])[0] if self.textures else "")
 
     def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
         """Batches of this process, from the position on."""

@@ -33,17 +33,38 @@ class RealData:
     """Selection of recordings to train on.
 
     Attributes:
-        folders: sequence folders with ground truth.
+        folders: sequence folders with ground truth; a single one may stand without a list.
         share: of the batches; the others are rendered.
         hops: frame gaps, one drawn a clip.
         flow_low, flow_high: mean induced flow between neighbouring frames, pixels, that a clip with depth should have.
     """
 
-    folders: list[str] = field(default_factory=list)
+    folders: list[str] | str = field(default_factory=list)
     share: float = 1.0
     hops: list[int] = field(default_factory=lambda: [1, 2, 3])
     flow_low: float = 1.0
     flow_high: float = 20.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.folders, str):
+            self.folders = [self.folders]
+
+    def check(self) -> None:
+        """Check the settings, which the command line does not do.
+
+        Raises:
+            DvoError: no folder, a share outside of 0 to 1, or a gap below 1.
+        """
+        if not self.folders:
+            raise DvoError(
+                "no recordings are named",
+                field="data.real.folders",
+                remedy="name a folder, or leave out data.real to train on renderings",
+            )
+        if not 0 <= self.share <= 1:
+            raise DvoError(f"{self.share:g} is no share", field="data.real.share", remedy="give a number from 0 to 1")
+        if not self.hops or min(self.hops) < 1:
+            raise DvoError(f"{self.hops} are no gaps", field="data.real.hops", remedy="give numbers of 1 or more")
 
 
 class RealClips(Dataset[dict[str, Tensor]]):

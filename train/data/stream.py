@@ -8,6 +8,8 @@ from typing import Any
 import lightning as L
 from torch.utils.data import Sampler
 
+from train.engine.provenance import Material
+
 
 class StreamSampler(Sampler[int]):
     """Indices from a start on, without end: clip ``i`` is the same whenever training is resumed.
@@ -50,3 +52,16 @@ class ClipStream(L.LightningDataModule):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go to a position."""
         self.clips_seen = int(state_dict["clips_seen"])
+
+    def summary(self) -> str:
+        """Description of the clips in a few words."""
+        return type(self).__name__
+
+    def material(self, clip: int, processes: int = 1) -> Material:
+        """Source of the batch that holds a clip, for the model card; unknown unless a derived class says it.
+
+        Args:
+            clip: index.
+            processes: number of training processes.
+        """
+        return Material(other=type(self).__name__)

@@ -14,6 +14,7 @@ from dvo.errors import DvoError
 from dvo.models.registry import DEFAULT_ARCHITECTURE, build_network, network_class, preset_name
 from dvo.models.weights import LoadedWeights, load_weights
 from train.engine.build import make_task, task_settings
+from train.engine.provenance import Provenance, clips_seen
 from train.tasks.registry import DEFAULT_TASK
 from train.tasks.task import Task
 
@@ -104,21 +105,19 @@ def task_of(state: State, **changes: Any) -> Task:
 
 
 def facts_of(state: State) -> dict[str, Any]:
-    """Facts of a training state for the model card: steps, clips, seed, preset, licence, data."""
+    """Facts of a training state for the model card: steps, clips, seed, preset, licence, data, starting weights."""
     said = state.get("network", {})
     settings = state["hyper_parameters"]
     preset = settings.get("model")
     if "config" in said:
         network = network_class(said["architecture"])
         preset = preset_name(network, network.config_type.from_dict(said["config"]))
-    streams = (value for value in state.values() if isinstance(value, Mapping))
     return {
         "steps": state["global_step"],
-        "clips": next((stream["clips_seen"] for stream in streams if "clips_seen" in stream), None),
+        "clips": clips_seen(state),
         "seed": settings.get("seed"),
         "preset": preset,
-        "licence": "MIT",
-        "data": "renderings of dvo.synth only",
+        **Provenance.of_state(state).facts(),
     }
 
 

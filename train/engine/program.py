@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,8 @@ from torch import Tensor
 
 from dvo.errors import DvoError
 from dvo.models.registry import as_network
+from dvo.models.weights import LoadedWeights
+from train.engine.provenance import KEY, Provenance, material_of
 from train.engine.ranks import all_agree, world_size
 from train.engine.rates import constant_rate, one_cycle_rate
 from train.engine.recovery import LastGood, weights_finite
@@ -49,6 +52,12 @@ class EngineSettings:
     bad_steps: int = 5
     keep_every: int = 50
 
+    def schedule(self) -> Callable[[int], float]:
+        """Factor of the learning rate by step, counted from the first step of the state."""
+        if self.cycle:
+            return one_cycle_rate(self.cycle)
+        return constant_rate(self.warmup, self.decay_from, self.decay_steps)
+
 
 class TrainingProgram(L.LightningModule):
     """Trains the network of a task on clips.
@@ -65,6 +74,8 @@ class TrainingProgram(L.LightningModule):
     Attributes:
         net: the network in training.
         average: moving average of its weights.
+        provenance: what the network has been trained on.
+        new_run: take rates from the settings, and callbacks as they are, not from the state that is loaded.
 
     Raises:
         DvoError: a network that does not name its architecture and sizes.
@@ -90,6 +101,8 @@ class TrainingProgram(L.LightningModule):
         self._bad_in_a_row = 0
         self._bad = False
         self._last_good = LastGood()
+        self.provenance = Provenance()
+        self.new_run = False
         self._clock = time.perf_counter()
         as_network(self.net)
 
@@ -131,8 +144,10 @@ class TrainingProgram(L.LightningModule):
     def _count_clips(self, clips: int) -> None:
         """The position in the data is saved with the weights, so it moves before a checkpoint can be written."""
         data = getattr(self._trainer, "datamodule", None)
+        first, clips = getattr(data, "clips_seen", 0), clips * world_size()
+        self.provenance = self.provenance.after(clips, material_of(data, first, world_size()))
         if hasattr(data, "clips_seen"):
-            data.clips_seen += clips * world_size()
+            data.clips_seen += clips
 
     # -- the optimiser -------------------------------------------------------------------------------------------
 
@@ -140,8 +155,7 @@ class TrainingProgram(L.LightningModule):
         """AdamW with the configured schedule of rates, a step at a time."""
         s = self.settings
         optimizer = torch.optim.AdamW(self.net.parameters(), s.learning_rate, weight_decay=s.weight_decay)
-        rate = one_cycle_rate(s.cycle) if s.cycle else constant_rate(s.warmup, s.decay_from, s.decay_steps)
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, s.schedule())
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
@@ -213,6 +227,7 @@ class TrainingProgram(L.LightningModule):
         checkpoint["network"] = {"architecture": network.architecture, "config": network.config.to_dict()}
         own = {"recovered": self.recovered, "bad_in_a_row": self._bad_in_a_row}
         checkpoint["training"] = self.task.state_dict() | own
+        checkpoint[KEY] = self.provenance.to_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restore the state that is not a tensor.
@@ -220,21 +235,85 @@ class TrainingProgram(L.LightningModule):
         Raises:
             DvoError: the state of another task.
         """
-        name = checkpoint.get("task", DEFAULT_TASK)
-        if name != self.task_name:
-            raise DvoError(
-                f"the state is of the task '{name}', the configuration names '{self.task_name}'",
-                field="task",
-                remedy="begin in another folder, or correct the configuration",
-            )
+        self.check_task(checkpoint)
         data = getattr(self._trainer, "datamodule", None)
         if hasattr(data, "clips_seen") and type(data).__qualname__ not in checkpoint:
             rank_zero_warn(f"the state holds no position in {type(data).__qualname__}: its clips start from the first")
+        self.provenance = Provenance.of_state(checkpoint)
+        if self.new_run:
+            checkpoint["callbacks"] = {}  # they know the files of another run
+            self._renew_rates(checkpoint)
         state = checkpoint.get("training")  # absent in checkpoints of the time before the balance
         if state is None:
             return
         self.task.load_state_dict(state)
         self.recovered, self._bad_in_a_row = state["recovered"], state["bad_in_a_row"]
+
+    def check_task(self, checkpoint: Mapping[str, Any], file: object | None = None) -> None:
+        """Check that a training state is of the task of this program.
+
+        Raises:
+            DvoError: it is of another.
+        """
+        name = checkpoint.get("task", DEFAULT_TASK)
+        if name != self.task_name:
+            raise DvoError(
+                f"the state is of the task '{name}', the configuration names '{self.task_name}'",
+                file=file,
+                field="task",
+                remedy="begin another run with --name, or correct the configuration",
+            )
+
+    def _renew_rates(self, checkpoint: dict[str, Any]) -> None:
+        """Put the rates of the settings, at the step of the state, in place of those of its optimiser."""
+        base, decay = self.settings.learning_rate, self.settings.weight_decay
+        now = base * self.settings.schedule()(checkpoint["global_step"])
+        for scheduler in checkpoint.get("lr_schedulers", []):
+            groups = len(scheduler["base_lrs"])
+            scheduler |= {"base_lrs": [base] * groups, "_last_lr": [now] * groups}
+        for optimizer in checkpoint.get("optimizer_states", []):
+            for group in optimizer["param_groups"]:
+                group |= {"lr": now, "initial_lr": base, "weight_decay": decay}
+
+    def start_from(self, weights: LoadedWeights) -> None:
+        """Take over trained weights, before the first step.
+
+        Raises:
+            DvoError: weights of another network.
+        """
+        file = weights.info.path if weights.info else weights.name
+        network = as_network(self.net)
+        if weights.architecture != network.architecture:
+            raise DvoError(
+                f"holds a network '{weights.architecture}', the task trains '{network.architecture}'",
+                file=file,
+                remedy="give weights of that network, or name another task",
+            )
+        tensors = weights.model.state_dict()
+        check_tensors(self.net, tensors, file)
+        for module in (self.net, self.average):
+            module.load_state_dict(tensors)
+        self.task.trained_weights_loaded({name: getattr(self, name) for name in self._task_buffers})
+        self.provenance = Provenance.of_weights(weights)
+
+
+def check_tensors(network: torch.nn.Module, tensors: Mapping[str, Tensor], file: object) -> None:
+    """Check that tensors are those of a network, by name and shape.
+
+    Raises:
+        DvoError: they are not; names the first that differs.
+    """
+    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    theirs = {name: tuple(value.shape) for name, value in tensors.items()}
+    for name in sorted({*shapes, *theirs}):
+        if shapes.get(name) != theirs.get(name):
+            raise DvoError(
+                f"has {theirs.get(name, 'nothing')} where the network of the configuration has "
+                f"{shapes.get(name, 'nothing')}",
+                file=file,
+                field=name,
+                remedy="name the network that the file holds, for instance with --model.model",
+            )
 
 
 def clips_in(batch: Batch) -> int:

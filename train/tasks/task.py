@@ -95,6 +95,9 @@ class Task(Protocol):
         """State of the task that is a tensor: saved by name beside the weights, and moved to their device."""
         return {}
 
+    def trained_weights_loaded(self, buffers: Mapping[str, Tensor]) -> None:
+        """Training starts from trained weights and not from random ones; state in the buffers may say so."""
+
     def state_dict(self) -> dict[str, Any]:
         """Further state of the task, for checkpoints."""
         return {}

@@ -68,7 +68,7 @@ class TrackWhileTraining(L.Callback):
     its states, and the time is left out of its timing.
 
     Args:
-        dirpath: folder of the run.
+        dirpath: folder of the run; None: that of the trainer.
         every: steps between validations.
         rendered: number of rendered clips.
         frames: length of each of them.
@@ -81,7 +81,7 @@ class TrackWhileTraining(L.Callback):
 
     def __init__(
         self,
-        dirpath: str,
+        dirpath: str | None = None,
         every: int = 1000,
         rendered: int = 2,
         frames: int = 40,
@@ -91,7 +91,7 @@ class TrackWhileTraining(L.Callback):
         real_frames: int = 40,
         limit_s: float = 60.0,
     ) -> None:
-        self.folder, self.every, self.limit_s = Path(dirpath) / "pictures", every, limit_s
+        self.dirpath, self.every, self.limit_s = dirpath, every, limit_s
         self.rendered, self.frames, self.size, self.fps = rendered, frames, size, fps
         self.sequences, self.real_frames = sequences or [], real_frames
         self._clips: list[Clip] | None = None
@@ -128,7 +128,7 @@ class TrackWhileTraining(L.Callback):
         pl_module.leave_out_of_timing(time.perf_counter() - start)
 
     def _validate(self, trainer: L.Trainer, program: Any, start: float) -> None:
-        step = trainer.global_step
+        step, folder = trainer.global_step, Path(self.dirpath or trainer.default_root_dir) / "pictures"
         if self._clips is None:
             self._clips = [*self._rendered_clips(), *self._real_clips()]
             start = time.perf_counter()  # reading and rendering them is paid once
@@ -143,7 +143,7 @@ class TrackWhileTraining(L.Callback):
             found[f"track/{name}/rotation_ratio"] = m.rotation_error_ratio
             image = None if flow is None else image_at(frames, flow.timestamp, flow.pixels)
             title = f"{name}, step {step}: ATE {m.ate_percent:.1f} %"
-            picture = draw(self.folder / f"{name}_{step:07d}.png", title, done.result.trajectory, truth, flow, image)
+            picture = draw(folder / f"{name}_{step:07d}.png", title, done.result.trajectory, truth, flow, image)
             for logger in trainer.loggers:
                 if hasattr(logger.experiment, "add_image"):
                     logger.experiment.add_image(f"track/{name}", picture, step, dataformats="HWC")

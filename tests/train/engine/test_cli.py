@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from train.__main__ import main
+from train.__main__ import COMMANDS, main
 from train.engine.cli import named_task
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "train"
@@ -54,7 +54,8 @@ def test_the_task_is_named_by_the_configuration(tmp_path):
     "command",
     ["study --config {0}/none", "export {0}/none {0}/out", "state {0}/none.ckpt {0}/out", "snr {0}/none.ckpt",
      "validate {0}/none.ckpt", "validate {0}/none", "export {0}/noise {0}/out", "validate {0}/noise.ckpt",
-     "export {0}/other.ckpt {0}/out", "fit --config {0}/unknown.yaml", "fit --task no.such_module:Class"],
+     "export {0}/other.ckpt {0}/out", "fit --config {0}/unknown.yaml", "fit --task no.such_module:Class",
+     "nonsense", "", "--config {0}/unknown.yaml"],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_code_2(command, tmp_path, monkeypatch, capsys):
     for name in ("noise", "noise.ckpt"):
@@ -67,3 +68,10 @@ def test_bad_input_is_one_line_and_code_2(command, tmp_path, monkeypatch, capsys
     assert stopped.value.code == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("error: ") and not (tmp_path / "out").exists()
+
+
+def test_help_names_the_commands(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["train", "--help"])
+    main()
+    said = capsys.readouterr().out
+    assert all(f"``{command}" in said for command in COMMANDS) and "--resume" in said

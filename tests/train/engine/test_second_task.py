@@ -57,7 +57,6 @@ def configuration(folder, steps, watched=False):
     folder.mkdir(exist_ok=True)
     saver = {"dirpath": str(folder), "save_last": True, "every_n_train_steps": 1, "enable_version_counter": False}
     watch = {
-        "dirpath": str(folder),
         "every": 4 if watched else 100,
         "rendered": int(watched),
         "frames": 4,
@@ -69,14 +68,11 @@ def configuration(folder, steps, watched=False):
             "accelerator": "cpu", "devices": 1, "max_epochs": -1, "max_steps": steps, "log_every_n_steps": 1,
             "enable_progress_bar": False, "enable_model_summary": False, "use_distributed_sampler": False,
             "default_root_dir": str(folder),
-            "logger": {"class_path": "lightning.pytorch.loggers.CSVLogger",
-                       "init_args": {"save_dir": str(folder), "name": "csv"}},
             "callbacks": [
                 {"class_path": "lightning.pytorch.callbacks.ModelCheckpoint", "init_args": saver},
                 {"class_path": "train.validation.watch.TrackWhileTraining", "init_args": watch},
             ],
         },
-        "ckpt_path": "last",
         "model": {"channels": 6, "learning_rate": 1e-2, "loss": {"weight": 2.0}},
         "data": {"frames": 2, "sizes": [[48, 64]], "workers": 0, "seed": 5},
     }  # fmt: skip
@@ -85,11 +81,10 @@ def configuration(folder, steps, watched=False):
     return file
 
 
-@pytest.mark.filterwarnings("ignore:.*ckpt_path=.*last:UserWarning")
 def test_from_a_configuration_to_a_trajectory(tmp_path, command, capsys):
     command("fit", "--config", configuration(tmp_path / "whole", 4, watched=True))
     command("fit", "--config", configuration(tmp_path / "parts", 2))
-    command("fit", "--config", configuration(tmp_path / "parts", 4))
+    command("fit", "--config", configuration(tmp_path / "parts", 4), "--resume")
     whole, parts = (read_state(tmp_path / name / "last.ckpt") for name in ("whole", "parts"))
     assert whole["global_step"] == parts["global_step"] == 4 and whole["task"] == NAME
     assert whole["Renderings"] == parts["Renderings"] == {"clips_seen": 4}

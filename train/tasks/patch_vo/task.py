@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -97,6 +98,10 @@ class PatchVOTask(Task):
     def buffers(self) -> dict[str, Tensor]:
         """``within_quarter``: running share of good flow; ``warming``: whether the warm-up goes on."""
         return {"within_quarter": torch.zeros(()), "warming": torch.tensor(self.warmup_until > 0)}
+
+    def trained_weights_loaded(self, buffers: Mapping[str, Tensor]) -> None:
+        """End the warm-up, which is for a network that does not see flow yet."""
+        buffers["warming"].fill_(False)
 
     def state_dict(self) -> dict[str, Any]:
         """State of the balance."""

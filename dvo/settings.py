@@ -14,6 +14,17 @@ from dvo.yaml_files import parse_yaml, read_yaml
 Range = tuple[float, float]
 
 
+def shown(value: Any, limit: int = 60) -> str:
+    """The value in a message, cut if it is long.
+
+    Args:
+        value: anything.
+        limit: characters.
+    """
+    text = repr(value)
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."
+
+
 def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
     """Check type and range of the numbers of a settings dataclass.
 
@@ -28,18 +39,20 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
     for item in fields(settings):
         value, kind = getattr(settings, item.name), hints[item.name]
         if kind is int and (isinstance(value, bool) or not isinstance(value, int)):
-            raise DvoError(f"must be a whole number, got {value!r}", field=item.name, remedy="give a whole number")
+            raise DvoError(f"must be a whole number, got {shown(value)}", field=item.name, remedy="give a whole number")
         if kind is float and (
             isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value)
         ):
-            raise DvoError(f"must be a number, got {value!r}", field=item.name, remedy="give a finite number")
+            raise DvoError(f"must be a number, got {shown(value)}", field=item.name, remedy="give a finite number")
         if kind in (bool, str) and not isinstance(value, kind):
-            raise DvoError(f"must be a {kind.__name__}, got {value!r}", field=item.name, remedy="see its description")
+            raise DvoError(
+                f"must be a {kind.__name__}, got {shown(value)}", field=item.name, remedy="see its description"
+            )
         if item.name in ranges:
             low, high = ranges[item.name]
             if not low <= value <= high:
                 limits = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
-                raise DvoError(f"out of range: {value}", field=item.name, remedy=f"give a number {limits}")
+                raise DvoError(f"out of range: {shown(value)}", field=item.name, remedy=f"give a number {limits}")
 
 
 def parse_settings(items: Iterable[str]) -> dict[str, Any]:
@@ -66,7 +79,9 @@ def parse_settings(items: Iterable[str]) -> dict[str, Any]:
         except DvoError:
             value = None
         if not name.isidentifier() or value is None:
-            raise DvoError(f"not a setting: {item!r}", field=name or None, remedy="give NAME=VALUE, such as patches=48")
+            raise DvoError(
+                f"not a setting: {shown(item)}", field=name or None, remedy="give NAME=VALUE, such as patches=48"
+            )
         found[name] = value
     return found
 

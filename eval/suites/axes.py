@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from dvo.errors import DvoError
-from eval.suites.fields import Range, build
+from dvo.settings import Range
+from eval.suites.fields import build
 
 Table = dict[str, Any]
 _SEED = (0, 2**53)

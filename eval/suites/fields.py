@@ -10,9 +10,9 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from dvo.errors import DvoError
+from dvo.settings import Range, shown
 
 T = TypeVar("T")
-Range = tuple[float, float]
 
 LONGEST = 200  # characters of a text
 NOUNS = {
@@ -52,13 +52,13 @@ def build(kind: type[T], entry: Any, file: Path, place: str = "") -> T:
     """
     noun = kind.__name__.lower()
     if not isinstance(entry, dict):
-        message = f"expected a table of settings ({noun}), got {shown(entry)}"
+        message = f"expected a table of settings ({noun}), got {_shown(entry)}"
         raise DvoError(message, file=file, field=place or None, remedy="give a table: {name: value, ...}")
     known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     unknown = [name for name in entry if name not in known]
     if unknown:
         remedy = f"known are {', '.join(sorted(known))}"
-        raise DvoError(f"unknown setting {shown(unknown[0])}", file=file, field=place or None, remedy=remedy)
+        raise DvoError(f"unknown setting {_shown(unknown[0])}", file=file, field=place or None, remedy=remedy)
     needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
     missing = [name for name in needed if name not in entry]
     if missing:
@@ -75,7 +75,7 @@ def build(kind: type[T], entry: Any, file: Path, place: str = "") -> T:
             if not low <= value <= high:
                 limits = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
                 raise DvoError(
-                    f"out of range: {shown(value)}", file=file, field=field, remedy=f"give a number {limits}"
+                    f"out of range: {_shown(value)}", file=file, field=field, remedy=f"give a number {limits}"
                 )
     return kind(**values)
 
@@ -97,7 +97,7 @@ def typed(value: Any, hint: Any, file: Path, field: str) -> Any:
     if origin is Literal:
         if not isinstance(value, str) or value not in inner:
             remedy = f"choose one of {', '.join(map(str, inner))}"
-            raise DvoError(f"unknown: {shown(value)}", file=file, field=field, remedy=remedy)
+            raise DvoError(f"unknown: {_shown(value)}", file=file, field=field, remedy=remedy)
         return value
     if origin is dict:
         if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
@@ -117,14 +117,12 @@ def typed(value: Any, hint: Any, file: Path, field: str) -> Any:
     return value
 
 
-def shown(value: Any) -> str:
-    """The value in a message, cut if it is long."""
+def _shown(value: Any) -> str:
     if isinstance(value, (dict, list, tuple)):
         return "a table" if isinstance(value, dict) else "a list"
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return shown(value)
 
 
 def _wrong(value: Any, kind: type, file: Path, field: str, noun: str | None = None) -> DvoError:
-    message = f"must be {noun or NOUNS[kind]}, got {shown(value)}"
+    message = f"must be {noun or NOUNS[kind]}, got {_shown(value)}"
     return DvoError(message, file=file, field=field, remedy=REMEDIES[kind])

@@ -12,9 +12,10 @@ from dvo.data.source import Source, open_source
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.metrics import Alignment, associate
+from dvo.settings import Range
 from dvo.yaml_files import read_yaml
 from eval.suites.axes import Axes, choose, expand, read_axes
-from eval.suites.fields import Range, build
+from eval.suites.fields import build
 from eval.suites.rendered import rendered_folder
 
 ROOT = Path(__file__).resolve().parents[2]

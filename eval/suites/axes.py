@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from dvo.errors import DvoError
-from dvo.settings import Range
-from eval.suites.fields import build
+from dvo.settings import Range, from_table
 
 Table = dict[str, Any]
 _SEED = (0, 2**53)
@@ -84,7 +83,7 @@ def read_axes(table: Any, file: Path) -> Axes:
     Raises:
         DvoError: a setting is missing, unknown, of another type or out of range.
     """
-    found = build(Axes, table, file)
+    found = from_table(Axes, table, file)
     lists: dict[str, tuple[Any, ...] | None] = {"families": found.families}
     lists |= {f"axes: {name}: families": axis.families for name, axis in found.axes.items()}
     lists |= {f"tiers: {name}: sizes": tier.sizes for name, tier in found.tiers.items()}

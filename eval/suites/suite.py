@@ -12,15 +12,15 @@ from dvo.data.source import Source, open_source
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.metrics import Alignment, associate
-from dvo.settings import Range
+from dvo.settings import Range, from_table
 from dvo.yaml_files import read_yaml
 from eval.suites.axes import Axes, choose, expand, read_axes
-from eval.suites.fields import build
 from eval.suites.rendered import rendered_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITES = ROOT / "configs" / "eval"
 AXES = "axes"  # the file of the rendered suites, and the name of them all
+LONGEST_NAME = 100
 Judge = Literal["ate_percent", "rpe_rot_deg"]
 
 
@@ -147,20 +147,27 @@ def _suite(table: Any, path: Path) -> Suite:
     """Suite from its table, every entry checked."""
     if not isinstance(table, dict) or not isinstance(table.get("sequences"), list):
         raise DvoError("no list of sequences", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
-    suite = build(Suite, table, path)
+    suite = from_table(Suite, table, path)
     names = [sequence.name for sequence in suite.sequences]
     for number, sequence in enumerate(suite.sequences):
         place = f"sequences[{number}]"
-        if not sequence.name:
-            raise DvoError("empty", file=path, field=f"{place}: name", remedy="give a name")
+        _check_name(sequence.name, f"{place}: name", path)
         if sequence.name in names[:number]:
             raise DvoError(f"twice the name '{sequence.name}'", file=path, field=place, remedy="give another name")
         if not sequence.path and sequence.rendered is None:
             raise DvoError(f"{sequence.name} has no path", file=path, field=f"{place}: path", remedy="add it")
-    if not names or not suite.name:
-        field = "name" if names else "sequences"
-        raise DvoError("empty", file=path, field=field, remedy="see configs/eval/validation.yaml")
+    _check_name(suite.name, "name", path)
+    if not names:
+        raise DvoError("empty", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
     return suite
+
+
+def _check_name(name: str, field: str, path: Path) -> None:
+    if not name.strip():
+        raise DvoError("empty", file=path, field=field, remedy="give a name")
+    if len(name) > LONGEST_NAME:  # it becomes the name of a folder
+        message = f"longer than {LONGEST_NAME} characters"
+        raise DvoError(message, file=path, field=field, remedy="give a shorter name")
 
 
 def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, Trajectory]:

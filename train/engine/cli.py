@@ -10,6 +10,7 @@ import yaml
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from train.engine.build import program_factory
+from train.engine.config_files import check_files
 from train.tasks.registry import DEFAULT_TASK, task_class
 
 
@@ -60,8 +61,9 @@ def train() -> None:
     """Run LightningCLI on the command line of this process.
 
     Raises:
-        DvoError: no such task.
+        DvoError: no such task, or a configuration that is not valid YAML.
     """
+    check_files(sys.argv[1:])
     task = named_task(sys.argv[1:])
     TaskCLI(
         program_factory(task),

@@ -250,7 +250,7 @@ def test_broken_obj(tmp_path: Path, case: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("../secret.png", "names a file outside"), ("/dev/zero", "names a file outside"), ("cut.jpg", "cut.jpg: a picture"),
+    [("../secret.png", "names a file outside"), ("/dev/zero", "names a file outside"), ("cut.jpg", "jpg: a picture"),
      ("huge.png", "huge: a picture of 30000x30000 pixels"), ("pipe", "names no regular file")],
 )  # fmt: skip
 def test_pictures_of_an_obj(tmp_path: Path, name: str, message: str) -> None:

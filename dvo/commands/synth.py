@@ -38,8 +38,9 @@ def preview(arguments: argparse.Namespace) -> int:
     if not out.parent.is_dir() or out.suffix.lower() not in (".png", ".jpg"):
         raise DvoError("cannot be written", file=out, field="--out", remedy="name a .png in a folder that exists")
     width, height = arguments.size
-    if (arguments.rows or len(FAMILIES)) * width * height > MOST_PIXELS:
-        message = f"too large: {arguments.rows or len(FAMILIES)} rows of {width}x{height} pixels"
+    most = arguments.rows or len(list(FAMILIES))
+    if most * width * height > MOST_PIXELS:
+        message = f"too large: {most} rows of {width}x{height} pixels"
         raise DvoError(message, field="--size, --rows", remedy="give a smaller size or fewer rows")
     if arguments.source == "clips":  # what training sees
         sheet = contact_sheet(

@@ -118,7 +118,8 @@ def _loader() -> Any:
 
         def __init__(self, text: str) -> None:
             super().__init__(text)
-            self._depth, self._extents = 0, {}  # of finished nodes by identity: number of values and levels in them
+            self._depth = 0
+            self._extents: dict[int, tuple[int, int]] = {}  # of finished nodes by identity: values and levels in them
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             mark = self.peek_event().start_mark

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from dvo.errors import DvoError
 
+MAX_BYTES = 2 * 1024**3
+"""Largest file; the training state of the ``full`` network has 60 MB."""
+
 
 def load_pickle(file: str | Path, remedy: str) -> Any:
     """Read a file that ``torch.save`` wrote, onto the CPU.
@@ -30,6 +33,8 @@ def load_pickle(file: str | Path, remedy: str) -> Any:
     path = Path(file)
     if not path.is_file():
         raise DvoError("no such file", file=path, remedy=remedy)
+    if path.stat().st_size > MAX_BYTES:
+        raise DvoError(f"larger than {MAX_BYTES // 1024**3} GB", file=path, remedy=remedy)
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:

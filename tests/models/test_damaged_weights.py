@@ -164,3 +164,12 @@ def test_weights_that_cannot_be_written(tmp_path):
         save_weights(tmp_path / "file" / "w.safetensors", PatchVO(preset("tiny")), {})
     with pytest.raises(DvoError, match="cannot be written"):
         save_weights(tmp_path, PatchVO(preset("tiny")), {})
+
+
+def test_a_checkpoint_of_4_gb_is_not_read(tmp_path):
+    path = tmp_path / "x.pth"
+    torch.save({"w": torch.zeros(3)}, path)
+    with path.open("r+b") as file:
+        file.truncate(4 * 1024**3)  # without taking the place on the disk
+    with pytest.raises(DvoError, match="larger than 2 GB"):
+        import_checkpoint(path, tmp_path / "out.safetensors")

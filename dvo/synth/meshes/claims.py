@@ -225,6 +225,8 @@ class FolderFiles:
             raise DvoError("names a huge file", file=self.mesh, field=text[:200], remedy=DECIMATE)
         size = image_size(place)
         check_picture(size, self.mesh, text[:200])
+        if size is not None and place.stat().st_size > MAX_JSON:
+            raise DvoError("names a huge picture", file=self.mesh, field=text[:200], remedy="replace the picture")
         data = place.read_bytes()
         if size is not None and not is_complete(data):
             raise DvoError(

@@ -43,6 +43,7 @@ def photographs() -> list[tuple[np.ndarray, str]]:
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 MOST_PHOTOGRAPHS, EDGE = 96, 1024  # of a folder: how many a pool takes, and their longer edge in pixels
+MOST_BYTES = 256 * 1024**2  # of a photograph
 TAGS = {tag for _, tag in (*PATTERNS.values(), *SPECIAL.values())} | {"photo"}
 
 
@@ -100,7 +101,7 @@ def _read(file: Path) -> np.ndarray:
         )
     image = None
     try:
-        data = file.read_bytes() if size is not None else b""
+        data = file.read_bytes() if size is not None and file.stat().st_size <= MOST_BYTES else b""
         if is_complete(data):
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except (OSError, cv2.error):

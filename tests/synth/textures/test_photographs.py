@@ -52,3 +52,11 @@ def test_a_huge_picture_is_not_decoded(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(huge_png())
     with pytest.raises(DvoError, match="huge: 30000x30000 pixels, 64 million at most"):
         folder_photographs(tmp_path, 0)
+
+
+def test_a_file_of_4_gb_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(coded(".jpg"))
+    with (tmp_path / "a.jpg").open("r+b") as file:
+        file.truncate(4 * 1024**3)  # without taking the place on the disk
+    with pytest.raises(DvoError, match="cannot be read as a picture"):
+        folder_photographs(tmp_path, 0)

@@ -71,7 +71,7 @@ def load_mesh(
     except ImportError:
         raise DvoError("meshes need trimesh", field="mesh", remedy="pip install 'dvo[synth]'") from None
     check_claims(path)
-    files = FolderFiles(path)
+    files: Any = FolderFiles(path)  # has the methods of a Resolver of trimesh
     with _reading(path):
         loaded = trimesh.load_scene(str(path), resolver=files, process=False)  # processing would hide defects
     if files.refused is not None:

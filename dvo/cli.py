@@ -83,7 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="family, mesh file (glTF, OBJ, PLY), or 'clips'; default: all families",
     )
     preview.add_argument("--out", metavar="FILE", required=True, help="PNG to write")
-    preview.add_argument("--rows", type=_positive_int, metavar="N", help="rows of a family, mesh or 'clips'")
+    preview.add_argument("--rows", type=_rows, metavar="N", help="rows of a family, mesh or 'clips'")
     _rendering_options(preview, "160x120")
     preview.set_defaults(run="dvo.commands.synth:preview")
     export = verbs.add_parser("export", help="write a sequence with ground truth in the layout of a dataset")
@@ -107,7 +107,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
     parser.add_argument("--size", type=_size, default=_size(size), metavar="WxH", help=f"pixels (default: {size})")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: %(default)s")
+    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="default: %(default)s")
     parser.add_argument("--textures", metavar="DIR", help="folder of photographs for the textures of the scenes")
     parser.add_argument("--up", choices=("y", "z"), help="axis of the mesh that points up (default: y; z for PLY)")
     parser.add_argument(
@@ -143,9 +143,24 @@ def _positive_int(text: str) -> int:
 
 def _size(text: str) -> tuple[int, int]:
     width, separator, height = text.lower().partition("x")
-    if not (separator and width.isdigit() and height.isdigit() and min(int(width), int(height)) >= 16):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT of 16 pixels or more, got {text!r}")
+    digits = all(part.isdecimal() and len(part) < 6 for part in (width, height))
+    if not (separator and digits and all(16 <= int(part) <= 8192 for part in (width, height))):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT from 16 to 8192 pixels, got {text[:60]!r}")
     return int(width), int(height)
+
+
+def _rows(text: str) -> int:
+    value = _positive_int(text)
+    if value > 1000:
+        raise argparse.ArgumentTypeError(f"must be 1000 or less, got {text[:60]}")
+    return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"must be 0 or more and below 2^63, got {text[:60]}")
+    return value
 
 
 def _positive_float(text: str) -> float:

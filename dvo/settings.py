@@ -1,16 +1,48 @@
-"""Checks of settings dataclasses, and reading of settings from text and YAML."""
+"""Settings dataclasses: checks of their values, and reading them from text, tables and YAML files."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from dvo.errors import DvoError
+from dvo.yaml_files import parse_yaml, read_yaml
 
+T = TypeVar("T")
 Range = tuple[float, float]
+
+LONGEST = 10_000  # characters of a text in a table
+_NOUNS = {
+    str: "text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    dict: "a table",
+    tuple: "a list",
+}
+_REMEDIES = {
+    str: "put it in quotes",
+    int: "give digits without quotes",
+    float: "give a finite number, such as 4.0e-4",
+    bool: "give true or false",
+    dict: "write {name: value, ...}",
+    tuple: "write [value, ...]",
+}
+
+
+def shown(value: Any, limit: int = 60) -> str:
+    """The value in a message, cut if it is long.
+
+    Args:
+        value: anything.
+        limit: characters.
+    """
+    text = repr(value)
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."
 
 
 def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
@@ -27,18 +59,20 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
     for item in fields(settings):
         value, kind = getattr(settings, item.name), hints[item.name]
         if kind is int and (isinstance(value, bool) or not isinstance(value, int)):
-            raise DvoError(f"must be a whole number, got {value!r}", field=item.name, remedy="give a whole number")
+            raise DvoError(f"must be a whole number, got {shown(value)}", field=item.name, remedy="give a whole number")
         if kind is float and (
             isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value)
         ):
-            raise DvoError(f"must be a number, got {value!r}", field=item.name, remedy="give a finite number")
+            raise DvoError(f"must be a number, got {shown(value)}", field=item.name, remedy="give a finite number")
         if kind in (bool, str) and not isinstance(value, kind):
-            raise DvoError(f"must be a {kind.__name__}, got {value!r}", field=item.name, remedy="see its description")
+            raise DvoError(
+                f"must be a {kind.__name__}, got {shown(value)}", field=item.name, remedy="see its description"
+            )
         if item.name in ranges:
             low, high = ranges[item.name]
             if not low <= value <= high:
                 limits = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
-                raise DvoError(f"out of range: {value}", field=item.name, remedy=f"give a number {limits}")
+                raise DvoError(f"out of range: {shown(value)}", field=item.name, remedy=f"give a number {limits}")
 
 
 def parse_settings(items: Iterable[str]) -> dict[str, Any]:
@@ -57,17 +91,17 @@ def parse_settings(items: Iterable[str]) -> dict[str, Any]:
         >>> parse_settings(["patches=48", "motion_damping=0.3"])
         {'patches': 48, 'motion_damping': 0.3}
     """
-    import yaml
-
     found = {}
     for item in items:
         name, _, text = (part.strip() for part in item.partition("="))
         try:
-            value = yaml.safe_load(text)
-        except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: dates, digits
+            value = parse_yaml(text)
+        except DvoError:
             value = None
         if not name.isidentifier() or value is None:
-            raise DvoError(f"not a setting: {item!r}", field=name or None, remedy="give NAME=VALUE, such as patches=48")
+            raise DvoError(
+                f"not a setting: {shown(item)}", field=name or None, remedy="give NAME=VALUE, such as patches=48"
+            )
         found[name] = value
     return found
 
@@ -84,17 +118,10 @@ def read_settings(file: str | Path) -> dict[str, Any]:
     Raises:
         DvoError: no such file, or invalid content.
     """
-    import yaml
-
-    path = Path(file)
-    if not path.is_file():
-        raise DvoError("no such file", file=path, remedy="give a YAML file with one 'name: value' a line")
-    try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: encoding, dates, digits
-        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="fix the file") from error
+    remedy = "give a YAML file with one 'name: value' a line"
+    table = read_yaml(file, remedy)
     if not isinstance(table, dict) or not all(isinstance(name, str) for name in table):
-        raise DvoError("not a table of settings", file=path, remedy="give one 'name: value' a line")
+        raise DvoError("not a table of settings", file=file, remedy=remedy)
     return table
 
 
@@ -114,3 +141,98 @@ def check_names(kind: type, values: Mapping[str, Any]) -> None:
         raise DvoError(
             f"unknown setting of {kind.__name__}", field=", ".join(unknown), remedy=f"use one of {', '.join(names)}"
         )
+
+
+def from_table(kind: type[T], entry: Any, file: Path, place: str = "") -> T:
+    """Instance of a dataclass from a table of a YAML file, with the type and the range of every value checked.
+
+    Args:
+        kind: dataclass whose fields are ``str``, ``int``, ``float``, ``bool``, ``Literal[...]``, ``dict[str, X]``,
+            ``tuple[X, ...]``, ``tuple[X, Y]``, ``Any``, another such dataclass, or one of these ``| None``. Its class
+            attribute ``RANGES``, if it has one, gives the smallest and the largest value of fields, both inclusive.
+        entry: the table, as read from the file.
+        file: for messages.
+        place: of the entry in the file, for messages.
+
+    Returns:
+        The instance; lists become tuples.
+
+    Raises:
+        DvoError: not a table; an unknown or missing field; a value of another type or out of range.
+    """
+    noun = kind.__name__.lower()
+    if not isinstance(entry, dict):
+        message = f"expected a table of settings ({noun}), got {_brief(entry)}"
+        raise DvoError(message, file=file, field=place or None, remedy="give a table: {name: value, ...}")
+    known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    unknown = [name for name in entry if name not in known]
+    if unknown:
+        remedy = f"known are {', '.join(sorted(known))}"
+        raise DvoError(f"unknown setting {_brief(unknown[0])}", file=file, field=place or None, remedy=remedy)
+    needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
+    missing = [name for name in needed if name not in entry]
+    if missing:
+        message = f"incomplete {noun}: no {missing[0]}"
+        raise DvoError(message, file=file, field=place or None, remedy="add it")
+    hints = get_type_hints(kind)
+    ranges: Mapping[str, Range] = getattr(kind, "RANGES", {})
+    values = {}
+    for name, value in entry.items():
+        field = f"{place}: {name}" if place else name
+        values[name] = typed(value, hints[name], file, field)
+        if name in ranges:
+            low, high = ranges[name]
+            if not low <= value <= high:
+                limits = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
+                raise DvoError(
+                    f"out of range: {_brief(value)}", file=file, field=field, remedy=f"give a number {limits}"
+                )
+    return kind(**values)
+
+
+def typed(value: Any, hint: Any, file: Path, field: str) -> Any:
+    """The value, if it has the type of an annotation; see :func:`from_table`.
+
+    Raises:
+        DvoError: it has another type, is a number that is not finite, or a very long text.
+    """
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return value
+    if is_dataclass(hint):
+        return from_table(cast(type, hint), value, file, field)
+    if origin in (Union, UnionType):
+        choices = [one for one in inner if one is not NoneType]
+        return None if value is None and NoneType in inner else typed(value, choices[0], file, field)
+    if origin is Literal:
+        if not isinstance(value, str) or value not in inner:
+            remedy = f"choose one of {', '.join(map(str, inner))}"
+            raise DvoError(f"unknown: {_brief(value)}", file=file, field=field, remedy=remedy)
+        return value
+    if origin is dict:
+        if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
+            raise _wrong(value, dict, file, field)
+        return {name: typed(one, inner[1], file, f"{field}: {name}") for name, one in value.items()}
+    if origin is tuple:
+        kinds = inner if inner[-1] is not Ellipsis else (inner[0],) * len(value if isinstance(value, list) else ())
+        if not isinstance(value, list) or len(value) != len(kinds):
+            raise _wrong(value, tuple, file, field, f"a list of {len(kinds)}" if kinds else "a list")
+        return tuple(typed(one, kind, file, f"{field}[{i}]") for i, (one, kind) in enumerate(zip(value, kinds)))  # noqa: B905
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    fits = whole or isinstance(value, float) if hint is float else whole if hint is int else isinstance(value, hint)
+    if not fits or (isinstance(value, float) and not math.isfinite(value)):
+        raise _wrong(value, hint, file, field)
+    if isinstance(value, str) and len(value) > LONGEST:
+        raise _wrong(value, hint, file, field, f"text of {LONGEST} characters at most")
+    return value
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, (dict, list, tuple)):
+        return "a table" if isinstance(value, dict) else "a list"
+    return shown(value)
+
+
+def _wrong(value: Any, kind: type, file: Path, field: str, noun: str | None = None) -> DvoError:
+    message = f"must be {noun or _NOUNS[kind]}, got {_brief(value)}"
+    return DvoError(message, file=file, field=field, remedy=_REMEDIES[kind])

@@ -19,6 +19,8 @@ from dvo.synth.preview import contact_sheet, family_sheet, sequence_rows
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.synth.specs import CameraSpec, MotionSpec, SceneSpec, SequenceFormat, SequenceSpec
 
+MOST_PIXELS = 2**25  # of a column of a contact sheet
+
 
 def preview(arguments: argparse.Namespace) -> int:
     """Write a contact sheet of a family, of a mesh, of training clips or of all families.
@@ -36,6 +38,10 @@ def preview(arguments: argparse.Namespace) -> int:
     if not out.parent.is_dir() or out.suffix.lower() not in (".png", ".jpg"):
         raise DvoError("cannot be written", file=out, field="--out", remedy="name a .png in a folder that exists")
     width, height = arguments.size
+    most = arguments.rows or len(list(FAMILIES))
+    if most * width * height > MOST_PIXELS:
+        message = f"too large: {most} rows of {width}x{height} pixels"
+        raise DvoError(message, field="--size, --rows", remedy="give a smaller size or fewer rows")
     if arguments.source == "clips":  # what training sees
         sheet = contact_sheet(
             arguments.seed, arguments.rows or 8, height=height, width=width, clips_per_scene=1,

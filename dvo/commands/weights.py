@@ -53,10 +53,13 @@ def import_file(arguments: argparse.Namespace) -> int:
     Raises:
         DvoError: the output file exists, or see :func:`dvo.models.weights.import_checkpoint`.
     """
-    out = Path(arguments.out or Path(arguments.file).with_suffix(".safetensors").name)
+    file = Path(arguments.file)
+    if not file.is_file():
+        raise DvoError("no such file", file=arguments.file, remedy="give a DPVO checkpoint (dpvo.pth)")
+    out = Path(arguments.out or file.with_suffix(".safetensors").name)
     if out.exists():
         raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")
-    describe(import_checkpoint(arguments.file, out))
+    describe(import_checkpoint(file, out))
     print(f"use it with: dvo run SOURCE --weights {out}")
     return 0
 
@@ -94,4 +97,5 @@ def describe(weights: WeightsInfo) -> None:
     }
     width = max(map(len, [*facts, *weights.card]))
     for name, value in [*facts.items(), *weights.card.items()]:
-        print(f"{name:<{width}}  {value if isinstance(value, str) else json.dumps(jsonable(value))}")
+        text = value if isinstance(value, str) and value.isprintable() else json.dumps(jsonable(value))
+        print(f"{name if name.isprintable() else json.dumps(name):<{width}}  {text}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dvo.errors import DvoError
+from dvo.models.pickles import check_plain, load_pickle
 from dvo.models.registry import (
     DEFAULT_ARCHITECTURE,
     NetworkConfig,
@@ -26,6 +26,9 @@ from dvo.models.registry import (
 
 FOLDER = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the weights that ship with the package."""
+
+_METADATA = 1_000_000  # characters of the sizes, or of the model card
+_OTHER = "give weights of this network"
 
 
 @dataclass(frozen=True)
@@ -106,9 +109,9 @@ def _open(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         with safe_open(path, framework="pt") as file:
             return {key: file.get_tensor(key) for key in file.keys()}, file.metadata() or {}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
         raise DvoError(
-            f"not a safetensors file ({error})",
+            f"not a safetensors file ({' '.join(str(error).split())[:200]})",
             file=path,
             remedy="give dvo weights; a checkpoint of DPVO is converted by 'dvo weights import FILE'",
         ) from error
@@ -117,20 +120,36 @@ def _open(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 def _parse(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> WeightsInfo:
     architecture = metadata.get("architecture", DEFAULT_ARCHITECTURE)
     network = network_class(architecture, path)
+    values = _table(path, metadata, "config")
     try:
-        config = network.config_type.from_dict(json.loads(metadata["config"]))
-        card = json.loads(metadata.get("card", "{}"))
-    except (KeyError, ValueError, TypeError, AttributeError, DvoError) as error:
+        config = network.config_type.from_dict(values)
+    except (ValueError, TypeError, AttributeError, DvoError) as error:
         raise DvoError(
             f"metadata does not give the sizes of the network ({error})",
             file=path,
             field="config",
             remedy="give dvo weights",
         ) from error
+    card = _table(path, {"card": "{}", **metadata}, "card")
     count = sum(t.numel() for t in tensors.values())
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
     preset = preset_name(network, config)
     return WeightsInfo(path.stem, path, architecture, preset, config, count, len(tensors), digest, card)
+
+
+def _table(path: Path, metadata: dict[str, str], name: str) -> dict[str, Any]:
+    """Table in JSON that the metadata holds under a name."""
+    text = metadata.get(name)
+    try:
+        value = json.loads(text) if text is not None and len(text) <= _METADATA else None
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict):
+        problem = "no" if text is None else "not a table of"
+        content = "sizes of the network" if name == "config" else "facts of a model card"
+        raise DvoError(f"metadata with {problem} {content}", file=path, field=name, remedy="give dvo weights")
+    return value
 
 
 def weights_info(name_or_file: str | Path) -> WeightsInfo:
@@ -163,6 +182,7 @@ def load_weights(name_or_file: str | Path, device: torch.device | str = "cpu") -
     path = find_weights(name_or_file)
     tensors, metadata = _open(path)
     info = _parse(path, tensors, metadata)
+    _compare(_skeleton(info.architecture, info.config), tensors, path)  # before memory of the stated sizes is taken
     model = build_network(info.architecture, info.config)
     _fill(model, tensors, path)
     return LoadedWeights.of(model.to(device).eval(), info.name, info)
@@ -185,15 +205,32 @@ def load_model(name_or_file: str | Path = "small", device: torch.device | str = 
     return load_weights(name_or_file, device).model
 
 
-def _fill(model: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+def _skeleton(architecture: str, config: NetworkConfig) -> nn.Module:
+    """Network with shapes and no memory for its tensors, if it can be built so."""
+    try:
+        with torch.device("meta"):
+            return build_network(architecture, config)
+    except (NotImplementedError, RuntimeError):  # a constructor that reads values of its tensors
+        return build_network(architecture, config)
+
+
+def _compare(model: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+    """Raise DvoError unless names, shapes and kinds of numbers are those of the network."""
     wanted = model.state_dict()
     missing, extra = sorted(set(wanted) - set(tensors)), sorted(set(tensors) - set(wanted))
-    wrong = [k for k in wanted if k in tensors and wanted[k].shape != tensors[k].shape]
-    for problem, names in (("misses", missing), ("has unknown", extra), ("has wrongly shaped", wrong)):
+    shared = [k for k in wanted if k in tensors]
+    wrong = [k for k in shared if wanted[k].shape != tensors[k].shape]
+    kinds = [k for k in shared if wanted[k].is_floating_point() != tensors[k].is_floating_point()]
+    kinds += [k for k in shared if tensors[k].is_complex()]
+    for problem, names in (
+        ("misses", missing), ("has unknown", extra), ("has wrongly shaped", wrong), ("has wrongly typed", kinds),
+    ):  # fmt: skip
         if names:
-            raise DvoError(
-                f"{problem} tensors ({len(names)})", file=path, field=names[0], remedy="give weights of this network"
-            )
+            raise DvoError(f"{problem} tensors ({len(names)})", file=path, field=names[0][:200], remedy=_OTHER)
+
+
+def _fill(model: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
+    _compare(model, tensors, path)
     bad = [k for k, t in tensors.items() if not torch.isfinite(t.float()).all()]
     if bad:
         raise DvoError("holds numbers that are not finite", file=path, field=bad[0], remedy="use another checkpoint")
@@ -210,7 +247,7 @@ def save_weights(path: str | Path, model: nn.Module, card: dict[str, Any], half:
         half: store float16.
 
     Raises:
-        DvoError: a module that does not name its architecture and sizes.
+        DvoError: a module that does not name its architecture and sizes, or a file that cannot be written.
     """
     network = as_network(model)
     dtype = torch.float16 if half else torch.float32
@@ -222,8 +259,11 @@ def save_weights(path: str | Path, model: nn.Module, card: dict[str, Any], half:
         "architecture": network.architecture, "config": json.dumps(network.config.to_dict()), "card": json.dumps(card),
         "format": "pt",
     }  # fmt: skip
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    save_file(tensors, path, metadata)
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, path, metadata)
+    except (OSError, SafetensorError) as error:
+        raise DvoError(f"cannot be written ({error})", file=path, remedy="give a file in another folder") from error
 
 
 def import_checkpoint(file: str | Path, out: str | Path) -> WeightsInfo:
@@ -240,26 +280,19 @@ def import_checkpoint(file: str | Path, out: str | Path) -> WeightsInfo:
     Raises:
         DvoError: no such file, not such a checkpoint, or one that holds more than tensors.
     """
-    file = Path(file)
-    if not file.is_file():
-        raise DvoError("no such file", file=file, remedy="give a DPVO checkpoint (dpvo.pth)")
-    try:
-        state = torch.load(file, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DvoError(
-            f"cannot be read as plain tensors ({reason})", file=file, remedy="give an unmodified DPVO checkpoint"
-        ) from error
+    file, remedy = Path(file), "give an unmodified DPVO checkpoint (dpvo.pth)"
+    state = load_pickle(file, remedy)
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise DvoError("holds no state dict", file=file, remedy="give a DPVO checkpoint (dpvo.pth)")
-    tensors = {key.removeprefix("module."): value.float() for key, value in state.items()}
+    if not isinstance(state, dict) or not state:
+        raise DvoError("holds no state dict", file=file, remedy=remedy)
+    check_plain(state, file, remedy)
+    tensors = {key.removeprefix("module."): value.detach() for key, value in state.items()}
     tensors.pop("update.lmbda", None)
     model = build_network("patch_vo", network_class("patch_vo").presets["full"])
+    _compare(model, tensors, file)
     for name in ("patchify.fnet.conv1.weight", "patchify.inet.conv1.weight"):
-        if name in tensors and tensors[name].ndim == 4:
-            tensors[name] = tensors[name].flip(1)
+        tensors[name] = tensors[name].flip(1)
     _fill(model, tensors, file)
     save_weights(out, model, {"origin": "DPVO checkpoint", "file": file.name}, half=False)
     return weights_info(out)

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from dvo.errors import DvoError
+from dvo.settings import check_names, check_settings, shown
+
+# Smallest and largest sizes; the largest are far beyond networks of use, and keep a file from claiming the memory.
+RANGES = {
+    "stem_channels": (1, 512),
+    "trunk_channels": (1, 512),
+    "feature_channels": (1, 1024),
+    "hidden_channels": (1, 2048),
+    "patch_size": (1, 9),
+    "radius": (1, 16),
+    "training_patches": (1, 100_000),
+}
+LEVELS, COARSEST, CORRELATIONS = 8, 64, 16_384  # of the pyramid: levels and largest factor; channels of an edge
 
 
 @dataclass(frozen=True)
@@ -25,7 +38,7 @@ class ModelConfig:
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`.
 
     Raises:
-        DvoError: a size below 1, or an even patch.
+        DvoError: a size of another type or out of :data:`RANGES`, or an even patch.
     """
 
     stem_channels: int = 32
@@ -43,13 +56,18 @@ class ModelConfig:
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, str):
-                continue
-            sizes = value if isinstance(value, tuple) else (value,)
-            if not sizes or not all(isinstance(size, int) and (size > 0 or size is False) for size in sizes):
-                raise DvoError(f"must be 1 or more, got {value}", field=field.name, remedy="give a whole number")
+        check_settings(self, RANGES)
+        sizes = self.pyramid
+        if not isinstance(sizes, tuple) or not 1 <= len(sizes) <= LEVELS:
+            raise DvoError(
+                f"not a list of levels: {shown(sizes)}", field="pyramid", remedy=f"give 1 to {LEVELS} numbers"
+            )
+        if not all(isinstance(size, int) and not isinstance(size, bool) and 1 <= size <= COARSEST for size in sizes):
+            remedy = f"give whole numbers from 1 to {COARSEST}"
+            raise DvoError(f"out of range: {shown(sizes)}", field="pyramid", remedy=remedy)
+        if self.correlation_channels > CORRELATIONS:
+            message = f"too many correlation channels: {self.correlation_channels:,}, {CORRELATIONS:,} at most"
+            raise DvoError(message, field="radius", remedy="give a smaller radius, patch or pyramid")
         if self.patch_size % 2 == 0:
             raise DvoError(f"must be odd, got {self.patch_size}", field="patch_size", remedy="give 1, 3 or 5")
 
@@ -79,11 +97,9 @@ class ModelConfig:
         Raises:
             DvoError: an unknown attribute, or an invalid size.
         """
-        unknown = sorted(set(values) - {f.name for f in fields(cls)})
-        if unknown:
-            raise DvoError("unknown model setting", field=", ".join(unknown), remedy="see dvo.nets.config.ModelConfig")
+        check_names(cls, values)
         values = dict(values)
-        if "pyramid" in values:
+        if isinstance(values.get("pyramid"), list):
             values["pyramid"] = tuple(values["pyramid"])
         return cls(**values)
 

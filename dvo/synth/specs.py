@@ -6,12 +6,19 @@ Configuration files and keyword arguments name the settings flat (``frames``, ``
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from dvo.errors import DvoError
 from dvo.geometry.camera import DistortionModel
+from dvo.settings import shown
+
+MOST_FRAMES = 100_000
+LONGEST = 3600.0  # seconds; planning the path of an hour takes minutes
+LONGEST_EDGE = 8192  # pixels
+MOST_RAYS = 2**25  # of a frame; about 100 bytes each while it is rendered
 
 
 @dataclass(frozen=True)
@@ -25,7 +32,9 @@ class SequenceFormat:
         supersample: rays per pixel edge for the colours.
 
     Raises:
-        DvoError: fewer than one frame, an image below 16x16 pixels, or a rate that is not positive.
+        DvoError: no frame or more than :data:`MOST_FRAMES`; an image below 16x16 pixels, with an edge above
+            :data:`LONGEST_EDGE` or with more than :data:`MOST_RAYS` rays; a rate that is not positive; a sequence of
+            more than :data:`LONGEST` seconds.
     """
 
     frames: int = 300
@@ -35,8 +44,18 @@ class SequenceFormat:
     supersample: int = 1
 
     def __post_init__(self) -> None:
-        if self.frames < 1 or self.height < 16 or self.width < 16 or self.fps <= 0:
-            raise DvoError("a sequence needs a frame or more of 16x16 pixels or more and fps > 0", field="frames, fps")
+        _check_number("frames", self.frames, 1, MOST_FRAMES, whole=True)
+        _check_number("height", self.height, 16, LONGEST_EDGE, whole=True)
+        _check_number("width", self.width, 16, LONGEST_EDGE, whole=True)
+        _check_number("supersample", self.supersample, 1, 16, whole=True)
+        _check_number("fps", self.fps, 0.001, 100_000)
+        rays = self.height * self.width * self.supersample**2
+        if rays > MOST_RAYS:
+            message = f"too large: {rays:,} rays for a frame, {MOST_RAYS:,} at most"
+            raise DvoError(message, field="height, width", remedy="give a smaller image or fewer rays per pixel")
+        if self.duration > LONGEST:
+            message = f"too long: {self.duration:,.0f} s, {LONGEST:,.0f} s at most"
+            raise DvoError(message, field="frames, fps", remedy="give fewer frames or a higher rate")
 
     @property
     def duration(self) -> float:
@@ -67,7 +86,7 @@ class SceneSpec:
 
     def __post_init__(self) -> None:
         _check_share("texture", self.texture)
-        _check_range("movers", self.movers >= 0)
+        _check_number("movers", self.movers, 0, 1000, whole=True)
 
 
 @dataclass(frozen=True)
@@ -78,11 +97,18 @@ class MotionSpec:
         kind: one of ``dvo.synth.LONG_KINDS``; if None, a drive in streets and corridors and a hand-held walk elsewhere.
         speed: relative to a relaxed pace.
         shake: factor on the amplitude of the hand's shake.
+
+    Raises:
+        DvoError: a number out of range.
     """
 
     kind: str | None = None
     speed: float = 1.0
     shake: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_number("speed", self.speed, 0, 1000)
+        _check_number("shake", self.shake, 0, 1000)
 
 
 @dataclass(frozen=True)
@@ -118,9 +144,9 @@ class CameraSpec:
         for name in ("shutter", "rolling_shutter", "light", "drop"):
             _check_share(name, getattr(self, name))
         _check_range("light", self.light > 0)
-        _check_range("lighting", self.lighting >= 0)
-        _check_range("blackout", self.blackout >= 0)
-        _check_range("jpeg", 0 <= self.jpeg <= 100)
+        _check_number("lighting", self.lighting, 0, 20)
+        _check_number("blackout", self.blackout, 0, LONGEST)
+        _check_number("jpeg", self.jpeg, 0, 100, whole=True)
 
 
 @dataclass(frozen=True)
@@ -191,9 +217,16 @@ def check_names(options: dict[str, Any], known: Iterable[str]) -> None:
         raise DvoError(f"no rendering option '{unknown[0]}'", field=unknown[0], remedy=remedy)
 
 
+def _check_number(name: str, value: float, low: float, high: float, whole: bool = False) -> None:
+    number = isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
+    if not number or not low <= value <= high:  # NaN fails too
+        kind = "a whole number" if whole else "a number"
+        raise DvoError(f"out of range: {shown(value)}", field=name, remedy=f"give {kind} from {low:g} to {high:g}")
+
+
 def _check_share(name: str, value: float) -> None:
-    if not 0 <= value <= 1:
-        raise DvoError(f"not a share: {value}", field=name, remedy="give a number from 0 to 1")
+    if not isinstance(value, numbers.Real) or not 0 <= value <= 1:
+        raise DvoError(f"not a share: {shown(value)}", field=name, remedy="give a number from 0 to 1")
 
 
 def _check_range(name: str, valid: bool) -> None:

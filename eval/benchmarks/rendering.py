@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
 from dvo.allocator import reuse_freed_memory
 from dvo.synth import random_path, random_scene, render
 from dvo.synth.clip import make_clip
 from dvo.synth.scenes.families import SHARES
 from dvo.synth.textures.texture import texture_pool
+from dvo.yaml_files import read_yaml
 
 SIZES = ((120, 160), (240, 320), (480, 640))
 RECIPE = Path(__file__).resolve().parents[2] / "configs" / "train" / "small.yaml"
@@ -131,7 +131,7 @@ def main() -> None:
         print(f"{'family':<10}" + "".join(f"{f'{width}x{height}':>10}" for height, width in SIZES))
         for name, rates in frames_per_second(device, options.frames):
             print(f"{name:<10}" + "".join(f"{rate:>10.1f}" for rate in rates))
-    recipe = yaml.safe_load(RECIPE.read_text(encoding="utf-8"))
+    recipe = read_yaml(RECIPE)
     clip, batches = clip_seconds(options.clips, recipe)
     step = step_seconds(options.steps, recipe, batches)
     print(f"one training clip {clip:.2f} s, one training step {step:.2f} s: rendering / training = {clip / step:.2f}")

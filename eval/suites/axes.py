@@ -2,60 +2,136 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from dvo.errors import DvoError
+from dvo.settings import Range, from_table
 
 Table = dict[str, Any]
+_SEED = (0, 2**53)
 
 
-def expand(table: Table, file: Path, axis: str, split: str, tier: str) -> Table:
+@dataclass(frozen=True)
+class Split:
+    """Purpose of sequences, and their first seed."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"seed": _SEED}
+
+    seed: int
+    label: str
+
+
+@dataclass(frozen=True)
+class Tier:
+    """Number, length in seconds, rate and sizes (width, height; taken in turn) of the sequences of a suite."""
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "seed": _SEED,
+        "count": (1, 1000),
+        "seconds": (0.1, 3600),
+        "fps": (0.1, 1000),
+    }
+
+    seed: int
+    count: int
+    seconds: float
+    fps: float
+    sizes: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Options of the sequences of a suite; ``about`` and ``judged_by`` as in :class:`eval.suites.suite.Sequence`."""
+
+    RANGES: ClassVar[dict[str, Range]] = {"seed": _SEED}
+
+    seed: int
+    about: str
+    options: dict[str, Any]
+    families: tuple[str, ...] | None = None
+    judged_by: str | None = None
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Content of the file.
+
+    Attributes:
+        version: of the renderings.
+        families: of scenes, taken in turn.
+        splits, tiers, axes: by name.
+        common: options of all sequences.
+    """
+
+    version: int
+    families: tuple[str, ...]
+    splits: dict[str, Split]
+    tiers: dict[str, Tier]
+    axes: dict[str, Axis]
+    common: dict[str, Any] = field(default_factory=dict)
+
+
+def read_axes(table: Any, file: Path) -> Axes:
+    """Check the content of the file.
+
+    Args:
+        table: as read.
+        file: for messages.
+
+    Raises:
+        DvoError: a setting is missing, unknown, of another type or out of range.
+    """
+    found = from_table(Axes, table, file)
+    lists: dict[str, tuple[Any, ...] | None] = {"families": found.families}
+    lists |= {f"axes: {name}: families": axis.families for name, axis in found.axes.items()}
+    lists |= {f"tiers: {name}: sizes": tier.sizes for name, tier in found.tiers.items()}
+    for place, values in lists.items():
+        if values is not None and not values:
+            raise DvoError("an empty list", file=file, field=place, remedy="give one or more")
+    return found
+
+
+def expand(table: Axes, axis: str, split: str, tier: str) -> Table:
     """One suite as a table of settings, its sequences with the options of :func:`dvo.synth.make_sequence`.
 
     Args:
         table: content of the file.
-        file: for messages.
         axis, split, tier: of the suite.
-
-    Raises:
-        DvoError: the file lacks a setting.
     """
-    try:
-        what, part, size = table["axes"][axis], table["splits"][split], table["tiers"][tier]
-        families, version = list(table["families"]), int(table["version"])
-        number = list(table["axes"]).index(axis)
-        sequences = []
-        for k in range(int(size["count"])):
-            width, height = size["sizes"][k % len(size["sizes"])]
-            options = {
-                **table.get("common", {}),
-                **what["options"],
-                "seed": int(part["seed"]) + int(what["seed"]) + int(size["seed"]) + k,
-                "family": what.get("families", families)[(number + k) % len(what.get("families", families))],
-                "frames": round(size["seconds"] * size["fps"]),
-                "fps": float(size["fps"]),
-                "width": int(width),
-                "height": int(height),
-            }
-            entry = {
-                "name": "_".join([axis, split, *([tier] if tier != "mini" else []), str(k)]),
-                "about": what["about"],
-                "rendered": tuple(sorted({**options, "version": version}.items())),
-            }
-            if "judged_by" in what:
-                entry["judged_by"] = what["judged_by"]
-            sequences.append(entry)
-        return {
-            "name": "/".join([axis, *([split] if split != "validation" else []), *([tier] if tier != "mini" else [])]),
-            "label": part["label"],
-            "sequences": sequences,
+    what, part, size = table.axes[axis], table.splits[split], table.tiers[tier]
+    families = what.families or table.families
+    number = list(table.axes).index(axis)
+    sequences = []
+    for k in range(size.count):
+        width, height = size.sizes[k % len(size.sizes)]
+        options = {
+            **table.common,
+            **what.options,
+            "seed": part.seed + what.seed + size.seed + k,
+            "family": families[(number + k) % len(families)],
+            "frames": round(size.seconds * size.fps),
+            "fps": float(size.fps),
+            "width": width,
+            "height": height,
         }
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DvoError(f"a setting is missing or wrong ({error!r})", file=file, field=axis, remedy="fix it") from error
+        entry: Table = {
+            "name": "_".join([axis, split, *([tier] if tier != "mini" else []), str(k)]),
+            "about": what.about,
+            "rendered": [list(pair) for pair in sorted({**options, "version": table.version}.items())],
+        }
+        if what.judged_by is not None:
+            entry["judged_by"] = what.judged_by
+        sequences.append(entry)
+    return {
+        "name": "/".join([axis, *([split] if split != "validation" else []), *([tier] if tier != "mini" else [])]),
+        "label": part.label,
+        "sequences": sequences,
+    }
 
 
-def choose(text: str, table: Table, group: str) -> list[tuple[str, str, str]]:
+def choose(text: str, table: Axes, group: str) -> list[tuple[str, str, str]]:
     """``NAME[/SPLIT][/TIER]`` to (axis, split, tier): of one axis, or of all if the name is that of the ``group``.
 
     Args:
@@ -69,11 +145,14 @@ def choose(text: str, table: Table, group: str) -> list[tuple[str, str, str]]:
     name, *rest = text.split("/")
     split, tier = "validation", "mini"
     for word in rest:
-        if word in table["splits"]:
+        if word in table.splits:
             split = word
-        elif word in table["tiers"]:
+        elif word in table.tiers:
             tier = word
         else:
-            known = ", ".join([*table["splits"], *table["tiers"]])
+            known = ", ".join([*table.splits, *table.tiers])
             raise DvoError(f"no split or tier '{word}'", field="--suite", remedy=f"choose from {known}")
-    return [(axis, split, tier) for axis in (table["axes"] if name == group else [name])]
+    for kind, word, known_words in (("split", split, table.splits), ("tier", tier, table.tiers)):
+        if word not in known_words:
+            raise DvoError(f"no {kind} '{word}'", field="--suite", remedy=f"choose from {', '.join(known_words)}")
+    return [(axis, split, tier) for axis in (table.axes if name == group else [name])]

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-import yaml
 
 from dvo.data.source import Source, open_source
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.metrics import Alignment, associate
-from eval.suites.axes import choose, expand
+from dvo.settings import Range, from_table
+from dvo.yaml_files import read_yaml
+from eval.suites.axes import Axes, choose, expand, read_axes
 from eval.suites.rendered import rendered_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITES = ROOT / "configs" / "eval"
 AXES = "axes"  # the file of the rendered suites, and the name of them all
+LONGEST_NAME = 100
 Judge = Literal["ate_percent", "rpe_rot_deg"]
 
 
@@ -62,6 +64,13 @@ class Suite:
         download: where the data can be had, if they are public.
     """
 
+    RANGES: ClassVar[dict[str, Range]] = {
+        "rpe_gap": (1, 10**6),
+        "stride": (1, 10**6),
+        "lost_below": (0.0, 1.0),
+        "time_limit": (1.0, 10**7),
+    }
+
     name: str
     label: str
     sequences: tuple[Sequence, ...]
@@ -102,16 +111,13 @@ def read_suites(text: str) -> list[Suite]:
     Raises:
         DvoError: no such suite.
     """
-    name, file = text.split("/")[0], SUITES / f"{AXES}.yaml"
-    table = _table(file)
-    if name != AXES and name not in table["axes"]:
+    name, table = text.split("/")[0], _axes()
+    if name != AXES and name not in table.axes:
         return [read_suite(text)]
-    built = []
-    for axis, split, tier in choose(text, table, AXES):
-        entry = expand(table, file, axis, split, tier)
-        entry["sequences"] = tuple(_build(Sequence, one, file) for one in entry["sequences"])
-        built.append(_checked(_build(Suite, entry, file), file))
-    return built
+    return [
+        _suite(expand(table, axis, split, tier), SUITES / f"{AXES}.yaml")
+        for axis, split, tier in choose(text, table, AXES)
+    ]
 
 
 def read_suite(name_or_file: str | Path) -> Suite:
@@ -127,33 +133,41 @@ def read_suite(name_or_file: str | Path) -> Suite:
     if path.suffix not in (".yaml", ".yml"):
         path = SUITES / f"{name_or_file}.yaml"
     if not path.is_file():
-        names = ", ".join(
-            [*sorted(file.stem for file in SUITES.glob("*.yaml")), *_table(SUITES / f"{AXES}.yaml")["axes"]]
-        )
+        names = ", ".join([*sorted(file.stem for file in SUITES.glob("*.yaml")), *_axes().axes])
         raise DvoError("no such suite", file=path, field="--suite", remedy=f"give a file, or one of: {names}")
-    table = _table(path)
+    return _suite(read_yaml(path), path)
+
+
+def _axes() -> Axes:
+    file = SUITES / f"{AXES}.yaml"
+    return read_axes(read_yaml(file), file)
+
+
+def _suite(table: Any, path: Path) -> Suite:
+    """Suite from its table, every entry checked."""
     if not isinstance(table, dict) or not isinstance(table.get("sequences"), list):
         raise DvoError("no list of sequences", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
-    sequences = tuple(_build(Sequence, entry, path) for entry in table.pop("sequences"))
-    return _checked(_build(Suite, {**table, "sequences": sequences}, path), path)
-
-
-def _table(path: Path) -> Any:
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="fix the file") from error
-
-
-def _checked(suite: Suite, path: Path) -> Suite:
-    _check(suite.alignment, get_args(Alignment), "alignment", path)
-    for sequence in suite.sequences:
+    suite = from_table(Suite, table, path)
+    names = [sequence.name for sequence in suite.sequences]
+    for number, sequence in enumerate(suite.sequences):
+        place = f"sequences[{number}]"
+        _check_name(sequence.name, f"{place}: name", path)
+        if sequence.name in names[:number]:
+            raise DvoError(f"twice the name '{sequence.name}'", file=path, field=place, remedy="give another name")
         if not sequence.path and sequence.rendered is None:
-            raise DvoError(
-                f"incomplete sequence ({sequence.name} has no path)", file=path, field="path", remedy="add it"
-            )
-        _check(sequence.judged_by, get_args(Judge), f"{sequence.name}: judged_by", path)
+            raise DvoError(f"{sequence.name} has no path", file=path, field=f"{place}: path", remedy="add it")
+    _check_name(suite.name, "name", path)
+    if not names:
+        raise DvoError("empty", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
     return suite
+
+
+def _check_name(name: str, field: str, path: Path) -> None:
+    if not name.strip():
+        raise DvoError("empty", file=path, field=field, remedy="give a name")
+    if len(name) > LONGEST_NAME:  # it becomes the name of a folder
+        message = f"longer than {LONGEST_NAME} characters"
+        raise DvoError(message, file=path, field=field, remedy="give a shorter name")
 
 
 def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, Trajectory]:
@@ -193,19 +207,3 @@ def reference_for(groundtruth: Trajectory, stamps: np.ndarray, max_dt: float = 0
     """
     fed, rows = associate(Trajectory(stamps, np.zeros((len(stamps), 7))), groundtruth, max_dt)
     return Trajectory(stamps[fed], groundtruth.poses_wc[rows])
-
-
-def _build(kind: type, entry: Any, path: Path) -> Any:
-    known = {field.name for field in fields(kind)}
-    if not isinstance(entry, dict) or not set(entry) <= known:
-        unknown = ", ".join(sorted(set(entry) - known)) if isinstance(entry, dict) else repr(entry)
-        raise DvoError(f"unknown setting {unknown}", file=path, remedy=f"known are {', '.join(sorted(known))}")
-    try:
-        return kind(**entry)
-    except TypeError as error:
-        raise DvoError(f"incomplete {kind.__name__.lower()} ({error})", file=path, remedy="add it") from error
-
-
-def _check(value: str, allowed: tuple[str, ...], field: str, path: Path) -> None:
-    if value not in allowed:
-        raise DvoError(f"'{value}'", file=path, field=field, remedy=f"choose one of {', '.join(allowed)}")

@@ -22,10 +22,10 @@ def version(weights: str) -> str:
 
 def missing(weights: str) -> str | None:
     """Reason why the weights cannot be used, or None."""
-    from dvo.models.weights import find_weights
+    from dvo.models.weights import weights_info
 
     try:
-        find_weights(weights)
+        weights_info(weights)
     except DvoError as error:
         return str(error)
     return None

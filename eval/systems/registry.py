@@ -15,15 +15,15 @@ Nothing of a system is imported before it is built, in a process of its own.
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dvo.errors import DvoError
 from dvo.registry import Registry, is_target
+from dvo.yaml_files import parse_yaml
 from eval.systems import plugin
 from eval.systems.system import System, package_facts
 
@@ -110,10 +110,14 @@ def split_settings(text: str) -> tuple[str, dict[str, Any]]:
         DvoError: a value that is no YAML.
     """
     name, *pairs = re.split(r"\+(?=[A-Za-z_]\w*=)", text)
-    try:
-        return name, {key: yaml.safe_load(value) for key, value in (pair.split("=", 1) for pair in pairs)}
-    except yaml.YAMLError as error:
-        raise DvoError("a setting cannot be read", field=text, remedy="write NAME+key=value") from error
+    settings = {}
+    for key, value in (pair.split("=", 1) for pair in pairs):
+        settings[key] = parse_yaml(value, field=f"{name[:60]}+{key}", remedy="write a setting as NAME+key=value")
+        try:
+            json.dumps(settings[key])
+        except TypeError:  # a date, say: the key of a prediction is JSON, so it stays text
+            settings[key] = value
+    return name, settings
 
 
 def list_systems() -> list[System]:

@@ -29,6 +29,20 @@ def test_short_form_is_run(tmp_path, image_folder, suite_file, capsys):
     assert capsys.readouterr().out.count("**made for a test**") == 3
 
 
+def test_runs_with_weights_of_a_file_are_labelled_by_it(tmp_path, image_folder, suite_file, capsys):
+    weights = tmp_path / "night.safetensors"
+    weights.write_bytes(b"none")
+    out = tmp_path / "results"
+    options = ["--suite", str(suite_file), "--data", str(tmp_path), "--out", str(out), "--no-report"]
+    assert main(["run", *options, "--systems", "dvo-small,null", "--weights", str(weights)]) == 0
+    told = capsys.readouterr()
+    assert "dvo:night" in told.out and "dvo-small" not in told.out + told.err
+    manifest = json.loads((out / "run.json").read_text())
+    assert manifest["systems"] == ["dvo:night", "null"] and "dvo:night" in manifest["facts"]
+    assert "dvo-small" not in (out / "results.csv").read_text() + (out / "table.md").read_text()
+    assert len(list(out.glob("predictions/dvo_night/tiny/clip/seed0-*/prediction.json"))) == 1
+
+
 def test_benchmark_without_data_says_what_is_missing(tmp_path, capsys):
     options = ["run", "--suite", "euroc", "--data", str(tmp_path), "--out", str(tmp_path / "o"), "--systems", "null"]
     assert main([*options, "--no-report"]) == 0

@@ -49,3 +49,28 @@ def test_unknown_names() -> None:
     with pytest.raises(DvoError, match="'flow'.*[Uu]se one of .*flow_range"):
         make_clip(0, 0, flow=(1.0, 2.0))
     assert ClipSpec(frames=4).frames == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"frames": 10**9}, "frames: out of range: 1000000000. Give a whole number from 1 to 100000"),
+     ({"frames": 0}, "frames: out of range"), ({"frames": 2.5}, "frames: out of range"),
+     ({"frames": True}, "frames: out of range"), ({"frames": "many"}, "frames: out of range: 'many'"),
+     ({"width": 100_000}, "width: out of range"), ({"height": 100_000}, "height: out of range"),
+     ({"width": 8192, "height": 8192}, "height, width: too large: 67,108,864 rays"),
+     ({"supersample": 100}, "supersample: out of range"), ({"supersample": 16, "width": 1000}, "too large"),
+     ({"frames": 100_000, "fps": 0.01}, "frames, fps: too long: 10,000,000 s"), ({"fps": 1e-300}, "fps: out of range"),
+     ({"fps": float("nan")}, "fps: out of range: nan"), ({"fps": float("inf")}, "fps: out of range: inf"),
+     ({"movers": 10**9}, "movers: out of range"), ({"movers": -1}, "movers: out of range"),
+     ({"speed": float("nan")}, "speed: out of range"), ({"speed": 1e300}, "speed: out of range"),
+     ({"shake": -1.0}, "shake: out of range"), ({"lighting": 1e9}, "lighting: out of range"),
+     ({"texture": float("nan")}, "texture: not a share"), ({"texture": "bare"}, "texture: not a share"),
+     ({"jpeg": 101}, "jpeg: out of range"), ({"blackout": float("inf")}, "blackout: out of range")],
+)  # fmt: skip
+def test_numbers_beyond_any_use(options: dict[str, float], message: str) -> None:
+    with pytest.raises(DvoError, match=message):
+        make_sequence(0, **options)
+
+
+def test_whole_numbers_of_numpy_are_whole_numbers() -> None:
+    assert sequence_spec(frames=np.int64(4), width=np.int32(64)).format.frames == 4

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Literal
 
-import torch
 from torch import nn
 
 from dvo.errors import DvoError
+from dvo.models.pickles import check_plain, load_pickle
 from dvo.models.registry import DEFAULT_ARCHITECTURE, build_network, network_class, preset_name
 from dvo.models.weights import LoadedWeights, load_weights
 from train.engine.build import make_task, task_settings
@@ -21,12 +20,20 @@ from train.tasks.task import Task
 State = dict[str, Any]
 Which = Literal["average", "net"]
 SUFFIXES = (".ckpt", ".pt")
+KINDS = {
+    "state_dict": dict,
+    "hyper_parameters": dict,
+    "global_step": int,
+    "network": dict,
+    "callbacks": dict,
+    "task": str,
+}
 
 
 def read_state(file: str | Path) -> State:
     """Read a training state.
 
-    The file is a pickle, which can run code when it is opened: give only states of your own.
+    The file is a pickle; it is read as plain tensors and containers, so that no code in it runs.
 
     Args:
         file: as :class:`lightning.pytorch.callbacks.ModelCheckpoint` writes it.
@@ -34,16 +41,16 @@ def read_state(file: str | Path) -> State:
     Raises:
         DvoError: no such file, or one that is no training state.
     """
-    path = Path(file)
-    if not path.is_file():
-        raise DvoError("no such file", file=path, remedy="give a training checkpoint")
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=False)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, AttributeError, ImportError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DvoError(f"cannot be read ({reason})", file=path, remedy="give a training checkpoint") from error
+    path, remedy = Path(file), "give a checkpoint that 'python -m train fit' wrote"
+    state = load_pickle(path, remedy)
     if not isinstance(state, dict) or not {"state_dict", "hyper_parameters", "global_step"} <= set(state):
-        raise DvoError("is no training state", file=path, remedy="give a checkpoint that 'python -m train fit' wrote")
+        raise DvoError("is no training state", file=path, remedy=remedy)
+    for name, kind in KINDS.items():
+        if not isinstance(state.get(name, kind()), kind):
+            raise DvoError(
+                f"is no training state (a {type(state[name]).__name__})", file=path, field=name, remedy=remedy
+            )
+    check_plain(state["state_dict"], path, remedy)
     return state
 
 
@@ -60,12 +67,14 @@ def network_of(state: State, which: Which = "average", file: object | None = Non
     """
     said = state.get("network", {})
     architecture = said.get("architecture", DEFAULT_ARCHITECTURE)
+    if not isinstance(architecture, str) or not isinstance(said.get("config", {}), dict):
+        raise DvoError("names no network", file=file, field="network", remedy="give a state of this version")
     network = network_class(architecture, file)
     if "config" in said:
         config = network.config_type.from_dict(said["config"])
     else:
         preset = state["hyper_parameters"].get("model")
-        if preset not in network.presets:
+        if not isinstance(preset, str) or preset not in network.presets:
             raise DvoError(f"no preset '{preset}'", file=file, field="model", remedy="give a state of this version")
         config = network.presets[preset]
     model = build_network(architecture, config)

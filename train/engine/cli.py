@@ -16,6 +16,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from dvo.errors import DvoError
 from train.engine.build import program_factory
 from train.engine.callbacks import RefuseStandstill, StopGently
+from train.engine.config_files import check_files
 from train.engine.parser import OneLineParser
 from train.engine.progress import StepBar
 from train.engine.run import ROOT, describe, find_start, place_outputs, prepare, run_folder, stop_step
@@ -163,8 +164,9 @@ def train() -> None:
     """Run LightningCLI on the command line of this process.
 
     Raises:
-        DvoError: no such task.
+        DvoError: no such task, or a configuration that is not valid YAML.
     """
+    check_files(sys.argv[1:])
     task = named_task(sys.argv[1:])
     logging.getLogger("lightning.fabric.utilities.seed").setLevel(logging.WARNING)  # the seed is in config.yaml
     TaskCLI(

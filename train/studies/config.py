@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from dvo.errors import DvoError
+from dvo.settings import Range, from_table
+from dvo.yaml_files import read_yaml
 from train.tasks.registry import DEFAULT_TASK
 
 
@@ -40,6 +41,17 @@ class StudyConfig:
         measures: name of a measure of the task to the label of its curves; the report compares by the first one, and
             names the second beside it.
     """
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "frames": (2, 1000),
+        "updates": (1, 1000),
+        "start_steps": (0, 10**9),
+        "start_rate": (0, 10),
+        "steps": (1, 10**9),
+        "clips": (1, 10**6),
+        "validate_every": (1, 10**9),
+        "validation_clips": (1, 10**5),
+    }
 
     folder: str = "runs/train/study"
     out: str = "docs/v2v_study"
@@ -88,15 +100,7 @@ class StudyConfig:
             file: keys are the attributes of this class.
 
         Raises:
-            DvoError: no such file, or a setting that does not exist.
+            DvoError: no such file; not valid YAML; or a setting that does not exist, of another type or out of range.
         """
-        import yaml
-
-        if not file.is_file():
-            raise DvoError("no such file", file=file, remedy="give configs/train/study.yaml")
-        values = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-        unknown = sorted(set(values) - {f.name for f in fields(cls)})
-        if unknown:
-            remedy = "see train.studies.config.StudyConfig"
-            raise DvoError("unknown setting", file=file, field=", ".join(unknown), remedy=remedy)
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        table = read_yaml(file, "give configs/train/study.yaml")
+        return from_table(cls, {} if table is None else table, file)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,6 +12,14 @@ import numpy as np
 
 from dvo.errors import DvoError
 from dvo.synth import salts
+from dvo.synth.meshes.claims import (
+    DECIMATE,
+    MAX_BYTES,
+    MAX_TRIANGLES,
+    FolderFiles,
+    check_claims,
+    check_picture,
+)
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.meshes.space import View, free_space
 from dvo.synth.meshes.textures import TextureSet
@@ -17,8 +27,8 @@ from dvo.synth.textures.patterns import PATTERNS
 
 Array = np.ndarray
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
-MAX_TRIANGLES, MAX_BYTES, MAX_EDGE = 4_000_000, 2 * 1024**3, 4096
-DECIMATE = "decimate it first, for instance by trimesh's simplify_quadric_decimation or in Blender"
+MAX_EDGE = 4096  # of a texture, pixels
+FARTHEST, MOST_REPEATS = 1e12, 1e6  # largest coordinate of a vertex, and of a texture
 SUN = np.array([0.45, -0.35, 0.82])  # direction of the light on meshes, whose files have none
 CREASE = np.cos(np.radians(50))  # corners bent more than this are shaded flat
 
@@ -46,7 +56,8 @@ def load_mesh(
         The mesh, z up.
 
     Raises:
-        DvoError: trimesh is not installed; no such file, or not a mesh; empty, broken or huge.
+        DvoError: trimesh is not installed; no such file, or not a mesh; empty, broken or huge; it names
+            files outside of its folder.
     """
     path = Path(path)
     if not path.is_file():
@@ -59,15 +70,12 @@ def load_mesh(
         import trimesh
     except ImportError:
         raise DvoError("meshes need trimesh", field="mesh", remedy="pip install 'dvo[synth]'") from None
-    try:
-        loaded = trimesh.load_scene(path, process=False)  # processing would hide defects
-    except Exception as error:  # trimesh's readers raise errors of many types
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise DvoError(
-            f"cannot be read as a mesh ({reason})",
-            file=path,
-            remedy="export it again; keep the files that it refers to",
-        ) from error
+    check_claims(path)
+    files: Any = FolderFiles(path)  # has the methods of a Resolver of trimesh
+    with _reading(path):
+        loaded = trimesh.load_scene(str(path), resolver=files, process=False)  # processing would hide defects
+    if files.refused is not None:
+        raise files.refused
     rotate = (up or ("z" if path.suffix.lower() in (".ply", ".stl", ".off") else "y")) == "y"
     return mesh_scene(loaded, rotate=rotate, view=view, ground=ground, light=light, seed=seed, file=path)
 
@@ -90,7 +98,8 @@ def mesh_scene(
     Raises:
         DvoError: empty, broken or huge.
     """
-    parts = loaded.dump() if hasattr(loaded, "dump") else [loaded]
+    with _reading(file):
+        parts = loaded.dump() if hasattr(loaded, "dump") else [loaded]
     meshes = [part for part in parts if hasattr(part, "faces") and len(part.faces)]
     if not meshes:
         what = "points but no triangles" if any(len(getattr(p, "vertices", ())) for p in parts) else "no triangles"
@@ -100,7 +109,8 @@ def mesh_scene(
         raise DvoError(f"huge: {total:,} triangles, {MAX_TRIANGLES:,} at most", file=file, remedy=DECIMATE)
     warnings: list[str] = []
     pictures = [_fallback(seed, 0), _fallback(seed, 1)]
-    gathered = [_gather(mesh, pictures, light, rotate, file, warnings) for mesh in meshes]
+    with _reading(file):
+        gathered = [_gather(mesh, pictures, light, rotate, file, warnings) for mesh in meshes]
     corners, tint, texture, uv = (np.concatenate([part[i] for part in gathered]) for i in range(4))
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     extent = corners.max((0, 1)) - corners.min((0, 1))
@@ -141,6 +151,22 @@ def mesh_scene(
     return MeshScene(corners, tint, texture, uv, textures, space, scale, hints, warnings=warnings)
 
 
+@contextmanager
+def _reading(file: Path | None) -> Iterator[None]:
+    """Turn the errors of trimesh and Pillow, which are of many types, into one."""
+    try:
+        yield
+    except DvoError:
+        raise
+    except Exception as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise DvoError(
+            f"cannot be read as a mesh ({reason[:200]})",
+            file=file,
+            remedy="export it again; keep the files that it refers to",
+        ) from error
+
+
 def _fallback(seed: int, kind: int) -> Array:
     """Tileable procedural texture: stains for meshes, a rough one for the ground."""
     rng = np.random.default_rng([seed, salts.MESH_TEXTURE, kind])
@@ -168,6 +194,8 @@ def _gather(
         raise DvoError("broken: a face names a vertex that is not there", file=file, remedy="export it again")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise DvoError("broken: a vertex is not finite", file=file, remedy="export it again")
+    if np.abs(vertices[np.unique(faces)]).max() > FARTHEST:
+        raise DvoError(f"broken: a vertex beyond {FARTHEST:g}", file=file, remedy="export it again")
     if mesh.visual.kind is None:  # smooth shading needs corners that are shared
         mesh = mesh.copy()
         mesh.merge_vertices()
@@ -182,9 +210,11 @@ def _gather(
         found = np.asarray(coordinates, np.float64)[:, :2]
         if not np.isfinite(found).all():
             raise DvoError("broken: a texture coordinate is not finite", file=file, remedy="export it again")
+        if np.abs(found).max() > MOST_REPEATS:
+            raise DvoError(f"broken: a texture coordinate beyond {MOST_REPEATS:g}", file=file, remedy="export it again")
         uv = (found * [1, -1] + [0, 1])[faces]  # trimesh counts v from the bottom
         texture[:] = len(pictures)
-        pictures.append(_picture(image, warnings))
+        pictures.append(_picture(image, file, warnings))
         if getattr(material, "alphaMode", None) in ("MASK", "BLEND"):
             warnings.append("transparent textures are drawn opaque")
     elif kind in ("vertex", "face"):
@@ -220,8 +250,15 @@ def _factor(material: Any) -> Array:
     return np.ones(3, np.float32)
 
 
-def _picture(image: Any, warnings: list[str]) -> Array:
-    picture: Array = np.asarray(image.convert("RGB"), np.float32) / 255
+def _picture(image: Any, file: Path | None, warnings: list[str]) -> Array:
+    check_picture(image.size, file, "texture")
+    try:
+        picture: Array = np.asarray(image.convert("RGB"), np.float32) / 255
+    except Exception as error:  # Pillow's decoders raise errors of many types
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise DvoError(
+            f"cannot be decoded ({reason[:200]})", file=file, field="texture", remedy="replace the picture"
+        ) from error
     shrink = MAX_EDGE / max(picture.shape[:2])
     if shrink < 1:
         warnings.append(f"a texture of {picture.shape[1]}x{picture.shape[0]} was reduced to {MAX_EDGE} pixels")

@@ -8,6 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dvo.data.image_header import MAX_PIXELS, image_size
+from dvo.data.images import is_complete
 from dvo.errors import DvoError
 from dvo.synth import salts
 from dvo.synth.textures.patterns import PATTERNS, SPECIAL
@@ -41,6 +43,7 @@ def photographs() -> list[tuple[np.ndarray, str]]:
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm")
 MOST_PHOTOGRAPHS, EDGE = 96, 1024  # of a folder: how many a pool takes, and their longer edge in pixels
+MOST_BYTES = 256 * 1024**2  # of a photograph
 TAGS = {tag for _, tag in (*PATTERNS.values(), *SPECIAL.values())} | {"photo"}
 
 
@@ -71,11 +74,7 @@ def folder_photographs(folder: Path | str, seed: int) -> list[tuple[np.ndarray, 
         files = [files[i] for i in sorted(chosen)]
     found = []
     for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_COLOR)
-        if image is None:
-            raise DvoError(
-                "cannot be read as a picture", file=file, field="textures", remedy="replace or remove the file"
-            )
+        image = _read(file)
         if min(image.shape[:2]) < 16:
             raise DvoError("smaller than 16 pixels", file=file, field="textures", remedy="remove the file")
         shrink = EDGE / max(image.shape[:2])
@@ -84,3 +83,30 @@ def folder_photographs(folder: Path | str, seed: int) -> list[tuple[np.ndarray, 
         tag = file.parent.name if file.parent.name in TAGS else "photo"
         found.append((cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.float32) / 255, tag))
     return found
+
+
+def _read(file: Path) -> np.ndarray:
+    """Picture ``(H, W, 3)`` uint8 BGR of a file that is whole and not huge.
+
+    Raises:
+        DvoError: it is not.
+    """
+    size = image_size(file)
+    if size is not None and size[0] * size[1] > MAX_PIXELS:
+        raise DvoError(
+            f"huge: {size[0]}x{size[1]} pixels, {MAX_PIXELS // 10**6} million at most",
+            file=file,
+            field="textures",
+            remedy="make it smaller",
+        )
+    image = None
+    try:
+        data = file.read_bytes() if size is not None and file.stat().st_size <= MOST_BYTES else b""
+        if is_complete(data):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):
+        pass
+    if image is None:
+        remedy = "replace or remove the file"
+        raise DvoError("cannot be read as a picture, or cut short", file=file, field="textures", remedy=remedy)
+    return image

@@ -38,13 +38,15 @@ def vocabulary_file() -> Path:
     Raises:
         DvoError: there is none.
     """
-    remedy = f"run python -m eval vocabulary --out FILE, then set {VOCABULARY}=FILE"
-    try:
-        path = Path(os.environ.get(VOCABULARY) or data_root(None) / "orb_vocabulary" / "tiny_orb_vocabulary.txt")
-    except DvoError:  # no data folder either: the vocabulary is what this system lacks
-        raise DvoError("no ORB vocabulary", field=VOCABULARY, remedy=remedy) from None
+    given = os.environ.get(VOCABULARY)
+    path = Path(given or data_root(required=False) / "orb_vocabulary" / "tiny_orb_vocabulary.txt")
     if not path.is_file():
-        raise DvoError("no ORB vocabulary", file=path, remedy=remedy)
+        raise DvoError(
+            "no ORB vocabulary",
+            file=path,
+            field=f"${VOCABULARY}" if given else f"${VOCABULARY} is not set",
+            remedy=f"run python -m eval vocabulary --out FILE, then set {VOCABULARY}=FILE",
+        )
     return path
 
 

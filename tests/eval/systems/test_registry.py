@@ -41,6 +41,28 @@ def test_missing_weights_are_a_reason_not_an_error(tmp_path):
     assert reason is not None and "no such weights" in reason
 
 
+def test_weights_that_cannot_be_read_are_a_reason(tmp_path):
+    file = tmp_path / "cut.safetensors"
+    file.write_bytes(b"\x10\0\0")
+    reason = find_system("dvo-small", str(file)).missing()
+    assert reason is not None and reason.startswith(f"{file}: not a safetensors file")
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [("2024-13-45", "not a date"), ("9" * 5000, "longer than 100 digits"),
+     ("[" * 500, "32 levels"), ("!!python/name:os.system", "python/name"), ("{a,a}", "'a' twice")],
+)  # fmt: skip
+def test_values_that_no_setting_has(value, message):
+    with pytest.raises(DvoError, match=message) as error:
+        find_system(f"klt-pnp+corners={value}")
+    assert "klt-pnp+corners: " in str(error.value) and len(str(error.value)) < 300
+
+
+def test_a_date_stays_text():
+    assert find_system("klt-pnp+corners=2024-01-31").settings == {"corners": "2024-01-31"}
+
+
 def test_settings_are_arguments_and_part_of_the_name(tmp_path):
     system = find_system("klt-pnp+corners=400+refill=0.5")
     assert (system.name, system.settings) == ("klt-pnp+corners=400+refill=0.5", {"corners": 400, "refill": 0.5})

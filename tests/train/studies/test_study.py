@@ -1,6 +1,7 @@
 """The study: paired arms, resumed runs, report."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,3 +91,24 @@ def test_ratios_are_medians_and_other_measures_means(tmp_path, monkeypatch):
     clips = study.DiskClips(tmp_path, 0, 3, small_study(tmp_path))
     monkeypatch.setattr(study.DiskClips, "__getitem__", lambda self, index: {"images": np.zeros(1)})
     assert study.validation_error(Measures(), None, clips) == {"a": 3.0, "b_ratio": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("steps: many", "steps: must be a whole number, got 'many'"), ("steps: 0", "steps: out of range"),
+     ("size: 96", "size: must be a list"), ("size: [96]", "size: must be a list of 2"), ("- steps", "got a list"),
+     ("rates: [1.0, x]", r"rates\[1\]: must be a number"), ("seeds: [yes]", r"seeds\[0\]: must be a whole number"),
+     ("arms: [DPVO]", "arms: must be a table"), ("arms: {DPVO: 3}", "arms: DPVO: must be a table"),
+     ("title: 2024-13-45", "not a date"), ("steps: [", "not valid YAML"), ("a: &a [*a]", "within its own anchor")],
+)  # fmt: skip
+def test_settings_of_a_wrong_type(text, message, tmp_path):
+    file = tmp_path / "study.yaml"
+    file.write_text(text)
+    with pytest.raises(DvoError, match=message) as error:
+        StudyConfig.read(file)
+    assert str(error.value).startswith(f"{file}: ")
+
+
+def test_the_study_of_the_checkout_can_be_read():
+    config = StudyConfig.read(Path(__file__).resolve().parents[3] / "configs" / "train" / "study.yaml")
+    assert config.rates == (4e-4, 2e-3) and list(config.arms) == ["DPVO", "V2V weighting", "V2V weighting + balance"]

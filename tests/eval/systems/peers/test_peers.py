@@ -96,6 +96,17 @@ def test_orbslam3_lacks_its_package_its_vocabulary_or_both(monkeypatch, tmp_path
         assert ("pyorbslam3 is" in orbslam3.missing()) is not package
 
 
+def test_orbslam3_names_the_place_where_it_looked(monkeypatch, tmp_path):
+    monkeypatch.delenv("DVO_ORB_VOCABULARY", raising=False)
+    monkeypatch.setenv("DVO_DATA", str(tmp_path / "no_such_folder"))
+    reason = orbslam3.missing() or ""
+    assert str(tmp_path / "no_such_folder" / "orb_vocabulary" / "tiny_orb_vocabulary.txt") in reason
+    assert "DVO_ORB_VOCABULARY is not set" in reason
+    monkeypatch.setenv("DVO_ORB_VOCABULARY", str(tmp_path / "words.txt"))
+    reason = orbslam3.missing() or ""
+    assert f"{tmp_path / 'words.txt'}: $DVO_ORB_VOCABULARY: no ORB vocabulary" in reason
+
+
 def test_settings_hold_the_camera(tmp_path):
     file = tmp_path / "settings.yaml"
     file.write_text(orbslam3.settings(Camera(500.5, 501.5, 319.5, 239.5, 640, 480)))

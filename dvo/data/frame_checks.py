@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import operator
 import sys
 import warnings
@@ -41,8 +42,8 @@ def checked_frame(frame: Frame) -> Frame:
 
     Raises:
         DvoError: an object that is not a frame; an index that is not a whole number; a time that is not a finite
-            number; an image of another form or type, without pixels, or with values that are not finite or out of range;
-            no camera, or one of another image size. Names the frame and the field.
+            number; an image of another form or type, without pixels, or with values not finite or out of range; no
+            camera, or one of another image size. Names the frame and the field.
 
     Example:
         >>> import numpy as np
@@ -88,7 +89,7 @@ def _seconds(time: Any, field: str) -> float:
         seconds = time if isinstance(time, float) else float(time)
     except OverflowError:
         seconds = float("inf")
-    if not np.isfinite(seconds):
+    if not math.isfinite(seconds):
         raise DvoError(f"{seconds} is not finite", field=field, remedy=remedy)
     return seconds
 
@@ -204,7 +205,7 @@ def _levels(pixels: np.ndarray, field: str) -> np.ndarray:
 
 def _of_floats(pixels: np.ndarray, field: str) -> np.ndarray:
     lowest, highest = float(pixels.min()), float(pixels.max())  # nan if any value is
-    if not np.isfinite([lowest, highest]).all():
+    if not (math.isfinite(lowest) and math.isfinite(highest)):
         count = int((~np.isfinite(pixels)).sum())
         raise DvoError(
             f"{count} of {pixels.size} values are not finite", field=field, remedy="replace nan and infinity"
@@ -214,7 +215,9 @@ def _of_floats(pixels: np.ndarray, field: str) -> np.ndarray:
         if lowest >= 0:
             remedy = "give uint8, or divide by 255" if highest <= 255 else "give uint16, or divide by 65535"
         raise DvoError(f"float values must lie in 0..1, got {lowest:.6g} to {highest:.6g}", field=field, remedy=remedy)
-    return np.rint(pixels.astype(np.float64) * 255).clip(0, 255).astype(np.uint8)
+    levels = np.multiply(pixels, 255, dtype=np.float32, casting="same_kind")
+    np.rint(levels, out=levels)
+    return np.clip(levels, 0, 255, out=levels).astype(np.uint8)
 
 
 def _warn_if_twelve_bits(highest: int, field: str) -> None:

@@ -14,6 +14,7 @@ import torch
 
 from dvo.ba.cold_start import COLD_UPDATES, damping_at
 from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.archive import ArchiveConfig
@@ -102,6 +103,7 @@ class PatchOdometry:
             DvoError: a timestamp that does not increase, an image of another size than the first, or a camera with
                 distortion.
         """
+        frame = checked_frame(frame)
         self._check(frame)
         window, config = self.window, self.config
         keyframe = self._append(frame)

@@ -13,7 +13,11 @@ from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.models.patch_vo import PatchVO
+from dvo.nets.config import preset
 from dvo.odometry import session
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.tracker import PatchOdometry
 
 CAMERA = Camera(50, 50, 31.5, 23.5, 64, 48)
 RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
@@ -265,3 +269,30 @@ def test_a_run_keeps_what_was_tracked_before_a_bad_frame(fake_odometry, broken, 
     assert warning.startswith("stopped at frame 3: frame")
     with pytest.raises(DvoError):
         session.run(fake_odometry(), [broken, *good[4:]])
+
+
+def test_the_tracker_goes_on_after_a_bad_frame_as_if_it_had_not_come():
+    """Every kind of bad frame raises a DvoError; poses of good frames are those of a run without them."""
+    config = TrackerConfig(pixels=64 * 48, patches=6, lifetime=4, removal=5, optimisation=4, initial_frames=5)
+    wall = np.random.default_rng(1).integers(0, 256, (48, 64 + 4 * 9, 3), dtype=np.uint8)
+    good = [Frame(k, 0.1 * k, wall[:, 4 * k : 4 * k + 64].copy(), CAMERA) for k in range(9)]
+    images = (None, RGB[:0], with_value(np.nan), RGB > 99, RGB[:40], RGB.tolist(), RGB.transpose(2, 0, 1))
+    bad = [frame(image, timestamp=0.35) for image in images]
+    bad += [frame(timestamp=np.nan), frame(timestamp="1"), frame(camera=None), None, RGB]
+
+    def track(sources: list) -> list[np.ndarray]:
+        torch.manual_seed(0)
+        odometry = PatchOdometry(PatchVO(preset("tiny")), config)
+        poses = []
+        for one in sources:
+            if any(one is other for other in bad):
+                with pytest.raises(DvoError, match="frame"):
+                    odometry.track(one)
+            else:
+                poses.append(odometry.track(one).pose_wc)
+        assert np.isfinite(odometry.finish().trajectory.poses_wc).all()
+        return poses
+
+    np.testing.assert_array_equal(track([*bad, *good[:4], *bad, *good[4:], *bad]), track(good))
+    as_floats = [Frame(one.index, one.timestamp, one.image / 255, one.camera) for one in good]
+    np.testing.assert_array_equal(track(as_floats), track(good))

@@ -14,6 +14,7 @@ from typing import NoReturn
 from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED
 from dvo.errors import DvoError
+from dvo.threads import wait_passively
 
 EXIT_CODES = (
     "exit codes: 0 done, 1 no frame could be tracked, 2 bad input, 130 interrupted (results so far are written)"
@@ -160,6 +161,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         arguments = build_parser().parse_args(argv)
+        wait_passively()  # before a command imports torch
         module, function = arguments.run.split(":")
         command: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
         return command(arguments)

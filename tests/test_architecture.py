@@ -18,6 +18,7 @@ ARROWS: dict[str, set[str]] = {
     "allocator": set(),
     "registry": set(),
     "settings": set(),
+    "threads": set(),
     "geometry": set(),
     "data": {"geometry"},
     "ba": {"geometry"},
@@ -27,7 +28,7 @@ ARROWS: dict[str, set[str]] = {
     "models": {"nets", "graph", "ba", "data", "geometry"},
     "synth": {"geometry", "ba", "data"},
     "losses": {"geometry"},
-    "odometry": {"models", "graph", "nets", "ba", "data", "geometry"},
+    "odometry": {"models", "graph", "nets", "ba", "data", "geometry", "threads"},
     "viz": {"data", "geometry", "odometry"},
 }
 TOP = {"cli", "commands", "demo", "__main__", "__init__"}  # these know everything, nobody below knows them

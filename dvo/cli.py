@@ -97,6 +97,10 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--device", metavar="D", default="cpu", help="torch device (default: %(default)s)")
     _rendering_options(export, "320x240")
     export.set_defaults(run="dvo.commands.synth:export")
+
+    doctor = commands.add_parser("doctor", help="report versions, devices, threads, codecs, weights, gaps")
+    doctor.add_argument("--json", action="store_true", help="print JSON, for bug reports")
+    doctor.set_defaults(run="dvo.commands.doctor:doctor")
     return parser
 
 

@@ -23,7 +23,6 @@ _TWELVE_BITS = 4096
 _PIL_MODES = ("L", "RGB", "RGBA", "F", "I")  # np.asarray gives their pixels; so it does for the modes I;16
 _FORMS = "give (H, W, 3) RGB or (H, W) grey"
 _REMEDY_TYPE = "give uint8 (0..255), uint16 (0..65535) or float (0..1)"
-_FAILURES = (OSError, ValueError, TypeError, RuntimeError, AttributeError, MemoryError, SyntaxError)
 _warned: set[str] = set()  # warnings that this process has given
 
 
@@ -159,7 +158,7 @@ def _of_tensor(image: Any) -> np.ndarray:
 def _converted(convert: Callable[[], np.ndarray], image: Any, field: str) -> np.ndarray:
     try:
         return convert()
-    except _FAILURES as error:
+    except Exception as error:  # the conversion is code of another package, or of the user
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DvoError(
             f"{_kind(image)} cannot be read as an array ({reason[:200]})",

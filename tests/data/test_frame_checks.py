@@ -188,6 +188,26 @@ def test_bad_images_are_refused(image, message, remedy):
     assert "\n" not in str(error)
 
 
+class Image:
+    """Image of another package; without an array it fails in a way of its own."""
+
+    def __init__(self, array: np.ndarray | None = None) -> None:
+        self.array = array
+
+    def __array__(self, dtype: object = None, copy: object = None) -> np.ndarray:
+        if self.array is None:
+            raise KeyError("no\npixels")
+        return self.array
+
+
+def test_objects_with_an_array():
+    np.testing.assert_array_equal(checked_frame(frame(Image(GREY))).image, GREY3)
+    with pytest.raises(DvoError, match="frame 7: image: an object of type Image cannot be read as an array"):
+        checked_frame(frame(Image()))
+    with pytest.raises(DvoError, match="frame 7: image: .*(1 x 48 x 64 x 3)"):
+        checked_frame(frame(Image(RGB[None])))
+
+
 @pytest.mark.parametrize(
     ("timestamp", "expected"),
     [(3, 3.0), (np.int64(3), 3.0), (np.float32(0.25), 0.25), (np.float64(0.1), 0.1), (-1.5, -1.5), (0, 0.0)],

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import time
 from itertools import islice
+from typing import Any
 
 
 def main() -> None:
@@ -18,7 +19,7 @@ def main() -> None:
     line.add_argument("--weights", default="small")
     line.add_argument("--frames", type=int, default=60, help="frames, those before timing included")
     line.add_argument("--warmup", type=int, default=12, help="frames before timing starts")
-    line.add_argument("--seconds", type=float, default=60.0, help="time after which no further frame is tracked")
+    line.add_argument("--seconds", type=float, default=60.0, help="longest time, of warm-up and measurement each")
     line.add_argument("--before", action="store_true", help="threads as if dvo chose nothing")
     given = line.parse_args()
     if given.before:
@@ -34,17 +35,30 @@ def main() -> None:
     if given.before:
         torch.set_num_threads(counts[0])
         cv2.setNumThreads(counts[1])
-    for frame in frames[: given.warmup]:
-        odometry.track(frame)
-    start = time.perf_counter()
-    count = 0
-    for frame in frames[given.warmup :]:
+    track(odometry, frames[: given.warmup], given.seconds)
+    speed = track(odometry, frames[given.warmup :], given.seconds)
+    threads = current_threads()
+    print(f"SPEED {speed:.4f} {threads.count} {threads.wait_policy}")
+
+
+def track(odometry: Any, frames: list[Any], seconds: float) -> float:
+    """Track frames until the time is over, and at least one.
+
+    Args:
+        odometry: on the clip.
+        frames: to track.
+        seconds: time after which no further frame is tracked.
+
+    Returns:
+        Frames per second.
+    """
+    start, count = time.perf_counter(), 0
+    for frame in frames:
         odometry.track(frame)
         count += 1
-        if time.perf_counter() - start > given.seconds:
+        if time.perf_counter() - start > seconds:
             break
-    threads = current_threads()
-    print(f"SPEED {count / (time.perf_counter() - start):.4f} {threads.count} {threads.wait_policy}")
+    return count / (time.perf_counter() - start)
 
 
 if __name__ == "__main__":

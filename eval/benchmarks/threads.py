@@ -175,7 +175,11 @@ def main(arguments: list[str] | None = None) -> int:
     line.add_argument("--warmup", type=int, default=12, metavar="N", help="those of them before timing starts (12)")
     line.add_argument("--rounds", type=int, default=3, metavar="N", help="measurements of each case (3)")
     line.add_argument(
-        "--seconds", type=float, default=60.0, metavar="S", help="longest time of a measurement after the warm-up (60)"
+        "--seconds",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="longest time of measurement and warm-up, each (60)",
     )
     line.add_argument("--states", default=",".join(STATES), help=f"separated by commas ({','.join(STATES)})")
     given = line.parse_args(arguments)

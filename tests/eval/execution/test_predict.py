@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from eval.execution.predict import predict, predict_here, read_prediction, read_trajectory
+from eval.execution.process import Ending
 
 
 def test_a_run_in_its_own_process(job):
@@ -58,3 +59,18 @@ def test_poses_that_are_not_finite(job, fake_odometry, systems):
 def test_missing_data_is_a_status(job):
     prediction = predict_here(replace(job, sequence=replace(job.sequence, path="elsewhere")))
     assert prediction.status == "no data" and "elsewhere" in prediction.reason
+
+
+def test_worker_has_the_threads_of_its_job_and_waits_passively(job, monkeypatch):
+    given = {}
+
+    def run(command, environment, seconds, log):
+        given.update(environment)
+        return Ending(1, "")
+
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("eval.execution.predict.run_limited", run)
+    assert predict(replace(job, threads=3)).status == "crashed"
+    assert given["OMP_NUM_THREADS"] == given["MKL_NUM_THREADS"] == given["OPENBLAS_NUM_THREADS"] == "3"
+    assert given["OMP_WAIT_POLICY"] == "PASSIVE"

@@ -30,7 +30,7 @@ def said(code: str, **variables: str) -> list[str]:
 
 
 def test_rule_depends_on_the_cores_alone():
-    assert [thread_rule(cores) for cores in (1, 2, 3, 4, 6, 8, 16, 128)] == [1, 1, 1, 2, 3, 4, 4, 4]
+    assert [thread_rule(cores) for cores in (1, 2, 3, 4, 6, 8, 16, 128)] == [1, 2, 3, 4, 4, 4, 4, 4]
 
 
 def test_cores_are_those_of_the_affinity():
@@ -80,8 +80,9 @@ def test_dvo_chooses_where_nothing_is_set():
         "t = now(); print(t.count, t.chosen_by, t.wait_policy, t.waits_by, torch.get_num_threads());"
         "torch.set_num_threads(3); dvo.load(); print(torch.get_num_threads())"
     )
-    count = thread_rule(available_cores())
-    assert said(code) == [f"{count} dvo passive dvo {count}", "3"]
+    counts = {min(thread_rule(available_cores()), count) for count in threads.default_counts()}
+    first, later = said(code)
+    assert first in {f"{count} dvo passive dvo {count}" for count in counts} and later == "3"
 
 
 def test_what_the_user_has_set_is_kept():
@@ -94,7 +95,10 @@ def test_what_the_user_has_set_is_kept():
 
 def test_torch_imported_first():
     """The number can still be set; spinning is told once, and only if several threads are left."""
-    start = "import torch, dvo, dvo.threads as t; t.thread_rule = lambda cores: {}; t.default_counts = lambda: {}; "
+    start = (
+        "import torch, dvo, dvo.threads as t; torch.set_num_threads(4); "
+        "t.thread_rule = lambda cores: {}; t.default_counts = lambda: {}; "
+    )
     show = "dvo.load(); dvo.load(); now = t.current_threads(); print(now.count, now.chosen_by, now.wait_policy)"
     default = "{torch.get_num_threads()}"
     several = said(start.format(3, default) + show)

@@ -55,7 +55,7 @@ def available_cores() -> int:
 def thread_rule(cores: int) -> int:
     """Number of threads on a machine: one per core, at most 4.
 
-    A fixed rule, because results depend on the number in their last digits. On two cores, two threads that wait passively
+    A fixed rule, because results depend on the number in their last digits. On two cores, two threads waiting passively
     are 1.1 times as fast as one with the weights ``small``, and 1.6 times with a network at full resolution.
 
     Args:

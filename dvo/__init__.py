@@ -74,6 +74,9 @@ def __getattr__(name: str) -> Any:
     """Resolve a public name on first use (PEP 562)."""
     if name not in _LAZY:
         raise AttributeError(f"module 'dvo' has no attribute '{name}'")
+    from dvo.threads import wait_passively
+
+    wait_passively()  # before a module imports torch
     module, attribute = _LAZY[name]
     found = import_module(module)
     value = getattr(found, attribute) if attribute else found

@@ -19,6 +19,7 @@ from typing import NoReturn
 from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
 from dvo.errors import DvoError
+from dvo.threads import wait_passively
 
 EXIT_CODES = (
     "exit codes: 0 done, 1 no frame could be tracked, 2 bad input or results that cannot be written, 130 interrupted, "
@@ -102,6 +103,10 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--device", metavar="D", default="cpu", help="torch device (default: %(default)s)")
     _rendering_options(export, "320x240")
     export.set_defaults(run="dvo.commands.synth:export")
+
+    doctor = commands.add_parser("doctor", help="report versions, devices, threads, codecs, weights, gaps")
+    doctor.add_argument("--json", action="store_true", help="print JSON, for bug reports")
+    doctor.set_defaults(run="dvo.commands.doctor:doctor")
     return parser
 
 
@@ -187,6 +192,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     try:
         arguments = build_parser().parse_args(argv)
+        wait_passively()  # before a command imports torch
         module, function = arguments.run.split(":")
         command: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
         return command(arguments)

@@ -19,6 +19,7 @@ ARROWS: dict[str, set[str]] = {
     "registry": set(),
     "settings": set(),
     "yaml_files": set(),
+    "threads": set(),
     "geometry": set(),
     "data": {"geometry"},
     "ba": {"geometry"},
@@ -29,7 +30,7 @@ ARROWS: dict[str, set[str]] = {
     "models": {"nets", "graph", "ba", "data", "geometry"},
     "synth": {"geometry", "ba", "data"},
     "losses": {"geometry"},
-    "odometry": {"models", "graph", "nets", "ba", "data", "geometry"},
+    "odometry": {"models", "graph", "nets", "ba", "data", "geometry", "threads"},
     "viz": {"data", "geometry", "odometry"},
 }
 TOP = {"cli", "commands", "demo", "__main__", "__init__"}  # these know everything, nobody below knows them

@@ -9,6 +9,7 @@ from dvo.models.weights import LoadedWeights, load_weights
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.registry import odometry_builder
+from dvo.threads import settle_threads
 
 if TYPE_CHECKING:
     import torch
@@ -26,7 +27,8 @@ def load(
 ) -> Odometry:
     """Load weights and build their odometry, for one sequence.
 
-    The architecture in the metadata of the file selects the odometry, see :data:`dvo.odometry.registry.ODOMETRIES`.
+    The architecture in the metadata of the file selects the odometry, see :data:`dvo.odometry.registry.ODOMETRIES`. The
+    first call in a process sets the number of threads, see :func:`dvo.threads.settle_threads`.
 
     Args:
         weights: name of weights that ship with dvo, or a file.
@@ -49,6 +51,7 @@ def load(
         ...     estimate = odometry.track(frame)
         >>> result = odometry.finish()
     """
+    settle_threads()
     return build_odometry(load_weights(weights, device), device=device, seed=seed, config=config, **overrides)
 
 

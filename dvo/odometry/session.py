@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Break, Estimate, Odometry, Result
@@ -54,8 +55,9 @@ def run(
     """Run an odometry over a source.
 
     Every ``stride``-th frame and the last one are tracked; frames between them get interpolated poses, within a segment
-    only. After an interruption, or a frame that cannot be read, the frames tracked so far are finished and returned
-    with a warning.
+    only. After an interruption, or a frame that cannot be read or used, the frames tracked so far are finished and
+    returned with a warning. Every frame is checked and, where harmless, converted first
+    (:func:`dvo.data.frame_checks.checked_frame`).
 
     Args:
         odometry: newly built; an odometry tracks one sequence.
@@ -222,6 +224,7 @@ class _Feeding:
         return len(self.fed) + len(self.skipped)
 
     def take(self, frame: Frame) -> None:
+        frame = checked_frame(frame)
         if self.frames_read % self.stride:
             self.pending = frame
             self.skipped.append(frame.timestamp)

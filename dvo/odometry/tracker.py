@@ -266,9 +266,8 @@ class PatchOdometry:
         self._close_segment()
         for view in waiting:
             estimate = self._take(view)
-        first = waiting[0].record
-        if not first.lost:
-            first.reason = reason
+        if not waiting[0].record.lost:
+            waiting[0].record.reason = reason
         return estimate
 
     def _close_segment(self, last: bool = False) -> None:

@@ -18,6 +18,7 @@ from dvo.allocator import reuse_freed_memory
 from dvo.odometry.load import load
 from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
+from dvo.threads import settle_threads
 
 STAGES = {
     "encoder and patches": ("front_end.py", "observe"),
@@ -45,6 +46,7 @@ def main() -> None:
     parser.add_argument("--warmup", type=int, default=30, help="frames before timing starts")
     options = parser.parse_args()
     reuse_freed_memory()
+    settle_threads()  # later calls, such as that of load, keep the number set here
     torch.set_num_threads(options.threads)
     frames = list(make_sequence(1, frames=options.frames, height=240, width=320))
 

@@ -26,6 +26,7 @@ from dvo.odometry.protocol import Estimate, Odometry, Segment
 from dvo.odometry.results import jsonable, peak_memory_mb
 from dvo.odometry.session import run
 from dvo.segments import worlds_of
+from dvo.threads import process_environment
 from eval.execution.process import run_limited
 from eval.scoring.blackout import dark_spans, is_dark, without_view
 from eval.suites.suite import ROOT, open_sequence
@@ -121,9 +122,8 @@ def predict(job: Job) -> Prediction:
         return write_prediction(job, Prediction("unavailable", reason))
     (folder / "job.json").write_text(json.dumps(asdict(job), indent=1), encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    environment |= {name: str(job.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
     command = [sys.executable, "-m", "eval.execution.worker", str(folder / "job.json")]
-    ending = run_limited(command, environment, job.time_limit, folder / LOG)
+    ending = run_limited(command, process_environment(job.threads, environment), job.time_limit, folder / LOG)
     if ending.code is None:
         late = Prediction("timeout", f"not done after {job.time_limit:g} s", system.version())
         return write_prediction(job, late)

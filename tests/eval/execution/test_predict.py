@@ -22,6 +22,7 @@ from eval.execution.predict import (
     read_segments,
     without_empty,
 )
+from eval.execution.process import Ending
 
 
 def test_a_run_in_its_own_process(job):
@@ -149,3 +150,18 @@ def test_frames_without_a_view_are_recorded(job, image_folder, pieces, systems):
             cv2.imwrite(str(image_folder / f"{number:04d}.png"), scene if image is None else np.full_like(scene, image))
     systems(parts=pieces((0, 20)))
     assert predict_here(replace(job, system="parts")).unseen == pytest.approx([10.4, 10.5, 11.7])
+
+
+def test_worker_has_the_threads_of_its_job_and_waits_passively(job, monkeypatch):
+    given = {}
+
+    def run(command, environment, seconds, log):
+        given.update(environment)
+        return Ending(1, "")
+
+    for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("eval.execution.predict.run_limited", run)
+    assert predict(replace(job, threads=3)).status == "crashed"
+    assert given["OMP_NUM_THREADS"] == given["MKL_NUM_THREADS"] == given["OPENBLAS_NUM_THREADS"] == "3"
+    assert given["OMP_WAIT_POLICY"] == "PASSIVE"

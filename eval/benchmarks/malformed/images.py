@@ -45,7 +45,7 @@ def headers(width: int, height: int) -> dict[str, bytes]:
     return {
         "PNG": png(width, height),
         "PNG of 16 bit": png(width, height, 16, 6),
-        "BMP": b"BM" + struct.pack("<IIIIiiHHIIiiII", 154, 0, 54, 40, width, height, 1, 24, 0, 0, 0, 0, 0, 0) + bytes(100),
+        "BMP": b"BM" + struct.pack("<IIIIiiHH", 154, 0, 54, 40, width, height, 1, 24) + bytes(124),
         "PGM": b"P5\n%d %d\n255\n" % (width, height) + bytes(100),
         "PPM": b"P6\n# text\n%d\n%d\n65535\n" % (width, height) + bytes(100),
         "PAM": b"P7\nWIDTH %d\nHEIGHT %d\nDEPTH 3\nMAXVAL 255\nENDHDR\n" % (width, height) + bytes(100),
@@ -55,7 +55,7 @@ def headers(width: int, height: int) -> dict[str, bytes]:
         "HDR": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (height, width) + bytes(100),
         "Sun raster": struct.pack(">8I", 0x59A66A95, width, height, 24, 100, 1, 0, 0) + bytes(100),
         "PFM": b"PF\n%d %d\n-1.0\n" % (width, height) + bytes(100),
-        "GIF": b"GIF89a" + struct.pack("<HH", w, h) + b"\0\0\0,\0\0\0\0" + struct.pack("<HH", w, h) + b"\0\x08\x01\0\0;",
+        "GIF": b"GIF89a" + struct.pack("<HH3x", w, h) + b",\0\0\0\0" + struct.pack("<HH", w, h) + b"\0\x08\x01\0\0;",
         "JPEG": _jpeg(w, h),
     }  # fmt: skip
 

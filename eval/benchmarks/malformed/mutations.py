@@ -137,7 +137,8 @@ def rename(file: Path, random: Random) -> str:
 
 
 BYTES: list[Mutation] = [
-    flip_bytes, flip_bytes, flip_bytes, truncate, truncate, insert_bytes, repeat_bytes, replace_by_noise, empty, exchange,
+    flip_bytes, flip_bytes, flip_bytes, truncate, truncate, insert_bytes, repeat_bytes, replace_by_noise, empty,
+    exchange,
 ]  # fmt: skip
 PLACES: list[Mutation] = [
     remove, replace_by_folder, replace_by_pipe, replace_by_link, replace_by_link, rename, lengthen,

@@ -28,16 +28,17 @@ def odd_images() -> list[Any]:
         unit * np.inf, image.astype(np.uint16) * 257, image.astype(np.int64), image.astype(np.int8), image > 100,
         image.astype(np.complex64), image.astype(object), image[:10], image[:0], image[:, :, :0], image[None],
         np.zeros((3, HEIGHT, WIDTH), np.uint8), np.zeros(5), np.float32(3), None, "image", b"x", image.tolist(), [],
-        3.5, {}, image[::2, ::2], image[:, ::-1], np.asfortranarray(image), np.ma.masked_array(image), image.astype(">u2"),
-        np.zeros((HEIGHT, WIDTH, 3), "datetime64[s]"), np.zeros((HEIGHT, WIDTH, 3), "U3"), np.recarray(3, "u1"),
-        np.broadcast_to(np.uint8(0), (40_000, 40_000, 3)), unit.astype(np.float16), -unit, unit * 255, unit * 1e30,
+        3.5, {}, image[::2, ::2], image[:, ::-1], np.asfortranarray(image), np.ma.masked_array(image),
+        image.astype(">u2"), np.zeros((HEIGHT, WIDTH, 3), "datetime64[s]"), np.zeros((HEIGHT, WIDTH, 3), "U3"),
+        np.recarray(3, "u1"), np.broadcast_to(np.uint8(0), (40_000, 40_000, 3)), unit.astype(np.float16), -unit, unit * 255, unit * 1e30,
     ]  # fmt: skip
 
 
 def odd_values() -> list[Any]:
     """Values that are neither index, time, camera, depth nor view."""
     return [None, "1", float("nan"), float("inf"), -float("inf"), -1, 10**400, 1e308, [], {}, (), 3 + 4j, b"1",
-            np.zeros(3), np.array(2.0), np.float32(7), True, np.datetime64("2024-01-01"), object(), 2.5, np.int64(5)]  # fmt: skip
+            np.zeros(3), np.array(2.0), np.float32(7), True, np.datetime64("2024-01-01"), object(), 2.5,
+            np.int64(5)]  # fmt: skip
 
 
 def _nothing(folder: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from dvo.errors import DvoError
+from dvo.yaml_files import parse_yaml, read_yaml
 
 Range = tuple[float, float]
 
@@ -57,14 +58,12 @@ def parse_settings(items: Iterable[str]) -> dict[str, Any]:
         >>> parse_settings(["patches=48", "motion_damping=0.3"])
         {'patches': 48, 'motion_damping': 0.3}
     """
-    import yaml
-
     found = {}
     for item in items:
         name, _, text = (part.strip() for part in item.partition("="))
         try:
-            value = yaml.safe_load(text)
-        except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: dates, digits
+            value = parse_yaml(text)
+        except DvoError:
             value = None
         if not name.isidentifier() or value is None:
             raise DvoError(f"not a setting: {item!r}", field=name or None, remedy="give NAME=VALUE, such as patches=48")
@@ -84,17 +83,10 @@ def read_settings(file: str | Path) -> dict[str, Any]:
     Raises:
         DvoError: no such file, or invalid content.
     """
-    import yaml
-
-    path = Path(file)
-    if not path.is_file():
-        raise DvoError("no such file", file=path, remedy="give a YAML file with one 'name: value' a line")
-    try:
-        table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: encoding, dates, digits
-        raise DvoError(f"not YAML ({str(error).splitlines()[0]})", file=path, remedy="fix the file") from error
+    remedy = "give a YAML file with one 'name: value' a line"
+    table = read_yaml(file, remedy)
     if not isinstance(table, dict) or not all(isinstance(name, str) for name in table):
-        raise DvoError("not a table of settings", file=path, remedy="give one 'name: value' a line")
+        raise DvoError("not a table of settings", file=file, remedy=remedy)
     return table
 
 

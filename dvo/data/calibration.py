@@ -10,6 +10,7 @@ import numpy as np
 
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
+from dvo.yaml_files import parse_yaml
 
 _LINE = "write 'fx fy cx cy [k1 k2 p1 p2 [k3]]' on one line, or a YAML with fx, fy, cx, cy"
 _MODELS: dict[str, DistortionModel] = {
@@ -181,27 +182,12 @@ def load_yaml(text: str, path: Path) -> Any:
         path: file that it comes from, for messages.
 
     Raises:
-        DvoError: not valid YAML.
+        DvoError: not valid YAML, see :func:`dvo.yaml_files.parse_yaml`.
     """
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """Safe loader with one tag more."""
-
-    def mapping(loader: yaml.SafeLoader, node: yaml.MappingNode) -> dict[Any, Any]:
-        return loader.construct_mapping(node, deep=True)
-
-    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", mapping)
     lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
     if lines and lines[0].strip() == "---":
         lines = lines[1:]
-    try:
-        return yaml.load("\n".join(lines), Loader=Loader)  # noqa: S506 (a subclass of SafeLoader)
-    except yaml.YAMLError as error:
-        where = getattr(error, "problem_mark", None)
-        raise DvoError(
-            "not valid YAML", file=path, field=f"line {where.line + 1}" if where else None, remedy=_LINE
-        ) from None
+    return parse_yaml("\n".join(lines), path, remedy=_LINE)
 
 
 def _numbers(value: Any, path: Path, field: str) -> np.ndarray:

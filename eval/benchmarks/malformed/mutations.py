@@ -168,6 +168,21 @@ def mutate_file(file: Path, random: Random, formats: bool = True) -> str:
     return f"{file.name}: {mutation(file, random)}"
 
 
+def mutate_text(folder: Path, random: Random) -> str:
+    """Change the text of one file, which stays a file: for text that does not come from a file.
+
+    Args:
+        folder: of the input.
+        random: source of all choices.
+
+    Returns:
+        Description of the change.
+    """
+    file = files_of(folder)[0]
+    mutations = [*text.MUTATIONS, flip_bytes, truncate, empty]
+    return mutations[int(random.integers(len(mutations)))](file, random)
+
+
 def mutate_folder(folder: Path, random: Random) -> str:
     """Change one to three files of an input, preferring files that are few of their kind.
 

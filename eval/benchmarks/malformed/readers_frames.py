@@ -29,8 +29,9 @@ def odd_images() -> list[Any]:
         image.astype(np.complex64), image.astype(object), image[:10], image[:0], image[:, :, :0], image[None],
         np.zeros((3, HEIGHT, WIDTH), np.uint8), np.zeros(5), np.float32(3), None, "image", b"x", image.tolist(), [],
         3.5, {}, image[::2, ::2], image[:, ::-1], np.asfortranarray(image), np.ma.masked_array(image),
-        image.astype(">u2"), np.zeros((HEIGHT, WIDTH, 3), "datetime64[s]"), np.zeros((HEIGHT, WIDTH, 3), "U3"),
-        np.recarray(3, "u1"), np.broadcast_to(np.uint8(0), (40_000, 40_000, 3)), unit.astype(np.float16), -unit, unit * 255, unit * 1e30,
+        image.astype(">u2"),
+        np.zeros((HEIGHT, WIDTH, 3), "datetime64[s]"), np.zeros((HEIGHT, WIDTH, 3), "U3"), np.recarray(3, "u1"),
+        np.broadcast_to(np.uint8(0), (40_000, 40_000, 3)), unit.astype(np.float16), -unit, unit * 255, unit * 1e30,
     ]  # fmt: skip
 
 

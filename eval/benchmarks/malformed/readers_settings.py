@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dvo.settings import parse_settings, read_settings
+from eval.benchmarks.malformed.mutations import mutate_folder, mutate_text
 from eval.benchmarks.malformed.readers_data import lines
 from eval.benchmarks.malformed.target import CleanExit, Target, require
 
@@ -103,12 +104,18 @@ def _study(folder: Path, random: np.random.Generator) -> None:
     require(all(isinstance(arm, dict) for arm in config.arms.values()), "arm that is no table")
 
 
+def _write(folder: Path, name: str, rows: list[str]) -> None:
+    lines(folder / name, rows)
+
+
 def _copy(folder: Path, name: str, source: Path) -> None:
     (folder / name).write_bytes(source.read_bytes())
 
 
 def _one(name: str, file: str, rows: list[str], read: Any, *modules: str) -> Target:
-    return Target(name, lambda folder: lines(folder / file, rows), read, modules=("yaml", "dvo.settings", *modules))
+    mutate = mutate_text if file.endswith(".items") else mutate_folder
+    write = partial(_write, name=file, rows=rows)
+    return Target(name, write, read, mutate, ("yaml", "dvo.settings", *modules))
 
 
 TARGETS = (

@@ -17,12 +17,13 @@ HUGE = 20 * 10**9  # bytes of a sparse file
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Regular files below a folder, sorted.
+    """Regular files below a folder, sorted, without those that :func:`lengthen` made.
 
     Args:
         folder: of the input.
     """
-    return sorted(path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    found = (path for path in folder.rglob("*") if path.is_file() and not path.is_symlink())
+    return sorted(path for path in found if path.stat().st_size < HUGE)
 
 
 def pick(random: Random, options: list) -> object:

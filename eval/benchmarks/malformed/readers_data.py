@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from dvo.data.source import open_source
-from eval.benchmarks.malformed.target import Target, check_frames, check_trajectory, require
+from eval.benchmarks.malformed.target import Target, chance, check_frames, check_trajectory, require
 
 WIDTH, HEIGHT, COUNT = 64, 48, 4
 K = "50 51 31.5 23.5"
@@ -188,19 +188,19 @@ def _video(folder: Path, ending: str, codec: str) -> None:
     lines(folder / "truth.txt", poses(8))
 
 
-def _read(folder: Path, random: np.random.Generator, place: str, options: tuple[str, ...] = ()) -> None:
+def _read(folder: Path, random: np.random.Generator | None, place: str, options: tuple[str, ...] = ()) -> None:
     """Open a source with some of the options, read its first frames, and check them with the ground truth."""
     path = folder / place
     given: dict[str, object] = {}
     for option in options:
         name, _, file = option.partition("=")
-        if name == "calib" or random.random() < 0.5:
+        if name == "calib" or not chance(random, 0.5):
             given[name] = folder / file
-    if random.random() < 0.1 and "times" not in given:
+    if random is not None and chance(random, 0.1) and "times" not in given:
         given["fps"] = float(random.choice([0.0, -1.0, np.nan, np.inf, 1e-320, 1e-9, 30.0, 1e9, 1e308]))
-    if random.random() < 0.1:
+    if random is not None and chance(random, 0.1):
         given["stride"] = int(random.choice([-1, 0, 1, 2, 10**9]))
-    source = open_source(path, undistort=bool(random.random() < 0.7), **given)  # type: ignore[arg-type]
+    source = open_source(path, undistort=not chance(random, 0.3), **given)  # type: ignore[arg-type]
     if source.groundtruth is not None:
         check_trajectory(source.groundtruth)
     check_frames(source)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ def _write(folder: Path, name: str, rows: list[str]) -> None:
     lines(folder / name, rows)
 
 
-def _calibration(folder: Path, random: np.random.Generator, name: str) -> None:
+def _calibration(folder: Path, random: np.random.Generator | None, name: str) -> None:
     calibration = read_calibration(folder / name)
     camera = calibration.camera(WIDTH, HEIGHT)
     calibration.doubts(WIDTH, HEIGHT)
@@ -54,20 +55,20 @@ def _calibration(folder: Path, random: np.random.Generator, name: str) -> None:
         require(value is None or (np.isfinite(value) and value > 0), "scale or baseline")
 
 
-def _times(folder: Path, random: np.random.Generator) -> None:
+def _times(folder: Path, random: np.random.Generator | None) -> None:
     check_times(read_times(folder / "times.txt", None))
 
 
-def _tum(folder: Path, random: np.random.Generator) -> None:
+def _tum(folder: Path, random: np.random.Generator | None) -> None:
     check_trajectory(read_tum(folder / "trajectory.txt"))
 
 
-def _kitti_poses(folder: Path, random: np.random.Generator) -> None:
+def _kitti_poses(folder: Path, random: np.random.Generator | None) -> None:
     found = read_kitti_poses(folder / "poses.txt")
     check_trajectory(Trajectory(np.arange(len(found), dtype=np.float64), found))
 
 
-def _truth(folder: Path, random: np.random.Generator, name: str) -> None:
+def _truth(folder: Path, random: np.random.Generator | None, name: str) -> None:
     check_trajectory(read_groundtruth(folder / name, 0.05 * np.arange(4)))
 
 
@@ -84,18 +85,16 @@ def _places(folder: Path) -> None:
 
 def _no_mutation(folder: Path, random: np.random.Generator) -> str:
     """Special files beside the valid ones; the options of the case are the mutation."""
-    import os
-
     os.mkfifo(folder / "pipe")
     (folder / "loop").symlink_to("loop")
     return "odd paths and options"
 
 
-def _options(folder: Path, random: np.random.Generator) -> None:
+def _options(folder: Path, random: np.random.Generator | None) -> None:
     """Open a source whose path and options are sometimes odd places or values."""
     given: dict[str, Any] = {"calib": "calib.txt", "times": "times.txt", "groundtruth": "truth.txt"}
     source = "s"
-    if (folder / "pipe").exists():
+    if random is not None:
         odd = [str(PATHS[int(i)]) for i in random.integers(len(PATHS), size=4)]
         which = int(random.integers(6))
         if which == 0:
@@ -128,14 +127,13 @@ def _nothing(folder: Path) -> None:
 
 
 def _odd_stream(folder: Path, random: np.random.Generator) -> str:
-    (folder / "odd").touch()
     return "odd elements of a stream"
 
 
-def _stream(folder: Path, random: np.random.Generator) -> None:
+def _stream(folder: Path, random: np.random.Generator | None) -> None:
     items: list[Any] = [picture(i) for i in range(4)]
     options: dict[str, Any] = {"fps": 10.0}
-    if (folder / "odd").exists():
+    if random is not None:
         odd = _odd_images(random)
         items[int(random.integers(4))] = odd[int(random.integers(len(odd)))]
         if random.random() < 0.3:

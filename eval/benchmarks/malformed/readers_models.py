@@ -11,7 +11,7 @@ import numpy as np
 
 from eval.benchmarks.malformed import text
 from eval.benchmarks.malformed.mutations import mutate_folder
-from eval.benchmarks.malformed.target import Target, require
+from eval.benchmarks.malformed.target import Target, chance, require
 
 MODULES = ("torch", "safetensors.torch", "dvo.models.weights", "dvo.models.patch_vo", "dvo.odometry.load",
            "dvo.odometry.tracker")  # fmt: skip
@@ -34,7 +34,7 @@ def _weights(folder: Path) -> None:
     save_weights(folder / "w.safetensors", _network("tiny"), {"steps": 3, "licence": "MIT"})
 
 
-def _read_weights(folder: Path, random: np.random.Generator) -> None:
+def _read_weights(folder: Path, random: np.random.Generator | None) -> None:
     from dvo.models.weights import list_weights, load_weights, weights_info
 
     weights_info(folder / "w.safetensors")
@@ -81,7 +81,7 @@ def _checkpoint(folder: Path) -> None:
     torch.save({f"module.{key}": value for key, value in _network("full").state_dict().items()}, folder / "dpvo.pth")
 
 
-def _import(folder: Path, random: np.random.Generator) -> None:
+def _import(folder: Path, random: np.random.Generator | None) -> None:
     from dvo.models.weights import import_checkpoint
 
     import_checkpoint(folder / "dpvo.pth", folder / "out.safetensors")
@@ -147,22 +147,22 @@ def _state(folder: Path) -> None:
     (folder / "card.json").write_text('{"hours": 3, "text": "a card"}', encoding="utf-8")
 
 
-def _export(folder: Path, random: np.random.Generator) -> None:
+def _export(folder: Path, random: np.random.Generator | None) -> None:
     from train.engine.export import export, export_state
 
     file = str(folder / "s.ckpt")
-    if random.random() < 0.7:
+    if not chance(random, 0.3):
         export([file, str(folder / "out.safetensors"), "--card", str(folder / "card.json")])
     else:
         export_state([file, str(folder / "out.ckpt")])
 
 
-def _validate(folder: Path, random: np.random.Generator) -> None:
+def _validate(folder: Path, random: np.random.Generator | None) -> None:
     from train.engine.checkpoint import task_of
     from train.validation.validate import main
 
     main([str(folder / "s.ckpt"), "--sequences"])
-    if random.random() < 0.5:
+    if not chance(random, 0.5):
         from train.engine.checkpoint import read_state
 
         task_of(read_state(folder / "s.ckpt"))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from eval.benchmarks.malformed.readers_data import images, lines
-from eval.benchmarks.malformed.target import Target, require
+from eval.benchmarks.malformed.target import Target, chance, require
 
 MODULES = ("trimesh", "PIL.Image", "dvo.synth.meshes.files", "dvo.synth.textures.photographs", "dvo.synth.sequence")
 
@@ -47,10 +47,10 @@ def _exported(folder: Path, name: str, binary: bool = True) -> None:
     box.export(folder / name)
 
 
-def _mesh(folder: Path, random: np.random.Generator, name: str) -> None:
+def _mesh(folder: Path, random: np.random.Generator | None, name: str) -> None:
     from dvo.synth.meshes.files import load_mesh
 
-    scene = load_mesh(folder / name, light=bool(random.random() < 0.8))
+    scene = load_mesh(folder / name, light=not chance(random, 0.2))
     require(np.isfinite(scene.corners).all() and np.isfinite(scene.texture_uv).all(), "mesh that is not finite")
     require(all(np.isfinite(picture).all() for picture in scene.textures.pictures), "texture that is not finite")
 
@@ -60,7 +60,7 @@ def _photographs(folder: Path) -> None:
     images(folder / "t", ["d.bmp", "e.tiff", "f.ppm", "g.pgm"])
 
 
-def _textures(folder: Path, random: np.random.Generator) -> None:
+def _textures(folder: Path, random: np.random.Generator | None) -> None:
     from dvo.synth.textures.photographs import folder_photographs
 
     cv2.setNumThreads(1)

@@ -38,20 +38,20 @@ TRAINING = [
 ]  # fmt: skip
 
 
-def _settings(folder: Path, random: np.random.Generator) -> None:
+def _settings(folder: Path, random: np.random.Generator | None) -> None:
     from dvo.odometry.config import TrackerConfig
 
     TrackerConfig.from_dict(read_settings(folder / "settings.yaml"))
 
 
-def _items(folder: Path, random: np.random.Generator) -> None:
+def _items(folder: Path, random: np.random.Generator | None) -> None:
     from dvo.odometry.config import TrackerConfig
 
     text = (folder / "set.items").read_bytes().decode("utf-8", errors="surrogateescape")
     TrackerConfig.from_dict(parse_settings(text[:10_000_000].splitlines()))
 
 
-def _suite(folder: Path, random: np.random.Generator) -> None:
+def _suite(folder: Path, random: np.random.Generator | None) -> None:
     from eval.suites.selection import load_suites, settle, suite_from
 
     for suite in load_suites([str(folder / "suite.yaml")], stride=None):
@@ -68,7 +68,7 @@ def _suite(folder: Path, random: np.random.Generator) -> None:
         require(isinstance(suite.name, str) and isinstance(suite.label, str), "label that is no text")
 
 
-def _system(folder: Path, random: np.random.Generator) -> None:
+def _system(folder: Path, random: np.random.Generator | None) -> None:
     from eval.systems.registry import find_system
 
     text = (folder / "systems.items").read_bytes().decode("utf-8", errors="surrogateescape")
@@ -80,7 +80,7 @@ def _system(folder: Path, random: np.random.Generator) -> None:
         require(isinstance(system.settings, dict), "settings that are no table")
 
 
-def _fit(folder: Path, random: np.random.Generator) -> None:
+def _fit(folder: Path, random: np.random.Generator | None) -> None:
     """Everything of ``python -m train fit`` up to the first step."""
     from lightning.pytorch.cli import LightningCLI
 
@@ -96,7 +96,7 @@ def _fit(folder: Path, random: np.random.Generator) -> None:
         raise
 
 
-def _study(folder: Path, random: np.random.Generator) -> None:
+def _study(folder: Path, random: np.random.Generator | None) -> None:
     from train.studies.config import StudyConfig
 
     config = StudyConfig.read(folder / "study.yaml")

@@ -14,7 +14,7 @@ from dvo.data.trajectory import Trajectory
 from eval.benchmarks.malformed.mutations import mutate_folder
 
 Mutate = Callable[[Path, np.random.Generator], str]
-Read = Callable[[Path, np.random.Generator], object]
+Read = Callable[[Path, np.random.Generator | None], object]
 
 
 class WrongResult(Exception):
@@ -32,7 +32,8 @@ class Target:
     Attributes:
         name: in the table, and in ``--case NAME:SEED``.
         build: writes a valid input into an empty folder.
-        read: reads the input and checks what was read; raises ``DvoError`` or :class:`CleanExit` to refuse it.
+        read: reads the input and checks what was read; raises ``DvoError`` or :class:`CleanExit` to refuse it. Chooses
+            options by its second argument, which is None for the valid input.
         mutate: changes the input, and returns a description of the change.
         modules: modules to import once, before cases are run.
     """
@@ -42,6 +43,16 @@ class Target:
     read: Read
     mutate: Mutate = mutate_folder
     modules: tuple[str, ...] = ()
+
+
+def chance(random: np.random.Generator | None, probability: float) -> bool:
+    """Draw whether an option is used; never for the valid input.
+
+    Args:
+        random: source of the choice; None for the valid input.
+        probability: from 0 to 1.
+    """
+    return random is not None and random.random() < probability
 
 
 def require(condition: object, message: str) -> None:

@@ -184,9 +184,8 @@ def _child(target: Target, seed: int, template: Path, folder: Path, pipe: int, l
         shutil.copytree(template, folder, symlinks=True)
         os.chdir(folder)
         random = np.random.default_rng([zlib.crc32(target.name.encode()), seed + 1])
-        if seed >= 0:
-            said["mutation"] = target.mutate(folder, random)
-        target.read(folder, random)
+        said["mutation"] = _mutated(target, folder, random) if seed >= 0 else "none"
+        target.read(folder, random if seed >= 0 else None)
     except (DvoError, CleanExit) as error:
         said |= {"verdict": "refused", "reason": str(error)}
     except BaseException as error:  # noqa: B036 (an exit or an interrupt by a reader is a failure too)
@@ -195,6 +194,13 @@ def _child(target: Target, seed: int, template: Path, folder: Path, pipe: int, l
     with open(pipe, "wb") as out:
         out.write(json.dumps(said).encode())
     os._exit(0)
+
+
+def _mutated(target: Target, folder: Path, random: np.random.Generator) -> str:
+    try:
+        return target.mutate(folder, random)
+    except Exception as error:
+        raise RuntimeError(f"the mutation itself failed: {error!r}") from error
 
 
 def _excess(process: _Process, limits: Limits) -> str:

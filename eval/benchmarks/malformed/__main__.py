@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import importlib
 import os
 import sys
@@ -128,13 +129,13 @@ def main(arguments: list[str] | None = None) -> int:
     ready = time.perf_counter()
     outcomes = []
     with tempfile.TemporaryDirectory(prefix="malformed-") as folder:
-        os.environ["DVO_CACHE"] = str(Path(folder) / "cache")
         for outcome in run_cases(cases, Path(folder), jobs=given.jobs):
             outcomes.append(checked(outcome))
             if given.case:
                 _describe(outcomes[-1])
             elif outcomes[-1].verdict == "failed":
                 print(f"failed {outcome.target}:{outcome.seed} {outcomes[-1].reason[:200]!r}", file=sys.stderr)
+    gc.unfreeze()
     if not given.case:
         print(table(outcomes, [target.name for target in targets]))
         took, tried = time.perf_counter() - ready, max(len(outcomes), 1)

@@ -123,6 +123,22 @@ def inflate(file: Path, random: Random) -> str:
     return "PNG with 100 MB of pixels for 64x48"
 
 
+def state_frame_size(file: Path, random: Random) -> str:
+    """State another size in the header of a Motion JPEG video, in that of its frames, or in both."""
+    data = bytearray(file.read_bytes())
+    width, height = SIZES[int(random.integers(len(SIZES)))]
+    way = int(random.integers(3))
+    at = data.find(b"strf")
+    if way != 0 and at >= 0:
+        data[at + 12 : at + 20] = struct.pack("<ii", width, height)
+    at = data.find(b"\xff\xc0")
+    while way != 1 and at >= 0:
+        data[at + 5 : at + 9] = struct.pack(">HH", min(height, 65_535), min(width, 65_535))
+        at = data.find(b"\xff\xc0", at + 9)
+    file.write_bytes(bytes(data))
+    return f"frames of {width}x{height} in the header of {('the frames', 'the video', 'both')[way]}"
+
+
 MUTATIONS: list[Callable[[Path, Random], str]] = [
     state_size, state_size, overwrite_size, cut_with_end, cut_with_end, change_pixels, change_pixels, inflate,
 ]  # fmt: skip

@@ -164,6 +164,8 @@ def mutate_file(file: Path, random: Random, formats: bool = True) -> str:
             groups += [text.YAML] * 2
     elif formats and file.suffix.lower() in images.SUFFIXES:
         groups += [images.MUTATIONS] * 2
+    elif formats and file.suffix.lower() == ".avi":
+        groups += [[images.state_frame_size]]
     group = groups[int(random.integers(len(groups)))]
     mutation = group[int(random.integers(len(group)))]
     return f"{file.name}: {mutation(file, random)}"

@@ -5,6 +5,7 @@ A process that exceeds its limits is killed; the case counts as failed, and the 
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import importlib
 import json
@@ -174,10 +175,12 @@ def _child(target: Target, seed: int, template: Path, folder: Path, pipe: int, l
         os.dup2(nothing, stream)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_DFL)
+    faulthandler.disable()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     # Far above the limit of resident memory: a stop for what is faster than the looks of the parent.
     data = 4 * limits.resident
     resource.setrlimit(resource.RLIMIT_DATA, (data, data))
+    os.environ["DVO_CACHE"] = str(folder.parent / "cache")
     np.seterr(all="ignore")
     said = {"verdict": "accepted", "reason": "", "mutation": "", "trace": ""}
     try:

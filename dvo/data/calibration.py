@@ -257,7 +257,8 @@ def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) ->
     for name, names in keys.items():
         value = _find(data, *names)
         if value is None and name == "baseline" and data.get("Camera.bf") is not None:
-            value = _numbers(data["Camera.bf"], path, "Camera.bf") / calibration.fx
+            product = _numbers(data["Camera.bf"], path, "Camera.bf")
+            value = product / calibration.fx if calibration.fx else product  # fx of 0 is refused later
         number = None if value is None else _numbers(value, path, name)
         if number is not None and (number.shape != () or not 1e-6 <= number <= 1e6):
             raise DvoError(

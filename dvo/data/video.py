@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
+_TIMEOUT = 8000  # milliseconds to open, or to find the next frame: gigabytes without one are no video
 
 
 def matches(path: Path) -> bool:
@@ -53,7 +54,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     cv2.utils.logging.setLogLevel(0)
     try:
         # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT]
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, limits)
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:

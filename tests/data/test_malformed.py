@@ -184,7 +184,8 @@ def test_texts_in_other_encodings_and_endless_ones(make, read):
 @pytest.mark.parametrize(
     "row",
     ["0 0 0 0 0 0 0 0 0 0 0 0", "0 0 31 0 0 50 23 0 0 0 1 0", "50 0 31 0 0 -50 23 0 0 0 1 0",
-     "50 0 31 0 0 50 23 0 0 0 0 0", "50 0 31 nan 0 50 23 0 0 0 1 0", "50 0 31 1e300 0 50 23 0 0 0 1 0", "1e-300 0 31 -5 0 50 23 0 0 0 1 0",
+     "50 0 31 0 0 50 23 0 0 0 0 0", "50 0 31 nan 0 50 23 0 0 0 1 0", "50 0 31 1e300 0 50 23 0 0 0 1 0",
+     "1e-300 0 31 -5 0 50 23 0 0 0 1 0",
      "50 50 31 0 50 50 23 0 0 0 1 0"],
 )  # fmt: skip
 def test_kitti_projections_without_a_camera(make, row):

@@ -13,7 +13,7 @@ from eval.benchmarks.malformed import images, text
 
 Random = np.random.Generator
 Mutation = Callable[[Path, Random], str]
-HUGE = 20 * 10**9  # bytes of a sparse file
+HUGE = 4 * 10**9  # bytes of a sparse file
 
 
 def files_of(folder: Path) -> list[Path]:

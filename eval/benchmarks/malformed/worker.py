@@ -5,6 +5,7 @@ A process that exceeds its limits is killed; the case counts as failed, and the 
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import gc
 import importlib
@@ -188,6 +189,7 @@ def _child(target: Target, seed: int, template: Path, folder: Path, pipe: int, l
         os.chdir(folder)
         random = np.random.default_rng([zlib.crc32(target.name.encode()), seed + 1])
         said["mutation"] = _mutated(target, folder, random) if seed >= 0 else "none"
+        os.write(pipe, json.dumps({"mutation": said["mutation"]}).encode() + b"\n")  # known even if it is killed
         target.read(folder, random if seed >= 0 else None)
     except (DvoError, CleanExit) as error:
         said |= {"verdict": "refused", "reason": str(error)}
@@ -195,7 +197,7 @@ def _child(target: Target, seed: int, template: Path, folder: Path, pipe: int, l
         trace = traceback.format_exc(limit=-12)
         said |= {"verdict": "failed", "reason": f"{type(error).__name__}: {error}"[:500], "trace": trace[-6000:]}
     with open(pipe, "wb") as out:
-        out.write(json.dumps(said).encode())
+        out.write(json.dumps(said).encode() + b"\n")
     os._exit(0)
 
 
@@ -237,10 +239,12 @@ def _end(process: _Process, limits: Limits) -> Outcome:
     shutil.rmtree(process.folder, ignore_errors=True)
     seconds, resident = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
     name, seed = process.target.name, process.seed
-    try:
-        said = json.loads(process.said)
-    except ValueError:
-        said = {"verdict": "failed", "reason": "", "mutation": "", "trace": ""}
+    said = {"reason": "", "mutation": "", "trace": ""}
+    for text in process.said.splitlines():
+        with contextlib.suppress(ValueError):  # cut, because the process was killed
+            said |= json.loads(text)
+    if "verdict" not in said:
+        said["verdict"] = "failed"
         if not process.killed:
             code = os.waitstatus_to_exitcode(status)
             said["reason"] = f"crash: {signal.Signals(-code).name}" if code < 0 else f"exit: code {code}"

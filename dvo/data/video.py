@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvo.data.calibration import Calibration
-from dvo.data.files import is_file
+from dvo.data.files import is_file, lookups
 from dvo.data.frame import InertialSamples
 from dvo.data.image_header import MAX_PIXELS
 from dvo.data.images import SUFFIXES, to_rgb8
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 # A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
-_TIMEOUT = 8000  # milliseconds to open, or to find the next frame: gigabytes without one are no video
+_SECONDS = 4  # to open, and to find the next frame: gigabytes without one are no video
 
 
 def matches(path: Path) -> bool:
@@ -46,6 +47,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
 
     if not is_file(path):  # a pipe or a device would never end, or never begin
         raise DvoError("no video file", file=path, remedy="give a file; images of a camera go to dvo.stream")
+    with lookups(path), path.open("rb") as file:
+        file.read(1)  # a disk that sleeps wakes before time counts
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
     # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
@@ -54,7 +57,7 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     cv2.utils.logging.setLogLevel(0)
     try:
         # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _TIMEOUT, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _TIMEOUT]
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, limits)
     finally:
         cv2.utils.logging.setLogLevel(level)
@@ -83,12 +86,16 @@ def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
     """``(index, container milliseconds, failed grabs just before)`` of every frame that decodes."""
     import cv2
 
-    index, failed = 0, 0
+    index, failed, failing_since = 0, 0, 0.0
     while failed <= _GIVE_UP_AFTER:
         if capture.grab():
             yield index, capture.get(cv2.CAP_PROP_POS_MSEC), failed
             failed = 0
         else:
+            now = time.monotonic()
+            failing_since = failing_since if failed else now
+            if now - failing_since > _SECONDS:
+                return
             failed += 1
         index += 1
 

@@ -22,6 +22,7 @@ from dvo.data.files import (
     parse_number,
     read_lines,
     read_rows,
+    read_text,
 )
 from dvo.data.folder import camera_images
 from dvo.data.frame import InertialSamples
@@ -31,7 +32,6 @@ from dvo.data.stamps import choose_times, read_times
 from dvo.data.trajectory import Trajectory, interpolate, unit_quaternions
 from dvo.errors import DvoError
 from dvo.geometry.poses import compose_poses, invert_poses, poses_from_matrices
-from dvo.yaml_files import read_text
 
 
 def _mav(path: Path) -> Path | None:
@@ -61,7 +61,7 @@ def read_extrinsics(sensor: Path) -> np.ndarray | None:
     """
     if not is_file(sensor):
         return None
-    data = load_yaml(read_text(sensor), sensor)
+    data = load_yaml(read_text(sensor, "use EuRoC's sensor.yaml"), sensor)
     value = data.get("T_BS") if isinstance(data, dict) else None
     if value is None:
         return None

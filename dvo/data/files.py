@@ -11,6 +11,8 @@ from dvo.errors import DvoError
 
 MAX_TABLE = 2**30
 """Largest table, bytes: some hours of inertial samples."""
+MAX_TEXT = 2**20
+"""Largest text that is read whole, such as a calibration, bytes."""
 MAX_LINE = 2**16
 """Longest row of a table, characters."""
 MAX_IMAGE_FILE = 2**29
@@ -73,13 +75,30 @@ def read_rows(path: Path, remedy: str, field: str | None = None) -> Iterator[tup
             yield number, fields
 
 
-def read_lines(path: Path, remedy: str, field: str | None = None) -> Iterator[tuple[int, str]]:
+def read_text(path: Path, remedy: str, field: str | None = None) -> str:
+    """Read a small text file as a whole.
+
+    Args:
+        path: UTF-8, with or without a byte order mark.
+        remedy: for messages about the file as a whole.
+        field: name of the text or the option, for the same messages.
+
+    Raises:
+        DvoError: as :func:`read_rows`, with :data:`MAX_TEXT` as the bound.
+    """
+    return "".join(line for _, line in read_lines(path, remedy, field, MAX_TEXT))
+
+
+def read_lines(
+    path: Path, remedy: str, field: str | None = None, largest: int = MAX_TABLE
+) -> Iterator[tuple[int, str]]:
     """Read a text file line by line; see :func:`read_rows`.
 
     Args:
         path: UTF-8, with or without a byte order mark.
         remedy: for messages about the file as a whole.
         field: name of the table or the option, for the same messages.
+        largest: bytes of the file.
 
     Yields:
         Number of a line, from 1, and its text.
@@ -90,8 +109,8 @@ def read_lines(path: Path, remedy: str, field: str | None = None) -> Iterator[tu
     if not is_file(path):
         raise DvoError("no such file", file=path, field=field, remedy=remedy)
     with lookups(path), path.open(encoding="utf-8-sig", errors="surrogateescape") as file:
-        if path.stat().st_size > MAX_TABLE:
-            raise DvoError(f"larger than {MAX_TABLE // 2**20:,} MB", file=path, field=field, remedy=remedy)
+        if path.stat().st_size > largest:
+            raise DvoError(f"larger than {largest // 2**20:,} MB", file=path, field=field, remedy=remedy)
         number = 0
         while line := file.readline(MAX_LINE + 1):
             number += 1

@@ -32,7 +32,10 @@ def _read(file: Path) -> str:
 
 
 def _write(file: Path, text: str) -> None:
-    file.write_bytes(text.encode("utf-8", errors="surrogatepass"))
+    try:
+        file.write_bytes(text.encode("utf-8", errors="surrogateescape"))  # the bytes of a binary file as they were
+    except UnicodeEncodeError:
+        file.write_bytes(text.encode("utf-8", errors="surrogatepass"))
 
 
 def _short(token: str) -> str:

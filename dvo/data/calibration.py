@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.data.files import MAX_NUMBER, is_file, read_text
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
 from dvo.yaml_files import parse_yaml
@@ -127,13 +128,13 @@ def read_calibration(path: Path | str) -> Calibration:
         525.0
     """
     path = Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    text = read_text(path, _LINE, "calibration")
     looks_yaml = path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
     calibration = _from_yaml(text, path) if looks_yaml else _from_text(text, path)
     values = [calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.coefficients]
-    if not np.isfinite(values).all():
+    if not (np.abs(values) <= MAX_NUMBER).all():  # NaN fails too
         raise DvoError("not a finite number", file=path, field="intrinsics", remedy=_LINE)
     if calibration.fx <= 0 or calibration.fy <= 0:
         raise DvoError("focal length must be positive", file=path, field="intrinsics", remedy=_LINE)
@@ -157,11 +158,13 @@ def _from_text(text: str, path: Path) -> Calibration:
         except ValueError:
             if ":" in line:  # a YAML with a .txt name
                 return _from_yaml(text, path)
-            raise DvoError(f"not a number in {line.strip()!r}", file=path, field="intrinsics", remedy=_LINE) from None
+            raise DvoError(
+                f"not a number in {line.strip()[:100]!r}", file=path, field="intrinsics", remedy=_LINE
+            ) from None
     if [len(row) for row in rows] == [3, 3, 3]:
         return _from_matrix(np.array(rows), path)
     if len(rows) != 1 or len(rows[0]) not in (4, 8, 9):
-        counts = " + ".join(str(len(row)) for row in rows) or "no"
+        counts = " + ".join(str(len(row)) for row in rows[:10]) or "no"
         raise DvoError(f"{counts} numbers, expected 4, 8 or 9 on one line", file=path, field="intrinsics", remedy=_LINE)
     fx, fy, cx, cy, *coefficients = rows[0]
     model: DistortionModel = "radtan" if any(coefficients) else "none"
@@ -195,7 +198,7 @@ def _numbers(value: Any, path: Path, field: str) -> np.ndarray:
         value = value.get("data")
     try:
         return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DvoError("not numbers", file=path, field=field, remedy=_LINE) from None
 
 
@@ -215,7 +218,7 @@ def _from_yaml(text: str, path: Path) -> Calibration:
     height = _find(data, "height", "image_height", "Camera.height") if resolution is None else None
     pair = resolution if resolution is not None else [width or 0, height or 0]
     size = _numbers(pair, path, "resolution")
-    if size.shape != (2,) or (size < 0).any() or not np.isfinite(size).all():
+    if size.shape != (2,) or not ((size >= 0) & (size <= 1e6) & (size == np.rint(size))).all():
         raise DvoError("expected width and height", file=path, field="resolution", remedy="give two whole numbers")
     calibration = replace(calibration, width=int(size[0]) or None, height=int(size[1]) or None)
     calibration = _with_sensors(calibration, data, path)
@@ -226,18 +229,23 @@ def _yaml_intrinsics(data: dict[str, Any], path: Path) -> Calibration:
     for prefix in ("", "Camera.", "Camera1."):
         found = [data.get(prefix + name) for name in ("fx", "fy", "cx", "cy")]
         if all(value is not None for value in found):
-            fx, fy, cx, cy = (float(value) for value in _numbers(found, path, "intrinsics"))
-            return Calibration(fx, fy, cx, cy, file=path)
-    value = _find(data, "intrinsics", "camera_matrix", "K", "Camera matrix")
-    if value is None:
-        raise DvoError("no fx, fy, cx, cy in it", file=path, field="intrinsics", remedy=_LINE)
-    numbers = _numbers(value, path, "intrinsics")
+            numbers = _numbers(found, path, "intrinsics")
+            break
+    else:
+        numbers = _other_intrinsics(data, path)
     if numbers.size == 9:
         return _from_matrix(numbers.reshape(3, 3), path)
     if numbers.shape != (4,):
         raise DvoError("expected 4 numbers or a 3x3 matrix", file=path, field="intrinsics", remedy=_LINE)
     fx, fy, cx, cy = (float(number) for number in numbers)
     return Calibration(fx, fy, cx, cy, file=path)
+
+
+def _other_intrinsics(data: dict[str, Any], path: Path) -> np.ndarray:
+    value = _find(data, "intrinsics", "camera_matrix", "K", "Camera matrix")
+    if value is None:
+        raise DvoError("no fx, fy, cx, cy in it", file=path, field="intrinsics", remedy=_LINE)
+    return _numbers(value, path, "intrinsics")
 
 
 def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:
@@ -249,9 +257,10 @@ def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) ->
     for name, names in keys.items():
         value = _find(data, *names)
         if value is None and name == "baseline" and data.get("Camera.bf") is not None:
-            value = _numbers(data["Camera.bf"], path, "Camera.bf") / calibration.fx
+            product = _numbers(data["Camera.bf"], path, "Camera.bf")
+            value = product / calibration.fx if calibration.fx else product  # fx of 0 is refused later
         number = None if value is None else _numbers(value, path, name)
-        if number is not None and (number.shape != () or not np.isfinite(number) or number <= 0):
+        if number is not None and (number.shape != () or not 1e-6 <= number <= 1e6):
             raise DvoError(
                 "expected one positive number", file=path, field=name, remedy="give a number, or leave it out"
             )
@@ -275,7 +284,10 @@ def _with_distortion(calibration: Calibration, data: dict[str, Any], path: Path)
         key = "radtan"
     if key not in _MODELS:
         raise DvoError(
-            f"unknown distortion model {name!r}", file=path, field="model", remedy="use none, radtan or fisheye"
+            f"unknown distortion model {str(name)[:60]!r}",
+            file=path,
+            field="model",
+            remedy="use none, radtan or fisheye",
         )
     model = _MODELS[key]
     allowed = {"none": (0,), "radtan": (0, 4, 5), "fisheye": (0, 4)}[model]

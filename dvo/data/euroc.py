@@ -7,18 +7,29 @@ Trap: the ground truth is the pose of the body (the inertial sensor) in the worl
 
 from __future__ import annotations
 
+from array import array
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from dvo.data.calibration import Calibration, load_yaml, read_calibration
+from dvo.data.files import (
+    MAX_NUMBER,
+    is_file,
+    listed_file,
+    parse_nanoseconds,
+    parse_number,
+    read_lines,
+    read_rows,
+    read_text,
+)
 from dvo.data.folder import camera_images
 from dvo.data.frame import InertialSamples
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors import SameName, Sensors, StereoRig
 from dvo.data.stamps import choose_times, read_times
-from dvo.data.trajectory import Trajectory, interpolate
+from dvo.data.trajectory import Trajectory, interpolate, unit_quaternions
 from dvo.errors import DvoError
 from dvo.geometry.poses import compose_poses, invert_poses, poses_from_matrices
 
@@ -48,15 +59,17 @@ def read_extrinsics(sensor: Path) -> np.ndarray | None:
     Raises:
         DvoError: ``T_BS`` is no rigid 4x4 matrix.
     """
-    if not sensor.is_file():
+    if not is_file(sensor):
         return None
-    data = load_yaml(sensor.read_text(encoding="utf-8-sig", errors="replace"), sensor)
+    data = load_yaml(read_text(sensor, "use EuRoC's sensor.yaml"), sensor)
     value = data.get("T_BS") if isinstance(data, dict) else None
     if value is None:
         return None
     try:
         matrix = np.array(value["data"] if isinstance(value, dict) else value, dtype=np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
+        matrix = np.zeros((4, 4))
+    if not (np.abs(matrix) <= MAX_NUMBER).all():  # NaN fails too
         matrix = np.zeros((4, 4))
     rotation = matrix[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
@@ -71,28 +84,32 @@ def read_state_groundtruth(path: Path) -> Trajectory:
         path: ``state_groundtruth_estimate0/data.csv``, rows ``ns, x, y, z, qw, qx, qy, qz, ...``.
 
     Raises:
-        DvoError: a malformed row, or no rows.
+        DvoError: a malformed row, times that do not increase, or no rows.
     """
-    times, rows = [], []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
-        try:
-            time, values = int(fields[0]), np.array([float(field) for field in fields[1:8]])
-        except ValueError:
-            time, values = 0, np.zeros(0)
-        if values.shape != (7,) or not np.isfinite(values).all() or np.linalg.norm(values[3:]) < 1e-6:
-            raise DvoError(
-                "not 'ns, x, y, z, qw, qx, qy, qz'", file=path, field=f"line {number}", remedy="correct the row"
-            )
-        times.append(time / 1e9)
-        rows.append(values)
-    if not rows:
+    nanoseconds, table, lines = _timed_rows(path, 7, "ns, x, y, z, qw, qx, qy, qz")
+    if not lines:
         raise DvoError("no poses in it", file=path, remedy="use EuRoC's data.csv")
-    table = np.array(rows)
-    table[:, 3:] /= np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
-    return Trajectory(np.array(times), table[:, [0, 1, 2, 4, 5, 6, 3]])
+    table[:, 3:] = unit_quaternions(table[:, 3:], path, lines)
+    return Trajectory(nanoseconds / 1e9, table[:, [0, 1, 2, 4, 5, 6, 3]])
+
+
+def _timed_rows(path: Path, columns: int, header: str) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """``(N,)`` int64 nanoseconds, ``(N, columns)`` float64 numbers after them, and the lines of the rows."""
+    times, values, lines = array("q"), array("d"), array("q")
+    for number, fields in read_rows(path, "use EuRoC's data.csv"):
+        try:
+            time, row = parse_nanoseconds(fields[0]), [parse_number(field) for field in fields[1 : columns + 1]]
+        except ValueError:
+            time, row = 0, []
+        if len(row) != columns or (times and time <= times[-1]):
+            raise DvoError(
+                f"not '{header}' with increasing times", file=path, field=f"line {number}", remedy="correct the row"
+            )
+        times.append(time)
+        values.extend(row)
+        lines.append(number)
+    table = np.array(values, dtype=np.float64).reshape(-1, columns)
+    return np.array(times, dtype=np.int64), table, lines.tolist()
 
 
 def read_inertial(path: Path, T_camera_imu: np.ndarray | None = None) -> InertialSamples:
@@ -105,27 +122,8 @@ def read_inertial(path: Path, T_camera_imu: np.ndarray | None = None) -> Inertia
     Raises:
         DvoError: a malformed row, or times that do not increase.
     """
-    times: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
-        try:
-            time, values = int(fields[0]), [float(field) for field in fields[1:7]]
-        except ValueError:
-            time, values = 0, []
-        if len(values) != 6 or not np.isfinite(values).all() or (times and time <= times[-1]):
-            raise DvoError(
-                "not 'ns, wx, wy, wz, ax, ay, az' with increasing times",
-                file=path,
-                field=f"line {number}",
-                remedy="correct the row",
-            )
-        times.append(time)
-        rows.append(values)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
-    return InertialSamples(np.array(times, dtype=np.int64) / 1e9, table[:, :3], table[:, 3:], T_camera_imu)
+    nanoseconds, table, _ = _timed_rows(path, 6, "ns, wx, wy, wz, ax, ay, az")
+    return InertialSamples(nanoseconds / 1e9, table[:, :3], table[:, 3:], T_camera_imu)
 
 
 def _rig(mav: Path) -> StereoRig | None:
@@ -180,15 +178,19 @@ def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray |
     if not listing.is_file():
         return camera_images(camera / "data", warnings), None
     rows = []
-    for number, line in enumerate(listing.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in read_lines(listing, "use EuRoC's data.csv"):
         fields = [field.strip() for field in line.split("#")[0].split(",")]
         if not fields[0]:
             continue
-        if len(fields) < 2 or not fields[0].isdigit():
-            raise DvoError("not 'ns,filename'", file=listing, field=f"line {number}", remedy="correct the row")
-        rows.append((int(fields[0]), fields[1]))
+        try:
+            time, name = parse_nanoseconds(fields[0]), fields[1]
+        except (ValueError, IndexError):
+            raise DvoError(
+                "not 'ns,filename'", file=listing, field=f"line {number}", remedy="correct the row"
+            ) from None
+        rows.append((time, listed_file(listing, camera / "data", name, number)))
     rows.sort()
-    return [camera / "data" / name for _, name in rows], np.array([time / 1e9 for time, _ in rows])
+    return [file for _, file in rows], np.array([time / 1e9 for time, _ in rows])
 
 
 def open_euroc(path: Path, request: Request) -> Recording:

@@ -11,7 +11,7 @@ from dvo.data.images import list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.stamps import choose_times, times_from_names
 
-_STEREO_NAME = re.compile(r"\d{16,}_[01]")
+_STEREO_NAME = re.compile(r"[0-9]{16,19}_[01]")
 
 
 def matches(path: Path) -> bool:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.data.files import read_rows
 from dvo.data.icl_nuim import read_counted_poses
 from dvo.data.tartanair import read_ned_poses
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
@@ -53,12 +54,7 @@ def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
 
 def _columns(file: Path) -> int:
     """Numbers in the first row."""
-    with open(file, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            fields = line.split("#")[0].replace(",", " ").split()
-            if fields:
-                return len(fields)
-    return 0
+    return next((len(fields) for _, fields in read_rows(file, "give an existing file", "groundtruth")), 0)
 
 
 def _no_times(rows: int, times: np.ndarray, file: Path) -> DvoError:

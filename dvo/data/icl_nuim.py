@@ -19,7 +19,7 @@ from dvo.data.images import has_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors import SameName, Sensors
 from dvo.data.sequence import find_calibration
-from dvo.data.stamps import choose_times
+from dvo.data.stamps import checked_rate, choose_times
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.errors import DvoError
 
@@ -89,7 +89,7 @@ def open_icl_nuim(path: Path, request: Request) -> Recording:
         raise DvoError("not a sequence of ICL-NUIM", file=path, remedy="give a folder such as living_room_traj0_loop")
     warnings: list[str] = []
     images = camera_images(folder, warnings)
-    nominal = np.arange(len(images)) / (request.fps or FPS)
+    nominal = np.arange(len(images)) / (checked_rate(request.fps) or FPS)
     times = choose_times(
         images, folder, times=request.times, fps=request.fps, warnings=warnings,
         fallback=lambda: None if request.fps else nominal,

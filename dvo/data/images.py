@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.data.files import read_image_file
+from dvo.data.image_header import MAX_PIXELS, image_size
 from dvo.errors import DvoError
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
@@ -19,7 +21,8 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
         name: of a file.
     """
     parts = re.split(r"([0-9]+)", name)
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part.lower()) for part in parts if part]
+    # "²" is a digit to str.isdigit, but no number to int
+    return [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part.lower()) for part in parts if part]
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -78,26 +81,48 @@ def read_image(path: Path) -> np.ndarray | None:
         ``(H, W, 3)`` uint8 RGB, or None if the file is missing, corrupt or cut short.
 
     Raises:
-        DvoError: a readable image with pixels that are no colours (float).
+        DvoError: an image of more than :data:`dvo.data.image_header.MAX_PIXELS`, or a readable one with pixels that
+            are no colours (float).
     """
-    import cv2
-
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return None
-    if not is_complete(data):
-        return None
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
-    if image is None or image.size == 0:
+    image = decode(path)
+    if image is None:
         return None
     try:
         return to_rgb8(image)
     except DvoError as error:
         raise DvoError(error.message, file=path, remedy=error.remedy) from None
+
+
+def decode(path: Path) -> np.ndarray | None:
+    """Decode an image file as it is; its size is taken from the header before.
+
+    Args:
+        path: the file.
+
+    Returns:
+        ``(H, W)`` or ``(H, W, C)`` in OpenCV's order of channels; None if the file is missing, no regular file, of an
+        unknown format, corrupt or cut short.
+
+    Raises:
+        DvoError: an image of more than :data:`dvo.data.image_header.MAX_PIXELS`.
+    """
+    import cv2
+
+    data = read_image_file(path)
+    if data is None or not is_complete(data):
+        return None
+    size = image_size(data)
+    if size is None:
+        return None
+    if size[0] * size[1] > MAX_PIXELS:
+        raise DvoError(
+            f"image of {size[0]}x{size[1]} pixels, more than {MAX_PIXELS:,}", file=path, remedy="reduce the images"
+        )
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    return None if image is None or image.size == 0 else image
 
 
 def is_complete(data: bytes) -> bool:

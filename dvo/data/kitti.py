@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.calibration import Calibration
+from dvo.data.files import is_file, lookups, parse_number, read_lines
 from dvo.data.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
 from dvo.data.sensors import SameName, Sensors, StereoRig
@@ -32,17 +33,22 @@ def read_projections(path: Path) -> dict[str, np.ndarray]:
         Name ``P0`` to ``P3``, those that are there, to a ``(3, 4)`` float64 matrix ``K [I | t]``.
 
     Raises:
-        DvoError: such a row without 12 numbers.
+        DvoError: such a row without 12 finite numbers, or whose matrix K is singular or not that of a pinhole camera.
     """
     found: dict[str, np.ndarray] = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for _, line in read_lines(path, "use KITTI's calib.txt"):
         name, colon, rest = line.partition(":")
-        if not colon or name.strip() not in ("P0", "P1", "P2", "P3"):
+        name = name.strip()
+        if not colon or name not in ("P0", "P1", "P2", "P3"):
             continue
         try:
-            found[name.strip()] = np.array([float(value) for value in rest.split()]).reshape(3, 4)
+            matrix = np.array([parse_number(value) for value in rest.split()]).reshape(3, 4)
         except ValueError:
-            raise DvoError("not 12 numbers", file=path, field=name.strip(), remedy="use KITTI's calib.txt") from None
+            raise DvoError("not 12 numbers", file=path, field=name, remedy="use KITTI's calib.txt") from None
+        K = matrix[:, :3]
+        if min(K[0, 0], K[1, 1]) < 1e-3 or (K[[1, 2, 2], [0, 0, 1]] != 0).any() or K[2, 2] != 1:
+            raise DvoError("not the projection of a camera", file=path, field=name, remedy="use KITTI's calib.txt")
+        found[name] = matrix
     return found
 
 
@@ -56,7 +62,12 @@ def _split(path: Path) -> tuple[Path, Path] | None:
             return None
         sequence, images = path, folders[0]
     calib = sequence / "calib.txt"
-    return (sequence, images) if calib.is_file() and "P0:" in calib.read_text(errors="replace")[:4096] else None
+    return (sequence, images) if is_file(calib) and "P0:" in _beginning(calib) else None
+
+
+def _beginning(file: Path) -> str:
+    with lookups(file), file.open(encoding="utf-8", errors="replace") as text:
+        return text.read(4096)
 
 
 def matches(path: Path) -> bool:

@@ -172,7 +172,7 @@ class ImageRecording:
         sensors: files of other sensors.
 
     Raises:
-        DvoError: no images.
+        DvoError: no images, or times that are not finite.
     """
 
     def __init__(
@@ -191,7 +191,10 @@ class ImageRecording:
         if not images:
             raise DvoError("no images in it", file=path, remedy="give a video, a folder of images or a sequence")
         self.kind, self.path, self.name = kind, path, name or path.resolve().name
-        self.calibration, self.groundtruth = calibration, groundtruth
+        if not np.isfinite(timestamps).all():
+            raise DvoError("times that are not finite", file=path, field="times", remedy="give times with --times")
+        # poses of images that share a time share it too
+        self.calibration, self.groundtruth = calibration, groundtruth.increasing() if groundtruth else None
         self.warnings = list(warnings or [])
         self.sensors = sensors or Sensors()
         later = np.ones(len(images), dtype=bool)
@@ -272,6 +275,6 @@ def rows_of_images(images: list[Path], rows: int) -> np.ndarray | None:
     """
     if rows == len(images):
         return np.arange(rows)
-    numbers = [re.match(r"\d+", image.stem) for image in images]
-    found = np.array([int(number.group()) if number else -1 for number in numbers], dtype=np.int64)
-    return found if len(found) and (found >= 0).all() and (found < rows).all() else None
+    matches = [re.match(r"[0-9]+", image.stem) for image in images]
+    numbers = [int(match.group()) if match else -1 for match in matches]  # of up to 255 digits
+    return np.array(numbers) if numbers and all(0 <= number < rows for number in numbers) else None

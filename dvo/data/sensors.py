@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.calibration import Calibration
+from dvo.data.files import is_file
 from dvo.data.frame import InertialSamples
 from dvo.data.images import list_images
 
@@ -80,7 +81,7 @@ class SameName:
     def __call__(self, image: Path) -> Path | None:
         name = image.name.replace(self.old, self.new) if self.old else image.name
         file = self.folder / name
-        return file if file.is_file() else None
+        return file if is_file(file) else None
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class SameNumbers:
 
 
 def _numbers(file: Path) -> tuple[str, ...]:
-    return tuple(re.findall(r"\d+", file.stem)) or (file.stem,)
+    return tuple(re.findall(r"[0-9]+", file.stem)) or (file.stem,)
 
 
 @dataclass(frozen=True)

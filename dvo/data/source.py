@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import islice
+from numbers import Integral
 from pathlib import Path
 
 import numpy as np
 
 from dvo.data.calibration import Calibration, read_calibration
+from dvo.data.files import is_file, lookups
 from dvo.data.frame import Frame, InertialSamples, StereoView
 from dvo.data.groundtruth import read_groundtruth
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
 from dvo.data.registry import find_reader
 from dvo.data.sensors import StereoRig
+from dvo.data.stamps import checked_rate
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
@@ -221,18 +224,21 @@ def open_source(
                 print(frame.timestamp, frame.image.shape, frame.depth is not None)
     """
     path = Path(source)
-    if not path.exists():
+    with lookups(path):
+        is_there = path.exists()
+    if not is_there:
         raise DvoError("no such file or folder", file=path, remedy="give a video, a folder of images or a sequence")
-    if stride < 1:
-        raise DvoError(f"stride {stride}", field="stride", remedy="give a whole number of at least 1")
+    if not isinstance(stride, Integral) or stride < 1:
+        raise DvoError(f"stride {str(stride)[:40]}", field="stride", remedy="give a whole number of at least 1")
     if times is not None and fps is not None:
         raise DvoError("both times and fps are given", field="times", remedy="give --times or --fps, not both")
     request = Request(
         _locate(times, path, "times") if times is not None else None,
-        fps,
+        checked_rate(fps),
         calib if calib is None or isinstance(calib, Calibration) else read_calibration(_locate(calib, path, "calib")),
     )
-    recording = find_reader(path, reader).open(path, request)
+    with lookups(path):
+        recording = find_reader(path, reader).open(path, request)
     first = _first_frame(recording)
     calibration = recording.calibration if request.calibration is None else request.calibration
     if calibration is None:
@@ -252,7 +258,7 @@ def _locate(given: Path | str, source: Path, field: str) -> Path:
     path = Path(given)
     base = source if source.is_dir() else source.parent
     for option in (path, base / path):
-        if option.is_file():
+        if is_file(option):
             return option
     raise DvoError("no such file", file=path, field=field, remedy=f"give an existing file to --{field}")
 

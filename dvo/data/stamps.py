@@ -8,15 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.data.files import is_file, is_nanoseconds, parse_nanoseconds, parse_number, read_rows
 from dvo.errors import DvoError
 
 NOMINAL_FPS = 30.0
-_NANOSECONDS = re.compile(r"\d{16,}")
-_SECONDS = re.compile(r"\d+\.\d+")
+RATES = (1e-5, 1e6)
+"""Slowest and fastest images a second: one a day, and more than any camera takes."""
+_SECONDS = re.compile(r"[0-9]{1,12}\.[0-9]+")
 
 
 def parse_stamp(text: str) -> float | None:
-    """Parse a time stamp: a decimal number of seconds, or an integer of at least 16 digits (nanoseconds).
+    """Parse a time stamp: a decimal number of seconds, or an integer of 16 to 19 digits (nanoseconds).
 
     Args:
         text: stem of a file name.
@@ -24,8 +26,8 @@ def parse_stamp(text: str) -> float | None:
     Returns:
         Seconds; None for anything else. A frame number (``000123``) is no stamp, so that it never passes for seconds.
     """
-    if _NANOSECONDS.fullmatch(text):
-        return int(text) / 1e9
+    if is_nanoseconds(text):
+        return parse_nanoseconds(text) / 1e9 if int(text) < 2**63 else None
     return float(text) if _SECONDS.fullmatch(text) else None
 
 
@@ -41,36 +43,26 @@ def read_times(path: Path, count: int | None) -> np.ndarray:
     Returns:
         ``(N,)`` float64 seconds, strictly increasing.
 
-    Args:
-        path: the file.
-        count: number of images, or None if not known.
-
-    Returns:
-        ``(count,)`` float64, strictly increasing.
-
     Raises:
-        DvoError: missing file, no number where one is expected, another number of rows, times that do not increase.
+        DvoError: missing or malformed file, no number where one is expected or one beyond
+            :data:`dvo.data.files.MAX_NUMBER`, another number of rows, times that do not increase.
     """
-    if not path.is_file():
-        raise DvoError("no such file", file=path, field="times", remedy="give a file with one time per image")
     times: list[float] = []
-    header_allowed = True
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").replace(";", " ").split()
-        if not fields:
-            continue
+    is_first = True
+    for number, fields in read_rows(path, "give a file with one time per image", "times"):
         try:
-            value = int(fields[0]) / 1e9 if _NANOSECONDS.fullmatch(fields[0]) else float(fields[0])
+            value = parse_nanoseconds(fields[0]) / 1e9 if is_nanoseconds(fields[0]) else parse_number(fields[0])
         except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            if header_allowed:
-                header_allowed = False
+            if is_first and not _is_number(fields[0]):  # the names of the columns
+                is_first = False
                 continue
             raise DvoError(
-                f"{fields[0]!r} is no time", file=path, field=f"line {number}", remedy="put seconds first in each row"
-            )
-        header_allowed = False
+                f"{fields[0][:40]!r} is no time",
+                file=path,
+                field=f"line {number}",
+                remedy="put seconds first in each row",
+            ) from None
+        is_first = False
         if times and value <= times[-1]:
             raise DvoError(
                 f"times must increase, but {value:.9g} follows {times[-1]:.9g}",
@@ -89,6 +81,15 @@ def read_times(path: Path, count: int | None) -> np.ndarray:
     return np.array(times, dtype=np.float64)
 
 
+def _is_number(text: str) -> bool:
+    """True also for what is not finite."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def times_from_names(paths: list[Path]) -> np.ndarray | None:
     """Read times from file names.
 
@@ -99,10 +100,34 @@ def times_from_names(paths: list[Path]) -> np.ndarray | None:
         ``(N,)`` float64 seconds if every stem is a stamp (``1305031102.175304``, ``1403636579763555584[_0]``), else
         None.
     """
-    times = [parse_stamp(re.sub(r"(?<=\d{16})_0$", "", path.stem)) for path in paths]
+    times = [parse_stamp(re.sub(r"(?<=[0-9]{16})_0$", "", path.stem)) for path in paths]
     if not paths or any(time is None for time in times):
         return None
     return np.array(times, dtype=np.float64)
+
+
+def checked_rate(fps: float | None, field: str = "fps") -> float | None:
+    """Check frames a second.
+
+    Args:
+        fps: the user's; None if not given.
+        field: name of the option, for messages.
+
+    Returns:
+        The rate.
+
+    Raises:
+        DvoError: no number, or one outside of :data:`RATES`.
+    """
+    if fps is None:
+        return None
+    try:
+        rate = float(fps)
+    except (TypeError, ValueError, OverflowError):
+        rate = float("nan")
+    if not RATES[0] <= rate <= RATES[1]:  # NaN fails too
+        raise DvoError(f"{str(fps)[:40]} frames a second", field=field, remedy="give a positive rate, such as 30")
+    return rate
 
 
 def choose_times(
@@ -133,12 +158,11 @@ def choose_times(
     Raises:
         DvoError: see :func:`read_times`; a rate that is not positive.
     """
-    if fps is not None and not (np.isfinite(fps) and fps > 0):
-        raise DvoError(f"{fps:g} frames a second", field="fps", remedy="give a positive rate")
+    fps = checked_rate(fps)
     if times is not None:
         return read_times(times, len(paths))
     found, origin = None, ""
-    beside = next((path for path in (folder / "times.txt", folder.parent / "times.txt") if path.is_file()), None)
+    beside = next((path for path in (folder / "times.txt", folder.parent / "times.txt") if is_file(path)), None)
     if beside is not None:
         found, origin = read_times(beside, len(paths)), str(beside)
     if found is None:

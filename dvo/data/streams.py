@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.data.stamps import checked_rate
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
@@ -106,42 +108,61 @@ def stream(
     """
     if timestamps is not None and fps is not None:
         raise DvoError("both timestamps and fps are given", field="timestamps", remedy="give one of them")
-    if fps is not None and not (np.isfinite(fps) and fps > 0):
-        raise DvoError(f"{fps:g} frames a second", field="fps", remedy="give a positive rate")
+    fps = checked_rate(fps)
     undistorter = Undistorter(camera) if camera is not None and undistort and needs_undistortion(camera) else None
-    times = iter(timestamps) if timestamps is not None else None
+    times = _iterator(timestamps, name, "timestamps") if timestamps is not None else None
 
     def frames() -> Iterator[Frame]:
-        for index, item in enumerate(images):
+        for index, item in enumerate(_iterator(images, name, "images")):
             if isinstance(item, Frame):
                 yield item
                 continue
-            time, image = item if isinstance(item, tuple) else (None, item)
+            time, image = item if isinstance(item, tuple) and len(item) == 2 else (None, item)
             if times is not None:
                 time = next(times, None)
             elif time is None and fps is not None:
                 time = index / fps
-            if time is None or not np.isfinite(time):
-                raise DvoError(
-                    f"no time for image {index}",
-                    file=name,
-                    field="timestamps",
-                    remedy="give timestamps=, fps=, or pairs (seconds, image)",
-                )
+            seconds = _seconds(time, index, name)
             if camera is None:
                 raise DvoError("no camera", file=name, field="camera", remedy="give the camera of the images")
             pixels = _checked(image, camera, index, name)
             if undistorter is None:
-                yield Frame(index, float(time), pixels, camera)
+                yield Frame(index, seconds, pixels, camera)
             else:
-                yield Frame(index, float(time), undistorter(pixels), undistorter.camera)
+                yield Frame(index, seconds, undistorter(pixels), undistorter.camera)
 
     return FrameStream(frames(), name, groundtruth)
 
 
-def _checked(image: np.ndarray, camera: Camera, index: int, name: str) -> np.ndarray:
+def _iterator(values: Any, name: str, field: str) -> Iterator[Any]:
+    try:
+        return iter(values)
+    except TypeError:
+        raise DvoError(f"not {field}: {type(values).__name__}", file=name, field=field, remedy="give a list") from None
+
+
+def _seconds(time: Any, index: int, name: str) -> float:
+    """A finite number of seconds."""
+    try:
+        seconds = float(time) if not isinstance(time, (str, bytes)) else np.nan
+    except (TypeError, ValueError, OverflowError):
+        seconds = np.nan
+    if not np.isfinite(seconds):
+        raise DvoError(
+            f"no time for image {index}",
+            file=name,
+            field="timestamps",
+            remedy="give timestamps=, fps=, or pairs (seconds, image)",
+        )
+    return seconds
+
+
+def _checked(image: Any, camera: Camera, index: int, name: str) -> np.ndarray:
     """``(H, W, 3)`` uint8 RGB of the camera's size."""
-    image = np.asarray(image)
+    try:
+        image = np.asarray(image)
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths
+        image = np.zeros(0)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,)):
         raise DvoError(
             f"image {index} is {image.dtype} of shape {image.shape}",

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.calibration import Calibration
+from dvo.data.files import is_file
 from dvo.data.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
 from dvo.data.sensors import SameName, Sensors, rectified
 from dvo.data.sequence import find_calibration
-from dvo.data.stamps import read_times
-from dvo.data.trajectory import Trajectory
+from dvo.data.stamps import checked_rate, read_times
+from dvo.data.trajectory import Trajectory, read_numbers, unit_quaternions
 from dvo.errors import DvoError
 from dvo.geometry.poses import ned_to_camera
 
@@ -88,7 +89,7 @@ def depth_file(image: Path) -> Path | None:
         options = [sequence / "depth_left" / f"{stem}_depth{end}" for end in (".npy", ".npz")]
     elif image.parent.name == "image_lcam_front":
         options = [sequence / "depth_lcam_front" / f"{stem}_depth.png"]
-    return next((option for option in options if option.is_file()), None)
+    return next((option for option in options if is_file(option)), None)
 
 
 def read_ned_poses(path: Path) -> np.ndarray:
@@ -101,21 +102,11 @@ def read_ned_poses(path: Path) -> np.ndarray:
         ``(N, 7)`` float64 camera-to-world poses of the camera frame x right, y down, z forward.
 
     Raises:
-        DvoError: a row that is not 7 finite numbers, or a quaternion of no length.
+        DvoError: missing file, no rows, a row that is not 7 finite numbers, or a quaternion of no length.
     """
-    rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").split()
-        if not fields:
-            continue
-        try:
-            row = np.array([float(field) for field in fields])
-        except ValueError:
-            row = np.zeros(0)
-        if row.shape != (7,) or not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 1e-6:
-            raise DvoError("not 'tx ty tz qx qy qz qw'", file=path, field=f"line {number}", remedy="correct the row")
-        rows.append(row)
-    return ned_to_camera(np.array(rows)) if rows else np.zeros((0, 7))
+    table, numbers = read_numbers(path, 7, "row", "tx ty tz qx qy qz qw")
+    table[:, 3:] = unit_quaternions(table[:, 3:], path, numbers)
+    return ned_to_camera(table)
 
 
 def open_tartanair(path: Path, request: Request) -> Recording:
@@ -168,11 +159,10 @@ def _times(path: Path, images: list[Path], request: Request, warnings: list[str]
         rows = rows_of_images(images, len(found))
         if rows is not None:
             return found[rows]
-    if request.fps is None:
+    fps = checked_rate(request.fps)
+    if fps is None:
         warnings.append(f"TartanAir has no times: assuming {NOMINAL_FPS:g} frames a second (or give --times or --fps)")
-    elif not (np.isfinite(request.fps) and request.fps > 0):
-        raise DvoError(f"{request.fps:g} frames a second", field="fps", remedy="give a positive rate")
-    return np.arange(len(images)) / (request.fps or NOMINAL_FPS)
+    return np.arange(len(images)) / (fps or NOMINAL_FPS)
 
 
 READER = Reader("tartanair", matches, open_tartanair)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from dvo.data.files import parse_number, read_rows
 from dvo.errors import DvoError
 from dvo.geometry.poses import pose_matrices, poses_from_matrices, slerp
 
@@ -42,6 +44,13 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    def increasing(self) -> Trajectory:
+        """Rows that are later than all rows before them; all of them, if the times increase."""
+        times = self.timestamps
+        later = np.ones(len(times), dtype=bool)
+        later[1:] = times[1:] > np.maximum.accumulate(times)[:-1]
+        return self if later.all() else Trajectory(times[later], self.poses_wc[later])
 
     @property
     def positions(self) -> np.ndarray:
@@ -93,7 +102,8 @@ def read_tum(path: Path | str) -> Trajectory:
         Camera-to-world poses in the order of the rows, quaternions normalised.
 
     Raises:
-        DvoError: missing file, no rows, a row without 8 finite numbers, or a quaternion of zero length.
+        DvoError: missing file, no rows, a row without 8 finite numbers, a quaternion of zero length, or times that do
+            not increase.
 
     Example:
         >>> from pathlib import Path
@@ -102,30 +112,70 @@ def read_tum(path: Path | str) -> Trajectory:
         array([[1., 2., 3., 0., 0., 0., 1.]])
     """
     path = Path(path)
-    if not path.is_file():
-        raise DvoError("no such file", file=path, remedy="give a TUM trajectory file")
-    rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        fields = line.replace(",", " ").split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            row = [float(value) for value in fields]
-        except ValueError:
-            row = []
-        if len(row) != 8 or not np.isfinite(row).all():
-            raise DvoError(
-                "not a TUM row", file=path, field=f"line {number}", remedy="use 'timestamp tx ty tz qx qy qz qw'"
-            )
-        rows.append(row)
-    if not rows:
-        raise DvoError("no poses in it", file=path, remedy="give a TUM trajectory file")
-    table = np.array(rows, dtype=np.float64)
-    norms = np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
-    if (norms < 1e-6).any():
-        raise DvoError("a quaternion has no length", file=path, field="qx qy qz qw", remedy="correct the row")
-    table[:, 4:] /= norms
+    table, numbers = read_numbers(path, 8, "TUM row", "timestamp tx ty tz qx qy qz qw")
+    late = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+    if len(late):
+        row = int(late[0]) + 1
+        raise DvoError(
+            f"times must increase, but {table[row, 0]:.9f} follows {table[row - 1, 0]:.9f}",
+            file=path,
+            field=f"line {numbers[row]}",
+            remedy="sort the rows, and remove duplicates",
+        )
+    table[:, 4:] = unit_quaternions(table[:, 4:], path, numbers)
     return Trajectory(table[:, 0].copy(), table[:, 1:].copy())
+
+
+def read_numbers(path: Path, columns: int, row: str, header: str) -> tuple[np.ndarray, list[int]]:
+    """Read a table of numbers, none of which is beyond :data:`dvo.data.files.MAX_NUMBER`.
+
+    Args:
+        path: the file; see :func:`dvo.data.files.read_rows`.
+        columns: numbers in each row.
+        row: name of a row, for messages.
+        header: names of the numbers, for messages.
+
+    Returns:
+        ``(N, columns)`` float64, and the lines of the rows.
+
+    Raises:
+        DvoError: missing or malformed file, no rows, or a row of other numbers.
+    """
+    values, numbers = array("d"), array("q")
+    for number, fields in read_rows(path, f"give a file of rows '{header}'"):
+        try:
+            parsed = [parse_number(field) for field in fields]
+        except ValueError:
+            parsed = []
+        if len(parsed) != columns:
+            raise DvoError(f"not a {row}", file=path, field=f"line {number}", remedy=f"use '{header}'")
+        values.extend(parsed)
+        numbers.append(number)
+    if not numbers:
+        raise DvoError("no poses in it", file=path, remedy=f"give a file of rows '{header}'")
+    return np.array(values, dtype=np.float64).reshape(-1, columns), numbers.tolist()
+
+
+def unit_quaternions(quaternions: np.ndarray, path: Path, lines: list[int]) -> np.ndarray:
+    """Normalise quaternions of a table.
+
+    Args:
+        quaternions: ``(N, 4)`` finite.
+        path: of the table.
+        lines: numbers of the rows' lines.
+
+    Returns:
+        ``(N, 4)`` of length 1.
+
+    Raises:
+        DvoError: a length below 1e-6 or above 1e6.
+    """
+    norms = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    bad = np.flatnonzero(~((norms > 1e-6) & (norms < 1e6)))
+    if len(bad):
+        message, where = "a quaternion has no length", f"line {lines[int(bad[0])]}"
+        raise DvoError(message, file=path, field=where, remedy="correct qx qy qz qw in this row")
+    return quaternions / norms
 
 
 def interpolate(trajectory: Trajectory, timestamps: np.ndarray, max_gap: float = 0.1) -> Trajectory:
@@ -168,26 +218,19 @@ def read_kitti_poses(path: Path | str) -> np.ndarray:
         ``(N, 7)`` float64 poses, camera to world. The file holds no times.
 
     Raises:
-        DvoError: missing file, no rows, or a row that is not 12 finite numbers.
+        DvoError: missing file, no rows, or a row that is not 12 finite numbers with a rotation.
     """
     path = Path(path)
-    if not path.is_file():
-        raise DvoError("no such file", file=path, remedy="give a KITTI pose file")
-    rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
-        fields = line.split()
-        if not fields or fields[0].startswith("#"):
-            continue
-        try:
-            row = [float(value) for value in fields]
-        except ValueError:
-            row = []
-        if len(row) != 12 or not np.isfinite(row).all():
-            raise DvoError("not a KITTI row", file=path, field=f"line {number}", remedy="use 12 numbers, a 3x4 matrix")
-        rows.append(row)
-    if not rows:
-        raise DvoError("no poses in it", file=path, remedy="give a KITTI pose file")
-    return poses_from_matrices(np.array(rows).reshape(-1, 3, 4))
+    table, numbers = read_numbers(path, 12, "KITTI row", "12 numbers, a 3x4 matrix")
+    matrices = table.reshape(-1, 3, 4)
+    rotations = matrices[:, :, :3]
+    products = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero(~((products < 0.02) & (np.linalg.det(rotations) > 0)))
+    if len(bad):
+        raise DvoError(
+            "the matrix is no rotation", file=path, field=f"line {numbers[int(bad[0])]}", remedy="correct the row"
+        )
+    return poses_from_matrices(matrices)
 
 
 def write_kitti_poses(path: Path | str, poses_wc: np.ndarray) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.calibration import Calibration
+from dvo.data.files import listed_file, parse_number, read_lines
 from dvo.data.folder import camera_images
 from dvo.data.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
@@ -49,17 +50,17 @@ def default_calibration(name: str) -> Calibration | None:
 def _listed_images(listing: Path) -> tuple[list[Path], np.ndarray]:
     """Files and times of ``rgb.txt`` (``timestamp filename`` a row), sorted by time."""
     rows: list[tuple[float, Path]] = []
-    for number, line in enumerate(listing.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in read_lines(listing, "give a list of images"):
         fields = line.split("#")[0].split(maxsplit=1)
         if not fields:
             continue
         try:
-            time = float(fields[0])
-        except ValueError:
-            time = float("nan")
-        if len(fields) != 2 or not np.isfinite(time):
-            raise DvoError("not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row")
-        rows.append((time, listing.parent / fields[1].strip()))
+            time, name = parse_number(fields[0]), fields[1].strip()
+        except (ValueError, IndexError):
+            raise DvoError(
+                "not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row"
+            ) from None
+        rows.append((time, listed_file(listing, listing.parent, name, number)))
     rows.sort(key=lambda row: row[0])
     return [path for _, path in rows], np.array([time for time, _ in rows])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,11 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvo.data.calibration import Calibration
+from dvo.data.files import is_file, lookups
 from dvo.data.frame import InertialSamples
+from dvo.data.image_header import MAX_PIXELS
 from dvo.data.images import SUFFIXES, to_rgb8
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
 from dvo.data.sensors import StereoRig
-from dvo.data.stamps import NOMINAL_FPS, read_times
+from dvo.data.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 # A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
+_SECONDS = 4  # to open, and to find the next frame: gigabytes without one are no video
 
 
 def matches(path: Path) -> bool:
@@ -41,6 +45,10 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     """The opened video, closed again at the end."""
     import cv2
 
+    if not is_file(path):  # a pipe or a device would never end, or never begin
+        raise DvoError("no video file", file=path, remedy="give a file; images of a camera go to dvo.stream")
+    with lookups(path), path.open("rb") as file:
+        file.read(1)  # a disk that sleeps wakes before time counts
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
     # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
@@ -49,7 +57,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     cv2.utils.logging.setLogLevel(0)
     try:
         # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, limits)
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:
@@ -60,7 +69,15 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
                 remedy="check that it plays; a recording that was cut off before its index was written must be "
                 "repaired first",
             )
+        size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if size[0] * size[1] > MAX_PIXELS:
+            message = f"frames of {size[0]:g}x{size[1]:g} pixels, more than {MAX_PIXELS:,}"
+            raise DvoError(message, file=path, remedy="reduce the video")
         yield capture
+    except cv2.error as error:
+        raise DvoError(
+            f"this video does not decode ({str(error).splitlines()[0][:200]})", file=path, remedy="check that it plays"
+        ) from None
     finally:
         capture.release()
 
@@ -69,12 +86,16 @@ def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
     """``(index, container milliseconds, failed grabs just before)`` of every frame that decodes."""
     import cv2
 
-    index, failed = 0, 0
+    index, failed, failing_since = 0, 0, 0.0
     while failed <= _GIVE_UP_AFTER:
         if capture.grab():
             yield index, capture.get(cv2.CAP_PROP_POS_MSEC), failed
             failed = 0
         else:
+            now = time.monotonic()
+            failing_since = failing_since if failed else now
+            if now - failing_since > _SECONDS:
+                return
             failed += 1
         index += 1
 
@@ -102,8 +123,7 @@ class VideoRecording:
     def __init__(self, path: Path, request: Request) -> None:
         import cv2
 
-        if request.fps is not None and not (np.isfinite(request.fps) and request.fps > 0):
-            raise DvoError(f"{request.fps:g} frames a second", field="fps", remedy="give a positive rate")
+        fps = checked_rate(request.fps)
         self.path, self.name = path, path.stem
         self.warnings: list[str] = []
         with _capture(path) as capture:
@@ -115,7 +135,7 @@ class VideoRecording:
         self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
         self._times = self._read_times(request.times) if request.times is not None else None
         self._use_container = bool(request.fps is None and (np.diff(first) > 0).all() and np.isfinite(first).all())
-        self._fps = request.fps or (rate if np.isfinite(rate) and 0 < rate < 1e5 else NOMINAL_FPS)
+        self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
         if self._times is None and not self._use_container and request.fps is None:
             known = "the stated" if self._fps == rate else "a guessed"
             self.warnings.append(
@@ -140,7 +160,7 @@ class VideoRecording:
                 if index % stride:
                     continue
                 timestamp = self._time(index, milliseconds)
-                if timestamp is None or timestamp <= previous:
+                if timestamp is None or not previous < timestamp < np.inf:  # NaN fails too
                     dropped += 1
                     if dropped == 1:
                         log.notes.append(f"from frame {index} on, frames not later than the one before were dropped")

@@ -1,0 +1,166 @@
+"""Readers of single files that a user names: calibrations, times, trajectories, ground truth; and streams."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.data.calibration import read_calibration
+from dvo.data.groundtruth import read_groundtruth
+from dvo.data.source import open_source
+from dvo.data.stamps import read_times
+from dvo.data.streams import stream
+from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
+from dvo.geometry.camera import Camera
+from dvo.geometry.undistort import Undistorter, needs_undistortion
+from eval.benchmarks.malformed.readers_data import HEIGHT, MODULES, WIDTH, K, images, lines, picture, poses
+from eval.benchmarks.malformed.target import Target, check_frames, check_times, check_trajectory, require
+
+CALIBRATIONS = {
+    "line": ("calib.txt", [f"{K} -0.1 0.01 0.001 0.001 0.0001"]),
+    "matrix": ("calib.txt", ["50 0 31.5", "0 51 23.5", "0 0 1"]),
+    "keys": ("calib.yaml", ["fx: 50", "fy: 51", "cx: 31.5", "cy: 23.5", "width: 64", "height: 48", "model: fisheye",
+                            "coefficients: [0.01, 0.002, 0.0003, 0.0001]", "depth_scale: 1000", "baseline: 0.1"]),
+    "kalibr": ("calib.yaml", ["cam0:", "  camera_model: pinhole", "  intrinsics: [50, 51, 31.5, 23.5]",
+                              "  distortion_model: radtan", "  distortion_coeffs: [-0.1, 0.01, 0.001, 0.001]",
+                              "  resolution: [64, 48]"]),
+    "opencv": ("calib.yml", ["%YAML:1.0", "---", "image_width: 64", "image_height: 48",
+                             "camera_matrix: !!opencv-matrix", "   rows: 3", "   cols: 3", "   dt: d",
+                             "   data: [50, 0, 31.5, 0, 51, 23.5, 0, 0, 1]",
+                             "distortion_coefficients: !!opencv-matrix", "   rows: 1", "   cols: 5", "   dt: d",
+                             "   data: [-0.1, 0.01, 0.001, 0.001, 0.0]"]),
+    "orbslam": ("calib.yaml", ["Camera.fx: 50", "Camera.fy: 51", "Camera.cx: 31.5", "Camera.cy: 23.5",
+                               "Camera.k1: -0.1", "Camera.k2: 0.01", "Camera.p1: 0.001", "Camera.p2: 0.001",
+                               "Camera.width: 64", "Camera.height: 48", "Camera.bf: 5", "DepthMapFactor: 5000"]),
+}  # fmt: skip
+
+
+def _write(folder: Path, name: str, rows: list[str]) -> None:
+    lines(folder / name, rows)
+
+
+def _calibration(folder: Path, random: np.random.Generator | None, name: str) -> None:
+    calibration = read_calibration(folder / name)
+    camera = calibration.camera(WIDTH, HEIGHT)
+    calibration.doubts(WIDTH, HEIGHT)
+    if needs_undistortion(camera):
+        undistorter = Undistorter(camera)
+        require(np.isfinite(undistorter.camera.intrinsics).all(), "undistorted camera that is not finite")
+        undistorter(picture(0))
+    for value in (calibration.depth_scale, calibration.baseline):
+        require(value is None or (np.isfinite(value) and value > 0), "scale or baseline")
+
+
+def _times(folder: Path, random: np.random.Generator | None) -> None:
+    check_times(read_times(folder / "times.txt", None))
+
+
+def _tum(folder: Path, random: np.random.Generator | None) -> None:
+    check_trajectory(read_tum(folder / "trajectory.txt"))
+
+
+def _kitti_poses(folder: Path, random: np.random.Generator | None) -> None:
+    found = read_kitti_poses(folder / "poses.txt")
+    check_trajectory(Trajectory(np.arange(len(found), dtype=np.float64), found))
+
+
+def _truth(folder: Path, random: np.random.Generator | None, name: str) -> None:
+    check_trajectory(read_groundtruth(folder / name, 0.05 * np.arange(4)))
+
+
+PATHS = ["/dev/null", "/dev/zero", "/dev/stdin", "/", "", ".", "x" * 300, "a\0b", "\udcff", "~", "/proc/self/mem",
+         "/proc/self/environ", "/dev/fd/0", "pipe", "loop", "/etc/passwd", "s/0.png", "calib.txt"]  # fmt: skip
+
+
+def _places(folder: Path) -> None:
+    images(folder / "s", [f"{i}.png" for i in range(3)])
+    lines(folder / "calib.txt", [K])
+    lines(folder / "times.txt", ["0", "0.1", "0.2"])
+    lines(folder / "truth.txt", poses(3))
+
+
+def _no_mutation(folder: Path, random: np.random.Generator) -> str:
+    """Special files beside the valid ones; the options of the case are the mutation."""
+    os.mkfifo(folder / "pipe")
+    (folder / "loop").symlink_to("loop")
+    return "odd paths and options"
+
+
+def _options(folder: Path, random: np.random.Generator | None) -> None:
+    """Open a source whose path and options are sometimes odd places or values."""
+    given: dict[str, Any] = {"calib": "calib.txt", "times": "times.txt", "groundtruth": "truth.txt"}
+    source = "s"
+    if random is not None:
+        odd = [str(PATHS[int(i)]) for i in random.integers(len(PATHS), size=4)]
+        which = int(random.integers(6))
+        if which == 0:
+            source = odd[0]
+        elif which < 4:
+            given[("calib", "times", "groundtruth")[which - 1]] = odd[1]
+        elif which == 4:
+            given["reader"] = ["video", "tum", "euroc", "kitti", "tartanair", "icl_nuim", "sequence", "folder", "x", "",
+                               "a:b", "os:system"][int(random.integers(12))]  # fmt: skip
+            source = source if random.random() < 0.5 else odd[0]
+        else:
+            given |= {"times": None, "fps": [0, -1, float("nan"), 1e308, 1e-320, 10**400, 1][int(random.integers(7))]}
+    opened = open_source(source, **given)
+    if opened.groundtruth is not None:
+        check_trajectory(opened.groundtruth)
+    check_frames(opened)
+
+
+def _odd_images(random: np.random.Generator) -> list[Any]:
+    image = picture(0)
+    return [image, image[..., 0], image.astype(np.float64), image.astype(np.uint16), image[:10], None, "image", 3.5,
+            [], [[1, 2], [3]], {}, b"bytes", image.astype(object), np.zeros((0, 0, 3), np.uint8), image[..., None],
+            np.ma.masked_array(image), (1.0,), (1.0, image, 2), ("one", image), (None, image), (np.nan, image),
+            (10**400, image), ([1.0], image), (1.0, None), (True, image), np.datetime64("2024-01-01"),
+            (np.float32(5), image), image.tolist(), np.zeros((HEIGHT, WIDTH, 4), np.uint8)]  # fmt: skip
+
+
+def _nothing(folder: Path) -> None:
+    lines(folder / "empty.txt", [])
+
+
+def _odd_stream(folder: Path, random: np.random.Generator) -> str:
+    return "odd elements of a stream"
+
+
+def _stream(folder: Path, random: np.random.Generator | None) -> None:
+    items: list[Any] = [picture(i) for i in range(4)]
+    options: dict[str, Any] = {"fps": 10.0}
+    if random is not None:
+        odd = _odd_images(random)
+        items[int(random.integers(4))] = odd[int(random.integers(len(odd)))]
+        if random.random() < 0.3:
+            times = [[0.0, 1.0], [0.0, np.nan, 1.0], ["a"], [None], 3, [2.0, 1.0, 0.0], [10**400], "0123", [[1], [2]]]
+            options = {"timestamps": times[int(random.integers(len(times)))]}
+        elif random.random() < 0.2:
+            options = {"fps": [0, -1, np.nan, "30", None, 10**400, 1e-320][int(random.integers(7))]}
+    check_frames(stream(items, Camera(50.0, 51.0, 31.5, 23.5, WIDTH, HEIGHT), **options))
+
+
+def _one(name: str, file: str, rows: list[str], read: Any) -> Target:
+    return Target(name, partial(_write, name=file, rows=rows), read, modules=MODULES)
+
+
+TARGETS = (
+    *(_one(f"calibration_{name}", file, rows, partial(_calibration, name=file))
+      for name, (file, rows) in CALIBRATIONS.items()),
+    _one("times", "times.txt", ["time", *(f"{0.1 * i:.3f}" for i in range(5))], _times),
+    _one("times_ns", "times.txt", [str(1_403_636_579_763_555_584 + 50_000_000 * i) for i in range(5)], _times),
+    _one("trajectory", "trajectory.txt", ["# text", *poses(6)], _tum),
+    _one("kitti_poses", "poses.txt", [f"1 0 0 {0.1 * i} 0 1 0 0 0 0 1 {i}" for i in range(4)], _kitti_poses),
+    _one("truth_tum", "t.txt", poses(), partial(_truth, name="t.txt")),
+    _one("truth_icl", "t.freiburg", [f"{i + 1} {row.split(maxsplit=1)[1]}" for i, row in enumerate(poses())],
+         partial(_truth, name="t.freiburg")),
+    _one("truth_kitti", "t.txt", [f"1 0 0 {0.1 * i} 0 1 0 0 0 0 1 {i}" for i in range(4)],
+         partial(_truth, name="t.txt")),
+    _one("truth_ned", "t.txt", [row.split(maxsplit=1)[1] for row in poses()], partial(_truth, name="t.txt")),
+    Target("options", _places, _options, _no_mutation, MODULES),
+    Target("stream", _nothing, _stream, _odd_stream, MODULES),
+)  # fmt: skip

@@ -2,7 +2,8 @@
 
 OpenMP threads that wait spin by default: with another busy process on the same cores, the others spin for whole time
 slices until the one that is not running comes back, and tracking gets 30 to 100 times slower. Threads that sleep until
-they are woken (passive waiting) do not. OpenMP reads its settings when torch is imported.
+they are woken (passive waiting) do not, and lose little on an idle machine if they spin for some microseconds before.
+OpenMP reads its settings when torch is imported.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 WAIT_POLICY = "OMP_WAIT_POLICY"
 NUMBERS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _WAITING = (WAIT_POLICY, "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # of OpenMP, of its GNU and of its LLVM library
+_CHOICE = {WAIT_POLICY: "PASSIVE", "GOMP_SPINCOUNT": "10000"}  # turns of GNU's loop before a thread sleeps
 _CGROUPS = Path("/sys/fs/cgroup")
 _MEMBERSHIP = Path("/proc/self/cgroup")
 
@@ -55,8 +57,8 @@ def available_cores() -> int:
 def thread_rule(cores: int) -> int:
     """Number of threads on a machine: one per core, at most 4.
 
-    A fixed rule, because results depend on the number in their last digits. On two cores, two threads waiting passively
-    are 1.1 times as fast as one with the weights ``small``, and 1.6 times with a network at full resolution.
+    A fixed rule, because results depend on the number in their last digits. On two cores, two threads are 1.3 to 1.6
+    times as fast as one (``python -m eval.benchmarks.threads``).
 
     Args:
         cores: that the process may use.
@@ -68,7 +70,7 @@ def thread_rule(cores: int) -> int:
 
 
 def wait_passively() -> bool:
-    """Choose passive waiting, unless the environment says otherwise. To be called before torch is imported.
+    """Choose passive waiting after a short spin, unless the environment says otherwise; before torch is imported.
 
     Returns:
         True if threads will wait as chosen by dvo or by the environment; False if torch is imported already, without a
@@ -78,7 +80,7 @@ def wait_passively() -> bool:
         return True
     if "torch" in sys.modules:
         return False
-    os.environ[WAIT_POLICY] = "PASSIVE"
+    os.environ.update(_CHOICE)
     _state["waits_by"] = "dvo"
     return True
 
@@ -153,7 +155,7 @@ def process_environment(count: int, environment: Mapping[str, str] | None = None
     variables = dict(os.environ if environment is None else environment)
     variables |= dict.fromkeys((*NUMBERS, "OPENBLAS_NUM_THREADS"), str(count))
     if not any(name in variables for name in _WAITING):
-        variables[WAIT_POLICY] = "PASSIVE"
+        variables |= _CHOICE
     return variables
 
 

@@ -134,6 +134,7 @@ def test_environment_of_a_process():
     assert found == {
         "PATH": "p", "OMP_NUM_THREADS": "3", "MKL_NUM_THREADS": "3", "OPENBLAS_NUM_THREADS": "3",
         "OMP_WAIT_POLICY": "PASSIVE",
+        "GOMP_SPINCOUNT": "10000",
     }  # fmt: skip
     assert process_environment(1, {"OMP_WAIT_POLICY": "ACTIVE"})["OMP_WAIT_POLICY"] == "ACTIVE"
     assert "OMP_WAIT_POLICY" not in process_environment(1, {"GOMP_SPINCOUNT": "0"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,17 @@ from dvo.data.frame import Frame
 from dvo.data.root import data_root as find_data_root
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.odometry.protocol import Estimate, Result, Segment, SparseMap, Status
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Lift a limit of the size of files that a test has set, before pytest writes its result to a file of its own."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        return (yield)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

@@ -25,7 +25,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions, recent_depth
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.evidence import NO_MATCH, missing_content, newest_evidence, window_inliers
+from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import Observation, observe
 from dvo.odometry.initialisation import drop_unrelated, initialise, median_revision, newest_confidence
@@ -90,9 +90,7 @@ class PatchOdometry:
         self.correlation = WindowCorrelation(self.window, c, self.device)
         self._step = WindowStep(self.model, self.window, self.correlation)
         self._count = 0
-        self._initialised = False
-        self._ever_initialised = False
-        self._finished = False
+        self._initialised = self._ever_initialised = self._finished = False
         self._sequence = FrameSequence(config.max_gap)
         self._waiting: list[_View] = []  # frames with content since tracking was lost
         self._joining = ""  # cause of the interruption that the next frame has to be joined across
@@ -104,8 +102,6 @@ class PatchOdometry:
     def window(self) -> Window:
         """Active keyframes and edges."""
         return self.graph.window
-
-    # -- streaming -----------------------------------------------------------------------------------------------
 
     @torch.inference_mode()
     def track(self, frame: Frame) -> Estimate:
@@ -161,10 +157,10 @@ class PatchOdometry:
             keyframe, up to scale.
         """
         if not self._finished:
+            self._finished = True
             if len(self._waiting) >= self.config.initial_frames:
                 self._begin_segment()
             self._close_segment(last=True)
-            self._finished = True
         return self._result({})
 
     @torch.inference_mode()
@@ -185,8 +181,6 @@ class PatchOdometry:
         }  # fmt: skip
         return result_of(self.graph, info, poses)
 
-    # -- parts of a frame ----------------------------------------------------------------------------------------
-
     def _take(self, view: _View) -> Estimate:
         """Add a frame with content to the window, and estimate its pose."""
         window, config, record = self.window, self.config, view.record
@@ -195,9 +189,9 @@ class PatchOdometry:
         if not self._initialised:
             return self._initialise(view, keyframe)
         before = window.snapshot()
-        for _ in range(config.search_updates if self._joining else config.updates):
-            self._update()
-        evidence = newest_evidence(self._step)
+        evidence = self._updated(config.search_updates if self._joining else config.updates)
+        if not (self._joining or evidence.supports(config)):
+            evidence = self._updated(config.search_updates)
         if not evidence.supports(config, joining=bool(self._joining)):
             # The frame leaves the graph, so that the next ones are joined with the frames before it.
             window.restore(before)
@@ -327,6 +321,11 @@ class PatchOdometry:
         """Take a step on the window; ``age``, the number of earlier steps, sets the damping of bundle adjustment."""
         fixed = max(1, len(self.window) - self.config.optimisation) if self._initialised else 1
         self._step(StepOptions(fixed=fixed, damping=damping_at(age)))
+
+    def _updated(self, count: int) -> Evidence:
+        for _ in range(count):
+            self._update()
+        return newest_evidence(self._step)
 
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""

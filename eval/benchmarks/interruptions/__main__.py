@@ -11,17 +11,22 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import dvo
 from dvo.data.root import data_root
+from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from dvo.odometry.protocol import Odometry
-from eval.benchmarks.interruptions.scoring import Score, follow, score
+from dvo.odometry.protocol import Estimate, Odometry
+from eval.benchmarks.interruptions.scoring import Score, score
 from eval.benchmarks.interruptions.trials import (
     AFTER,
     BEFORE,
@@ -72,27 +77,58 @@ def trials(clip: Clip, seed: int, arguments: argparse.Namespace) -> Iterator[Tri
 def run(arguments: argparse.Namespace) -> list[Score]:
     """Run all trials; a line is printed, and written if asked for, after each.
 
+    The frames before the interruption are tracked once for each clip; every trial goes on from there in a process of
+    its own.
+
     Args:
         arguments: of the command line.
 
     Returns:
         Scores.
     """
+    torch.set_num_threads(1)  # processes that are forked cannot share threads, and all trials run with one number
     scores = []
     for clip, seed in clips(arguments):
-
-        def build(seed: int = seed) -> Odometry:
-            return dvo.load(arguments.weights, seed=seed, device=arguments.device)
-
-        whole = follow(build(), list(clip.frames))[1].trajectory
-        for trial in trials(clip, seed, arguments):
-            found = score(trial, clip, build, whole)
-            scores.append(found)
-            print(line(found), flush=True)
-            if arguments.out:
-                with arguments.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(asdict(found)) + "\n")
+        whole = dvo.load(arguments.weights, seed=seed, device=arguments.device)
+        for frame in clip.frames:
+            whole.track(frame)
+        unbroken = whole.finish().trajectory
+        odometry = dvo.load(arguments.weights, seed=seed, device=arguments.device)
+        before: list[Estimate] = []
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            jobs = []
+            for trial in trials(clip, seed, arguments):
+                while len(before) < trial.cut:
+                    before.append(odometry.track(trial.frames[len(before)]))
+                jobs.append(pool.submit(_forked, partial(_finish, odometry, before, trial, clip, unbroken)))
+            for job in jobs:
+                scores.append(job.result())
+                print(line(scores[-1]), flush=True)
+                if arguments.out:
+                    with arguments.out.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(asdict(scores[-1])) + "\n")
     return scores
+
+
+def _finish(odometry: Odometry, before: list[Estimate], trial: Trial, clip: Clip, unbroken: Trajectory) -> Score:
+    """Track a trial from the interruption on, and score it."""
+    after = [odometry.track(frame) for frame in trial.frames[trial.cut :]]
+    return score(trial, clip, [*before, *after], odometry.finish(), unbroken)
+
+
+def _forked(work: Callable[[], Score]) -> Score:
+    """Run a function in a forked process, which changes nothing in this one."""
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=lambda: sender.send(work()))
+    process.start()
+    sender.close()
+    try:
+        return receiver.recv()
+    except EOFError as error:
+        raise DvoError("a trial failed", remedy="see its messages above") from error
+    finally:
+        process.join()
 
 
 def line(found: Score) -> str:
@@ -157,6 +193,7 @@ def main() -> None:
     parser.add_argument("--weights", default="small", metavar="NAME|FILE")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--split", choices=("calibration", "test"), default="test", help="rendered scenes")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="trials at the same time")
     parser.add_argument("--seeds", type=int, default=3, metavar="N")
     parser.add_argument("--clips", nargs="+", default=["rendered", *RECORDINGS], metavar="NAME")
     parser.add_argument("--kinds", nargs="+", default=[*WITHOUT_VIEW, *OTHERS], choices=[*WITHOUT_VIEW, *OTHERS])

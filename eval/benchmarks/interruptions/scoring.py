@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import associate, evaluate
-from dvo.odometry.protocol import Estimate, Odometry, Result, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 from eval.benchmarks.interruptions.trials import Clip, Trial
 
 SCORED = 10
@@ -55,32 +55,19 @@ class Score:
     error_without: float
 
 
-def follow(odometry: Odometry, frames: list) -> tuple[list[Estimate], Result]:
-    """Track frames.
-
-    Args:
-        odometry: newly built.
-        frames: in order of time.
-
-    Returns:
-        Estimate of each frame, and the result.
-    """
-    return [odometry.track(frame) for frame in frames], odometry.finish()
-
-
-def score(trial: Trial, clip: Clip, build: Callable[[], Odometry], whole: Trajectory) -> Score:
-    """Track a trial and score it.
+def score(trial: Trial, clip: Clip, estimates: Sequence[Estimate], result: Result, whole: Trajectory) -> Score:
+    """Score a trial.
 
     Args:
         trial: interrupted sequence.
         clip: that it was made from, with the ground truth.
-        build: of a new odometry.
+        estimates: of its frames.
+        result: of the tracker.
         whole: trajectory of the clip tracked without an interruption.
 
     Returns:
         The score.
     """
-    estimates, result = follow(build(), list(trial.frames))
     times = np.array([frame.timestamp for frame in trial.frames])
     rows = np.isin(times, np.concatenate([[], *[part.trajectory.timestamps for part in result.segments]]))
     tracking = np.array([estimate.status is Status.TRACKING for estimate in estimates])

@@ -17,7 +17,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.synth.sequence import make_sequence
 
 BEFORE = 60  # good frames before an interruption
-AFTER = 90  # good frames after it
+AFTER = 60  # good frames after it
 FPS = 30.0
 FAMILIES = ("hall", "courtyard", "gallery")  # families that training never draws
 FIRST_SEED = {"calibration": 3_200_000_000, "test": 4_200_000_000}

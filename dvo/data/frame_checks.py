@@ -59,9 +59,12 @@ def checked_frame(frame: Frame) -> Frame:
     name = _name(frame.index)
     timestamp = _seconds(frame.timestamp, f"{name}: timestamp")
     image = frame.image
-    if not _is_ready(image):
-        image = _rgb8(image, f"{name}: image")
-    _check_camera(frame.camera, image, name)
+    if _is_ready(image):
+        _check_camera(frame.camera, image, name)
+    else:
+        pixels = _with_channels(_array_of(image, f"{name}: image"), f"{name}: image")
+        _check_camera(frame.camera, pixels, name)  # before the conversion, which needs memory for all pixels
+        image = _rgb8(pixels, f"{name}: image")
     if image is frame.image and timestamp is frame.timestamp:
         return frame
     converted = copy.copy(frame)  # dataclasses.replace would load depth, right image and inertial samples
@@ -118,9 +121,8 @@ def _is_ready(image: Any) -> bool:
     )
 
 
-def _rgb8(image: Any, field: str) -> np.ndarray:
-    """``(H, W, 3)`` uint8 RGB image, contiguous and writable."""
-    pixels = _with_channels(_array_of(image, field), field)
+def _rgb8(pixels: np.ndarray, field: str) -> np.ndarray:
+    """``(H, W, 3)`` uint8 RGB image, contiguous and writable, of ``(H, W, C)`` pixels."""
     levels = _levels(pixels[..., :3], field)
     if levels.shape[2] == 1:
         levels = np.repeat(levels, 3, axis=2)

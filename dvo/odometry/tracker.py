@@ -190,16 +190,17 @@ class PatchOdometry:
             return self._initialise(view, keyframe)
         before = window.snapshot()
         evidence = self._updated(config.search_updates if self._joining else config.updates)
-        if not (self._joining or evidence.supports(config)):
+        supported = evidence.supports(config, joining=bool(self._joining))
+        if not (supported or self._joining):  # a fast motion may need more updates, but then has to be found for sure
             evidence = self._updated(config.search_updates)
-        if not evidence.supports(config, joining=bool(self._joining)):
+            supported = evidence.supports(config, joining=True)
+        if not supported:
             # The frame leaves the graph, so that the next ones are joined with the frames before it.
             window.restore(before)
             self.graph.discard(len(window) - 1)
             self._waiting.append(view)
             return self._lose(record, NO_MATCH)
-        self._place(record, keyframe.identifier)
-        record.reason = self._joining if self._skipped else ""
+        self._place(record, keyframe.identifier, self._joining if self._skipped else "")
         self._joining, self._skipped = "", False
         self._waiting.clear()
         pose_wc = self._pose_wc(len(window) - 1)
@@ -243,8 +244,8 @@ class PatchOdometry:
         self._last = image, estimate
         return estimate
 
-    def _place(self, record: FrameRecord, anchor: int) -> None:
-        record.anchor, record.lost, record.segment, record.reason = anchor, False, self.graph.segment, ""
+    def _place(self, record: FrameRecord, anchor: int, reason: str = "") -> None:
+        record.anchor, record.lost, record.segment, record.reason = anchor, False, self.graph.segment, reason
 
     def _lose(self, record: FrameRecord, reason: str) -> Estimate:
         """Mark a frame as lost; the next frame of an initialised segment has to be joined across it."""

@@ -23,5 +23,5 @@ def check_files(arguments: list[str]) -> None:
         name, separator, value = argument.partition("=")
         text, option = (value, name) if separator and name.startswith("-") else (argument, before)
         path, before = Path(text), argument
-        if (option in ("--config", "-c") or path.suffix in SUFFIXES) and len(text) < 4096 and path.is_file():
-            read_yaml(path)
+        if (option in ("--config", "-c") or path.suffix in SUFFIXES) and len(text) < 4096 and path.exists():
+            read_yaml(path)  # refuses pipes and devices, which the parser would wait for

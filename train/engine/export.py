@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from dvo.data.files import read_text
 from dvo.errors import DvoError
 from dvo.models.weights import save_weights
 from train.engine.checkpoint import facts_of, network_of, portable, read_state
@@ -26,11 +27,17 @@ def export(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     state = read_state(options.checkpoint)
     facts = facts_of(state)
+    try:
+        json.dumps(facts)
+    except (TypeError, ValueError, RecursionError) as error:
+        remedy = "give a checkpoint that 'python -m train fit' wrote"
+        raise DvoError(f"holds facts that are no text ({error})", file=options.checkpoint, remedy=remedy) from error
     if options.card:
+        remedy = "give a JSON object"
         try:
-            facts |= json.loads(options.card.read_text(encoding="utf-8"))
-        except (OSError, ValueError, TypeError) as error:
-            raise DvoError(f"is no model card ({error})", file=options.card, remedy="give a JSON object") from error
+            facts |= json.loads(read_text(options.card, remedy))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise DvoError(f"is no model card ({error})", file=options.card, remedy=remedy) from error
     save_weights(options.out, network_of(state, file=options.checkpoint), facts)
     print(f"{options.out}: {facts}")
 

@@ -31,7 +31,6 @@ SYSTEMS = [
 TRAINING = [
     "task: patch_vo", "seed_everything: 0", "trainer:", "  accelerator: cpu", "  devices: 1", "  max_epochs: -1",
     "  max_steps: 1", "  logger: false", "  enable_checkpointing: false", "  enable_progress_bar: false",
-    "  callbacks:", "    - class_path: train.engine.callbacks.StopGently", "      init_args: {dirpath: runs}",
     "model:", "  model: tiny", "  learning_rate: 4.0e-4", "  initial: 4",
     "  loss: {pose: 10.0, flow: 0.3, target: 0.5}", "  augmentation: {colour: 0.0, zoom: 0.0, exposure: 0.3}",
     "data:", "  batch_size: 1", "  sizes: [[120, 160], [96, 200]]", "  flow_low: 1.0", "  flow_high: 14.0",

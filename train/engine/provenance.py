@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, cast
 
+from dvo.errors import DvoError
 from dvo.models.weights import LoadedWeights
 
 KEY = "provenance"
@@ -70,7 +71,14 @@ class Provenance:
         kept = state.get(KEY)
         if kept is None:
             return cls(rendered=clips_seen(state) or 0)
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()})
+        if not isinstance(kept, Mapping):
+            raise _no_record(KEY)
+        names = {item.name: type(getattr(cls(), item.name)) for item in fields(cls)}
+        plain = {name: tuple(value) if isinstance(value, list) else value for name, value in dict(kept).items()}
+        for name, value in plain.items():
+            if name not in names or not isinstance(value, names[name]):
+                raise _no_record(f"{KEY}: {name}")
+        return cls(**plain)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain containers, for a training state and for JSON."""
@@ -123,9 +131,22 @@ class Provenance:
 
 
 def clips_seen(state: Mapping[str, Any]) -> int | None:
-    """Position in the clips that a training state holds; None without one."""
+    """Position in the clips that a training state holds; None without one.
+
+    Raises:
+        DvoError: a position that is no number.
+    """
     streams = (value for value in state.values() if isinstance(value, Mapping))
-    return next((int(stream["clips_seen"]) for stream in streams if "clips_seen" in stream), None)
+    found = next((stream["clips_seen"] for stream in streams if "clips_seen" in stream), None)
+    if found is not None and (isinstance(found, bool) or not isinstance(found, int)):
+        raise _no_record("clips_seen")
+    return found
+
+
+def _no_record(field: str) -> DvoError:
+    """Error of a training state whose record has another form."""
+    remedy = "give a checkpoint that 'python -m train fit' wrote"
+    return DvoError("is no training state", field=field, remedy=remedy)
 
 
 def material_of(data: object, clip: int, processes: int) -> Material:

@@ -50,6 +50,6 @@ def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
         )
     width, height = working_size(frame.camera.width, frame.camera.height, pixels)
     if (width, height) == (frame.camera.width, frame.camera.height):
-        return np.ascontiguousarray(frame.image), frame.camera
+        return np.array(frame.image, order="C"), frame.camera  # a copy: a caller may use its buffer for the next frame
     image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
     return image, frame.camera.resized(width, height)

@@ -108,6 +108,17 @@ def test_frames_out_of_order_or_of_another_size_are_refused():
     assert len(odometry.finish().trajectory) == 1
 
 
+def test_a_buffer_that_is_used_again_for_every_frame():
+    images = frames(9)
+    buffer = np.zeros_like(images[0].image)
+    odometry = tracker()
+    for frame in images:
+        buffer[:] = frame.image
+        odometry.track(replace(frame, image=buffer))
+    expected = run(tracker(), images)[1].trajectory
+    assert odometry.finish().trajectory.poses_wc.tobytes() == expected.poses_wc.tobytes()
+
+
 def test_unknown_setting_is_named():
     with pytest.raises(DvoError, match="colour"):
         TrackerConfig.from_dict({"colour": 1})

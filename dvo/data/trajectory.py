@@ -99,11 +99,11 @@ def read_tum(path: Path | str) -> Trajectory:
         path: the file; blanks or commas between the numbers.
 
     Returns:
-        Camera-to-world poses in the order of the rows, quaternions normalised.
+        Camera-to-world poses in the order of the rows, quaternions normalised; of rows with the same time the first.
 
     Raises:
-        DvoError: missing file, no rows, a row without 8 finite numbers, a quaternion of zero length, or times that do
-            not increase.
+        DvoError: missing file, no rows, a row without 8 finite numbers, a quaternion of zero length, or times that
+            decrease.
 
     Example:
         >>> from pathlib import Path
@@ -113,17 +113,18 @@ def read_tum(path: Path | str) -> Trajectory:
     """
     path = Path(path)
     table, numbers = read_numbers(path, 8, "TUM row", "timestamp tx ty tz qx qy qz qw")
-    late = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+    late = np.flatnonzero(np.diff(table[:, 0]) < 0)
     if len(late):
         row = int(late[0]) + 1
         raise DvoError(
-            f"times must increase, but {table[row, 0]:.9f} follows {table[row - 1, 0]:.9f}",
+            f"times must not decrease, but {table[row, 0]:.9f} follows {table[row - 1, 0]:.9f}",
             file=path,
             field=f"line {numbers[row]}",
-            remedy="sort the rows, and remove duplicates",
+            remedy="sort the rows",
         )
     table[:, 4:] = unit_quaternions(table[:, 4:], path, numbers)
-    return Trajectory(table[:, 0].copy(), table[:, 1:].copy())
+    first = np.diff(table[:, 0], prepend=-np.inf) > 0  # TUM's own ground truth repeats some rows
+    return Trajectory(table[first, 0], table[first, 1:])
 
 
 def read_numbers(path: Path, columns: int, row: str, header: str) -> tuple[np.ndarray, list[int]]:

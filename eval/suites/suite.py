@@ -68,7 +68,7 @@ class Suite:
         "rpe_gap": (1, 10**6),
         "stride": (1, 10**6),
         "lost_below": (0.0, 1.0),
-        "time_limit": (1.0, 10**7),
+        "time_limit": (0.1, 10**7),
     }
 
     name: str
@@ -147,7 +147,14 @@ def _suite(table: Any, path: Path) -> Suite:
     """Suite from its table, every entry checked."""
     if not isinstance(table, dict) or not isinstance(table.get("sequences"), list):
         raise DvoError("no list of sequences", file=path, field="sequences", remedy="see configs/eval/validation.yaml")
-    suite = from_table(Suite, table, path)
+    # A file has the options of a rendered sequence as a table.
+    entries = [
+        {**entry, "rendered": [list(option) for option in sorted(entry["rendered"].items(), key=str)]}
+        if isinstance(entry, dict) and isinstance(entry.get("rendered"), dict)
+        else entry
+        for entry in table["sequences"]
+    ]
+    suite = from_table(Suite, {**table, "sequences": entries}, path)
     names = [sequence.name for sequence in suite.sequences]
     for number, sequence in enumerate(suite.sequences):
         place = f"sequences[{number}]"

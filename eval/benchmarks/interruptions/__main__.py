@@ -67,7 +67,8 @@ def trials(clip: Clip, seed: int, arguments: argparse.Namespace) -> Iterator[Tri
         arguments: of the command line.
     """
     for kind in arguments.kinds:
-        for duration in arguments.durations if kind in WITHOUT_VIEW else [min(60, max(arguments.durations))]:
+        single = min(60, max(arguments.durations), len(clip.frames) - BEFORE - 30)
+        for duration in arguments.durations if kind in WITHOUT_VIEW else [single]:
             other = rendered(seed + 1, arguments.split, BEFORE + duration) if kind == "other scene" else None
             # Recordings too short to go on during the interruption stand still in it.
             moves = len(clip.frames) >= BEFORE + duration + 30

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import sys
 import time
@@ -48,8 +49,9 @@ def loop(folder: Path, random: np.random.Generator | None) -> None:
 
 def memory(folder: Path, random: np.random.Generator | None) -> None:
     if random is not None:
-        held = [np.ones(2_000_000) for _ in range(20)]
-        time.sleep(0.01 * len(held))
+        held = mmap.mmap(-1, 320 * 10**6)  # new pages: an allocator may have freed memory left
+        held.write(bytes(1) * len(held))
+        time.sleep(0.2)
 
 
 def crash(folder: Path, random: np.random.Generator | None) -> None:

@@ -50,6 +50,9 @@ def read_state(file: str | Path) -> State:
             raise DvoError(
                 f"is no training state (a {type(state[name]).__name__})", file=path, field=name, remedy=remedy
             )
+    said = state.get("network", {})
+    if not isinstance(said.get("architecture", ""), str) or not isinstance(said.get("config", {}), dict):
+        raise DvoError("names no network", file=path, field="network", remedy=remedy)
     check_plain(state["state_dict"], path, remedy)
     return state
 
@@ -67,8 +70,6 @@ def network_of(state: State, which: Which = "average", file: object | None = Non
     """
     said = state.get("network", {})
     architecture = said.get("architecture", DEFAULT_ARCHITECTURE)
-    if not isinstance(architecture, str) or not isinstance(said.get("config", {}), dict):
-        raise DvoError("names no network", file=file, field="network", remedy="give a state of this version")
     network = network_class(architecture, file)
     if "config" in said:
         config = network.config_type.from_dict(said["config"])

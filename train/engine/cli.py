@@ -12,6 +12,7 @@ import yaml
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from dvo.errors import DvoError
 from train.engine.build import program_factory
@@ -82,7 +83,7 @@ class TaskCLI(LightningCLI):
         """Trainer whose files lie in the folder of the run.
 
         Raises:
-            DvoError: the start does not fit the program, or nothing would be learnt.
+            DvoError: the start does not fit the program, nothing would be learnt, or settings that Lightning refuses.
         """
         prepare(self.model, self.start, self.stop)
         given = self._get(self.config_init, "trainer")
@@ -96,7 +97,11 @@ class TaskCLI(LightningCLI):
         changes |= {"default_root_dir": self.folder, "max_steps": self.stop}
         if given["logger"] in (None, True) and not given["barebones"]:
             changes["logger"] = default_loggers(self.folder)
-        return super().instantiate_trainer(**changes)
+        try:
+            return super().instantiate_trainer(**changes)
+        except (MisconfigurationException, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise DvoError(reason, field="trainer", remedy="see the arguments of lightning.pytorch.Trainer") from error
 
     def fit(self, **arguments: Any) -> None:
         """Train.

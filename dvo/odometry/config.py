@@ -81,7 +81,7 @@ class TrackerConfig:
     updates: int = 1
     initial_motion: float = 0.5
     initial_parallax: float = 1.0
-    initial_inliers: float = 0.2
+    initial_inliers: float = 0.1
     keyframe_motion: float = 5.0
     keyframe_index: int = 4
     motion_damping: float = 0.5

@@ -24,7 +24,7 @@ ARROWS: dict[str, set[str]] = {
     "data": {"geometry"},
     "ba": {"geometry"},
     "metrics": {"data", "geometry"},
-    "segments": {"metrics", "odometry", "data", "geometry"},
+    "segment_metrics": {"metrics", "odometry", "data", "geometry"},
     "graph": {"data", "geometry"},
     "nets": {"geometry", "ba", "data", "graph"},
     "models": {"nets", "graph", "ba", "data", "geometry"},

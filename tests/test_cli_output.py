@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import io
-import json
 import os
 import signal
 import subprocess
@@ -22,28 +21,9 @@ from dvo.commands.report import describe_breaks
 from dvo.data.trajectory import read_tum
 from dvo.odometry import files
 from dvo.odometry.protocol import Break, Estimate, Status
+from tests.command_line import arguments, errors, names, summary
 
 resource = pytest.importorskip("resource")
-
-
-def arguments(images: Path, out: Path | str, *more: str) -> list[str]:
-    beside = images.parent
-    return ["run", str(images), "--calib", str(beside / "calib.txt"), "--times", str(beside / "times.txt"),
-            "--out", str(out), "--device", "cpu", *more]  # fmt: skip
-
-
-def summary(out: Path) -> dict:
-    return json.loads((out / "run.json").read_text())
-
-
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
-def errors(text: str) -> list[str]:
-    """Lines of stderr without those of the progress bar."""
-    assert "Traceback" not in text
-    return [line for line in text.splitlines() if line.startswith("dvo: ")]
 
 
 # -- failures of the system ----------------------------------------------------------------------------------------

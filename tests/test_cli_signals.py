@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
+from tests.command_line import arguments, errors, names, summary
 
 # A program that is `dvo` with an odometry that knows the answer, several times over in processes of their own: imports
 # take longer than all runs. Each logs a line when the odometry is asked for a frame, at which moment the frame before
@@ -49,26 +49,6 @@ for run, (lines, signal) in enumerate(signals):
     codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 print(json.dumps(codes))
 """
-
-
-def arguments(images: Path, out: Path | str, *more: str) -> list[str]:
-    beside = images.parent
-    return ["run", str(images), "--calib", str(beside / "calib.txt"), "--times", str(beside / "times.txt"),
-            "--out", str(out), "--device", "cpu", *more]  # fmt: skip
-
-
-def summary(out: Path) -> dict:
-    return json.loads((out / "run.json").read_text())
-
-
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
-def errors(text: str) -> list[str]:
-    """Lines of stderr without those of the progress bar."""
-    assert "Traceback" not in text
-    return [line for line in text.splitlines() if line.startswith("dvo: ")]
 
 
 def test_kill_loses_no_tracked_frame(image_folder, tmp_path, repository):

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from dvo.data.files import MAX_NUMBER, is_file, read_text
+from dvo.data.files import MAX_NUMBER, is_file
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
-from dvo.yaml_files import parse_yaml
+from dvo.yaml_files import parse_yaml, read_text
 
 _LINE = "write 'fx fy cx cy [k1 k2 p1 p2 [k3]]' on one line, or a YAML with fx, fy, cx, cy"
 _MODELS: dict[str, DistortionModel] = {
@@ -130,7 +130,7 @@ def read_calibration(path: Path | str) -> Calibration:
     path = Path(path)
     if not is_file(path):
         raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
-    text = read_text(path, _LINE, "calibration")
+    text = read_text(path, _LINE)
     looks_yaml = path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
     calibration = _from_yaml(text, path) if looks_yaml else _from_text(text, path)
     values = [calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.coefficients]

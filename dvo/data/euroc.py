@@ -22,7 +22,6 @@ from dvo.data.files import (
     parse_number,
     read_lines,
     read_rows,
-    read_text,
 )
 from dvo.data.folder import camera_images
 from dvo.data.frame import InertialSamples
@@ -32,6 +31,7 @@ from dvo.data.stamps import choose_times, read_times
 from dvo.data.trajectory import Trajectory, interpolate, unit_quaternions
 from dvo.errors import DvoError
 from dvo.geometry.poses import compose_poses, invert_poses, poses_from_matrices
+from dvo.yaml_files import read_text
 
 
 def _mav(path: Path) -> Path | None:

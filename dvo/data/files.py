@@ -11,8 +11,6 @@ from dvo.errors import DvoError
 
 MAX_TABLE = 2**30
 """Largest table, bytes: some hours of inertial samples."""
-MAX_TEXT = 2**20
-"""Largest text that is read whole, such as a calibration, bytes."""
 MAX_LINE = 2**16
 """Longest row of a table, characters."""
 MAX_IMAGE_FILE = 2**29
@@ -73,20 +71,6 @@ def read_rows(path: Path, remedy: str, field: str | None = None) -> Iterator[tup
         fields = line.split("#", 1)[0].replace(",", " ").replace(";", " ").split()
         if fields:
             yield number, fields
-
-
-def read_text(path: Path, remedy: str, field: str | None = None) -> str:
-    """Read a small text file as a whole.
-
-    Args:
-        path: UTF-8, with or without a byte order mark.
-        remedy: for messages about the file as a whole.
-        field: name of the text or the option, for the same messages.
-
-    Raises:
-        DvoError: as :func:`read_rows`, with :data:`MAX_TEXT` as the bound.
-    """
-    return "".join(line for _, line in read_lines(path, remedy, field, MAX_TEXT))
 
 
 def read_lines(

@@ -86,9 +86,8 @@ class KeyframeGraph:
         self.archive = Archive(archive)
         self.log = KeyframeLog()
         self.segment = 0
-        self._first: list[tuple[int, int]] = [
-            (0, 0)
-        ]  # first keyframe and number of each segment; -1 for a rejected one
+        # First keyframe and number of each segment; -1 for a rejected one.
+        self._first: list[tuple[int, int]] = [(0, 0)]
 
     def begin_segment(self, first: int, keep: bool = True, reason: str = "") -> None:
         """Begin a segment. The window must be empty.

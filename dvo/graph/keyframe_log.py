@@ -32,6 +32,15 @@ class FrameRecord:
     segment: int = 0
     reason: str = ""
 
+    def follow(self, other: FrameRecord) -> None:
+        """Take the pose and the state of another frame.
+
+        Args:
+            other: record of a frame with the same image.
+        """
+        self.anchor, self.relative, self.lost, self.segment = other.anchor, other.relative, other.lost, other.segment
+        self.reason = other.reason if other.lost else ""
+
 
 class KeyframeLog:
     """Every frame relative to an anchor keyframe, so that a keyframe that moves takes its frames with it.

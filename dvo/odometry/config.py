@@ -56,10 +56,12 @@ class TrackerConfig:
         keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
         motion_damping: factor of the last motion in the prediction of the next pose, in [0, 1].
         patience: number of frames with content that are tried after a loss before a new segment begins with them.
-        search_updates: recurrent updates of a frame after a lost one or a gap in time, to join it with the window.
+        search_updates: recurrent updates of a frame after a lost one or a gap in time, to join it with the window, and
+            further ones of a frame that would be lost otherwise.
         lost_confidence: mean confidence of the newest frame's edges below which the status is ``lost``.
-        min_inliers: share of the window's patches found in the newest frame below which the status is ``lost``.
-        join_inliers: the same share for a frame after a lost one or a gap in time.
+        min_inliers: share of the window's patches found in the newest frame below which further updates are made.
+        join_inliers: the same share below which the status is ``lost``, for a frame after further updates, after a lost
+            one, or after a gap in time.
         max_gap: time between frames above which they are separated by a gap, in medians of the recent intervals.
 
     Raises:

@@ -120,7 +120,7 @@ def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
         pair = (window.ii == position - 1) & (window.jj == position)
         pair |= (window.ii == position) & (window.jj == position - 1)
         confidence, inliers = float(window.weights[pair].mean()), _inliers(step, pair)
-        if confidence < config.lost_confidence or inliers < config.initial_inliers:
+        if not (confidence >= config.lost_confidence and inliers >= config.initial_inliers):  # NaN fails too
             found = position
     return found
 

@@ -30,8 +30,8 @@ class Estimate:
 
     Attributes:
         timestamp: seconds, of the frame.
-        pose_wc: ``(7,)`` float64 camera to world ``T_wc`` (x y z, quaternion x y z w), or None if there is none: before
-            the first one, and while the status is ``lost``.
+        pose_wc: ``(7,)`` float64 camera to world ``T_wc`` (x y z, quaternion x y z w), or None while there is none:
+            never with the status ``lost``, always with ``tracking``.
         status: state of the tracker.
         confidence: in [0, 1]; comparable within one run only.
         segment: number of the segment that the pose belongs to, from 0. Poses of two segments have different worlds and

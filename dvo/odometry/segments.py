@@ -31,32 +31,43 @@ def segments_of(log: KeyframeLog, poses: Mapping[int, np.ndarray] | None = None)
     return tuple(found)
 
 
-def breaks_of(log: KeyframeLog) -> tuple[Break, ...]:
-    """Intervals without poses, and changes of segment.
+def find_breaks(times: np.ndarray, owner: np.ndarray, reasons: Mapping[float, str]) -> tuple[Break, ...]:
+    """Find the intervals without poses, the changes of segment, and the gaps in time that a segment goes on across.
 
     Args:
-        log: of every frame; the first lost record of an interval states its cause, and a record with a pose and a
-            reason was joined across a gap in time.
+        times: ``(N,)`` increasing timestamps of all frames, seconds.
+        owner: ``(N,)`` number of the segment of each frame, -1 for a frame without a pose.
+        reasons: causes by timestamp: of a loss, or of a break before a frame with a pose.
+
+    Returns:
+        The breaks in order of time, each with the first cause that there is.
+    """
+    posed = np.flatnonzero(owner >= 0)
+    breaks = []
+    for before, after in zip([-1, *posed.tolist()], [*posed.tolist(), len(times)], strict=True):
+        inside = before >= 0 and after < len(times)
+        lost, new_segment = after - before - 1, inside and bool(owner[before] != owner[after])
+        causes = [reasons[time] for time in times[before + 1 : after + 1].tolist() if reasons.get(time)]
+        if lost or new_segment or (inside and causes):
+            start = float(times[before]) if before >= 0 else None
+            end = float(times[after]) if after < len(times) else None
+            reason = causes[0] if causes else "no pose" if lost else "change of segment"
+            breaks.append(Break(start, end, lost, reason, new_segment))
+    return tuple(breaks)
+
+
+def breaks_of(log: KeyframeLog) -> tuple[Break, ...]:
+    """Breaks of a log.
+
+    Args:
+        log: of every frame; a record with a pose and a reason was joined across a gap in time.
 
     Returns:
         Breaks in order of time.
     """
-    found: list[Break] = []
-    before = None  # last record with a pose
-    count, reason = 0, ""
-    for record in log.frames:
-        if record.lost:
-            reason = reason or record.reason
-            count += 1
-            continue
-        new = before is not None and record.segment != before.segment
-        if count or new or record.reason:
-            start = None if before is None else before.timestamp
-            found.append(Break(start, record.timestamp, count, reason or record.reason, new))
-        before, count, reason = record, 0, ""
-    if count:
-        found.append(Break(None if before is None else before.timestamp, None, count, reason, False))
-    return tuple(found)
+    times = np.array([record.timestamp for record in log.frames], dtype=np.float64)
+    owner = np.array([-1 if record.lost else record.segment for record in log.frames], dtype=np.int64)
+    return find_breaks(times, owner, {record.timestamp: record.reason for record in log.frames})
 
 
 def result_of(graph: KeyframeGraph, info: dict[str, Any], poses: Mapping[int, np.ndarray] | None = None) -> Result:

@@ -12,7 +12,8 @@ from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.errors import DvoError
-from dvo.odometry.protocol import Break, Estimate, Odometry, Result
+from dvo.odometry.protocol import Estimate, Odometry, Result
+from dvo.odometry.segments import find_breaks
 
 FrameCallback = Callable[[Frame, Estimate | None], None]
 
@@ -140,7 +141,8 @@ def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: d
     owner = np.full(len(times), -1)
     for number, segment in enumerate(segments):
         owner[np.isin(times, segment.trajectory.timestamps)] = number
-    breaks = result.breaks or find_breaks(times, owner, reasons)
+    causes = {time: cause for time, cause in reasons.items() if owner[np.searchsorted(times, time)] < 0}
+    breaks = result.breaks or find_breaks(times, owner, causes)
     if len(skipped):
         lost = times[owner < 0]
         breaks = tuple(replace(b, frames=_count_between(lost, b.start, b.end)) for b in breaks)
@@ -152,31 +154,6 @@ def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: d
         segments=segments,
         breaks=breaks,
     )
-
-
-def find_breaks(times: np.ndarray, owner: np.ndarray, reasons: dict[float, str]) -> tuple[Break, ...]:
-    """Find the intervals without poses, and the changes of segment.
-
-    Args:
-        times: ``(N,)`` increasing timestamps of all frames, seconds.
-        owner: ``(N,)`` number of the segment of each frame, -1 for a frame without a pose.
-        reasons: causes by timestamp.
-
-    Returns:
-        The breaks in order of time.
-    """
-    posed = np.flatnonzero(owner >= 0)
-    breaks = []
-    for before, after in zip([-1, *posed.tolist()], [*posed.tolist(), len(times)], strict=True):
-        inside = before >= 0 and after < len(times)
-        new_segment = inside and bool(owner[before] != owner[after])
-        if after - before > 1 or new_segment:
-            causes = (reasons[t] for t in times[before + 1 : after].tolist() if t in reasons)
-            start = float(times[before]) if before >= 0 else None
-            end = float(times[after]) if after < len(times) else None
-            default = "no pose" if after - before > 1 else "change of segment"
-            breaks.append(Break(start, end, after - before - 1, next(causes, default), new_segment))
-    return tuple(breaks)
 
 
 def _count_between(times: np.ndarray, start: float | None, end: float | None) -> int:

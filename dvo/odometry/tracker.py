@@ -41,9 +41,9 @@ _DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a ne
 
 @dataclass(frozen=True)
 class _View:
-    """Frame with content that is not part of the window yet."""
+    """Frame with content that is not part of the window yet; ``records`` of it and of the frames that repeat it."""
 
-    record: FrameRecord
+    records: list[FrameRecord]
     seen: Observation
 
 
@@ -126,8 +126,8 @@ class PatchOdometry:
         if self._finished:
             raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
         frame = checked_frame(frame)
-        self._sequence.check(frame)
         image, camera = working_image(frame, self.config.pixels)
+        self._sequence.check(frame)
         record = self.graph.log.add(frame.timestamp)
         if self._last is not None and np.array_equal(image, self._last[0]):
             self._sequence.repeat(frame.timestamp)
@@ -142,7 +142,7 @@ class PatchOdometry:
             seen = observe(self.model, image, camera, self.config.patches, self._generator, self.device)
             height, width = image.shape[:2]
             self._info = {"working_size": [width, height], "working_intrinsics": seen.image_intrinsics.tolist()}
-            estimate = self._take(_View(record, seen))
+            estimate = self._take(_View([record], seen))
             if len(self._waiting) >= self.config.patience:
                 estimate = self._begin_segment()
         self._last = image, estimate
@@ -183,7 +183,7 @@ class PatchOdometry:
 
     def _take(self, view: _View) -> Estimate:
         """Add a frame with content to the window, and estimate its pose."""
-        window, config, record = self.window, self.config, view.record
+        window, config, record = self.window, self.config, view.records[0]
         keyframe = self._append(view)
         self._connect()
         if not self._initialised:
@@ -209,9 +209,8 @@ class PatchOdometry:
 
     def _initialise(self, view: _View, keyframe: Keyframe) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
-        window, config, record = self.window, self.config, view.record
-        self._joining = ""
-        confidence = 0.0
+        window, config, record = self.window, self.config, view.records[0]
+        self._joining, confidence = "", 0.0
         if len(window) > 1:
             revision = self._step.revise()
             confidence = newest_confidence(revision, window)
@@ -236,13 +235,12 @@ class PatchOdometry:
     def _repeat(self, record: FrameRecord) -> Estimate:
         """Give a frame with the image of the frame before it the same pose and state."""
         assert self._last is not None
-        image, estimate = self._last
         past = self.graph.log.frames[-2]
-        record.anchor, record.relative, record.lost = past.anchor, past.relative, past.lost
-        record.segment, record.reason = past.segment, past.reason if past.lost else ""
-        estimate = replace(estimate, timestamp=record.timestamp)
-        self._last = image, estimate
-        return estimate
+        record.follow(past)
+        if self._waiting and self._waiting[-1].records[-1] is past:
+            self._waiting[-1].records.append(record)
+        self._last = self._last[0], replace(self._last[1], timestamp=record.timestamp)
+        return self._last[1]
 
     def _place(self, record: FrameRecord, anchor: int, reason: str = "") -> None:
         record.anchor, record.lost, record.segment, record.reason = anchor, False, self.graph.segment, reason
@@ -261,8 +259,10 @@ class PatchOdometry:
         self._close_segment()
         for view in waiting:
             estimate = self._take(view)
-        if not waiting[0].record.lost:
-            waiting[0].record.reason = reason
+            for repeat in view.records[1:]:
+                repeat.follow(view.records[0])
+        if not waiting[0].records[0].lost:
+            waiting[0].records[0].reason = reason
         return estimate
 
     def _close_segment(self, last: bool = False) -> None:
@@ -295,7 +295,7 @@ class PatchOdometry:
         self._step.bounds = seen.bounds
         slot = window.free_map_slot()
         self.correlation.keep_maps(slot, seen.maps)
-        keyframe = Keyframe(self._count, view.record.timestamp, slot, seen.matching, seen.context, seen.colors,
+        keyframe = Keyframe(self._count, view.records[0].timestamp, slot, seen.matching, seen.context, seen.colors,
                             seen.intrinsics, seen.image)  # fmt: skip
         self._count += 1
         depth = torch.ones(1, config.patches, device=self.device)

@@ -25,7 +25,7 @@ from dvo.errors import DvoError
 from dvo.odometry.protocol import Estimate, Odometry, Segment
 from dvo.odometry.results import jsonable, peak_memory_mb
 from dvo.odometry.session import run
-from dvo.segments import worlds_of
+from dvo.segment_metrics import worlds_of
 from dvo.threads import process_environment
 from eval.execution.process import run_limited
 from eval.scoring.blackout import dark_spans, is_dark, without_view

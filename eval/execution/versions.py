@@ -18,7 +18,16 @@ from eval.systems.system import System
 
 LIBRARIES = ("numpy", "opencv-python-headless", "opencv-python", "scipy", "torch")
 # Rooms of the library that cannot change a trajectory, or whose output is part of the sequence's own fingerprint.
-WITHOUT = ("dvo.viz", "dvo.synth", "dvo.commands", "dvo.cli", "dvo.demo", "dvo.losses", "dvo.metrics", "dvo.segments")
+WITHOUT = (
+    "dvo.viz",
+    "dvo.synth",
+    "dvo.commands",
+    "dvo.cli",
+    "dvo.demo",
+    "dvo.losses",
+    "dvo.metrics",
+    "dvo.segment_metrics",
+)
 TORCH_ROOMS = (ROOT / "dvo" / "ba", ROOT / "dvo" / "nets")
 _OWN = ("dvo", "eval")
 

@@ -11,7 +11,7 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, associate, fit_alignment, transform
 from dvo.odometry.protocol import Segment
-from dvo.segments import worlds_of
+from dvo.segment_metrics import worlds_of
 
 DARK_MEAN, DARK_SPREAD = 20.0, 6.0  # grey levels of 255
 WHITE_MEAN = 235.0
@@ -52,6 +52,8 @@ def is_dark(image: np.ndarray) -> bool:
 
 def without_view(image: np.ndarray) -> bool:
     """Return True if a ``(H, W, 3)`` uint8 image is black, white, or noise: no pose can be found from it.
+
+    Independent of the criteria of the systems that are judged by it (:mod:`dvo.odometry.evidence`).
 
     Args:
         image: RGB.

@@ -11,7 +11,7 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.odometry.protocol import Segment
-from dvo.segments import most_worlds, worlds_of
+from dvo.segment_metrics import most_worlds, worlds_of
 from eval.execution.plan import Manifest, Run, groundtruth_file
 from eval.execution.predict import RECORD, Prediction, read_prediction, read_segments
 from eval.scoring.blackout import dark_spans

@@ -90,6 +90,19 @@ def test_a_frozen_image_is_a_view_with_one_pose(clear):
     assert result.frames_lost == 0 and not result.breaks
 
 
+def test_repeated_frames_share_the_fate_of_the_first(clear):
+    """A video of twice the rate: what begins a segment, and what is lost, does so with its repetition."""
+    dark = with_images(clear, [np.zeros_like(clear[0].image)] * 12, CUT)
+    twice = [
+        replace(frame, index=2 * frame.index + k, timestamp=frame.timestamp + k / FPS / 2)
+        for frame in dark
+        for k in (0, 1)
+    ]
+    _, result, _ = track(twice)
+    assert len(result.breaks) == 1 and result.breaks[0].frames == 24
+    assert result.frames_tracked == 2 * (len(clear) - 12)
+
+
 def test_a_gap_in_time_is_told(clear):
     later = [replace(frame, timestamp=frame.timestamp + 5.0) for frame in clear[CUT + 14 :]]
     _, result, _ = track([*clear[:CUT], *later])

@@ -37,7 +37,7 @@ def test_breaks_tell_from_when_until_when_and_why():
     )
     assert breaks_of(log_of("x0")) == (Break(None, 1.0, 1, "black image", False),)
     assert breaks_of(log_of("0x")) == (Break(0.0, None, 1, "black image", False),)
-    assert breaks_of(log_of("0011")) == (Break(1.0, 2.0, 0, "", True),)
+    assert breaks_of(log_of("0011")) == (Break(1.0, 2.0, 0, "change of segment", True),)
 
 
 def test_a_frame_joined_across_a_gap_is_a_break_without_lost_frames():

@@ -119,6 +119,28 @@ def test_a_buffer_that_is_used_again_for_every_frame():
     assert odometry.finish().trajectory.poses_wc.tobytes() == expected.poses_wc.tobytes()
 
 
+def test_a_refused_frame_leaves_no_size_behind():
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    lens = Camera(80.0, 80.0, 32.0, 24.0, 64, 48, model="radtan", coefficients=(0.1, 0.0, 0.0, 0.0))
+    odometry = tracker()
+    with pytest.raises(DvoError, match="distortion"):
+        odometry.track(Frame(0, 0.0, image, lens))
+    assert odometry.track(frames(1)[0]).status is Status.INITIALISING
+
+
+def test_poses_that_are_not_finite_are_not_given():
+    odometry = tracker()
+    images = frames(9)
+    for frame in images[:8]:
+        odometry.track(frame)
+    with torch.no_grad():
+        for parameter in odometry.model.update.parameters():
+            parameter.fill_(float("nan"))
+    estimate = odometry.track(images[8])
+    assert estimate.status is Status.LOST and estimate.pose_wc is None
+    assert np.isfinite(odometry.finish().trajectory.poses_wc).all()
+
+
 def test_unknown_setting_is_named():
     with pytest.raises(DvoError, match="colour"):
         TrackerConfig.from_dict({"colour": 1})

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-from dvo.data.files import read_text
 from dvo.errors import DvoError
 from dvo.models.weights import save_weights
+from dvo.yaml_files import read_text
 from train.engine.checkpoint import facts_of, network_of, portable, read_state
 
 

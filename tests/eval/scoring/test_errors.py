@@ -9,13 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvo.data.trajectory import Trajectory
-from dvo.metrics import transform
-from dvo.odometry.protocol import Segment
-from dvo.segments import evaluate_segments, rows_of
+from dvo.segment_metrics import evaluate_segments, rows_of
 from eval.scoring.errors import align_segments, all_errors
 from eval.scoring.metrics import Aligned, absolute_rmse, align_pair, metrics_of, path_errors
 from eval.scoring.protocols import kitti_errors, per_frame_scale, relative_pose_auc
 from eval.suites.suite import Suite
+from tests.walks import cut, moved, segment
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 SUITE = Suite("s", "l", (), rpe_gap=2)
@@ -43,19 +42,6 @@ def drifting(trajectory: Trajectory, rate: float = 0.01) -> Trajectory:
     steps = np.diff(trajectory.positions, axis=0) * factor
     positions = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     return Trajectory(trajectory.timestamps, np.column_stack([positions, trajectory.poses_wc[:, 3:]]))
-
-
-def moved(trajectory: Trajectory, scale: float, turn: float) -> Trajectory:
-    return transform(trajectory, scale, Rotation.from_rotvec([0, turn, 0.1]).as_matrix(), np.array([5.0, -1, 2]))
-
-
-def segment(trajectory: Trajectory, joined_to: int | None = None) -> Segment:
-    return Segment(trajectory, float(trajectory.timestamps[0]), float(trajectory.timestamps[-1]), joined_to)
-
-
-def cut(trajectory: Trajectory, *bounds: int) -> list[Trajectory]:
-    edges = [0, *bounds, len(trajectory)]
-    return [rows_of(trajectory, np.arange(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
 def test_one_segment_is_scored_as_a_trajectory():

@@ -1,4 +1,4 @@
-"""dvo.segments: each world aligned on its own, combined over frames, and not gained by cutting."""
+"""dvo.segment_metrics: each world aligned on its own, combined over frames, and not gained by cutting."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from dvo.metrics import evaluate, transform
-from dvo.odometry.protocol import Segment
-from dvo.segments import SEGMENT_POSES, evaluate_segments, match_worlds, most_worlds, rows_of
+from dvo.metrics import evaluate
+from dvo.segment_metrics import SEGMENT_POSES, evaluate_segments, match_worlds, most_worlds, rows_of
+from tests.walks import cut, moved, segment
 
 
 def walk(count: int = 120, seed: int = 0) -> Trajectory:
@@ -28,19 +28,6 @@ def shaken(trajectory: Trajectory, by: float, seed: int = 1) -> Trajectory:
     """With noise on the positions."""
     noise = np.random.default_rng(seed).normal(0, by, (len(trajectory), 3))
     return Trajectory(trajectory.timestamps, trajectory.poses_wc + np.column_stack([noise, np.zeros((len(noise), 4))]))
-
-
-def moved(trajectory: Trajectory, scale: float, turn: float) -> Trajectory:
-    return transform(trajectory, scale, Rotation.from_rotvec([0, turn, 0.1]).as_matrix(), np.array([5.0, -1, 2]))
-
-
-def segment(trajectory: Trajectory, joined_to: int | None = None) -> Segment:
-    return Segment(trajectory, float(trajectory.timestamps[0]), float(trajectory.timestamps[-1]), joined_to)
-
-
-def cut(trajectory: Trajectory, *bounds: int) -> list[Trajectory]:
-    edges = [0, *bounds, len(trajectory)]
-    return [rows_of(trajectory, np.arange(a, b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
 
 
 def test_one_segment_is_an_ordinary_trajectory():

@@ -208,6 +208,8 @@ def drive(odometry: Odometry, source: Source) -> tuple[Prediction, tuple[Segment
         prediction.status, prediction.reason = "invalid", f"{broken} poses are not finite"
     elif twice:
         prediction.status, prediction.reason = "invalid", f"{twice} frames have more than one pose"
+    elif (np.diff(rows) < 0).any():
+        prediction.status, prediction.reason = "invalid", "its segments are not in order of time"
     return prediction, segments
 
 

@@ -129,6 +129,12 @@ def test_a_frame_has_one_pose(job, pieces, systems):
     assert read_segments(job.folder) == ()
 
 
+def test_segments_are_in_order_of_time(job, pieces, systems):
+    systems(parts=pieces((9, 20), (0, 7)))
+    prediction = predict_here(replace(job, system="parts"))
+    assert prediction.status == "invalid" and "order of time" in prediction.reason
+
+
 def test_empty_segments_are_dropped():
     one = Trajectory(np.zeros(1), np.array([[0.0, 0, 0, 0, 0, 0, 1]]))
     none = Trajectory(np.zeros(0), np.zeros((0, 7)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from numbers import Integral
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -15,6 +16,7 @@ from dvo.yaml_files import parse_yaml, read_yaml
 T = TypeVar("T")
 Range = tuple[float, float]
 
+LARGEST_SEED = 2**63 - 1  # of torch
 LONGEST = 10_000  # characters of a text in a table
 _NOUNS = {
     str: "text",
@@ -73,6 +75,19 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
             if not low <= value <= high:
                 limits = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
                 raise DvoError(f"out of range: {shown(value)}", field=item.name, remedy=f"give a number {limits}")
+
+
+def check_seed(seed: Any) -> None:
+    """Check the seed of random numbers.
+
+    Args:
+        seed: anything.
+
+    Raises:
+        DvoError: no whole number, or out of range.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= int(seed) <= LARGEST_SEED:
+        raise DvoError(f"not a seed: {shown(seed)}", field="seed", remedy="give a whole number from 0 to 2^63 - 1")
 
 
 def parse_settings(items: Iterable[str]) -> dict[str, Any]:

@@ -67,6 +67,12 @@ def test_run_writes_the_results_folder(given, image_folder, tmp_path, capsys):
     assert "tracked 20 of 20 frames" in printed and str(out) in printed
 
 
+def test_the_largest_seed_seeds_every_generator(given, image_folder, tmp_path):
+    given()
+    assert main(arguments(image_folder, tmp_path / "out", "--seed", str(2**63 - 1))) == 0
+    assert torch.initial_seed() == 2**63 - 1
+
+
 def test_default_results_folder_is_named_after_the_clip(given, image_folder, tmp_path, monkeypatch):
     given()
     monkeypatch.chdir(tmp_path)

@@ -110,6 +110,8 @@ def test_groundtruth_that_is_none(image_folder, tmp_path, capsys):
         ["--fps", "-3"],
         ["--fps", "3", "--times", "t.txt"],
         ["--device", "nonsense"],
+        ["--seed", "-1"],
+        ["--seed", str(2**63)],
         ["--no-such-option"],
     ],
     ids=" ".join,

@@ -65,7 +65,7 @@ def seed_everything(seed: int) -> None:
     """
     random.seed(seed)
     torch.manual_seed(seed)
-    cv2.setRNGSeed(seed)
+    cv2.setRNGSeed(seed % 2**31)  # takes an int of C
 
 
 def say(text: str) -> None:

@@ -9,6 +9,7 @@ from dvo.models.weights import LoadedWeights, load_weights
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.registry import odometry_builder
+from dvo.settings import check_seed
 from dvo.threads import settle_threads
 
 if TYPE_CHECKING:
@@ -76,8 +77,9 @@ def build_odometry(
         The odometry, see :func:`load`.
 
     Raises:
-        DvoError: an architecture without an odometry; an unknown or invalid setting.
+        DvoError: an architecture without an odometry; an unknown or invalid setting or seed.
     """
+    check_seed(seed)
     builder = odometry_builder(weights.architecture)
     return builder(weights, device=device, seed=seed, config=config, **overrides)
 

@@ -30,6 +30,16 @@ def test_a_network_in_memory():
     assert custom.preset == "custom" and build_odometry(custom).config == TrackerConfig()
 
 
+@pytest.mark.parametrize("seed", [-1, 2**63, 1.5, True, "3", None])
+def test_what_is_no_seed_is_refused(seed):
+    with pytest.raises(DvoError, match="seed: not a seed"):
+        dvo.load("small", seed=seed)
+
+
+def test_the_largest_seed_is_one():
+    assert dvo.load("small", seed=2**63 - 1).seed == 2**63 - 1
+
+
 def test_unknown_settings_and_architectures_are_named():
     with pytest.raises(DvoError, match="colour"):
         dvo.load("small", colour=1)

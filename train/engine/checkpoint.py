@@ -120,7 +120,7 @@ def facts_of(state: State) -> dict[str, Any]:
     settings = state["hyper_parameters"]
     preset = settings.get("model")
     if "config" in said:
-        network = network_class(said["architecture"])
+        network = network_class(said.get("architecture", DEFAULT_ARCHITECTURE))
         preset = preset_name(network, network.config_type.from_dict(said["config"]))
     return {
         "steps": state["global_step"],

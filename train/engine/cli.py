@@ -15,6 +15,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from dvo.errors import DvoError
+from dvo.settings import shown
 from train.engine.build import program_factory
 from train.engine.callbacks import RefuseStandstill, StopGently
 from train.engine.config_files import check_files
@@ -22,6 +23,8 @@ from train.engine.parser import OneLineParser
 from train.engine.progress import StepBar
 from train.engine.run import ROOT, describe, find_start, place_outputs, prepare, run_folder, stop_step
 from train.tasks.registry import DEFAULT_TASK, task_class
+
+LARGEST_SEED = 2**32 - 1  # of numpy
 
 
 class TaskCLI(LightningCLI):
@@ -73,6 +76,10 @@ class TaskCLI(LightningCLI):
                 remedy="give --from FILE for a new run that starts there, or --resume",
             )
         trainer = settings["trainer"]
+        seed = settings["seed_everything"]
+        if not isinstance(seed, bool) and not 0 <= seed <= LARGEST_SEED:
+            remedy = f"give a whole number from 0 to {LARGEST_SEED}"
+            raise DvoError(f"out of range: {shown(seed)}", field="seed_everything", remedy=remedy)
         self.folder = run_folder(settings["name"], trainer["default_root_dir"], settings["task"])
         parts = [*_as_list(trainer["logger"]), *_as_list(trainer["callbacks"])]
         place_outputs([part for part in parts if not isinstance(part, bool)], self.folder)

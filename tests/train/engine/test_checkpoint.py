@@ -55,6 +55,8 @@ def test_the_sizes_of_a_state_are_its_own(tmp_path, runs):
     assert task_of(state, updates=7, no_such_setting=1).updates == 7
     old = {key: value for key, value in state.items() if key not in ("network", "task")}
     assert network_of(old).config == PRESETS["tiny"]
+    unnamed = state | {"network": {"config": state["network"]["config"]}}
+    assert facts_of(unnamed) == facts_of(state)
 
 
 def test_a_state_of_other_tensors_is_refused(tmp_path, runs):

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.settings import check_settings
+
 
 @dataclass(frozen=True)
 class Augmentation:
@@ -38,6 +40,9 @@ class Augmentation:
     off_centre: bool = True
     exposure: float = 0.0
     exposure_range: tuple[float, float] = (-1.5, 0.8)
+
+    def __post_init__(self) -> None:
+        check_settings(self, {})
 
 
 def augment(batch: dict[str, Tensor], settings: Augmentation, seed: int, step: int) -> dict[str, Tensor]:

@@ -76,6 +76,10 @@ class TaskCLI(LightningCLI):
                 remedy="give --from FILE for a new run that starts there, or --resume",
             )
         trainer = settings["trainer"]
+        defaults = self._subcommand_parsers["fit"].get_defaults()
+        for name, value in settings.items():
+            if value is None and defaults.get(name) is not None:  # a file may leave out any value, for the parser
+                raise DvoError("has no value", field=name, remedy=f"give one, or leave {name} out")
         seed = settings["seed_everything"]
         if not isinstance(seed, bool) and not 0 <= seed <= LARGEST_SEED:
             remedy = f"give a whole number from 0 to {LARGEST_SEED}"

@@ -119,6 +119,14 @@ def test_options_that_do_not_parse_are_one_line(refused):
     assert "hops: Expected a list. Got value: abc" in refused("--data.real.hops", "abc")
 
 
+@pytest.mark.parametrize("field", ["seed_everything", "data.batch_size", "model.clip", "trainer.max_steps"])
+def test_a_setting_without_a_value_is_named(field, refused, tmp_path):
+    """A file with ``batch_size:`` and nothing behind it, which the parser lets pass."""
+    section, _, name = field.rpartition(".")
+    (tmp_path / "empty.yaml").write_text(yaml.safe_dump({section: {name: None}} if section else {name: None}))
+    assert field in refused("--steps", 1, "--config", "empty.yaml")
+
+
 @pytest.mark.parametrize("given", ["nowhere", "[nowhere]"])
 def test_a_folder_of_recordings_needs_no_brackets(fit, given, capsys):
     with pytest.raises(SystemExit):

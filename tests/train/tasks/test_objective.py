@@ -7,6 +7,7 @@ import torch
 
 from dvo.ba.cold_start import damping_at, solve_from_nothing
 from dvo.ba.layer import BAOptions, bundle_adjust
+from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.pose import pose_errors
@@ -14,9 +15,16 @@ from dvo.models.patch_vo import UpdateState
 from dvo.models.schedule import full_graph
 from dvo.nets.patchifier import patch_coordinates, random_centres
 from dvo.synth.clip import make_clip
+from train.data.augment import Augmentation
 from train.tasks.patch_vo.objective import LossConfig, clip_terms, true_reprojection, truth_of
 
 PATCHES = 24
+
+
+@pytest.mark.parametrize(("settings", "change"), [(LossConfig, {"pose": None}), (Augmentation, {"zoom": None})])
+def test_a_setting_without_a_value_is_refused(settings, change):
+    with pytest.raises(DvoError, match=f"{next(iter(change))}: must be a number, got None"):
+        settings(**change)
 
 
 def state_of(graph, poses_cw, patches, coords, targets, weights):

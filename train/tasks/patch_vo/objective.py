@@ -19,6 +19,7 @@ from dvo.losses.flow import flow_error, flow_loss, weighted_flow_error
 from dvo.losses.pose import PoseErrors, pose_errors
 from dvo.models.patch_vo import Mode, UpdateState
 from dvo.nets.patchifier import crop_patches
+from dvo.settings import check_settings
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,9 @@ class LossConfig:
     balance_parameter: str = PARAMETER
     balance_every: int = 20
     balance_window: int = 50
+
+    def __post_init__(self) -> None:
+        check_settings(self, {})
 
 
 @dataclass(frozen=True)

@@ -110,8 +110,8 @@ class TaskCLI(LightningCLI):
             changes["logger"] = default_loggers(self.folder)
         try:
             return super().instantiate_trainer(**changes)
-        except (MisconfigurationException, TypeError, ValueError) as error:
-            reason = " ".join(str(error).split())
+        except (MisconfigurationException, TypeError, ValueError, MemoryError) as error:  # of 10^15 devices
+            reason = " ".join(str(error).split()) or type(error).__name__
             raise DvoError(reason, field="trainer", remedy="see the arguments of lightning.pytorch.Trainer") from error
 
     def fit(self, **arguments: Any) -> None:

@@ -115,6 +115,7 @@ def test_a_run_that_trained_nothing_is_an_error(fit, options, capsys):
 def test_options_that_do_not_parse_are_one_line(refused):
     assert "unrecognized arguments: --nonsense" in refused("--nonsense")
     assert "model.learning_rate: Expected a float. Got value: abc" in refused("--model.learning_rate", "abc")
+    assert "trainer: MemoryError" in refused("--steps", 1, "--trainer.devices", 10**17)
     assert "seed_everything: out of range: -1" in refused("--seed_everything", -1)
     assert "hops: Expected a list. Got value: abc" in refused("--data.real.hops", "abc")
 

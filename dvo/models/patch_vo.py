@@ -21,7 +21,8 @@ from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import PRESETS, ModelConfig
 from dvo.nets.correlation import Correlation, CorrelationVolume
-from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates, random_centres
+from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates
+from dvo.nets.selection import SELECTIONS, PatchSelection
 from dvo.nets.update import UPDATE_OPERATORS
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
@@ -50,6 +51,7 @@ class PatchVO(nn.Module):
         super().__init__()
         self.config = config
         self.patchify = Patchifier(config)
+        self.select: PatchSelection = SELECTIONS.resolve(config.selection)
         self.update = UPDATE_OPERATORS.resolve(config.update_operator)(config)
 
     def forward(
@@ -118,10 +120,9 @@ class PatchVO(nn.Module):
         features = self.patchify.encode(normalise_images(images))
         height, width = features.matching.shape[-2:]
         if isinstance(generator, list):
-            drawn = [random_centres(n, m, height, width, one) for one in generator]
-            centres = torch.cat(drawn).to(images.device)
+            centres = torch.cat([self.select(clip[None], m, one) for clip, one in zip(images, generator, strict=True)])
         else:
-            centres = random_centres(n, m, height, width, generator, b).to(images.device)
+            centres = self.select(images, m, generator)
         matching, context = self.patchify.cut(features, centres)
         volume = CorrelationVolume(matching, features.matching, config.pyramid, config.radius)
         scaled = intrinsics / config.STRIDE

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from dvo.errors import DvoError
@@ -35,6 +35,7 @@ class ModelConfig:
         pyramid: down-sampling of each correlation level relative to the features.
         training_patches: patches drawn from a frame in training.
         self_edges: join patches with their own frame too, as DPVO does.
+        selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`.
 
     Raises:
@@ -51,6 +52,7 @@ class ModelConfig:
     pyramid: tuple[int, ...] = (1, 4)
     training_patches: int = 80
     self_edges: bool = True
+    selection: str = field(default="random", compare=False)  # no size: a preset stays one
     update_operator: str = "gated"
 
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)

@@ -1,4 +1,4 @@
-"""Patches: their sampling, and their matching and context features (DPVO 3.1)."""
+"""Patches: their matching and context features (DPVO 3.1)."""
 
 from __future__ import annotations
 
@@ -36,27 +36,6 @@ def normalise_images(images: Tensor) -> Tensor:
         Float tensor of the same shape.
     """
     return images.float() * (2.0 / 255.0) - 0.5
-
-
-def random_centres(
-    frames: int, patches: int, height: int, width: int, generator: torch.Generator | None, batch: int = 1
-) -> Tensor:
-    """Integer patch centres, uniform over the feature map without its border.
-
-    Args:
-        frames: number of frames.
-        patches: number of patches in each frame.
-        height, width: size of the feature map.
-        generator: on the CPU, so that the centres do not depend on the device of the network.
-        batch: number of clips.
-
-    Returns:
-        ``(batch, frames, patches, 2)`` int64 ``x, y`` in ``[1, width - 2] x [1, height - 2]``.
-    """
-    shape = (batch, frames, patches)
-    x = torch.randint(1, width - 1, shape, generator=generator)
-    y = torch.randint(1, height - 1, shape, generator=generator)
-    return torch.stack([x, y], dim=-1)
 
 
 def crop_patches(maps: Float[Tensor, "B N C h w"], centres: Tensor, size: int) -> Float[Tensor, "B N M C p p"]:
@@ -120,7 +99,7 @@ class Patchifier(nn.Module):
 
         Args:
             features: output of :meth:`encode`.
-            centres: ``(B, N, M, 2)`` from :func:`random_centres`.
+            centres: ``(B, N, M, 2)`` see :mod:`dvo.nets.selection`.
 
         Returns:
             ``(B, N*M, C, p, p)`` matching features and ``(B, N*M, D)`` context at the patch centres, divided by 4.

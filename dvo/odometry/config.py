@@ -40,6 +40,8 @@ class TrackerConfig:
     Attributes:
         pixels: largest number of pixels of the working image; the aspect is kept (0: full resolution).
         patches: number of patches in each frame.
+        selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; empty for the one that the network
+            was trained with.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
@@ -74,6 +76,7 @@ class TrackerConfig:
 
     pixels: int = 320 * 240
     patches: int = 24
+    selection: str = ""
     lifetime: int = 7
     removal: int = 9
     optimisation: int = 8

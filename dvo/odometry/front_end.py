@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from dvo.geometry.camera import Camera
 from dvo.models.patch_vo import PatchVO
-from dvo.nets.patchifier import normalise_images, random_centres
+from dvo.nets.patchifier import normalise_images
 
 
 @dataclass(frozen=True)
@@ -59,16 +60,15 @@ def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Ten
 
 
 def observe(
-    model: PatchVO, image: np.ndarray, camera: Camera, patches: int, generator: torch.Generator, device: torch.device
+    model: PatchVO, image: np.ndarray, camera: Camera, select: Callable[[Tensor], Tensor], device: torch.device
 ) -> Observation:
-    """Encode a working image and draw its patches.
+    """Encode a working image and select its patches.
 
     Args:
         model: the network.
         image: ``(H, W, 3)`` uint8 RGB, see :func:`dvo.odometry.working_image.working_image`.
         camera: of the image.
-        patches: number of patches.
-        generator: of the patch centres, on the CPU.
+        select: selection of the patches, with their number and the generator given (:mod:`dvo.nets.selection`).
         device: of the network.
 
     Returns:
@@ -76,8 +76,7 @@ def observe(
     """
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
     features = model.patchify.encode(normalise_images(rgb)[None, None])
-    h, w = features.matching.shape[-2:]
-    centres = random_centres(1, patches, h, w, generator).to(device)
+    centres = select(rgb[None, None])
     matching, context = model.patchify.cut(features, centres)
     stride = model.config.STRIDE
     x, y = (centres[0, 0] * stride).unbind(-1)

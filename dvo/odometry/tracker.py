@@ -8,6 +8,7 @@ keyframe. Keyframes that leave the window are archived (:mod:`dvo.graph.keyframe
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions, recent_depth
 from dvo.nets.patchifier import patch_coordinates
+from dvo.nets.selection import SELECTIONS
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
 from dvo.odometry.frame_sequence import FrameSequence
@@ -79,13 +81,12 @@ class PatchOdometry:
         name: str = "dvo",
         archive: ArchiveConfig | None = None,
     ) -> None:
-        self.name = name
-        self.config = config
+        self.name, self.config, self.seed = name, config, seed
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
-        self.seed = seed
-        self._generator = torch.Generator().manual_seed(seed)
         c = model.config
+        select = SELECTIONS.resolve(config.selection or c.selection)
+        self._select = partial(select, patches=config.patches, generator=torch.Generator().manual_seed(seed))
         self.graph = KeyframeGraph(config.patches, c.patch_size, c.hidden_channels, self.device, archive)
         self.correlation = WindowCorrelation(self.window, c, self.device)
         self._step = WindowStep(self.model, self.window, self.correlation)
@@ -139,7 +140,7 @@ class PatchOdometry:
         else:
             if gap and self._initialised and not self._joining:
                 self._joining, self._skipped = str(gap), not gap.frozen
-            seen = observe(self.model, image, camera, self.config.patches, self._generator, self.device)
+            seen = observe(self.model, image, camera, self._select, self.device)
             height, width = image.shape[:2]
             self._info = {"working_size": [width, height], "working_intrinsics": seen.image_intrinsics.tolist()}
             estimate = self._take(_View([record], seen))

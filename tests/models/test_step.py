@@ -15,7 +15,8 @@ from dvo.models.schedule import training_schedule
 from dvo.models.step import StepOptions, UpdateState, recent_depth, revise, step
 from dvo.nets.config import preset
 from dvo.nets.correlation import Correlation, correlate_reference
-from dvo.nets.patchifier import normalise_images, patch_coordinates, random_centres
+from dvo.nets.patchifier import normalise_images, patch_coordinates
+from dvo.nets.selection import random_centres
 from dvo.nets.update import UPDATE_OPERATORS
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep

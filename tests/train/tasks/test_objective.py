@@ -13,7 +13,8 @@ from dvo.geometry.projection import reproject
 from dvo.losses.pose import pose_errors
 from dvo.models.patch_vo import UpdateState
 from dvo.models.schedule import full_graph
-from dvo.nets.patchifier import patch_coordinates, random_centres
+from dvo.nets.patchifier import patch_coordinates
+from dvo.nets.selection import random_centres
 from dvo.synth.clip import make_clip
 from train.data.augment import Augmentation
 from train.tasks.patch_vo.objective import LossConfig, clip_terms, true_reprojection, truth_of

@@ -6,6 +6,7 @@ import torch
 from train.data.augment import Augmentation
 from train.engine.build import make_program
 from train.tasks.patch_vo.objective import LossConfig
+from train.tasks.patch_vo.task import PatchVOTask
 
 
 def test_warm_up_ends_when_the_flow_has_clicked():
@@ -84,3 +85,8 @@ def test_augmentation_is_part_of_a_step_and_repeats(tmp_path, runs):
     _, b = runs.fit(tmp_path, 2, runs.module(**options))
     _, plain = runs.fit(tmp_path, 2)
     assert a == b != plain
+
+
+def test_the_selection_of_patches_is_that_of_the_run():
+    assert PatchVOTask("tiny").network().config.selection == "random"
+    assert PatchVOTask("tiny", selection="structure").network().config.selection == "structure"

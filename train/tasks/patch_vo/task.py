@@ -50,6 +50,7 @@ class PatchVOTask(Task):
         loss: weights of the terms.
         augmentation: random changes of the clips, None for none.
         patches: patches a frame; None: those of the preset.
+        selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; None: that of the preset.
 
     Attributes:
         beta, rotation: weights of the flow and of the rotation, which V2V's balance moves.
@@ -71,8 +72,10 @@ class PatchVOTask(Task):
         loss: LossConfig | None = None,
         augmentation: Augmentation | None = None,
         patches: int | None = None,
+        selection: str | None = None,
     ) -> None:
-        self.model, self.seed, self.patches = model, seed, patches
+        self.model, self.seed = model, seed
+        self.changes = {"training_patches": patches, "selection": selection}
         self.updates, self.initial, self.settle = updates, initial, settle
         self.warmup_mode, self.warmup_until, self.warmup_steps = warmup_mode, warmup_until, warmup_steps
         self.correlation_gradient = correlation_gradient
@@ -87,8 +90,8 @@ class PatchVOTask(Task):
 
     def network(self) -> nn.Module:
         """New network of the preset."""
-        config = preset(self.model)
-        return PatchVO(config if self.patches is None else replace(config, training_patches=self.patches))
+        changes = {name: value for name, value in self.changes.items() if value is not None}
+        return PatchVO(replace(preset(self.model), **changes))
 
     def parts(self, net: nn.Module) -> dict[str, nn.Module]:
         """Encoder and update operator."""

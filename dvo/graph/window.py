@@ -55,6 +55,7 @@ class WindowSnapshot:
     hidden: Tensor
     targets: Tensor
     weights: Tensor
+    confidence: Tensor
 
 
 @dataclass
@@ -67,7 +68,8 @@ class Window:
         patches: ``(n * M, 3, p, p)`` x, y (feature-map pixels) and inverse depth.
         hidden: ``(E, D)`` state of the update operator.
         targets: ``(E, 2)`` positions of the patch centres measured by the last update, feature-map pixels.
-        weights: ``(E, 2)`` confidence of the targets; 0 for an edge before its first update.
+        weights: ``(E, 2)`` of the targets in bundle adjustment; 0 for an edge before its first update.
+        confidence: ``(E, 2)`` of the network in its measurements, in (0, 1); 0 before the first update.
         jj, kk: ``(E,)`` target frame and patch of each edge.
         edge_slots: ``(E,)`` index of each edge in the correlation caches.
         frames: the keyframes, oldest first.
@@ -79,6 +81,7 @@ class Window:
     hidden: Tensor
     targets: Tensor
     weights: Tensor
+    confidence: Tensor
     jj: Tensor
     kk: Tensor
     edge_slots: Tensor
@@ -103,8 +106,8 @@ class Window:
             return torch.zeros(*shape, device=device)
 
         index = torch.zeros(0, dtype=torch.long, device=device)
-        patches = zeros(0, 3, patch_size, patch_size)
-        return cls(per_frame, zeros(0, 7), patches, zeros(0, hidden), zeros(0, 2), zeros(0, 2), index, index, index)
+        patches, edges = zeros(0, 3, patch_size, patch_size), zeros(0, 2)
+        return cls(per_frame, zeros(0, 7), patches, zeros(0, hidden), edges, edges, edges, index, index, index)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -182,6 +185,7 @@ class Window:
         self.hidden = torch.cat([self.hidden, self.hidden.new_zeros(count, self.hidden.shape[1])])
         self.targets = torch.cat([self.targets, self.targets.new_zeros(count, 2)])
         self.weights = torch.cat([self.weights, self.weights.new_zeros(count, 2)])
+        self.confidence = torch.cat([self.confidence, self.confidence.new_zeros(count, 2)])
         return slots
 
     def keep(self, mask: Tensor) -> None:
@@ -193,6 +197,7 @@ class Window:
         self._edges = None
         self.kk, self.jj, self.edge_slots = self.kk[mask], self.jj[mask], self.edge_slots[mask]
         self.hidden, self.targets, self.weights = self.hidden[mask], self.targets[mask], self.weights[mask]
+        self.confidence = self.confidence[mask]
 
     def touching(self, position: int) -> Tensor:
         """Select the edges of a frame.
@@ -228,7 +233,7 @@ class Window:
         Returns:
             The snapshot; it shares memory with the window, which replaces its tensors rather than changing them.
         """
-        return WindowSnapshot(self.poses_cw, self.patches, self.hidden, self.targets, self.weights)
+        return WindowSnapshot(self.poses_cw, self.patches, self.hidden, self.targets, self.weights, self.confidence)
 
     def restore(self, before: WindowSnapshot) -> None:
         """Restore poses, patches and edge states.
@@ -238,3 +243,4 @@ class Window:
         """
         self.poses_cw, self.patches = before.poses_cw, before.patches
         self.hidden, self.targets, self.weights = before.hidden, before.targets, before.weights
+        self.confidence = before.confidence

@@ -39,7 +39,9 @@ class UpdateState:
         coords: ``(B, E, p, p, 2)`` reprojection of the patches under these poses and depths; None if not computed yet.
         targets: ``(B, E, 2)`` positions of the patch centres measured by the network in the last step; None before
             the first one.
-        weights: ``(B, E, 2)`` confidence of the targets; None before the first step.
+        weights: ``(B, E, 2)`` of the targets in bundle adjustment: the confidence, unless a :class:`Refinement` has
+            changed it; None before the first step.
+        confidence: ``(B, E, 2)`` of the network, in (0, 1); None before the first step.
     """
 
     graph: PatchGraph
@@ -51,6 +53,7 @@ class UpdateState:
     coords: Tensor | None = None
     targets: Tensor | None = None
     weights: Tensor | None = None
+    confidence: Tensor | None = None
 
     @property
     def frames(self) -> int:
@@ -114,6 +117,35 @@ class Revision:
         return self.coords[:, :, centre, centre] + self.delta
 
 
+@dataclass(frozen=True)
+class Measurement:
+    """Input of bundle adjustment.
+
+    Attributes:
+        targets: ``(B, E, 2)`` positions of the patch centres, feature pixels.
+        weights: ``(B, E, 2)`` of the targets.
+    """
+
+    targets: Tensor
+    weights: Tensor
+
+
+class Refinement(Protocol):
+    """Interface of a stage between the network and bundle adjustment, such as sub-pixel alignment."""
+
+    def __call__(self, state: UpdateState, revision: Revision) -> Measurement:
+        """Improve the measurements of the network.
+
+        Args:
+            state: before the step.
+            revision: output of the network.
+
+        Returns:
+            Targets and weights of all edges for bundle adjustment.
+        """
+        ...
+
+
 class StepModel(Protocol):
     """Interface of a model that a step can be taken with: it has an update operator."""
 
@@ -151,6 +183,7 @@ def step(
     state: UpdateState,
     lookup: CorrelationLookup,
     options: StepOptions = StepOptions(),  # noqa: B008
+    refine: Refinement | None = None,
 ) -> UpdateState:
     """Revise the flow of all edges, then fit poses and inverse depths to it by bundle adjustment.
 
@@ -159,25 +192,34 @@ def step(
         state: edges, poses and patches to start from. Detach poses and patches to cut gradients between steps.
         lookup: correlation of patches and feature maps.
         options: mode, fixed poses, damping.
+        refine: stage between the network and bundle adjustment, None for none; not used in mode ``flow``.
 
     Returns:
-        The state with new poses, patches, hidden state, targets and weights. ``coords`` is None, except in mode
-        ``flow``, in which each edge moves by its own revision alone.
+        The state with new poses, patches, hidden state, targets, weights and confidence. ``coords`` is None, except
+        in mode ``flow``, in which each edge moves by its own revision alone.
 
     Raises:
         DvoError: invalid indices or weights, if ``options.check`` is set.
     """
     revision = revise(model, state, lookup)
-    targets, graph = revision.targets, state.graph
-    state = replace(state, hidden=revision.hidden, targets=targets, weights=revision.weights, coords=None)
+    graph, measured = state.graph, Measurement(revision.targets, revision.weights)
+    if refine is not None and options.mode != "flow":
+        measured = refine(state, revision)
+    state = replace(
+        state, hidden=revision.hidden, targets=measured.targets, weights=measured.weights, confidence=revision.weights,
+        coords=None,
+    )  # fmt: skip
     if options.mode == "flow":
         return replace(state, coords=revision.coords + revision.delta[:, :, None, None])
-    measured = targets, revision.weights, graph.ii, graph.jj, graph.kk
     solved = bundle_adjust(
         state.poses_cw,
         state.patches,
         state.intrinsics,
-        *measured,
+        measured.targets,
+        measured.weights,
+        graph.ii,
+        graph.jj,
+        graph.kk,
         BAOptions(
             fixed=options.fixed,
             iterations=options.iterations,

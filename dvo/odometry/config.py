@@ -6,11 +6,14 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from dvo.nets.alignment import AlignmentOptions
 from dvo.settings import check_names, check_settings
 
 _RANGES = {
     "pixels": (0, 2**28),
     "patches": (1, 2**14),
+    "align_gain": (0, 1e6),
+    "align_reach": (0, 100),
     "lifetime": (1, 1000),
     "removal": (1, 1000),
     "optimisation": (1, 1000),
@@ -42,6 +45,9 @@ class TrackerConfig:
         patches: number of patches in each frame.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; empty for the one that the network
             was trained with.
+        align: sub-pixel alignment of the measurements (:mod:`dvo.nets.alignment`), with the two settings below.
+        align_gain: factor of the weight of aligned measurements in bundle adjustment.
+        align_reach: largest distance of an alignment from the measurement of the network, feature pixels.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
@@ -77,6 +83,9 @@ class TrackerConfig:
     pixels: int = 320 * 240
     patches: int = 24
     selection: str = ""
+    align: bool = False
+    align_gain: float = 10.0
+    align_reach: float = 0.3
     lifetime: int = 7
     removal: int = 9
     optimisation: int = 8
@@ -99,6 +108,11 @@ class TrackerConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, _RANGES)
+
+    @property
+    def alignment(self) -> AlignmentOptions:
+        """Options of the sub-pixel alignment."""
+        return AlignmentOptions(gain=self.align_gain, reach=self.align_reach)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrackerConfig:

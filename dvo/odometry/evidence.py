@@ -97,7 +97,7 @@ def newest_evidence(step: WindowStep) -> Evidence:
     into = window.jj == newest
     if not bool(into.any()):
         return Evidence(0.0, 0.0)
-    confidence = float(window.weights[into].mean())
+    confidence = float(window.confidence[into].mean())
     earlier = into & (window.ii < newest)
     if not bool(earlier.any()):
         return Evidence(confidence, 0.0)
@@ -119,7 +119,7 @@ def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
     for position in range(1, len(window)):
         pair = (window.ii == position - 1) & (window.jj == position)
         pair |= (window.ii == position) & (window.jj == position - 1)
-        confidence, inliers = float(window.weights[pair].mean()), _inliers(step, pair)
+        confidence, inliers = float(window.confidence[pair].mean()), _inliers(step, pair)
         if not (confidence >= config.lost_confidence and inliers >= config.initial_inliers):  # NaN fails too
             found = position
     return found
@@ -144,5 +144,5 @@ def _inliers(step: WindowStep, edges: Tensor) -> float:
     coords = reproject(w.poses_cw[None], w.patches[None], w.intrinsics[None], ii, jj, kk).coords
     centre = coords.shape[2] // 2
     residual = (w.targets[edges] - coords[0, :, centre, centre]).norm(dim=-1)
-    found = (w.weights[edges].mean(dim=-1) > CONFIDENT) & (residual < AGREEMENT)
+    found = (w.confidence[edges].mean(dim=-1) > CONFIDENT) & (residual < AGREEMENT)
     return float(found.float().mean())

@@ -34,6 +34,7 @@ from dvo.odometry.initialisation import drop_unrelated, initialise, median_revis
 from dvo.odometry.motion import flow_magnitude, predict_pose
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
+from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
 from dvo.odometry.working_image import working_image
@@ -89,7 +90,8 @@ class PatchOdometry:
         self._select = partial(select, patches=config.patches, generator=torch.Generator().manual_seed(seed))
         self.graph = KeyframeGraph(config.patches, c.patch_size, c.hidden_channels, self.device, archive)
         self.correlation = WindowCorrelation(self.window, c, self.device)
-        self._step = WindowStep(self.model, self.window, self.correlation)
+        align = WindowAlignment(self.window, config.alignment, self.device) if config.align else None
+        self._step = WindowStep(self.model, self.window, self.correlation, align)
         self._count = 0
         self._initialised = self._ever_initialised = self._finished = False
         self._sequence = FrameSequence(config.max_gap)
@@ -141,8 +143,7 @@ class PatchOdometry:
             if gap and self._initialised and not self._joining:
                 self._joining, self._skipped = str(gap), not gap.frozen
             seen = observe(self.model, image, camera, self._select, self.device)
-            height, width = image.shape[:2]
-            self._info = {"working_size": [width, height], "working_intrinsics": seen.image_intrinsics.tolist()}
+            self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
             estimate = self._take(_View([record], seen))
             if len(self._waiting) >= self.config.patience:
                 estimate = self._begin_segment()
@@ -292,32 +293,31 @@ class PatchOdometry:
 
     def _append(self, view: _View) -> Keyframe:
         """Add a frame to the window, with predicted pose and the median depth of the frames before it."""
-        config, window, net, seen = self.config, self.window, self.model.config, view.seen
-        self._step.bounds = seen.bounds
+        config, window, seen = self.config, self.window, view.seen
         slot = window.free_map_slot()
-        self.correlation.keep_maps(slot, seen.maps)
+        self._step.keep_frame(slot, seen)
         keyframe = Keyframe(self._count, view.records[0].timestamp, slot, seen.matching, seen.context, seen.colors,
                             seen.intrinsics, seen.image)  # fmt: skip
         self._count += 1
         depth = torch.ones(1, config.patches, device=self.device)
         if self._initialised:
             depth *= recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES)
-        times = [f.timestamp for f in window.frames]
-        pose = predict_pose(window.poses_cw, times, keyframe.timestamp, config.motion_damping)
-        window.append(keyframe, pose, patch_coordinates(seen.centres, depth, net.patch_size)[0])
+        pose = predict_pose(
+            window.poses_cw, [f.timestamp for f in window.frames], keyframe.timestamp, config.motion_damping
+        )
+        window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe
 
     def _connect(self) -> None:
         """Join recent patches with the newest frame, and its patches with recent frames."""
-        m, n = self.config.patches, len(self.window)
+        m, n, device = self.config.patches, len(self.window), self.device
         first = max(0, n - 1 - self.config.lifetime)
-        device = self.device
         old = torch.arange(first * m, (n - 1) * m, device=device)
         slots = [self.window.connect(old, torch.full_like(old, n - 1))]
         new = torch.arange((n - 1) * m, n * m, device=device)
         targets = torch.arange(first, n if self.model.config.self_edges else n - 1, device=device)
         slots.append(self.window.connect(new.repeat_interleave(len(targets)), targets.repeat(m)))
-        self.correlation.forget(torch.cat(slots))
+        self._step.forget(torch.cat(slots))
 
     def _update(self, age: int = COLD_UPDATES) -> None:
         """Take a step on the window; ``age``, the number of earlier steps, sets the damping of bundle adjustment."""
@@ -332,8 +332,7 @@ class PatchOdometry:
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
         window, config = self.window, self.config
-        n = len(window)
-        back = config.keyframe_index
+        n, back = len(window), config.keyframe_index
         if self._initialised and n > back + 1:
             i, j = n - back - 1, n - back + 1
             if (flow_magnitude(window, i, j) + flow_magnitude(window, j, i)) / 2 < config.keyframe_motion:

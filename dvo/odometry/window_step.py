@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from torch import Tensor
+
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepModel, StepOptions, UpdateState, revise, step
-from dvo.nets.correlation import CorrelationLookup
+from dvo.odometry.front_end import Observation
+from dvo.odometry.window_alignment import WindowAlignment
+from dvo.odometry.window_correlation import WindowCorrelation
 
 
 class WindowStep:
@@ -16,14 +20,39 @@ class WindowStep:
         model: the network.
         window: keyframes and edges.
         lookup: correlation of the window's edges.
+        align: sub-pixel alignment of its measurements, None for none.
 
     Attributes:
         bounds: ``(width, height)`` of the feature map.
     """
 
-    def __init__(self, model: StepModel, window: Window, lookup: CorrelationLookup) -> None:
-        self.model, self.window, self.lookup = model, window, lookup
+    def __init__(
+        self, model: StepModel, window: Window, lookup: WindowCorrelation, align: WindowAlignment | None = None
+    ) -> None:
+        self.model, self.window, self.lookup, self.align = model, window, lookup, align
         self.bounds = (0, 0)
+
+    def keep_frame(self, map_slot: int, seen: Observation) -> None:
+        """Store feature maps and image of a frame.
+
+        Args:
+            map_slot: slot of the frame; its content is overwritten.
+            seen: the frame.
+        """
+        self.bounds = seen.bounds
+        self.lookup.keep_maps(map_slot, seen.maps)
+        if self.align is not None:
+            self.align.keep_image(map_slot, seen.image)
+
+    def forget(self, edge_slots: Tensor) -> None:
+        """Invalidate the cached results of new edges.
+
+        Args:
+            edge_slots: ``(e,)``.
+        """
+        self.lookup.forget(edge_slots)
+        if self.align is not None:
+            self.align.forget(edge_slots)
 
     def state(self) -> UpdateState:
         """State of the window.
@@ -50,8 +79,9 @@ class WindowStep:
         Args:
             options: of the step; ``bounds`` are replaced by those of the feature map.
         """
-        after = step(self.model, self.state(), self.lookup, replace(options, bounds=self.bounds))
-        assert after.targets is not None and after.weights is not None
+        after = step(self.model, self.state(), self.lookup, replace(options, bounds=self.bounds), self.align)
+        assert after.targets is not None and after.weights is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]
         window.targets, window.weights = after.targets[0], after.weights[0]
+        window.confidence = after.confidence[0]

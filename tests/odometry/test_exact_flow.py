@@ -26,6 +26,12 @@ class TrueFlow:
     def __init__(self, odometry, clip):
         self.odometry, self.clip = odometry, clip
 
+    def keep_maps(self, map_slot, maps):
+        pass
+
+    def forget(self, edge_slots):
+        pass
+
     def __call__(self, coords, graph):
         window = self.odometry.window
         edges = (graph.ii, graph.jj, graph.kk)

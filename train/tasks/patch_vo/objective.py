@@ -209,7 +209,7 @@ def clip_terms(
         terms.target.append(target)
         counted = flow
         if config.weighted and mode != "flow":
-            weighted = weighted_flow_error(state.coords, coords, valid, state.weights)
+            weighted = weighted_flow_error(state.coords, coords, valid, state.confidence)
             counted = flow_loss(weighted, torch.ones_like(near))
         terms.flow.append(counted if mode != "flow" else None)
         errors = None
@@ -217,7 +217,7 @@ def clip_terms(
             errors = pose_errors(state.poses_cw, truth.poses_cw[:, : state.frames])
         terms.translation.append(None if errors is None else errors.translation)
         terms.rotation.append(None if errors is None else errors.rotation)
-        measures = {"flow": flow, "target": target, "confidence": state.weights.mean()}
+        measures = {"flow": flow, "target": target, "confidence": state.confidence.mean()}
         # Only the last update is measured further.
         measured = partial(_further_measures, truth, state, mode, errors, error, wanted, near)
     return terms, {name: value.detach() for name, value in (measures | measured()).items()}

@@ -59,7 +59,7 @@ def flow_loss_variants(
         near = (distance > 0) & (distance <= 2)
         errors = {
             False: flow_error(state.coords, *there),
-            True: weighted_flow_error(state.coords, *there, state.weights),
+            True: weighted_flow_error(state.coords, *there, state.confidence),
         }
         for name, (weighted, all_edges) in VARIANTS.items():
             edges = torch.ones_like(near) if all_edges else near

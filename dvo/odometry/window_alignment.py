@@ -1,0 +1,101 @@
+"""Sub-pixel alignment of the edges of a sliding window."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.graph.window import Window
+from dvo.models.step import Measurement, Revision, UpdateState
+from dvo.nets.alignment import AlignmentOptions, accept, align_patches, patch_warps
+from dvo.nets.config import ModelConfig
+
+
+class WindowAlignment:
+    """:class:`dvo.models.step.Refinement` over a window, which aligns new and moved edges only.
+
+    Args:
+        window: provides the edges.
+        options: of the alignment.
+        device: of the images.
+    """
+
+    def __init__(self, window: Window, options: AlignmentOptions, device: torch.device) -> None:
+        self.window, self.options = window, options
+        self._images = torch.zeros(0, 0, 0, device=device)
+        # By edge slot: measurement of the network that was aligned (infinite for none), its alignment, and whether the
+        # alignment was accepted.
+        self._measured = torch.zeros(0, 2, device=device)
+        self._aligned = torch.zeros(0, 2, device=device)
+        self._accepted = torch.zeros(0, dtype=torch.bool, device=device)
+
+    def keep_image(self, map_slot: int, image: np.ndarray) -> None:
+        """Store the working image of a frame.
+
+        Args:
+            map_slot: slot of the frame; its content is overwritten.
+            image: ``(H, W, 3)`` uint8 RGB.
+        """
+        grey = torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).to(self._images)
+        missing = map_slot + 1 - len(self._images)
+        if missing > 0:
+            empty = grey.new_zeros(missing, *grey.shape)
+            self._images = torch.cat([self._images, empty]) if len(self._images) else empty
+        self._images[map_slot] = grey
+
+    def forget(self, edge_slots: Tensor) -> None:
+        """Invalidate the slots of new edges.
+
+        Args:
+            edge_slots: ``(e,)``.
+        """
+        if not len(edge_slots):
+            return
+        missing = int(edge_slots.max()) + 1 - len(self._measured)
+        if missing > 0:
+            self._measured = torch.cat([self._measured, self._measured.new_zeros(missing, 2)])
+            self._aligned = torch.cat([self._aligned, self._aligned.new_zeros(missing, 2)])
+            self._accepted = torch.cat([self._accepted, self._accepted.new_zeros(missing)])
+        self._measured[edge_slots] = torch.inf
+        self._accepted[edge_slots] = False
+
+    def __call__(self, state: UpdateState, revision: Revision) -> Measurement:
+        """Replace the measurements of the network by the alignments that are accepted.
+
+        Args:
+            state: of the window, with a batch dimension of 1.
+            revision: output of the network.
+
+        Returns:
+            Targets and weights for bundle adjustment.
+        """
+        options, slots, measured = self.options, self.window.edge_slots, revision.targets[0]
+        known = (measured - self._measured[slots]).norm(dim=-1) <= options.moved
+        stale = (~known).nonzero()[:, 0]
+        if len(stale):
+            self._align(state, revision, stale)
+        # The measurement may have moved a little since the alignment.
+        near = (self._aligned[slots] - measured).norm(dim=-1) <= options.reach
+        good = self._accepted[slots] & near
+        targets = torch.where(good[:, None], self._aligned[slots], measured)
+        weights = revision.weights[0] * torch.where(good, options.gain, 1.0)[:, None]
+        return Measurement(targets[None], weights[None])
+
+    def _align(self, state: UpdateState, revision: Revision, edges: Tensor) -> None:
+        graph, options = state.graph, self.options
+        centre = state.patches.shape[-1] // 2
+        stride = float(ModelConfig.STRIDE)
+        measured = revision.targets[0, edges]
+        centres = state.patches[0, graph.kk[edges], :2, centre, centre] * stride
+        map_slots = self.window.map_slots
+        found = align_patches(
+            self._images, map_slots[graph.ii[edges]], map_slots[graph.jj[edges]], centres, measured * stride,
+            patch_warps(revision.coords[0, edges]), options,
+        )  # fmt: skip
+        size = self._images.shape[2], self._images.shape[1]
+        slots = self.window.edge_slots[edges]
+        self._measured[slots] = measured
+        self._aligned[slots] = found.positions / stride
+        self._accepted[slots] = accept(found, measured * stride, size, stride, options)

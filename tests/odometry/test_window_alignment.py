@@ -1,0 +1,105 @@
+"""Alignment of a window's edges: what is aligned when, and what the tracker makes of it."""
+
+import numpy as np
+import pytest
+import torch
+
+import dvo
+from dvo.geometry import se3
+from dvo.graph.window import Keyframe, Window
+from dvo.metrics import evaluate
+from dvo.models.step import Revision, UpdateState
+from dvo.nets.alignment import AlignmentOptions
+from dvo.nets.patchifier import patch_coordinates
+from dvo.odometry.session import run
+from dvo.odometry.window_alignment import WindowAlignment
+from dvo.synth.sequence import make_sequence
+
+SIZE, SHIFT = (96, 128), 3  # the second image is the first, shifted to the right by so many pixels
+
+
+def picture():
+    generator = np.random.default_rng(0)
+    coarse = generator.uniform(0, 255, (32, 48))
+    return np.kron(coarse, np.ones((4, 4)))[:96, :160].astype(np.uint8)
+
+
+@pytest.fixture
+def two_frames():
+    """A window of two frames of a plane, its alignment, and a function that gives the state before a step."""
+    wide = picture()
+    images = [np.repeat(wide[:, at : at + 128, None], 3, -1) for at in (16, 16 - SHIFT)]
+    window = Window.empty(4, 3, 8, torch.device("cpu"))
+    alignment = WindowAlignment(window, AlignmentOptions(), torch.device("cpu"))
+    centres = torch.tensor([[[[8, 6], [16, 12], [24, 16], [0, 12]]]])
+    patches = patch_coordinates(centres, torch.ones(1, 4), 3)[0]
+    for i, image in enumerate(images):
+        slot = window.free_map_slot()
+        alignment.keep_image(slot, image)
+        frame = Keyframe(i, float(i), slot, torch.zeros(4, 1), torch.zeros(4, 8), torch.zeros(4, 3), torch.ones(4))
+        window.append(frame, se3.identity(), patches)
+    kk = torch.arange(4)
+    alignment.forget(window.connect(kk, torch.ones_like(kk)))
+
+    def before(error):
+        """State, and a network that measures the true shift with an error, feature pixels."""
+        state = UpdateState(window.edges, window.poses_cw[None], window.patches[None], window.intrinsics[None],
+                            window.context[None], window.hidden[None])  # fmt: skip
+        coords = window.patches[None, window.kk].permute(0, 1, 3, 4, 2)[..., :2]
+        delta = torch.tensor([SHIFT / 4, 0.0]) + error
+        weights = torch.full((1, len(window.kk), 2), 0.5)
+        return state, Revision(coords, window.hidden[None], delta.expand(1, len(window.kk), 2), weights)
+
+    return window, alignment, before
+
+
+def test_measurements_are_replaced_where_the_images_agree(two_frames):
+    window, alignment, before = two_frames
+    state, revision = before(torch.tensor([0.15, -0.1]))
+    measured = alignment(state, revision)
+    truth = window.patches[:4, :2, 1, 1] + torch.tensor([SHIFT / 4, 0.0])
+    error = (measured.targets[0] - truth).norm(dim=-1)
+    assert (error[:3] < 0.01).all()
+    assert torch.equal(measured.weights[0, :3], torch.full((3, 2), 5.0))  # ten times the confidence
+    assert torch.equal(measured.targets[0, 3], revision.targets[0, 3])  # its window is not inside the image
+    assert torch.equal(measured.weights[0, 3], torch.full((2,), 0.5))
+
+
+def test_only_new_and_moved_edges_are_aligned(two_frames, monkeypatch):
+    window, alignment, before = two_frames
+    asked = []
+    original = alignment._align
+    monkeypatch.setattr(alignment, "_align", lambda *a: (asked.append(a[2].tolist()), original(*a)))
+    first = alignment(*before(torch.tensor([0.1, 0.0])))
+    again = alignment(*before(torch.tensor([0.15, 0.0])))  # has moved by less than a tenth
+    assert torch.equal(first.targets[0, :3], again.targets[0, :3])
+    alignment(*before(torch.tensor([0.25, 0.0])))
+    alignment.forget(window.edge_slots[1:2])
+    alignment(*before(torch.tensor([0.25, 0.0])))
+    assert asked == [[0, 1, 2, 3], [0, 1, 2, 3], [1]]
+
+
+def test_an_alignment_that_the_network_has_left_is_not_used(two_frames):
+    window, alignment, before = two_frames
+    alignment.options = AlignmentOptions(moved=100)
+    alignment(*before(torch.tensor([0.1, 0.0])))
+    state, far = before(torch.tensor([1.0, 0.0]))
+    measured = alignment(state, far)
+    assert torch.equal(measured.targets, far.targets) and torch.equal(measured.weights, far.weights)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return make_sequence(900_077, frames=24, height=192, width=256, fps=15.0, apart=True)
+
+
+def tracked(clip, **settings):
+    done = run(dvo.load("small", seed=0, **settings), clip)
+    return done.result.trajectory
+
+
+def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip):
+    plain, aligned, again = tracked(clip), tracked(clip, align=True), tracked(clip, align=True)
+    assert np.array_equal(aligned.poses_wc, again.poses_wc)
+    errors = [evaluate(x, clip.groundtruth, rpe_gap=2).rpe_rot_deg for x in (plain, aligned)]
+    assert len(aligned) == 24 and errors[1] < errors[0]

@@ -322,7 +322,7 @@ class PatchOdometry:
     def _update(self, age: int = COLD_UPDATES) -> None:
         """Take a step on the window; ``age``, the number of earlier steps, sets the damping of bundle adjustment."""
         fixed = max(1, len(self.window) - self.config.optimisation) if self._initialised else 1
-        self._step(StepOptions(fixed=fixed, damping=damping_at(age)))
+        self._step(StepOptions(fixed=fixed, damping=damping_at(age)), align=self._initialised)
 
     def _updated(self, count: int) -> Evidence:
         for _ in range(count):

@@ -73,13 +73,17 @@ class WindowStep:
         """
         return revise(self.model, self.state(), self.lookup)
 
-    def __call__(self, options: StepOptions) -> None:
+    def __call__(self, options: StepOptions, align: bool = False) -> None:
         """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
 
         Args:
             options: of the step; ``bounds`` are replaced by those of the feature map.
+            align: use the sub-pixel alignment, if there is one. Its large weights would keep the first solution of a
+                window from leaving a wrong minimum.
         """
-        after = step(self.model, self.state(), self.lookup, replace(options, bounds=self.bounds), self.align)
+        after = step(
+            self.model, self.state(), self.lookup, replace(options, bounds=self.bounds), self.align if align else None
+        )
         assert after.targets is not None and after.weights is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]

@@ -90,11 +90,11 @@ def test_an_alignment_that_the_network_has_left_is_not_used(two_frames):
 
 @pytest.fixture(scope="module")
 def clip():
-    return make_sequence(900_077, frames=24, height=192, width=256, fps=15.0, apart=True)
+    return make_sequence(77, frames=24, height=192, width=256, fps=15.0, family="street", kind="handheld", apart=True)
 
 
 def tracked(clip, **settings):
-    done = run(dvo.load("small", seed=0, **settings), clip)
+    done = run(dvo.load("small", seed=0, selection="structure", **settings), clip)
     return done.result.trajectory
 
 
@@ -102,4 +102,4 @@ def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip):
     plain, aligned, again = tracked(clip), tracked(clip, align=True), tracked(clip, align=True)
     assert np.array_equal(aligned.poses_wc, again.poses_wc)
     errors = [evaluate(x, clip.groundtruth, rpe_gap=2).rpe_rot_deg for x in (plain, aligned)]
-    assert len(aligned) == 24 and errors[1] < errors[0]
+    assert len(aligned) == 24 and errors[1] < 0.75 * errors[0]

@@ -19,7 +19,7 @@ from dvo.settings import shown
 from train.engine.build import program_factory
 from train.engine.callbacks import RefuseStandstill, StopGently
 from train.engine.config_files import check_files
-from train.engine.parser import OneLineParser
+from train.engine.parser import OneLineParser, in_one_line
 from train.engine.progress import StepBar
 from train.engine.run import ROOT, describe, find_start, place_outputs, prepare, run_folder, stop_step
 from train.tasks.registry import DEFAULT_TASK, task_class
@@ -89,6 +89,20 @@ class TaskCLI(LightningCLI):
         place_outputs([part for part in parts if not isinstance(part, bool)], self.folder)
         self.start = find_start(self.folder, settings["from"], settings["resume"])
         self.stop = stop_step(self.start, settings["steps"], trainer["max_steps"])
+
+    def instantiate_classes(self) -> None:
+        """Build trainer, program and data.
+
+        Raises:
+            DvoError: also for a value that a settings dataclass refuses, which jsonargparse reports as a ValueError.
+        """
+        try:
+            super().instantiate_classes()
+        except ValueError as error:
+            if "Does not validate against any" not in str(error):
+                raise
+            reason = in_one_line(str(error)).split(" Given value: ")[0]
+            raise DvoError(reason, field="settings", remedy="see python -m train fit --help") from error
 
     def instantiate_trainer(self, **changes: Any) -> L.Trainer:
         """Trainer whose files lie in the folder of the run.

@@ -128,6 +128,18 @@ def test_a_setting_without_a_value_is_named(field, refused, tmp_path):
     assert field in refused("--steps", 1, "--config", "empty.yaml")
 
 
+@pytest.mark.parametrize(("field", "name"), [("loss", "pose"), ("augmentation", "zoom")])
+def test_a_setting_of_a_table_without_a_value_is_named(field, name, monkeypatch, tmp_path, capsys):
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump({"task": "patch_vo", "model": {field: {name: None}}}))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["train", "fit", "--config", "settings.yaml", "--steps", "1"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert f"{name}: must be a number, got None" in line
+
+
 @pytest.mark.parametrize("given", ["nowhere", "[nowhere]"])
 def test_a_folder_of_recordings_needs_no_brackets(fit, given, capsys):
     with pytest.raises(SystemExit):

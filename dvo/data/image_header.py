@@ -21,8 +21,7 @@ def image_size(source: Path | str | bytes) -> tuple[int, int] | None:
         source: file, or its bytes: PNG, JPEG, BMP, TIFF, WebP, or PNM (PBM, PGM, PPM, PAM).
 
     Returns:
-        Width and height in pixels; None for another format, a cut header, a PNG chunk that is longer than the file, or
-        a file that cannot be read.
+        Width and height in pixels; None for another format, a cut header, or a file that cannot be read.
     """
     try:
         if isinstance(source, bytes):
@@ -36,7 +35,7 @@ def image_size(source: Path | str | bytes) -> tuple[int, int] | None:
 def _size(file: BinaryIO) -> tuple[int, int] | None:
     head = file.read(32)
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return _png(file, head)
+        return _pair(">II", head, 16)
     if head.startswith(b"\xff\xd8"):
         return _jpeg(file)
     if head.startswith(b"BM"):
@@ -53,17 +52,6 @@ def _size(file: BinaryIO) -> tuple[int, int] | None:
 def _pair(form: str, data: bytes, at: int) -> tuple[int, int]:
     first, second = struct.unpack_from(form, data, at)
     return first, second
-
-
-def _png(file: BinaryIO, head: bytes) -> tuple[int, int] | None:
-    end, at, kind = file.seek(0, io.SEEK_END), 8, b""
-    while at < end and kind != b"IEND":
-        file.seek(at)
-        length, kind = struct.unpack(">I4s", file.read(8))
-        at += length + 12
-        if at > end:  # OpenCV allocates the length that a chunk states
-            return None
-    return _pair(">II", head, 16)
 
 
 def _bmp(head: bytes) -> tuple[int, int]:

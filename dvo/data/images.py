@@ -126,15 +126,24 @@ def decode(path: Path) -> np.ndarray | None:
 
 
 def is_complete(data: bytes) -> bool:
-    """True if the end mark of a PNG or JPEG file is there.
+    """True if the end mark of a PNG or JPEG file is there, and every chunk of a PNG lies inside the file.
 
-    The decoders return a cut file with its lower part grey, and no error.
+    The decoders return a cut file with its lower part grey, and no error; OpenCV allocates what a chunk states as its
+    length.
 
     Args:
         data: the bytes of an image file; of other formats any byte will do.
     """
     if data.startswith(b"\x89PNG"):
-        return b"IEND" in data[-4096:]
+        return b"IEND" in data[-4096:] and _chunks_inside(data)
     if data.startswith(b"\xff\xd8"):  # the first half may hold a thumbnail with its own end mark
         return b"\xff\xd9" in data[len(data) // 2 :]
     return len(data) > 0
+
+
+def _chunks_inside(data: bytes) -> bool:
+    at, kind = 8, b""
+    while kind != b"IEND" and at < len(data):
+        kind = data[at + 4 : at + 8]
+        at += int.from_bytes(data[at : at + 4], "big") + 12
+    return at <= len(data)

@@ -31,7 +31,7 @@ def test_a_setting_without_a_value_is_refused(settings, change):
 def state_of(graph, poses_cw, patches, coords, targets, weights):
     """A state as a step leaves it; what the losses do not read is empty."""
     none = torch.zeros(1, 0)
-    return UpdateState(graph, poses_cw, patches, none, none, none, coords, targets, weights)
+    return UpdateState(graph, poses_cw, patches, none, none, none, coords, targets, weights, weights)
 
 
 def rendered(index, **options):

@@ -57,8 +57,8 @@ def available_cores() -> int:
 def thread_rule(cores: int) -> int:
     """Number of threads on a machine: one per core, at most 4.
 
-    A fixed rule, because results depend on the number in their last digits. On two cores, two threads are about
-    1.4 times as fast as one (``python -m eval.benchmarks.threads``).
+    A fixed rule, because results depend on the number in their last digits. On two cores, two threads are 1.4 to
+    1.6 times as fast as one (``python -m eval.benchmarks.threads``).
 
     Args:
         cores: that the process may use.

@@ -126,6 +126,17 @@ class ArchivedEdges:
         """Memory of the arrays."""
         return sum(a.nbytes for a in (self.source, self.patch, self.target, self.position, self.weight))
 
+    def select(self, rows: np.ndarray) -> ArchivedEdges:
+        """Choose edges.
+
+        Args:
+            rows: ``(E,)`` bool, or indices.
+
+        Returns:
+            The chosen edges.
+        """
+        return ArchivedEdges(*(a[rows] for a in (self.source, self.patch, self.target, self.position, self.weight)))
+
     @classmethod
     def concatenate(cls, parts: list[ArchivedEdges]) -> ArchivedEdges:
         """Concatenate edges.
@@ -203,26 +214,44 @@ class Archive:
             self._bytes += edges.nbytes
             self._shrink()
 
-    def edges(self) -> ArchivedEdges:
-        """All measurements that are kept.
+    def edges(self, first: int = 0, last: int | None = None) -> ArchivedEdges:
+        """Measurements that are kept.
+
+        Args:
+            first, last: identifiers; only edges with an end between them and none after ``last``. None: no limit.
 
         Returns:
             The edges, oldest first.
         """
-        return ArchivedEdges.concatenate(list(self._edges))
+        if first <= 0 and last is None:
+            return ArchivedEdges.concatenate(list(self._edges))
+        parts = []
+        for part in self._edges:
+            newest = np.maximum(part.source, part.target)
+            part = part.select((newest >= first) & (newest <= (np.iinfo(np.int32).max if last is None else last)))
+            if len(part):
+                parts.append(part)
+        return ArchivedEdges.concatenate(parts)
 
-    def set_pose(self, identifier: int, pose_cw: np.ndarray, inverse_depth: np.ndarray | None = None) -> None:
+    def set_pose(
+        self,
+        identifier: int,
+        pose_cw: np.ndarray,
+        inverse_depth: np.ndarray | None = None,
+        anchor: int | None = None,
+    ) -> None:
         """Correct a keyframe, for instance after a global bundle adjustment; its points move along.
 
         Args:
-            identifier: of the keyframe; a dropped one loses its anchor.
-            pose_cw: ``(7,)`` world to camera ``T_cw``.
+            identifier: of the keyframe.
+            pose_cw: ``(7,)`` world to camera ``T_cw``, or relative to ``anchor``.
             inverse_depth: ``(M,)`` of its patches; None leaves them unchanged.
+            anchor: keyframe that it is relative to; None for the world.
         """
         keyframe = self._keyframes[identifier]
         depth = keyframe.inverse_depth if inverse_depth is None else np.asarray(inverse_depth, np.float32)
         self._keyframes[identifier] = replace(
-            keyframe, pose_cw=np.asarray(pose_cw, np.float64), anchor=None, inverse_depth=depth
+            keyframe, pose_cw=np.asarray(pose_cw, np.float64), anchor=anchor, inverse_depth=depth
         )
 
     def _shrink(self) -> None:

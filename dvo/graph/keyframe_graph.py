@@ -8,6 +8,7 @@ measurements are archived), and :meth:`KeyframeGraph.discard` for a frame of whi
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,8 @@ class KeyframeGraph:
         hidden: channels of the state of the update operator.
         device: of the window's tensors.
         archive: memory bound and content of the archive.
+        finalise: called with the positions ``(e,)`` of edges of the window that are about to be archived; it may change
+            their targets and weights in the window.
 
     Attributes:
         window: active keyframes and edges.
@@ -71,7 +74,7 @@ class KeyframeGraph:
 
         >>> odometry = dvo.load("small")
         >>> done = dvo.run(odometry, dvo.open("video.mp4", calib="calib.txt"))
-        >>> p = odometry.graph.problem(dropped=False)
+        >>> p = odometry.graph.problem()
         >>> blocks = (p.poses_cw[0], p.patches[0], p.intrinsics[0], p.targets[0], p.weights[0])
         >>> solved = global_bundle_adjust(*blocks, p.ii, p.jj, p.kk)
         >>> for identifier, pose_cw in zip(p.identifiers.tolist(), solved.poses_cw.numpy()):
@@ -80,10 +83,16 @@ class KeyframeGraph:
     """
 
     def __init__(
-        self, per_frame: int, patch_size: int, hidden: int, device: torch.device, archive: ArchiveConfig | None = None
+        self,
+        per_frame: int,
+        patch_size: int,
+        hidden: int,
+        device: torch.device,
+        archive: ArchiveConfig | None = None,
+        finalise: Callable[[Tensor], None] | None = None,
     ) -> None:
         self.window = Window.empty(per_frame, patch_size, hidden, device)
-        self.archive = Archive(archive)
+        self.archive, self._finalise = Archive(archive), finalise
         self.log = KeyframeLog()
         self.segment = 0
         # First keyframe and number of each segment; -1 for a rejected one.
@@ -133,10 +142,10 @@ class KeyframeGraph:
         """
         window = self.window
         relative = se3.relative(window.poses_cw[position - 1], window.poses_cw[position]).double().cpu().numpy()
-        anchor, oldest = window.frames[position - 1].identifier, window.frames[0].identifier
+        anchor = window.frames[position - 1].identifier
         self._archive_edges(window.touching(position))
         self._archive_keyframe(position, relative, anchor)
-        self.log.reanchor(window.remove(position).identifier, anchor, relative, oldest)
+        self.log.reanchor(window.remove(position).identifier, anchor, relative)
 
     def archive_oldest(self) -> None:
         """Move the oldest keyframe of the window to the archive."""
@@ -162,12 +171,18 @@ class KeyframeGraph:
         """Set the pose of an archived keyframe; its frames and points move along.
 
         Args:
-            identifier: of a keyframe that was not dropped.
+            identifier: of a keyframe. A dropped one stays relative to the keyframe before it: correct that one first.
             pose_cw: ``(7,)`` float64 world to camera ``T_cw``.
             inverse_depth: ``(M,)`` of its patches; None leaves them unchanged.
         """
-        self.archive.set_pose(identifier, pose_cw, inverse_depth)
-        self.log.set_pose(identifier, np.asarray(pose_cw, np.float64))
+        pose_cw, anchor = np.asarray(pose_cw, np.float64), self.archive[identifier].anchor
+        if anchor is None:
+            self.archive.set_pose(identifier, pose_cw, inverse_depth)
+            self.log.set_pose(identifier, pose_cw)
+            return
+        relative = se3.relative(self.poses_cw(np.array([anchor]))[0], torch.from_numpy(pose_cw)).numpy()
+        self.archive.set_pose(identifier, relative, inverse_depth, anchor)
+        self.log.reanchor(identifier, anchor, relative)
 
     def points(self, segment: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Map points of the archived keyframes of a segment, from the current poses of these.
@@ -195,47 +210,65 @@ class KeyframeGraph:
             colors.append(keyframe.colors[near])
         return np.concatenate(points), np.concatenate(colors)
 
-    def problem(self, dropped: bool = True, segment: int = 0) -> GraphProblem:
+    def poses_cw(self, identifiers: np.ndarray) -> Tensor:
+        """Poses of archived keyframes, dropped or not.
+
+        Args:
+            identifiers: ``(N,)``; the keyframes that dropped ones are relative to are archived as well.
+
+        Returns:
+            ``(N, 7)`` float64 world to camera.
+        """
+        frames = [self.archive[int(identifier)] for identifier in identifiers]
+        if not frames:
+            return torch.zeros(0, 7, dtype=torch.float64)
+        poses = torch.from_numpy(np.stack([frame.pose_cw for frame in frames]))
+        while any(frame.anchor is not None for frame in frames):
+            moving = torch.tensor([frame.anchor is not None for frame in frames])
+            frames = [frame if frame.anchor is None else self.archive[frame.anchor] for frame in frames]
+            anchors = torch.from_numpy(np.stack([frame.pose_cw for frame in frames]))
+            poses = torch.where(moving[:, None], se3.compose(poses, anchors), poses)
+        return poses
+
+    def problem(self, dropped: bool = True, segment: int = 0, first: int = 0, last: int | None = None) -> GraphProblem:
         """Bundle adjustment problem of the archived keyframes and edges of a segment.
 
         Args:
             dropped: include dropped keyframes.
             segment: its number.
+            first, last: part of the segment from one identifier to another, with the earlier keyframes that share an
+                edge with it. None: to the end.
 
         Returns:
-            The problem, on the CPU; keyframes whose patches have been released are left out.
+            The problem, on the CPU; keyframes whose patches have been released are left out, and dropped ones whose
+            anchor is still in the window.
         """
-        poses: dict[int, Tensor] = {}
-        frames = []
-        for keyframe in self.archive:
-            if self.segment_of(keyframe.identifier) != segment:
-                continue
-            pose = torch.from_numpy(keyframe.pose_cw)
-            if keyframe.anchor is not None:
-                if keyframe.anchor not in poses:
-                    continue
-                pose = se3.compose(pose, poses[keyframe.anchor])
-            poses[keyframe.identifier] = pose
-            if len(keyframe.inverse_depth) and (dropped or keyframe.anchor is None):
-                frames.append(keyframe)
+        edges = self.archive.edges(first, last)
+        linked = set(np.unique(np.concatenate([edges.source, edges.target])).tolist()) if first > 0 else set()
+        frames = [
+            frame
+            for frame in self.archive
+            if self.segment_of(frame.identifier) == segment
+            and (frame.identifier >= first or frame.identifier in linked)
+            and (last is None or frame.identifier <= last)
+            and len(frame.inverse_depth)
+            and (frame.anchor is None or (dropped and frame.anchor in self.archive))
+        ]
         m = self.window.per_frame
         identifiers = np.array([frame.identifier for frame in frames], dtype=np.int64)
-        edges = self.archive.edges()
-        known = np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers)
-        ii = np.searchsorted(identifiers, edges.source[known])
-        jj = np.searchsorted(identifiers, edges.target[known])
+        edges = edges.select(np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers))
+        ii, jj = np.searchsorted(identifiers, edges.source), np.searchsorted(identifiers, edges.target)
         patches = [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
-        shape = (len(frames) * m, 3, 1, 1)
         return GraphProblem(
             identifiers=identifiers,
-            poses_cw=torch.stack([poses[i] for i in identifiers.tolist()]) if frames else torch.zeros(0, 7).double(),
-            patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(shape),
+            poses_cw=self.poses_cw(identifiers),
+            patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(len(frames) * m, 3, 1, 1),
             intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(-1, 4)),
-            targets=torch.from_numpy(edges.position[known].astype(np.float64)),
-            weights=torch.from_numpy(edges.weight[known].astype(np.float64)),
+            targets=torch.from_numpy(edges.position.astype(np.float64)),
+            weights=torch.from_numpy(edges.weight.astype(np.float64)),
             ii=torch.from_numpy(ii),
             jj=torch.from_numpy(jj),
-            kk=torch.from_numpy(ii * m + edges.patch[known]),
+            kk=torch.from_numpy(ii * m + edges.patch),
         )
 
     def _archive_edges(self, mask: Tensor) -> None:
@@ -244,6 +277,8 @@ class KeyframeGraph:
         chosen = mask & (window.weights > 0).any(-1)
         if not chosen.any():
             return
+        if self._finalise is not None:
+            self._finalise(chosen.nonzero()[:, 0])
         identifiers = np.array([frame.identifier for frame in window.frames], dtype=np.int32)
         kk, jj = window.kk[chosen].cpu().numpy(), window.jj[chosen].cpu().numpy()
         m = window.per_frame

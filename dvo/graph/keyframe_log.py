@@ -18,7 +18,8 @@ class FrameRecord:
 
     Attributes:
         timestamp: seconds.
-        anchor: keyframe that carries the frame; None while the frame has no pose.
+        anchor: keyframe that carries the frame, which may have been removed since
+            (:meth:`KeyframeLog.reanchor`); None while the frame has no pose.
         relative: pose of the frame relative to its anchor, ``T_cw = relative T_cw[anchor]``; None for the identity.
         lost: tracking was lost; the frame gets no row in the trajectory.
         segment: number of the segment of the frame; means nothing for a lost frame.
@@ -63,6 +64,7 @@ class KeyframeLog:
     def __init__(self) -> None:
         self.frames: list[FrameRecord] = []
         self._poses: dict[int, np.ndarray] = {}
+        self._removed: dict[int, tuple[int, np.ndarray]] = {}  # anchor and relative pose of removed keyframes
         self._points: list[np.ndarray] = []
         self._colors: list[np.ndarray] = []
 
@@ -105,23 +107,16 @@ class KeyframeLog:
                 break
         self._poses.pop(keyframe, None)
 
-    def reanchor(self, gone: int, anchor: int, relative: np.ndarray | None = None, oldest: int | None = None) -> None:
-        """Remove keyframe ``gone``; its frames are relative to ``anchor`` from now on and stay where they are.
+    def reanchor(self, gone: int, anchor: int, relative: np.ndarray | None = None) -> None:
+        """Remove keyframe ``gone``, or move one that is removed: from now on it is relative to ``anchor``.
 
         Args:
             gone, anchor: keyframes.
             relative: pose of ``gone`` relative to ``anchor``; None takes the poses of both from the log.
-            oldest: frames of keyframes older than this end the search; None searches all.
         """
-        for frame in range(len(self.frames) - 1, -1, -1):
-            record = self.frames[frame]
-            if record.anchor == gone:
-                if relative is None:
-                    self.place(frame, anchor, _compose(record.relative, self._poses[gone]))
-                else:
-                    record.anchor, record.relative = anchor, _compose(record.relative, relative)
-            elif oldest is not None and record.anchor is not None and record.anchor < oldest:
-                break
+        if relative is None:
+            relative = _compose(self._poses[gone], _inverse(self._poses[anchor]))
+        self._removed[gone] = anchor, relative
         self._poses.pop(gone, None)
 
     def set_pose(self, keyframe: int, T_cw: np.ndarray) -> None:
@@ -159,8 +154,21 @@ class KeyframeLog:
             the frame or its keyframe has none.
         """
         record = self.frames[frame]
-        anchor = None if record.anchor is None else self._poses.get(record.anchor)
-        return None if anchor is None else _compose(record.relative, anchor)
+        if record.anchor is None:
+            return None
+        kept, relative = self._carrier(record.anchor)
+        if kept not in self._poses:
+            return None
+        carrier = self._poses[kept] if relative is None else _compose(relative, self._poses[kept])
+        return _compose(record.relative, carrier)
+
+    def _carrier(self, keyframe: int) -> tuple[int, np.ndarray | None]:
+        """Keyframe that carries another one, which may have been removed, and the pose relative to it."""
+        relative: np.ndarray | None = None
+        while keyframe in self._removed:
+            keyframe, further = self._removed[keyframe]
+            relative = further if relative is None else _compose(relative, further)
+        return keyframe, relative
 
     def trajectory(self, segment: int | None = None, poses: Mapping[int, np.ndarray] | None = None) -> Trajectory:
         """Trajectory of every frame that has a pose and was not lost, camera to world.
@@ -173,13 +181,16 @@ class KeyframeLog:
             The trajectory.
         """
         known = {**self._poses, **(poses or {})}
-        kept = [r for r in self.frames if not r.lost and r.anchor in known and segment in (None, r.segment)]
+        placed = [r for r in self.frames if not r.lost and r.anchor is not None and segment in (None, r.segment)]
+        carriers = {r.anchor: self._carrier(r.anchor) for r in placed}  # type: ignore[arg-type]
+        kept = [record for record in placed if carriers[record.anchor][0] in known]
         rows = np.zeros((0, 7))
         if kept:
-            anchors = np.stack([known[record.anchor] for record in kept])  # type: ignore[index]
+            anchors = np.stack([known[carriers[record.anchor][0]] for record in kept])
             identity = _identity(anchors)
-            relative = np.stack([identity if record.relative is None else record.relative for record in kept])
-            rows = _rows(_inverse(_compose(relative, anchors)))
+            removed = np.stack([_or(carriers[record.anchor][1], identity) for record in kept])
+            relative = np.stack([_or(record.relative, identity) for record in kept])
+            rows = _rows(_inverse(_compose(relative, _compose(removed, anchors))))
         return Trajectory(np.array([record.timestamp for record in kept], dtype=np.float64), rows)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
@@ -195,6 +206,10 @@ def _is_matrix(pose: np.ndarray) -> bool:
 def _identity(pose: np.ndarray) -> np.ndarray:
     """Identity in the form of ``pose``."""
     return np.eye(4) if _is_matrix(pose) else np.array([0.0, 0, 0, 0, 0, 0, 1])
+
+
+def _or(relative: np.ndarray | None, identity: np.ndarray) -> np.ndarray:
+    return identity if relative is None else relative
 
 
 def _compose(a: np.ndarray | None, b: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from dvo.nets.alignment import AlignmentOptions
 from dvo.settings import check_names, check_settings
@@ -45,12 +45,16 @@ class TrackerConfig:
         patches: number of patches in each frame.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; empty for the one that the network
             was trained with.
-        align: sub-pixel alignment of the measurements (:mod:`dvo.nets.alignment`), with the two settings below.
+        align: sub-pixel alignment of the measurements (:mod:`dvo.nets.alignment`), with the two settings below:
+            ``final`` for those that leave the window, which serves the final adjustment; ``always`` in every step,
+            which serves the poses of ``track`` as well and takes longer; ``none``.
         align_gain: factor of the weight of aligned measurements in bundle adjustment.
         align_reach: largest distance of an alignment from the measurement of the network, feature pixels.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
+        final_adjustment: solve for all frames of a segment at once in ``finish``
+            (:mod:`dvo.odometry.final_adjustment`).
         initial_frames: keyframes before the first joint optimisation.
         initial_updates, final_updates: updates at initialisation and in ``finish``.
         updates: updates of each frame.
@@ -83,7 +87,7 @@ class TrackerConfig:
     pixels: int = 320 * 240
     patches: int = 24
     selection: str = ""
-    align: bool = False
+    align: Literal["none", "final", "always"] = "final"
     align_gain: float = 10.0
     align_reach: float = 0.3
     lifetime: int = 7
@@ -92,6 +96,7 @@ class TrackerConfig:
     initial_frames: int = 5
     initial_updates: int = 16
     final_updates: int = 8
+    final_adjustment: bool = True
     updates: int = 1
     initial_motion: float = 0.5
     initial_parallax: float = 1.0

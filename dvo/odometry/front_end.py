@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dvo.geometry.camera import Camera
+from dvo.graph.keyframe_log import FrameRecord
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.patchifier import normalise_images
 
@@ -42,6 +43,19 @@ class Observation:
     def bounds(self) -> tuple[int, int]:
         """Width and height of the feature map."""
         return self.maps.shape[-1], self.maps.shape[-2]
+
+
+@dataclass(frozen=True)
+class View:
+    """Frame with content, before it is part of the window.
+
+    Attributes:
+        records: of the frame, and of those after it that repeat it.
+        seen: its features.
+    """
+
+    records: list[FrameRecord]
+    seen: Observation
 
 
 def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Tensor:

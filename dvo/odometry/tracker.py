@@ -7,7 +7,7 @@ keyframe. Keyframes that leave the window are archived (:mod:`dvo.graph.keyframe
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 
 import numpy as np
@@ -28,8 +28,9 @@ from dvo.nets.patchifier import patch_coordinates
 from dvo.nets.selection import SELECTIONS
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
+from dvo.odometry.final_adjustment import adjust_segment
 from dvo.odometry.frame_sequence import FrameSequence
-from dvo.odometry.front_end import Observation, observe
+from dvo.odometry.front_end import View, observe
 from dvo.odometry.initialisation import drop_unrelated, initialise, median_revision, newest_confidence
 from dvo.odometry.motion import flow_magnitude, predict_pose
 from dvo.odometry.protocol import Estimate, Result, Status
@@ -40,14 +41,6 @@ from dvo.odometry.window_step import WindowStep
 from dvo.odometry.working_image import working_image
 
 _DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a new frame
-
-
-@dataclass(frozen=True)
-class _View:
-    """Frame with content that is not part of the window yet; ``records`` of it and of the frames that repeat it."""
-
-    records: list[FrameRecord]
-    seen: Observation
 
 
 class PatchOdometry:
@@ -88,14 +81,16 @@ class PatchOdometry:
         c = model.config
         select = SELECTIONS.resolve(config.selection or c.selection)
         self._select = partial(select, patches=config.patches, generator=torch.Generator().manual_seed(seed))
-        self.graph = KeyframeGraph(config.patches, c.patch_size, c.hidden_channels, self.device, archive)
+        sizes = config.patches, c.patch_size, c.hidden_channels
+        self.graph = KeyframeGraph(*sizes, self.device, archive, lambda edges: self._step.finalise(edges))
         self.correlation = WindowCorrelation(self.window, c, self.device)
-        align = WindowAlignment(self.window, config.alignment, self.device) if config.align else None
-        self._step = WindowStep(self.model, self.window, self.correlation, align)
+        align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
+        self._step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final")
         self._count = 0
-        self._initialised = self._ever_initialised = self._finished = False
+        self._initialised = self._finished = False
+        self._adjustable: list[int] = []  # segments that were initialised
         self._sequence = FrameSequence(config.max_gap)
-        self._waiting: list[_View] = []  # frames with content since tracking was lost
+        self._waiting: list[View] = []  # frames with content since tracking was lost
         self._joining = ""  # cause of the interruption that the next frame has to be joined across
         self._skipped = False  # the interruption is a gap in time
         self._last: tuple[np.ndarray, Estimate] | None = None  # last image and its estimate
@@ -144,7 +139,7 @@ class PatchOdometry:
                 self._joining, self._skipped = str(gap), not gap.frozen
             seen = observe(self.model, image, camera, self._select, self.device)
             self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
-            estimate = self._take(_View([record], seen))
+            estimate = self._take(View([record], seen))
             if len(self._waiting) >= self.config.patience:
                 estimate = self._begin_segment()
         self._last = image, estimate
@@ -163,6 +158,8 @@ class PatchOdometry:
             if len(self._waiting) >= self.config.initial_frames:
                 self._begin_segment()
             self._close_segment(last=True)
+            for segment in self._adjustable if self.config.final_adjustment else ():
+                adjust_segment(self.graph, segment)
         return self._result({})
 
     @torch.inference_mode()
@@ -179,11 +176,11 @@ class PatchOdometry:
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
         info = {
             **self._info, "keyframes": self.graph.log.keyframes, "seed": self.seed,
-            "initialised": self._ever_initialised, "config": asdict(self.config),
+            "initialised": bool(self._adjustable), "config": asdict(self.config),
         }  # fmt: skip
         return result_of(self.graph, info, poses)
 
-    def _take(self, view: _View) -> Estimate:
+    def _take(self, view: View) -> Estimate:
         """Add a frame with content to the window, and estimate its pose."""
         window, config, record = self.window, self.config, view.records[0]
         keyframe = self._append(view)
@@ -209,7 +206,7 @@ class PatchOdometry:
         self._reduce()
         return self._estimate(record, pose_wc, Status.TRACKING, evidence.confidence)
 
-    def _initialise(self, view: _View, keyframe: Keyframe) -> Estimate:
+    def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
         window, config, record = self.window, self.config, view.records[0]
         self._joining, confidence = "", 0.0
@@ -228,7 +225,7 @@ class PatchOdometry:
             evidence = newest_evidence(self._step)
             supported = len(window) >= config.initial_frames and evidence.supports(config)
             self._initialised = enough and supported
-            self._ever_initialised |= self._initialised
+            self._adjustable += [self.graph.segment] * self._initialised
             confidence = evidence.confidence
         pose_wc = self._pose_wc(len(window) - 1) if self._initialised else None
         self._reduce()
@@ -291,7 +288,7 @@ class PatchOdometry:
         self.graph.begin_segment(self._count, supported, "too few frames with content")
         self._initialised, self._joining, self._skipped = False, "", False
 
-    def _append(self, view: _View) -> Keyframe:
+    def _append(self, view: View) -> Keyframe:
         """Add a frame to the window, with predicted pose and the median depth of the frames before it."""
         config, window, seen = self.config, self.window, view.seen
         slot = window.free_map_slot()

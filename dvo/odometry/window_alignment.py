@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.geometry.projection import reproject
 from dvo.graph.window import Window
 from dvo.models.step import Measurement, Revision, UpdateState
 from dvo.nets.alignment import AlignmentOptions, accept, align_patches, patch_warps
@@ -14,7 +15,9 @@ from dvo.nets.config import ModelConfig
 
 
 class WindowAlignment:
-    """:class:`dvo.models.step.Refinement` over a window, which aligns new and moved edges only.
+    """Alignment of the edges of a window: as a :class:`dvo.models.step.Refinement`, or of those that leave it.
+
+    As a refinement it takes part in every step, and aligns new and moved edges only.
 
     Args:
         window: provides the edges.
@@ -75,7 +78,7 @@ class WindowAlignment:
         known = (measured - self._measured[slots]).norm(dim=-1) <= options.moved
         stale = (~known).nonzero()[:, 0]
         if len(stale):
-            self._align(state, revision, stale)
+            self._align(revision, stale)
         # The measurement may have moved a little since the alignment.
         near = (self._aligned[slots] - measured).norm(dim=-1) <= options.reach
         good = self._accepted[slots] & near
@@ -83,19 +86,45 @@ class WindowAlignment:
         weights = revision.weights[0] * torch.where(good, options.gain, 1.0)[:, None]
         return Measurement(targets[None], weights[None])
 
-    def _align(self, state: UpdateState, revision: Revision, edges: Tensor) -> None:
-        graph, options = state.graph, self.options
-        centre = state.patches.shape[-1] // 2
+    def finalise(self, edges: Tensor) -> None:
+        """Replace the measurements of edges in the window by their alignments, where these are accepted.
+
+        For edges that leave the window: their measurements will not change any more, so that each is aligned once.
+
+        Args:
+            edges: ``(e,)`` positions among the edges of the window; its targets and weights are changed.
+        """
+        window = self.window
+        poses, patches, intrinsics = window.poses_cw[None], window.patches[None], window.intrinsics[None]
+        coords = reproject(poses, patches, intrinsics, window.ii[edges], window.jj[edges], window.kk[edges]).coords[0]
+        targets, weights = window.targets.clone(), window.weights.clone()
+        aligned, good = self._find(edges, coords, targets[edges])
+        targets[edges] = torch.where(good[:, None], aligned, targets[edges])
+        weights[edges] *= torch.where(good, self.options.gain, 1.0)[:, None]
+        window.targets, window.weights = targets, weights
+
+    def _align(self, revision: Revision, edges: Tensor) -> None:
+        """Align edges and keep the result by edge slot."""
+        slots = self.window.edge_slots[edges]
+        self._measured[slots] = revision.targets[0, edges]
+        self._aligned[slots], self._accepted[slots] = self._find(
+            edges, revision.coords[0, edges], revision.targets[0, edges]
+        )
+
+    def _find(self, edges: Tensor, coords: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+        """Align edges ``(e,)`` of the window from measured positions ``(e, 2)``, with warps from reprojected patches.
+
+        Returns:
+            Aligned positions ``(e, 2)``, feature pixels, and whether they are accepted.
+        """
+        window, options = self.window, self.options
+        centre = window.patches.shape[-1] // 2
         stride = float(ModelConfig.STRIDE)
-        measured = revision.targets[0, edges]
-        centres = state.patches[0, graph.kk[edges], :2, centre, centre] * stride
-        map_slots = self.window.map_slots
+        centres = window.patches[window.kk[edges], :2, centre, centre] * stride
+        map_slots = window.map_slots
         found = align_patches(
-            self._images, map_slots[graph.ii[edges]], map_slots[graph.jj[edges]], centres, measured * stride,
-            patch_warps(revision.coords[0, edges]), options,
+            self._images, map_slots[window.ii[edges]], map_slots[window.jj[edges]], centres, measured * stride,
+            patch_warps(coords), options,
         )  # fmt: skip
         size = self._images.shape[2], self._images.shape[1]
-        slots = self.window.edge_slots[edges]
-        self._measured[slots] = measured
-        self._aligned[slots] = found.positions / stride
-        self._accepted[slots] = accept(found, measured * stride, size, stride, options)
+        return found.positions / stride, accept(found, measured * stride, size, stride, options)

@@ -21,15 +21,21 @@ class WindowStep:
         window: keyframes and edges.
         lookup: correlation of the window's edges.
         align: sub-pixel alignment of its measurements, None for none.
+        final: align the measurements that leave the window (:meth:`finalise`), instead of those of every step.
 
     Attributes:
         bounds: ``(width, height)`` of the feature map.
     """
 
     def __init__(
-        self, model: StepModel, window: Window, lookup: WindowCorrelation, align: WindowAlignment | None = None
+        self,
+        model: StepModel,
+        window: Window,
+        lookup: WindowCorrelation,
+        align: WindowAlignment | None = None,
+        final: bool = True,
     ) -> None:
-        self.model, self.window, self.lookup, self.align = model, window, lookup, align
+        self.model, self.window, self.lookup, self.align, self.final = model, window, lookup, align, final
         self.bounds = (0, 0)
 
     def keep_frame(self, map_slot: int, seen: Observation) -> None:
@@ -51,8 +57,17 @@ class WindowStep:
             edge_slots: ``(e,)``.
         """
         self.lookup.forget(edge_slots)
-        if self.align is not None:
+        if self.align is not None and not self.final:
             self.align.forget(edge_slots)
+
+    def finalise(self, edges: Tensor) -> None:
+        """Align edges that leave the window, if that is wanted.
+
+        Args:
+            edges: ``(e,)`` positions among the edges of the window.
+        """
+        if self.align is not None and self.final:
+            self.align.finalise(edges)
 
     def state(self) -> UpdateState:
         """State of the window.
@@ -78,12 +93,11 @@ class WindowStep:
 
         Args:
             options: of the step; ``bounds`` are replaced by those of the feature map.
-            align: use the sub-pixel alignment, if there is one. Its large weights would keep the first solution of a
-                window from leaving a wrong minimum.
+            align: use the sub-pixel alignment, if it takes part in every step. Its large weights would keep the first
+                solution of a window from leaving a wrong minimum.
         """
-        after = step(
-            self.model, self.state(), self.lookup, replace(options, bounds=self.bounds), self.align if align else None
-        )
+        refine = self.align if align and not self.final else None
+        after = step(self.model, self.state(), self.lookup, replace(options, bounds=self.bounds), refine)
         assert after.targets is not None and after.weights is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]

@@ -27,8 +27,8 @@ def test_reanchoring_keeps_every_frame_in_place(seed):
     for number in range(3):
         kept.set_pose(number, at[number])
     relative = [se3.relative(torch.from_numpy(at[i]), torch.from_numpy(at[i + 1])).numpy() for i in (0, 1)]
-    thinned.reanchor(2, 1, relative[1], oldest=0)
-    thinned.reanchor(1, 0, relative[0], oldest=0)
+    thinned.reanchor(2, 1, relative[1])
+    thinned.reanchor(1, 0, relative[0])
     thinned.set_pose(0, at[0])
     a, b = kept.trajectory(), thinned.trajectory()
     assert a.timestamps.tolist() == b.timestamps.tolist() == [0.0, 0.1, 0.2, 0.3]

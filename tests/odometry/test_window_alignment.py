@@ -69,7 +69,7 @@ def test_only_new_and_moved_edges_are_aligned(two_frames, monkeypatch):
     window, alignment, before = two_frames
     asked = []
     original = alignment._align
-    monkeypatch.setattr(alignment, "_align", lambda *a: (asked.append(a[2].tolist()), original(*a)))
+    monkeypatch.setattr(alignment, "_align", lambda *a: (asked.append(a[1].tolist()), original(*a)))
     first = alignment(*before(torch.tensor([0.1, 0.0])))
     again = alignment(*before(torch.tensor([0.15, 0.0])))  # has moved by less than a tenth
     assert torch.equal(first.targets[0, :3], again.targets[0, :3])
@@ -98,8 +98,21 @@ def tracked(clip, **settings):
     return done.result.trajectory
 
 
-def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip):
-    plain, aligned, again = tracked(clip), tracked(clip, align=True), tracked(clip, align=True)
+@pytest.mark.parametrize(("mode", "adjusted"), [("always", False), ("final", True)])
+def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip, mode, adjusted):
+    plain, aligned, again = (tracked(clip, align=align, final_adjustment=adjusted) for align in ("none", mode, mode))
     assert np.array_equal(aligned.poses_wc, again.poses_wc)
     errors = [evaluate(x, clip.groundtruth, rpe_gap=2).rpe_rot_deg for x in (plain, aligned)]
     assert len(aligned) == 24 and errors[1] < 0.75 * errors[0]
+
+
+def test_measurements_that_leave_the_window_are_replaced_once(two_frames):
+    window, alignment, before = two_frames
+    error = torch.tensor([0.15, -0.1])
+    window.targets = before(error)[1].targets[0]
+    window.weights = torch.full((4, 2), 0.5)
+    alignment.finalise(torch.tensor([0, 2, 3]))
+    truth = window.patches[:4, :2, 1, 1] + torch.tensor([SHIFT / 4, 0.0])
+    found = (window.targets - truth).norm(dim=-1)
+    assert (found[[0, 2]] < 0.01).all() and torch.allclose(found[[1, 3]], error.norm())
+    assert window.weights[:, 0].tolist() == [5.0, 0.5, 5.0, 0.5]  # edge 3: its window is not inside the image

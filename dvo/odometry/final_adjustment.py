@@ -1,0 +1,126 @@
+"""Final adjustment of a tracker: bundle adjustment of all frames of a segment, once the segment is complete.
+
+While it runs, the tracker estimates a frame from the frames before it, and fixes the pose of a redundant keyframe when
+the keyframe is dropped, although depths and scale of the window still change afterwards. The final adjustment solves
+for all keyframes, dropped ones included, and all inverse depths at once, from every archived measurement and with a
+robust kernel that takes the influence from moving bodies and wrong matches. Long segments are solved in blocks with the
+frames before each held, which bounds the memory, and the time per frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
+from dvo.ba.kernels import Kernel
+from dvo.ba.levenberg import LMOptions
+from dvo.geometry import se3
+from dvo.graph.keyframe_graph import GraphProblem, KeyframeGraph
+
+
+@dataclass(frozen=True)
+class AdjustmentOptions:
+    """Options of :func:`adjust_segment`.
+
+    Attributes:
+        kernels: robust kernels of the weighted residuals, one after the other; their width is in feature pixels times
+            the root of the weight. The first is wide, for poses that are far off; the last decides.
+        max_residual: feature pixels; a longer residual has no influence.
+        iterations: Levenberg-Marquardt steps of a block with each kernel, at most.
+        block: largest number of frames that are solved for at once.
+        overlap: frames at the end of a block that the next block solves for again.
+    """
+
+    kernels: tuple[Kernel, ...] = (Kernel("huber", 0.5), Kernel("cauchy", 0.1))
+    max_residual: float = 32.0
+    iterations: int = 10
+    block: int = 600
+    overlap: int = 60
+
+
+@dataclass(frozen=True)
+class _Change:
+    """Similarity from the poses before the adjustment to those of the frames that are solved already.
+
+    Attributes:
+        before, after: ``(7,)`` world to camera of the newest frame that is solved.
+        scale: of lengths, after over before.
+    """
+
+    before: Tensor
+    after: Tensor
+    scale: float
+
+    def __call__(self, poses_cw: Tensor) -> Tensor:
+        """Move poses ``(N, 7)`` along with the newest frame that is solved."""
+        relative = se3.relative(self.before.expand_as(poses_cw), poses_cw)
+        scaled = torch.cat([relative[:, :3] * self.scale, relative[:, 3:]], 1)
+        return se3.compose(scaled, self.after.expand_as(poses_cw))
+
+
+def adjust_segment(
+    graph: KeyframeGraph,
+    segment: int,
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
+) -> int:
+    """Solve for the archived keyframes and inverse depths of a segment, in place.
+
+    Args:
+        graph: the whole segment is archived; its poses and inverse depths are replaced.
+        segment: its number.
+        options: kernels, iterations and size of the blocks.
+
+    Returns:
+        Number of keyframes that were solved for, dropped ones included. Those whose patches have been released to save
+        memory keep their poses.
+
+    Example:
+        >>> run = dvo.run(odometry, dvo.open("video.mp4", calib="calib.txt"))
+        >>> adjust_segment(odometry.graph, segment=0)
+    """
+    frames = [frame for frame in graph.archive if graph.segment_of(frame.identifier) == segment]
+    identifiers = np.array([frame.identifier for frame in frames if len(frame.inverse_depth)])
+    if len(identifiers) < 3:
+        return 0
+    old = graph.poses_cw(identifiers)
+    # With frames before it that stay, the first block starts from several held frames, which hold its scale.
+    held = 1 if len(identifiers) == len(frames) else min(options.overlap, len(identifiers) - 1)
+    start = solved = held
+    change = _Change(old[held - 1], old[held - 1], 1.0)
+    while solved < len(identifiers):
+        end = min(start + options.block, len(identifiers))
+        # Held frames that share no edge with the block are left out, but not those that hold the first one.
+        first = 0 if start == held else int(identifiers[start])
+        part = graph.problem(True, segment, first, int(identifiers[end - 1]))
+        fixed = torch.from_numpy(part.identifiers < identifiers[start])
+        new = torch.from_numpy(part.identifiers > identifiers[solved - 1])
+        poses, depths = part.poses_cw.clone(), part.patches[:, 2, 0, 0].reshape(len(part.poses_cw), -1).clone()
+        poses[new] = change(old[np.searchsorted(identifiers, part.identifiers[new.numpy()])])
+        depths[new] /= change.scale
+        found, found_depths = _solve(part, poses, depths, fixed, options)
+        scale = change.scale * float((depths[new] / found_depths[new]).median())
+        change = _Change(old[end - 1], found[-1], scale)
+        for row in (~fixed).nonzero()[:, 0].tolist():
+            graph.correct(int(part.identifiers[row]), found[row].numpy(), found_depths[row].numpy())
+        solved, start = end, max(end - options.overlap, start + 1)
+    return len(identifiers)
+
+
+def _solve(
+    part: GraphProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
+) -> tuple[Tensor, Tensor]:
+    """Poses ``(N, 7)`` and inverse depths ``(N, M)`` of a block from given ones, of which some poses are fixed."""
+    if not len(part.kk) or fixed.all():
+        return poses_cw, depths
+    patches = torch.cat([part.patches[:, :2], depths.reshape(-1, 1, 1, 1)], 1)
+    measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
+    solver = LMOptions(max_iterations=options.iterations)
+    for kernel in options.kernels:
+        settings = GlobalBAOptions(fixed=fixed, kernel=kernel, max_residual=options.max_residual, solver=solver)
+        found = global_bundle_adjust(poses_cw, patches, *measured, settings)
+        poses_cw, patches = se3.normalise(found.poses_cw), found.patches
+    return poses_cw, patches[:, 2, 0, 0].reshape_as(depths)

@@ -9,7 +9,7 @@ frames before each held, which bounds the memory, and the time per frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.levenberg import LMOptions
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import GraphProblem, KeyframeGraph
+from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class AdjustmentOptions:
         iterations: Levenberg-Marquardt steps of a block with each kernel, at most.
         block: largest number of frames that are solved for at once.
         overlap: frames at the end of a block that the next block solves for again.
+        shutter_rounds: solutions with measurements corrected for a rolling shutter, each from the motion of the last.
     """
 
     kernels: tuple[Kernel, ...] = (Kernel("huber", 0.5), Kernel("cauchy", 0.1))
@@ -40,6 +42,7 @@ class AdjustmentOptions:
     iterations: int = 10
     block: int = 600
     overlap: int = 60
+    shutter_rounds: int = 2
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,7 @@ def adjust_segment(
     graph: KeyframeGraph,
     segment: int,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
+    shutter: Shutter | None = None,
 ) -> int:
     """Solve for the archived keyframes and inverse depths of a segment, in place.
 
@@ -73,6 +77,7 @@ def adjust_segment(
         graph: the whole segment is archived; its poses and inverse depths are replaced.
         segment: its number.
         options: kernels, iterations and size of the blocks.
+        shutter: timing of the rows of a rolling shutter, None for a global one.
 
     Returns:
         Number of keyframes that were solved for, dropped ones included. Those whose patches have been released to save
@@ -83,29 +88,38 @@ def adjust_segment(
         >>> adjust_segment(odometry.graph, segment=0)
     """
     frames = [frame for frame in graph.archive if graph.segment_of(frame.identifier) == segment]
-    identifiers = np.array([frame.identifier for frame in frames if len(frame.inverse_depth)])
+    solvable = [frame for frame in frames if len(frame.inverse_depth)]
+    identifiers = np.array([frame.identifier for frame in solvable])
     if len(identifiers) < 3:
         return 0
+    times = torch.tensor([frame.timestamp for frame in solvable], dtype=torch.float64)
     old = graph.poses_cw(identifiers)
+    now = old.clone()
     # With frames before it that stay, the first block starts from several held frames, which hold its scale.
     held = 1 if len(identifiers) == len(frames) else min(options.overlap, len(identifiers) - 1)
     start = solved = held
     change = _Change(old[held - 1], old[held - 1], 1.0)
     while solved < len(identifiers):
-        end = min(start + options.block, len(identifiers))
+        end = min(max(start + options.block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
-        first = 0 if start == held else int(identifiers[start])
-        part = graph.problem(True, segment, first, int(identifiers[end - 1]))
-        fixed = torch.from_numpy(part.identifiers < identifiers[start])
-        new = torch.from_numpy(part.identifiers > identifiers[solved - 1])
-        poses, depths = part.poses_cw.clone(), part.patches[:, 2, 0, 0].reshape(len(part.poses_cw), -1).clone()
-        poses[new] = change(old[np.searchsorted(identifiers, part.identifiers[new.numpy()])])
+        part = graph.problem(True, segment, 0 if start == held else int(identifiers[start]), int(identifiers[end - 1]))
+        rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))
+        fixed, new = rows < start, rows >= solved
+        now[solved:end] = change(old[solved:end])
+        depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1).clone()
         depths[new] /= change.scale
-        found, found_depths = _solve(part, poses, depths, fixed, options)
-        scale = change.scale * float((depths[new] / found_depths[new]).median())
-        change = _Change(old[end - 1], found[-1], scale)
+        poses, found = _solve(part, now[rows], depths, fixed, options)
+        for _ in range(options.shutter_rounds):
+            if shutter is None:
+                break
+            now[rows] = poses
+            track = PoseTrack.through(times[:end], now[:end])
+            corrected = as_global_shutter(part, poses, found, rows, track, shutter)
+            poses, found = _solve(corrected, poses, found, fixed, replace(options, kernels=options.kernels[-1:]))
+        now[rows] = poses
+        change = _Change(old[end - 1], now[end - 1], change.scale * float((depths[new] / found[new]).median()))
         for row in (~fixed).nonzero()[:, 0].tolist():
-            graph.correct(int(part.identifiers[row]), found[row].numpy(), found_depths[row].numpy())
+            graph.correct(int(part.identifiers[row]), poses[row].numpy(), found[row].numpy())
         solved, start = end, max(end - options.overlap, start + 1)
     return len(identifiers)
 

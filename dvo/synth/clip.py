@@ -16,14 +16,16 @@ import torch
 from dvo.errors import DvoError
 from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth import salts
+from dvo.synth.conditions import Conditions, draw_conditions, stage_clip
 from dvo.synth.motion.paths import Path, find_start, random_path
 from dvo.synth.render.quality import Quality
-from dvo.synth.render.renderer import render, render_depth
+from dvo.synth.render.renderer import Rendering, render, render_depth
+from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.families import random_scene
 from dvo.synth.scenes.scene import Scene
-from dvo.synth.sensors.sensor import Sensor, expose, random_degradation, random_intrinsics, random_sensor
+from dvo.synth.sensors.sensor import Sensor, expose, low_light, random_degradation, random_intrinsics, random_sensor
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from dvo.synth.specs import check_names
+from dvo.synth.specs import check_names, check_share
 from dvo.synth.textures.texture import texture_pool
 
 Array = np.ndarray
@@ -42,9 +44,11 @@ class ClipSpec:
         clips_per_scene: neighbouring indices that share a scene; more is faster and less varied.
         supersample: rays per pixel edge for the colours.
         textures: folder of photographs to use as textures; those shipped with scikit-image if None.
+        movers: probability of a clip with moving bodies, 1 to 8 of them.
+        low_light: probability of a clip with 3 to 30 % of the usual light; without a sensor it has no effect.
 
     Raises:
-        DvoError: sizes or flow range out of order.
+        DvoError: sizes or flow range out of order, or a probability that is none.
     """
 
     frames: int = 8
@@ -55,12 +59,16 @@ class ClipSpec:
     clips_per_scene: int = 2
     supersample: int = 1
     textures: str | None = None
+    movers: float = 0.0
+    low_light: float = 0.0
 
     def __post_init__(self) -> None:
         if self.frames < 2 or self.height < 16 or self.width < 16:
             raise DvoError("a clip needs 2 frames or more of 16x16 pixels or more", field="frames, height, width")
         if not 0 < self.flow_range[0] <= self.flow_range[1]:
             raise DvoError(f"not a range: {self.flow_range}", field="flow_range", remedy="give low <= high, in pixels")
+        for name in ("movers", "low_light"):
+            check_share(name, getattr(self, name))
 
 
 @dataclass
@@ -69,15 +77,23 @@ class Clip:
 
     Attributes:
         images: ``(N, 3, H, W)`` uint8 RGB.
-        depth: ``(N, H, W)`` float32 Z along the optical axis; the median over the clip is 1.
+        depth: ``(N, H, W)`` float32 Z along the optical axis, of moving bodies too; the median over what does not move
+            is 1.
         poses_cw: ``(N, 7)`` float32 world to camera, in units of that depth; the first is the identity.
         intrinsics: ``(N, 4)`` float32 fx fy cx cy in pixels of the images.
+        moving: ``(N, H, W)`` bool, pixels that show a moving body; None if nothing moves.
     """
 
     images: torch.Tensor
     depth: torch.Tensor
     poses_cw: torch.Tensor
     intrinsics: torch.Tensor
+    moving: torch.Tensor | None = None
+
+    @property
+    def static_depth(self) -> torch.Tensor:
+        """Depth ``(N, H, W)``, nan at pixels that show a moving body."""
+        return self.depth if self.moving is None else self.depth.masked_fill(self.moving, torch.nan)
 
 
 def induced_flow(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Array, Array]:
@@ -124,6 +140,7 @@ def flow_field(depth: Array, poses_wc: Array, intrinsics: Array) -> tuple[Array,
 class _Plan:
     path: Path
     times: Array
+    flow: float  # mean between neighbouring frames, pixels
 
 
 def _match_flow(path: Path, rhythm: Array, target: float, speed: float, depth: Array, low: Array) -> float:
@@ -185,7 +202,7 @@ def _plan(
             seen = depth[depth > 0]
             median, near = float(np.median(seen)), float(np.quantile(seen, 0.01))
             roomy = near > 0.07 * median and scene.clearance(between[:, :3]).min() > 0.03 * median
-            return _Plan(moved, times) if roomy and overlap.min() > 0.5 else None
+            return _Plan(moved, times, mean) if roomy and overlap.min() > 0.5 else None
         if overlap.min() < 0.25:
             return None
         speed = _match_flow(path, rhythm, target, speed, depth, low)
@@ -227,15 +244,16 @@ def make_clip(
     rng = np.random.default_rng([seed, salts.CLIP, index])
     plan, intrinsics = _draw_plan(scene, rng, spec, index)
     poses_wc = plan.path.poses_wc(plan.times)
-    rendering = render(
-        scene, poses_wc, intrinsics, spec.height, spec.width, quality=Quality(spec.supersample), device=device,
-        coordinates=False,
-    )  # fmt: skip
+    conditions = draw_conditions(seed, index, spec.movers, spec.low_light)
+    rendering, moving = _render(scene, plan, poses_wc, intrinsics, spec, conditions, device)
     images = rendering.images
     if spec.sensor:
         camera = random_sensor(rng)
         flow: torch.Tensor | None = None
+        if conditions.light < 1:
+            camera = low_light(camera, conditions.light)
         if camera.shutter > 0:
+            # Bodies are blurred as if they stood still: by the motion of the camera at their depth.
             field, _ = flow_field(rendering.depth.cpu().numpy(), poses_wc, intrinsics)
             field = np.clip(np.concatenate([field, field[-1:]]), -spec.width / 3, spec.width / 3)
             flow = torch.from_numpy(field.astype(np.float32))
@@ -245,7 +263,8 @@ def make_clip(
             np.random.default_rng([seed, salts.CLIP_DEGRADATION, index]), camera, float(times[-1])
         )
         images = expose(images, camera, rng, flow, times)
-    scale = float(rendering.depth.median())
+    depth = rendering.depth if moving is None or moving.all() else rendering.depth[~moving]
+    scale = float(depth.median())
     relative = compose_rodrigues(invert_rodrigues(poses_wc), poses_wc[:1])  # world := first camera
     relative[:, :3] /= scale
     relative[0] = [0, 0, 0, 0, 0, 0, 1]
@@ -254,7 +273,24 @@ def make_clip(
         depth=rendering.depth / scale,
         poses_cw=torch.from_numpy(relative.astype(np.float32)).to(device),
         intrinsics=torch.from_numpy(np.tile(intrinsics, (spec.frames, 1)).astype(np.float32)).to(device),
+        moving=moving,
     )
+
+
+def _render(
+    scene: Scene, plan: _Plan, poses_wc: Array, intrinsics: Array, spec: ClipSpec, conditions: Conditions,
+    device: torch.device | str,
+) -> tuple[Rendering, torch.Tensor | None]:  # fmt: skip
+    """Clean frames, and the pixels ``(N, H, W)`` that show moving bodies; None without bodies."""
+    stage: Scene | Stage = scene
+    times: Array | None = None
+    if conditions.bodies:
+        stage, times = stage_clip(scene, plan.path, plan.times, conditions, plan.flow, float(intrinsics[0]))
+    rendering = render(
+        stage, poses_wc, intrinsics, spec.height, spec.width, quality=Quality(spec.supersample), device=device,
+        coordinates=False, times=times,
+    )  # fmt: skip
+    return rendering, rendering.surface >= stage.static if isinstance(stage, Stage) else None
 
 
 def _draw_plan(scene: Scene, rng: np.random.Generator, spec: ClipSpec, index: int) -> tuple[_Plan, Array]:

@@ -85,7 +85,7 @@ class SceneSpec:
     textures: str | None = None
 
     def __post_init__(self) -> None:
-        _check_share("texture", self.texture)
+        check_share("texture", self.texture)
         _check_number("movers", self.movers, 0, 1000, whole=True)
 
 
@@ -142,7 +142,7 @@ class CameraSpec:
 
     def __post_init__(self) -> None:
         for name in ("shutter", "rolling_shutter", "light", "drop"):
-            _check_share(name, getattr(self, name))
+            check_share(name, getattr(self, name))
         _check_range("light", self.light > 0)
         _check_number("lighting", self.lighting, 0, 20)
         _check_number("blackout", self.blackout, 0, LONGEST)
@@ -224,7 +224,16 @@ def _check_number(name: str, value: float, low: float, high: float, whole: bool 
         raise DvoError(f"out of range: {shown(value)}", field=name, remedy=f"give {kind} from {low:g} to {high:g}")
 
 
-def _check_share(name: str, value: float) -> None:
+def check_share(name: str, value: float) -> None:
+    """Check a share or a probability.
+
+    Args:
+        name: of the setting.
+        value: of the setting.
+
+    Raises:
+        DvoError: not a number from 0 to 1.
+    """
     if not isinstance(value, numbers.Real) or not 0 <= value <= 1:
         raise DvoError(f"not a share: {shown(value)}", field=name, remedy="give a number from 0 to 1")
 

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 from dvo.errors import DvoError
 from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth.clip import Clip, induced_flow, make_clip
+from dvo.synth.conditions import draw_conditions
 from dvo.synth.dataset import ClipDataset
 
 SMALL = {"frames": 4, "height": 60, "width": 80, "flow_range": (1.0, 8.0)}
@@ -113,3 +114,65 @@ def test_bad_options() -> None:
         make_clip(SEED, 0, flow_range=(3.0, 1.0))
     with pytest.raises(DvoError, match="frames"):
         make_clip(SEED, 0, frames=1)
+
+
+def test_bad_probabilities() -> None:
+    for name in ("movers", "low_light"):
+        for value in (-0.1, 1.1, float("nan")):
+            with pytest.raises(DvoError, match=f"{name}: not a share"):
+                make_clip(SEED, 0, **{name: value})
+
+
+def test_clips_that_are_not_chosen_keep_their_bytes(clips: list[Clip]) -> None:
+    chosen = [draw_conditions(SEED, i, 0.3, 0.3) for i in range(12)]
+    usual = [i for i, c in enumerate(chosen) if c.bodies == 0 and c.light == 1]
+    assert 0 < len(usual) < 12
+    for index in usual[:2]:
+        clip = make_clip(SEED, index, movers=0.3, low_light=0.3, **SMALL)
+        assert digest(parts(clip)) == digest(parts(clips[index])) and clip.moving is None
+    changed = next(i for i in range(12) if i not in usual)
+    clip = make_clip(SEED, changed, movers=0.3, low_light=0.3, **SMALL)
+    assert digest(parts(clip)) != digest(parts(clips[changed]))
+
+
+@pytest.mark.parametrize("index", [1, 4, 7])
+def test_depth_is_nan_where_a_body_is_seen(index: int) -> None:
+    """The static scene shows through everywhere else, and is farther away where a body is seen."""
+    options = {"sensor": False, **SMALL}
+    clip, static = (make_clip(SEED, index, movers=share, **options) for share in (1.0, 0.0))
+    moving = clip.moving
+    assert moving is not None and static.moving is None and 0 < moving.float().mean() < 0.6
+    assert torch.isfinite(clip.depth).all() and torch.isfinite(clip.poses_cw).all()
+    scale = float((clip.depth / static.depth)[~moving].median())  # both have a median of 1, over other pixels
+    known = clip.depth / scale
+    torch.testing.assert_close(known[~moving], static.depth[~moving])
+    assert (known[moving] < static.depth[moving]).all()
+    torch.testing.assert_close(clip.poses_cw[:, :3] / scale, static.poses_cw[:, :3])
+    item = ClipDataset(SEED, 1, start=index, movers=1.0, **options)[0]["depth"]
+    assert torch.equal(torch.isnan(item), moving) and torch.equal(item[~moving], clip.depth[~moving])
+    assert float(item.nanmedian()) == pytest.approx(1, rel=1e-5)
+    # Bodies are in the pictures too, and but for the smoothed outlines nothing else is.
+    change = (clip.images.int() - static.images.int()).abs().sum(1)
+    assert (change[moving] > 0).float().mean() > 0.9 and (change[~moving] > 0).float().mean() < 0.1
+
+
+def test_bodies_move_and_are_the_same_for_the_same_seed() -> None:
+    clip, again = (make_clip(SEED, 6, movers=1.0, low_light=1.0, **SMALL) for _ in range(2))
+    assert digest(parts(clip)) == digest(parts(again))
+    assert clip.moving is not None and again.moving is not None and torch.equal(clip.moving, again.moving)
+    assert not torch.equal(clip.moving[0], clip.moving[-1])
+
+
+def test_low_light_is_noise_in_the_pictures_alone() -> None:
+    def roughness(images: torch.Tensor) -> float:
+        x = images.float()
+        return float((x[..., 1:-1] - (x[..., 2:] + x[..., :-2]) / 2).abs().mean() / x.mean())
+
+    ratios = []
+    for index in range(4):
+        dark, usual = (make_clip(SEED, index, low_light=share, **SMALL) for share in (1.0, 0.0))
+        assert torch.equal(dark.depth, usual.depth) and torch.equal(dark.poses_cw, usual.poses_cw)
+        ratios.append(roughness(dark.images) / roughness(usual.images))
+    assert np.median(ratios) > 1.2, ratios
+    clean, same = (make_clip(SEED, 1, low_light=share, sensor=False, **SMALL) for share in (1.0, 0.0))
+    assert torch.equal(clean.images, same.images)

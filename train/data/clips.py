@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 from dvo.allocator import reuse_freed_memory
 from dvo.errors import DvoError
 from dvo.synth.dataset import ClipDataset
+from dvo.synth.specs import check_share
 from train.data.real import RealClips, RealData
 from train.data.stream import ClipStream, StreamSampler
 from train.engine.provenance import Material, names_of
@@ -110,9 +111,12 @@ class Renderings(ClipStream):
         real: recordings to train on as well or instead.
         textures: folder of photographs to paint the scenes with; None: those that scikit-image ships.
         courses: former name of ``stages``.
+        movers: probability that moving bodies are in a rendered clip; the depth is nan where they are seen.
+        low_light: probability that a rendered clip has 3 to 30 % of the usual light.
 
     Raises:
-        DvoError: ``stages`` under both names, sizes of no batch and no clip, or no recordings where there should be.
+        DvoError: ``stages`` under both names, sizes of no batch and no clip, a probability that is none, or no
+            recordings where there should be.
     """
 
     def __init__(
@@ -128,6 +132,8 @@ class Renderings(ClipStream):
         real: RealData | None = None,
         textures: str | None = None,
         courses: list[CurriculumStage] | None = None,
+        movers: float = 0.0,
+        low_light: float = 0.0,
     ) -> None:
         super().__init__()
         if stages and courses:
@@ -135,6 +141,8 @@ class Renderings(ClipStream):
         for name, value, least in (("batch_size", batch_size, 1), ("frames", frames, 2), ("workers", workers, 0)):
             if value < least:
                 raise DvoError(f"{value} is too small", field=f"data.{name}", remedy=f"give {least} or more")
+        check_share("data.movers", movers)
+        check_share("data.low_light", low_light)
         if real is not None:
             real.check()
         self.save_hyperparameters(
@@ -144,10 +152,13 @@ class Renderings(ClipStream):
         first = CurriculumStage(0, flow_low, flow_high, sizes or [(120, 160)])
         self.stages = [first, *(stages or courses or [])]
         self.real, self.textures = real, textures
+        self.movers, self.low_light = movers, low_light
 
     def clips(self, processes: int = 1) -> MixedClips:
         """The clips, in batches that span so many processes."""
-        options = {"frames": self.frames, "textures": self.textures}
+        options = {
+            "frames": self.frames, "textures": self.textures, "movers": self.movers, "low_light": self.low_light,
+        }  # fmt: skip
         return MixedClips(self.seed, self.stages, self.batch_size * processes, self.real, **options)
 
     def summary(self) -> str:

@@ -41,6 +41,16 @@ def test_a_window_of_the_whole_image_is_the_image():
         torch.testing.assert_close(new[name], clip[name])
 
 
+def test_unknown_depth_stays_unknown_and_does_not_spread():
+    clip = ramp()
+    clip["depth"][:, 8:16, 8:16] = torch.nan
+    new = crop_and_resize(clip, 1.5, 2.0, 3.0)
+    x, y = ((torch.arange(n) + 0.5) / 1.5 + start - 0.5 for n, start in ((32, 2.0), (24, 3.0)))
+    column, row = x.round(), y.round()
+    hidden = ((row >= 8) & (row < 16))[:, None] & ((column >= 8) & (column < 16))
+    assert torch.equal(torch.isnan(new["depth"][0]), hidden) and hidden.any()
+
+
 def test_one_draw_for_all_frames_and_the_same_for_the_same_step():
     pytest.importorskip("kornia")
     batch = {name: value[None].repeat(3, *[1] * value.dim()) for name, value in ramp().items()}

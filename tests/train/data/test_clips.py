@@ -1,6 +1,7 @@
 """Curricula of rendered clips."""
 
 import pytest
+import torch
 
 from dvo.errors import DvoError
 from train.data.clips import CurriculumStage, MixedClips, Renderings
@@ -19,3 +20,21 @@ def test_stages_keep_their_former_name():
     assert Renderings(stages=later).stages[1:] == later
     with pytest.raises(DvoError, match="courses"):
         Renderings(stages=later, courses=later)
+
+
+def test_moving_bodies_and_low_light_are_in_the_clips_of_all_stages():
+    options = {"seed": 5, "frames": 2, "sizes": [(48, 64)], "flow_low": 1.0, "flow_high": 4.0}
+    later = [CurriculumStage(4, 1.0, 4.0, [(32, 48)])]
+    hard = Renderings(movers=1.0, low_light=1.0, stages=later, **options).clips()
+    for index in (0, 5):
+        depth = hard[index]["depth"]
+        assert torch.isnan(depth).any() and depth.nanmedian() == pytest.approx(1, rel=1e-5)
+    usual = Renderings(stages=later, **options).clips()[0]
+    assert torch.isfinite(usual["depth"]).all() and not torch.equal(usual["images"], hard[0]["images"])
+
+
+@pytest.mark.parametrize("name", ["movers", "low_light"])
+def test_a_probability_is_from_0_to_1(name):
+    for value in (-0.1, 1.5, float("nan")):
+        with pytest.raises(DvoError, match=f"data.{name}: not a share"):
+            Renderings(**{name: value})

@@ -62,7 +62,7 @@ def test_run_writes_the_results_folder(given, image_folder, tmp_path, capsys):
     written = summary(out)
     assert written["frames"] == {"read": 20, "fed": 20, "tracked": 20, "lost": 0}
     assert (written["seed"], written["stride"], written["device"], written["odometry"]) == (5, 1, "cpu", "fake")
-    assert written["metrics"] is None and written["config"] == {"patches": 3}
+    assert written["metrics"] is None and written["config"] == {"patches": 3} and written["readout"] == 0
     printed = capsys.readouterr().out
     assert "tracked 20 of 20 frames" in printed and str(out) in printed
 

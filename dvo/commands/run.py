@@ -78,6 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         "source": str(arguments.source),
         "kind": getattr(source, "kind", None),
         "calibration": arguments.calib,
+        "readout": source.camera.readout,
         "groundtruth": arguments.groundtruth,
         "weights": arguments.weights,
         "device": str(device),

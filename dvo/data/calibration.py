@@ -44,6 +44,7 @@ class Calibration:
         file: file that it was read from, for messages.
         depth_scale: units of a metre in depth images of integers that belong to the images.
         baseline: metres from the camera to the right camera of a rectified pair with the same intrinsics.
+        readout: seconds in which a rolling shutter reads the rows, as in :class:`dvo.geometry.camera.Camera`.
     """
 
     fx: float
@@ -57,6 +58,7 @@ class Calibration:
     file: Path | None = None
     depth_scale: float | None = None
     baseline: float | None = None
+    readout: float = 0.0
 
     def camera(self, width: int, height: int) -> Camera:
         """Camera of images of this size.
@@ -66,7 +68,7 @@ class Calibration:
 
         Raises:
             DvoError: the intrinsics do not fit: another resolution stated, a focal length below 0.1 or above 20 image
-                widths, a principal point outside of the image.
+                widths, a principal point outside of the image; or a readout outside of 0 to 1 s.
         """
         remedy = f"give the calibration of these {width}x{height} images"
         if (self.width or width, self.height or height) != (width, height):
@@ -85,7 +87,8 @@ class Calibration:
                     remedy=f"{remedy}, in pixels",
                 )
         try:
-            return Camera(self.fx, self.fy, self.cx, self.cy, width, height, self.model, self.coefficients)
+            numbers = (self.fx, self.fy, self.cx, self.cy)
+            return Camera(*numbers, width, height, self.model, self.coefficients, self.readout)
         except DvoError as error:
             raise DvoError(error.message, file=self.file, field=error.field, remedy=error.remedy) from None
 
@@ -113,7 +116,9 @@ def read_calibration(path: Path | str) -> Calibration:
     or a 3x3 matrix K on three lines. YAML: ``fx, fy, cx, cy`` with optional ``width, height,
     model: none|radtan|fisheye, coefficients``; EuRoC ``sensor.yaml``; Kalibr camchain (its ``cam0``); ROS camera_info
     and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state ``depth_scale`` (ORB-SLAM:
-    ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too.
+    ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too;
+    and ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global one, if it is left
+    out; Kalibr's ``line_delay`` is not read).
 
     Args:
         path: text or YAML file.
@@ -250,9 +255,10 @@ def _other_intrinsics(data: dict[str, Any], path: Path) -> np.ndarray:
 
 def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:
     found: dict[str, float | None] = {}
-    keys = {
+    keys: dict[str, tuple[str, ...]] = {
         "depth_scale": ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor"),
         "baseline": ("baseline", "Stereo.b"),
+        "readout": ("readout",),
     }
     for name, names in keys.items():
         value = _find(data, *names)
@@ -260,12 +266,12 @@ def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) ->
             product = _numbers(data["Camera.bf"], path, "Camera.bf")
             value = product / calibration.fx if calibration.fx else product  # fx of 0 is refused later
         number = None if value is None else _numbers(value, path, name)
-        if number is not None and (number.shape != () or not 1e-6 <= number <= 1e6):
-            raise DvoError(
-                "expected one positive number", file=path, field=name, remedy="give a number, or leave it out"
-            )
+        low, high, expected = (0, 1, "seconds, 0 to 1") if name == "readout" else (1e-6, 1e6, "one positive number")
+        if number is not None and (number.shape != () or not low <= number <= high):
+            raise DvoError(f"expected {expected}", file=path, field=name, remedy="give a number, or leave it out")
         found[name] = None if number is None else float(number)
-    return replace(calibration, depth_scale=found["depth_scale"], baseline=found["baseline"])
+    scale, baseline, readout = found["depth_scale"], found["baseline"], found["readout"] or 0.0
+    return replace(calibration, depth_scale=scale, baseline=baseline, readout=readout)
 
 
 def _with_distortion(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:

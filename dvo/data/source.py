@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import islice
 from numbers import Integral
@@ -244,12 +245,17 @@ def open_source(
     if calibration is None:
         raise _no_calibration(path)
     height, width = first.image.shape[:2]
+    doubts = calibration.doubts(width, height)
+    turned = getattr(recording, "turned", 0)
+    if turned and calibration.readout:  # rows of the images are columns of the sensor, or come in reverse order
+        calibration = replace(calibration, readout=0.0)
+        doubts.append(f"the video is turned by {turned} degrees: the readout of the calibration was not used")
     camera = calibration.camera(width, height)
     truth = recording.groundtruth
     if groundtruth is not None:
         truth = read_groundtruth(_locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
     try:
-        return Source(recording, camera, truth, stride, undistort, calibration.doubts(width, height))
+        return Source(recording, camera, truth, stride, undistort, doubts)
     except DvoError as error:  # the lens model does not know its file
         raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None
 

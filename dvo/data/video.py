@@ -110,6 +110,10 @@ class VideoRecording:
         path: the file.
         request: options of the user.
 
+    Attributes:
+        turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
+            rows of the sensor in the order in which it reads them.
+
     Raises:
         DvoError: it does not open, holds no frame, or ``times`` has another number of rows than it has frames.
     """
@@ -128,6 +132,9 @@ class VideoRecording:
         self.warnings: list[str] = []
         with _capture(path) as capture:
             announced, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+            angle = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 360
+            does_turn = capture.get(cv2.CAP_PROP_ORIENTATION_AUTO) and angle in (90, 180, 270)
+            self.turned = int(angle) if does_turn else 0
             first = [milliseconds for (_, milliseconds, _), _ in zip(_grabs(capture), range(3), strict=False)]
         if not first:
             raise DvoError("no frame of this video decodes", file=path, remedy="check that it plays, or re-encode it")

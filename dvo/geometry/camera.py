@@ -1,4 +1,4 @@
-"""Camera: pinhole intrinsics, the size of the image that they belong to, and the lens distortion.
+"""Camera: pinhole intrinsics, the size of the image that they belong to, lens distortion, and readout of the rows.
 
 Pixel centres lie at integer coordinates: the first pixel covers [-0.5, 0.5].
 """
@@ -24,9 +24,12 @@ class Camera:
         width, height: image size in pixels.
         model: ``none``, ``radtan`` (k1 k2 p1 p2 [k3], OpenCV order) or ``fisheye`` (Kannala-Brandt k1 k2 k3 k4).
         coefficients: distortion coefficients of that model.
+        readout: seconds from the first to the last row of a rolling shutter, read from top to bottom: row r is read
+            ``(r - (height - 1) / 2) readout / height`` seconds after the time of the frame, which is that of its middle
+            row; 0 for a global shutter.
 
     Raises:
-        DvoError: intrinsics that cannot belong to an image of this size.
+        DvoError: intrinsics that cannot belong to an image of this size, or a readout outside of 0 to 1 s.
 
     Example:
         >>> camera = Camera(500.0, 500.0, 319.5, 239.5, 640, 480)
@@ -42,6 +45,7 @@ class Camera:
     height: int
     model: DistortionModel = "none"
     coefficients: tuple[float, ...] = ()
+    readout: float = 0.0
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy, *self.coefficients)
@@ -58,6 +62,12 @@ class Camera:
                 f"principal point ({self.cx:g}, {self.cy:g}) lies outside the {self.width}x{self.height} image",
                 field="intrinsics",
                 remedy="give the calibration of this image size, or scale it",
+            )
+        if not 0 <= self.readout <= 1:  # NaN fails too
+            raise DvoError(
+                f"must be 0 to 1 s, got {self.readout:g}",
+                field="readout",
+                remedy="give seconds, or 0 for a global shutter",
             )
 
     @property
@@ -82,6 +92,8 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """Camera of the same image resampled to another size: ``f' = f s``, ``c' = (c + .5) s - .5``.
 
+        The rows together take as long as before: ``readout`` stays.
+
         Args:
             width, height: new size in pixels.
         """
@@ -99,6 +111,10 @@ class Camera:
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """Camera of a window of the image.
 
+        Its rows take their share of ``readout``. The time of a frame stays that of the middle row of the whole image;
+        the middle row of the window is read ``(top + (height - self.height) / 2) self.readout / self.height`` seconds
+        later, which is nothing for a centred window. Whoever cuts elsewhere adds it to the frame's time.
+
         Args:
             left, top: column and row of the window's first pixel.
             width, height: size of the window in pixels.
@@ -106,4 +122,5 @@ class Camera:
         Raises:
             DvoError: the principal point lies outside the window.
         """
-        return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height)
+        readout = self.readout * height / self.height
+        return replace(self, cx=self.cx - left, cy=self.cy - top, width=width, height=height, readout=readout)

@@ -160,6 +160,14 @@ def _scaled(camera: Camera, scale: float) -> Camera:
     return replace(camera, fx=camera.fx * scale, fy=camera.fy * scale, model="none", coefficients=())
 
 
+def _rows_per_row(camera: Camera, target: Camera) -> float:
+    """Rows of the real image to a row of an undistorted one, by least squares over the image."""
+    u, v = np.meshgrid(np.linspace(0, target.width - 1, 17), np.linspace(0, target.height - 1, 17))
+    ideal = np.stack([(u - target.cx) / target.fx, (v - target.cy) / target.fy], axis=-1)
+    offsets = v - v.mean()
+    return float((offsets * distort(ideal, camera)[..., 1] * camera.fy).sum() / (offsets**2).sum())
+
+
 def _border(camera: Camera) -> np.ndarray:
     """Pixels ``(M, 2)`` along the image's edge, about every fourth."""
     u = np.linspace(0, camera.width - 1, max(camera.width // 4, 2))
@@ -192,6 +200,9 @@ def undistorted_camera(camera: Camera) -> Camera:
     to. (OpenCV's ``getOptimalNewCameraMatrix(alpha=0)`` has the same aim, but stretches the two axes differently, and
     for wide fisheyes zooms out until the corners are smeared; 0.75 bounds that.)
 
+    ``readout`` becomes the one that suits the rows of the result best: each is made of pixels of several real rows, and
+    all of them may cover only a part of the sensor. The time of the middle row moves by the readout of a few rows.
+
     Args:
         camera: the real camera.
 
@@ -200,6 +211,14 @@ def undistorted_camera(camera: Camera) -> Camera:
     """
     if not needs_undistortion(camera):
         return _scaled(camera, 1.0)
+    pinhole = _widest(camera)
+    if camera.readout > 0:
+        pinhole = replace(pinhole, readout=min(camera.readout * _rows_per_row(camera, pinhole), 1.0))
+    return pinhole
+
+
+def _widest(camera: Camera) -> Camera:
+    """Pinhole camera with the shortest focal length that :func:`undistorted_camera` allows."""
     low, high = 0.75, 2.0
     if _all_seen(camera, low):
         return _scaled(camera, low)

@@ -89,7 +89,7 @@ def export_sequence(
     ``groundtruth.txt``. ``tartanair``: ``image_left/``, ``depth_left/*.npy`` (metres, float32, 0 for none), ``flow/``
     with masks (0 valid, 1 occluded, 100 out of view), ``pose_left.txt`` (camera x forward, y right, z down; the world's
     z axis points up, unlike TartanAir's), ``imu/cam_time.txt``. Both: ``calib.txt`` with fx fy cx cy; of a lens with
-    distortion (``tum`` only) also its coefficients, of a fisheye ``calib.yaml`` instead.
+    distortion (``tum`` only) also its coefficients, of a fisheye or a rolling shutter ``calib.yaml`` instead.
 
     Args:
         sequence: rendered frame by frame while it is written.
@@ -112,7 +112,7 @@ def export_sequence(
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
             raise DvoError("holds something already", file=out, field="--out", remedy="name a new folder")
-        _write_calibration(sequence.camera, out)
+        write_calibration(sequence.camera, out)
         write = _write_tum if layout == "tum" else _write_tartanair
         notes = write(_frames(sequence, on_frame), sequence, out)
     except OSError as error:
@@ -120,12 +120,20 @@ def export_sequence(
     return [*sequence.warnings, *notes]
 
 
-def _write_calibration(camera: Camera, out: Path) -> None:
-    """Write ``calib.txt``, or ``calib.yaml`` for a fisheye model."""
-    if camera.model == "fisheye":
+def write_calibration(camera: Camera, out: Path) -> None:
+    """Write ``calib.txt``, or ``calib.yaml`` for what only that can state: a fisheye model, a rolling shutter.
+
+    Args:
+        camera: of the images.
+        out: the folder.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    if camera.model == "fisheye" or camera.readout > 0:
         rows = {name: f"{value:.9f}" for name, value in zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True)}
-        rows |= {"width": str(camera.width), "height": str(camera.height), "model": "fisheye"}
-        rows["coefficients"] = str(list(camera.coefficients))
+        rows |= {"width": str(camera.width), "height": str(camera.height), "model": camera.model}
+        rows |= {"coefficients": str(list(camera.coefficients)), "readout": f"{camera.readout:.9f}"}
         text = "\n".join(f"{name}: {value}" for name, value in rows.items())
         (out / "calib.yaml").write_text(text + "\n", encoding="utf-8")
         return

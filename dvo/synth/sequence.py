@@ -49,7 +49,7 @@ class SyntheticSequence:
 
     Attributes:
         name: family, kind of path and seed.
-        camera: intrinsics and distortion of every frame.
+        camera: intrinsics and distortion of every frame, and the readout of ``sensor`` whatever readout was given.
         groundtruth: camera-to-world poses, one per frame, metres.
         scene, path: scene and camera path that are rendered.
         sensor: None for clean frames; its exposure is fixed, its shutter and readout are shares of ``interval``.
@@ -76,6 +76,10 @@ class SyntheticSequence:
     warnings: list[str] = field(default_factory=list)
     interval: float = 1 / 30
 
+    def __post_init__(self) -> None:
+        readout = (self.sensor or Sensor()).readout * self.interval
+        self.camera = replace(self.camera, readout=readout)
+
     @property
     def frame_count(self) -> int | None:
         """Number of frames."""
@@ -87,11 +91,8 @@ class SyntheticSequence:
     @property
     def shot(self) -> Shot:
         """Scene, path and shutter, for ground truth at any time."""
-        sensor = self.sensor or Sensor()
-        return Shot(
-            self.scene, self.path, self.camera, sensor.shutter * self.interval, sensor.readout * self.interval,
-            self.supersample, self.device,
-        )  # fmt: skip
+        exposure = (self.sensor or Sensor()).shutter * self.interval
+        return Shot(self.scene, self.path, self.camera, exposure, self.camera.readout, self.supersample, self.device)
 
     def time(self, index: int) -> float:
         """Timestamp of a frame, seconds.
@@ -208,7 +209,7 @@ def film(
     Args:
         scene: static, or a :class:`Stage` with moving bodies.
         path: camera to world, anything with ``poses_wc(times)``: :class:`Path`, :class:`SplinePath`, your own.
-        camera: intrinsics, distortion and image size.
+        camera: intrinsics, distortion and image size; its readout is replaced with that of the sensor.
         sensor: None for clean frames. An automatic exposure is measured on a few frames and then held.
         seed: of noise and lost frames: same arguments, same bytes (on one machine).
         device: where to render.

@@ -1,7 +1,8 @@
 """Rendered sequences, kept on disk: made once, read back by the same readers as recordings, the same for every system.
 
 A folder of the cache has the layout of TUM RGB-D (``rgb.txt``, ``rgb/``, ``groundtruth.txt``) with ``calib.txt``, so
-that other people's tools read it too. It appears under its name only when it is whole.
+that other people's tools read it too; with a rolling shutter ``calib.yaml`` instead, which states the readout. It
+appears under its name only when it is whole.
 """
 
 from __future__ import annotations
@@ -81,6 +82,7 @@ def rendered_folder(name: str, options: dict[str, Any]) -> Path:
 def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
     import cv2  # imported here, like rendering: the evaluation of recordings needs neither
 
+    from dvo.synth.export import write_calibration
     from dvo.synth.sequence import make_sequence
 
     begin, clock = time.perf_counter(), time.process_time()
@@ -98,8 +100,7 @@ def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
         rows.append(f"{frame.timestamp:.9f} {file}")
     (folder / "rgb.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
     write_tum(folder / "groundtruth.txt", sequence.groundtruth)
-    camera = " ".join(f"{value:.9f}" for value in sequence.camera.intrinsics)
-    (folder / "calib.txt").write_text(f"{camera}\n", encoding="utf-8")
+    write_calibration(sequence.camera, folder)
     facts = {
         "name": name, "options": options, "scene": sequence.name, "frames": len(sequence),
         "path_m": round(sequence.groundtruth.path_length, 4), "seconds": round(time.perf_counter() - begin, 2),

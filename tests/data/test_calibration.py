@@ -118,6 +118,10 @@ def test_yaml(make, text, expected):
         ("c.yaml", "{fx: 1, fy: 1, cx: 1, cy: 1, model: none, coefficients: [0.1]}", "1 coefficients"),
         ("c.yaml", "{fx: 1, fy: 1, cx: 1, cy: 1, model: fisheye, coefficients: [1, 2, 3, 4, 5]}", "5 coefficients"),
         ("c.yaml", "{fx: 1, fy: 1, cx: 1, cy: 1, resolution: [640]}", "width and height"),
+        ("c.yaml", "{fx: 1, fy: 1, cx: 1, cy: 1, readout: 20}", "readout: expected seconds, 0 to 1"),
+        ("c.yaml", "{fx: 1, fy: 1, cx: 1, cy: 1, readout: -0.01}", "0 to 1"),
+        ("c.yaml", "{fx: 1, fy: 1, cx: 1, cy: 1, readout: .nan}", "0 to 1"),
+        ("c.yaml", "{fx: 1, fy: 1, cx: 1, cy: 1, readout: fast}", "not numbers"),
         ("c.yaml", "!!python/object/apply:os.system ['true']", "not valid YAML"),
     ],
 )
@@ -159,3 +163,19 @@ def test_doubts_about_a_calibration_of_another_resolution():
     assert Calibration(718.9, 718.9, 607.2, 185.2).doubts(1241, 376) == []
     assert "principal point" in Calibration(500, 500, 320, 240).doubts(1920, 1080)[0]
     assert "stretched" in Calibration(500, 1000, 320, 240).doubts(640, 480)[0]
+
+
+@pytest.mark.parametrize("text", [EUROC, KALIBR.replace("cam1:", "  readout: 0.02\ncam1:"), OPENCV, ROS, ORB])
+def test_readout_of_a_rolling_shutter(make, text):
+    text = text if "readout" in text else text + "readout: 0.02\n"
+    found = read_calibration(make.text("c.yaml", text))
+    assert found.readout == 0.02
+    assert found.camera(found.width, found.height).readout == 0.02
+
+
+def test_readout_is_0_unless_it_is_stated(make):
+    assert read_calibration(make.text("c.yaml", OURS)).readout == 0
+    assert read_calibration(make.text("c.yaml", OURS.replace("}", ", readout: 0}"))).readout == 0
+    assert read_calibration(make.text("c.txt", "500 510 320 240")).readout == 0
+    with pytest.raises(DvoError, match="0 to 1 s"):
+        Calibration(500, 510, 320, 240, readout=20).camera(640, 480)

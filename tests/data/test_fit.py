@@ -32,3 +32,9 @@ def test_no_depth_is_unknown_everywhere():
     fitted = Camera(35, 35, 30, 10, 62, 20)
     depth = fit_depth(None, Camera(70, 70, 60, 20, 124, 40), fitted)
     assert depth.shape == (20, 62) and depth.dtype == np.float32 and np.isnan(depth).all()
+
+
+def test_a_fitted_camera_reads_out_the_rows_that_are_left():
+    camera = Camera(70, 70, 20, 62, 40, 124, readout=0.031)
+    _, fitted = fit(np.zeros((124, 40, 3), np.uint8), camera, 20, 20)
+    assert fitted.readout == pytest.approx(0.01)

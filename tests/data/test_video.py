@@ -1,3 +1,6 @@
+import struct
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -148,3 +151,27 @@ def test_times_of_the_container(make, monkeypatch, milliseconds, times, warned):
     source = open_source(make.text("v.mp4", "stand-in"), calib=CALIB)
     assert [frame.timestamp for frame in source] == pytest.approx(times)
     assert any(warned in warning for warning in source.warnings) if warned else source.warnings == []
+
+
+def turn(video, degrees):
+    """Ask players, in the header of an MP4's track, to turn the frames clockwise."""
+    data = bytearray(video.read_bytes())
+    at = data.index(b"tkhd") + 4 + 40  # the matrix a b u, c d v, x y w; version 0 of the header
+    one = 1 << 16
+    a, b = {90: (0, one), 180: (-one, 0), 270: (0, -one)}[degrees]
+    data[at : at + 36] = struct.pack(">9i", a, b, 0, -b, a, 0, 0, 0, 1 << 30)
+    video.write_bytes(data)
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_a_turned_video_has_no_rows_to_read_out(make, degrees):
+    video = make.video("v.mp4", "mp4v")
+    if degrees:
+        turn(video, degrees)
+    calib = Calibration(100, 100, 60, 60, readout=0.02)
+    source = open_source(video, calib=calib)
+    frame = next(iter(source))
+    assert frame.image.shape[:2] == ((160, 120) if degrees in (90, 270) else (120, 160))
+    assert frame.camera.readout == (0 if degrees else 0.02)
+    assert any("readout" in warning for warning in source.warnings) == bool(degrees)
+    assert open_source(video, calib=CALIB if degrees in (0, 180) else replace(calib, readout=0.0)).warnings == []

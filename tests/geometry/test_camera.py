@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -72,3 +73,25 @@ def test_crop_then_resize_is_one_linear_map() -> None:
 def test_intrinsics_that_do_not_fit(values: tuple[float, ...]) -> None:
     with pytest.raises(DvoError):
         Camera(*values, 640, 480)
+
+
+ROLLING = replace(CAMERA, readout=0.024)
+
+
+def test_a_readout_goes_along_with_resizes_and_crops() -> None:
+    assert CAMERA.readout == 0 and CAMERA.cropped(0, 10, 400, 400).readout == 0
+    assert ROLLING.resized(320, 120).readout == ROLLING.readout
+    crop = ROLLING.cropped(100, 30, 400, 240)
+    assert crop.readout == pytest.approx(0.012)
+    # every row of the window is read when it was read in the whole image, after the shift that the docstring gives
+    shift = (30 + (240 - 480) / 2) * 0.024 / 480
+    for row in (0, 100, 239):
+        whole = (row + 30 - 479 / 2) * ROLLING.readout / 480
+        assert shift + (row - 239 / 2) * crop.readout / 240 == pytest.approx(whole)
+
+
+@pytest.mark.parametrize("readout", [-0.01, 1.01, 20.0, math.nan, math.inf])
+def test_a_readout_that_cannot_be(readout: float) -> None:
+    with pytest.raises(DvoError, match="0 to 1 s") as caught:
+        replace(CAMERA, readout=readout)
+    assert caught.value.field == "readout" and caught.value.remedy

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -159,3 +161,25 @@ def test_unknown_depth_stays_unknown_and_a_pinhole_keeps_its_depth():
     assert Undistorter(pinhole).depth(own) is own
     with pytest.raises(ValueError, match="48x64"):
         Undistorter(pinhole).depth(np.ones((24, 32), np.float32))
+
+
+@LENSES
+def test_the_readout_suits_the_rows_of_the_result(camera):
+    assert undistorted_camera(camera).readout == 0
+    new = undistorted_camera(replace(camera, readout=0.02))
+    assert replace(new, readout=0.0) == undistorted_camera(camera)
+    u, v = np.meshgrid(np.linspace(0, new.width - 1, 33), np.linspace(0, new.height - 1, 33))
+    ideal = np.stack([(u - new.cx) / new.fx, (v - new.cy) / new.fy], -1)
+    real = distort(ideal, camera)[..., 1] * camera.fy + camera.cy
+    times = (real - (camera.height - 1) / 2) * 0.02 / camera.height
+
+    def spread(readout):
+        return float(np.std(times - (v - (new.height - 1) / 2) * readout / new.height))
+
+    assert spread(new.readout) < min(spread(0.9 * new.readout), spread(1.1 * new.readout), 0.02 / 25)
+    assert spread(new.readout) <= spread(0.02) + 1e-9
+    assert abs(times.mean()) < 0.02 / 25
+
+
+def test_a_pinhole_keeps_its_readout():
+    assert undistorted_camera(Camera(50, 50, 31, 23, 64, 48, readout=0.02)).readout == 0.02

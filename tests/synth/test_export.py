@@ -13,7 +13,7 @@ from dvo.cli import main
 from dvo.errors import DvoError
 from dvo.geometry.poses import look_rotation, pose_from
 from dvo.synth import mesh_scene
-from dvo.synth.export import OCCLUDED, OUT_OF_VIEW, export_sequence, mesh_sequence, static_flow
+from dvo.synth.export import OCCLUDED, OUT_OF_VIEW, Layout, export_sequence, mesh_sequence, static_flow
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.synth.specs import SequenceFormat
 
@@ -137,3 +137,13 @@ def test_preview_of_a_mesh_by_one_command(tmp_path: Path, capsys: pytest.Capture
     sheet = cv2.imread(str(out))
     assert sheet.shape == (48, 7 * 64, 3)
     assert all(sheet[:, i * 64 : (i + 1) * 64].std() > 1 for i in range(7)), "a cell is empty"
+
+
+@pytest.mark.parametrize("layout", ["tum", "tartanair"])
+def test_the_readout_of_a_rolling_shutter_reads_back(layout: Layout, tmp_path: Path) -> None:
+    sequence = make_sequence(6, frames=2, height=48, width=64, fps=12, family="room", rolling_shutter=0.5)
+    export_sequence(sequence, tmp_path / "out", layout)
+    assert not (tmp_path / "out" / "calib.txt").exists()
+    check_read_back(tmp_path / "out", sequence, layout)
+    for frame in dvo.open(tmp_path / "out"):
+        assert frame.camera.readout == pytest.approx(0.5 / 12, abs=1e-8)

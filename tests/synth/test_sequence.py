@@ -162,3 +162,16 @@ def test_film_is_the_whole_call(scene: Scene) -> None:
 def test_options_out_of_range(bad: dict[str, Any]) -> None:
     with pytest.raises(DvoError, match=next(iter(bad))):
         make_sequence(SEED, **SMALL, **bad)
+
+
+def test_frames_state_their_readout(plain: SyntheticSequence, scene: Scene) -> None:
+    assert plain.camera.readout == plain.frame(0).camera.readout == 0
+    rolling = make_sequence(SEED, **SMALL, rolling_shutter=0.4)
+    assert rolling.frame(3).camera.readout == rolling.camera.readout == rolling.shot.readout == pytest.approx(0.04)
+    assert rolling.stereo(0.1).frame(0).camera.readout == rolling.camera.readout
+    # what was rendered counts, not what the given camera says; lost frames do not lengthen the interval
+    path, camera = long_path(scene, 0, "handheld", duration=1.0), Camera(60, 60, 31.5, 23.5, 64, 48, readout=0.5)
+    times = np.arange(10) / 20
+    assert film(scene, path, camera, times=times).frame(0).camera.readout == 0
+    filmed = film(scene, path, camera, Sensor(readout=0.5, drop=0.6), times=times)
+    assert len(filmed) < 8 and filmed.camera.readout == pytest.approx(0.025)

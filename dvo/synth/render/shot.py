@@ -83,7 +83,8 @@ class Shot:
     Attributes:
         scene: static, or a :class:`Stage` with moving bodies.
         path: camera to world at any time.
-        camera: pinhole, or with distortion (:mod:`dvo.synth.render.lens`); depth is along the optical axis in any case.
+        camera: pinhole, or with distortion (:mod:`dvo.synth.render.lens`); depth is along the optical axis in any case;
+            its own readout is not used.
         exposure: seconds during which a row gathers light; 0 freezes the motion.
         readout: seconds from the first to the last row of a rolling shutter; 0 is a global shutter.
         supersample: rays per pixel edge for the colours.

@@ -24,7 +24,8 @@ CALIBRATIONS = {
     "line": ("calib.txt", [f"{K} -0.1 0.01 0.001 0.001 0.0001"]),
     "matrix": ("calib.txt", ["50 0 31.5", "0 51 23.5", "0 0 1"]),
     "keys": ("calib.yaml", ["fx: 50", "fy: 51", "cx: 31.5", "cy: 23.5", "width: 64", "height: 48", "model: fisheye",
-                            "coefficients: [0.01, 0.002, 0.0003, 0.0001]", "depth_scale: 1000", "baseline: 0.1"]),
+                            "coefficients: [0.01, 0.002, 0.0003, 0.0001]", "depth_scale: 1000", "baseline: 0.1",
+                            "readout: 0.02"]),
     "kalibr": ("calib.yaml", ["cam0:", "  camera_model: pinhole", "  intrinsics: [50, 51, 31.5, 23.5]",
                               "  distortion_model: radtan", "  distortion_coeffs: [-0.1, 0.01, 0.001, 0.001]",
                               "  resolution: [64, 48]"]),
@@ -50,6 +51,7 @@ def _calibration(folder: Path, random: np.random.Generator | None, name: str) ->
     if needs_undistortion(camera):
         undistorter = Undistorter(camera)
         require(np.isfinite(undistorter.camera.intrinsics).all(), "undistorted camera that is not finite")
+        require(0 <= undistorter.camera.readout <= 1, "readout of the undistorted camera")
         undistorter(picture(0))
     for value in (calibration.depth_scale, calibration.baseline):
         require(value is None or (np.isfinite(value) and value > 0), "scale or baseline")

@@ -104,6 +104,20 @@ def test_readers_give_back_what_was_rendered(cache: Path) -> None:
     assert open_sequence(again, NOWHERE, 1)[0].path == source.path
 
 
+def test_every_frame_of_a_rolling_shutter_has_its_readout(cache: Path) -> None:
+    options = {**OPTIONS, "rolling_shutter": 0.5}
+    source, _ = open_sequence(Sequence("one", rendered=tuple(options.items())), NOWHERE, 1)
+    assert [frame.camera.readout for frame in source] == pytest.approx([0.5 / 15] * 4, abs=1e-8)
+    still, _ = open_sequence(Sequence("one", rendered=tuple(OPTIONS.items())), NOWHERE, 1)
+    assert {frame.camera.readout for frame in still} == {0.0}
+
+
+def test_renderings_of_before_the_readout_are_not_used() -> None:
+    for suite in read_suites("axes"):
+        for sequence in suite.sequences:
+            assert dict(sequence.rendered or ())["version"] >= 4
+
+
 def test_cache_is_used_and_keyed_by_everything(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = rendered_folder("one", OPTIONS)
     stamp = (folder / RECORD).stat().st_mtime_ns

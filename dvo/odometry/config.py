@@ -55,6 +55,8 @@ class TrackerConfig:
         optimisation: number of newest frames whose poses are optimised.
         final_adjustment: solve for all frames of a segment at once in ``finish``
             (:mod:`dvo.odometry.final_adjustment`).
+        estimate_readout: look for a rolling shutter in the final adjustment if the camera states no readout time
+            (:mod:`dvo.odometry.self_calibration`).
         initial_frames: keyframes before the first joint optimisation.
         initial_updates, final_updates: updates at initialisation and in ``finish``.
         updates: updates of each frame.
@@ -97,6 +99,7 @@ class TrackerConfig:
     initial_updates: int = 16
     final_updates: int = 8
     final_adjustment: bool = True
+    estimate_readout: bool = True
     updates: int = 1
     initial_motion: float = 0.5
     initial_parallax: float = 1.0

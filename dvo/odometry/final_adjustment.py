@@ -77,7 +77,7 @@ def adjust_segment(
         graph: the whole segment is archived; its poses and inverse depths are replaced.
         segment: its number.
         options: kernels, iterations and size of the blocks.
-        shutter: timing of the rows of a rolling shutter, None for a global one.
+        shutter: timing of the rows; None, or a readout time of 0, for a global shutter.
 
     Returns:
         Number of keyframes that were solved for, dropped ones included. Those whose patches have been released to save
@@ -98,7 +98,7 @@ def adjust_segment(
     # With frames before it that stay, the first block starts from several held frames, which hold its scale.
     held = 1 if len(identifiers) == len(frames) else min(options.overlap, len(identifiers) - 1)
     start = solved = held
-    change = _Change(old[held - 1], old[held - 1], 1.0)
+    change, last = _Change(old[held - 1], old[held - 1], 1.0), replace(options, kernels=options.kernels[-1:])
     while solved < len(identifiers):
         end = min(max(start + options.block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
@@ -108,14 +108,14 @@ def adjust_segment(
         now[solved:end] = change(old[solved:end])
         depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1).clone()
         depths[new] /= change.scale
-        poses, found = _solve(part, now[rows], depths, fixed, options)
+        poses, found, _ = solve_part(part, now[rows], depths, fixed, options)
         for _ in range(options.shutter_rounds):
-            if shutter is None:
+            if shutter is None or shutter.readout == 0:
                 break
             now[rows] = poses
             track = PoseTrack.through(times[:end], now[:end])
             corrected = as_global_shutter(part, poses, found, rows, track, shutter)
-            poses, found = _solve(corrected, poses, found, fixed, replace(options, kernels=options.kernels[-1:]))
+            poses, found, _ = solve_part(corrected, poses, found, fixed, last)
         now[rows] = poses
         change = _Change(old[end - 1], now[end - 1], change.scale * float((depths[new] / found[new]).median()))
         for row in (~fixed).nonzero()[:, 0].tolist():
@@ -124,17 +124,29 @@ def adjust_segment(
     return len(identifiers)
 
 
-def _solve(
+def solve_part(
     part: GraphProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
-) -> tuple[Tensor, Tensor]:
-    """Poses ``(N, 7)`` and inverse depths ``(N, M)`` of a block from given ones, of which some poses are fixed."""
+) -> tuple[Tensor, Tensor, float]:
+    """Solve for poses and inverse depths of a part of a segment.
+
+    Args:
+        part: measurements; its poses and depths are not used.
+        poses_cw: ``(N, 7)`` to start from.
+        depths: ``(N, M)`` inverse depths to start from.
+        fixed: ``(N,)`` bool, poses that stay.
+        options: kernels and iterations.
+
+    Returns:
+        Poses ``(N, 7)``, inverse depths ``(N, M)``, and the cost with the last kernel (0 without measurements).
+    """
+    cost = 0.0
     if not len(part.kk) or fixed.all():
-        return poses_cw, depths
+        return poses_cw, depths, cost
     patches = torch.cat([part.patches[:, :2], depths.reshape(-1, 1, 1, 1)], 1)
     measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
     solver = LMOptions(max_iterations=options.iterations)
     for kernel in options.kernels:
         settings = GlobalBAOptions(fixed=fixed, kernel=kernel, max_residual=options.max_residual, solver=solver)
         found = global_bundle_adjust(poses_cw, patches, *measured, settings)
-        poses_cw, patches = se3.normalise(found.poses_cw), found.patches
-    return poses_cw, patches[:, 2, 0, 0].reshape_as(depths)
+        poses_cw, patches, cost = se3.normalise(found.poses_cw), found.patches, found.cost
+    return poses_cw, patches[:, 2, 0, 0].reshape_as(depths), cost

@@ -28,13 +28,14 @@ from dvo.nets.patchifier import patch_coordinates
 from dvo.nets.selection import SELECTIONS
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
-from dvo.odometry.final_adjustment import adjust_segment
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
 from dvo.odometry.initialisation import drop_unrelated, initialise, median_revision, newest_confidence
 from dvo.odometry.motion import flow_magnitude, predict_pose
 from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.segments import result_of
+from dvo.odometry.self_calibration import adjust_segments
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
@@ -125,6 +126,7 @@ class PatchOdometry:
             raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
         frame = checked_frame(frame)
         image, camera = working_image(frame, self.config.pixels)
+        self._shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
         self._sequence.check(frame)
         record = self.graph.log.add(frame.timestamp)
         if self._last is not None and np.array_equal(image, self._last[0]):
@@ -158,8 +160,8 @@ class PatchOdometry:
             if len(self._waiting) >= self.config.initial_frames:
                 self._begin_segment()
             self._close_segment(last=True)
-            for segment in self._adjustable if self.config.final_adjustment else ():
-                adjust_segment(self.graph, segment)
+            if self.config.final_adjustment and self._adjustable:
+                self._info |= adjust_segments(self.graph, self._adjustable, self._shutter, self.config.estimate_readout)
         return self._result({})
 
     @torch.inference_mode()

@@ -133,6 +133,9 @@ def _tracking_options(parser: argparse.ArgumentParser) -> None:
         "--device", metavar="D", default="auto", help="torch device (default: accelerator if available)"
     )
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="default: %(default)s")
+    parser.add_argument(
+        "--preset", metavar="NAME", help="settings of the odometry: default, fast or accurate (default: default)"
+    )
     parser.add_argument("--config", metavar="FILE", help="YAML file with settings of the odometry")
     parser.add_argument(
         "--set", metavar="NAME=VALUE", action="append", default=[], help="one setting, such as patches=48; repeatable"

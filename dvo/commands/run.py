@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
-    """Load the odometry of ``--weights`` with the settings of ``--config``, overridden by those of ``--set``.
+    """Load the odometry of ``--weights`` with the settings of ``--preset``, ``--config`` and ``--set``; the later win.
 
     Args:
         arguments: of the command line.
@@ -106,6 +106,8 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     """
     settings = read_settings(arguments.config) if arguments.config else {}
     settings |= parse_settings(arguments.set)
+    if arguments.preset is not None:
+        settings["preset"] = arguments.preset
     reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
     if reserved:
         raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")

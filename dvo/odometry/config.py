@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from dvo.errors import DvoError
 from dvo.nets.alignment import AlignmentOptions
 from dvo.settings import check_names, check_settings
 
@@ -155,3 +156,27 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
         keyframe_motion=15.0,
     ),  # fmt: skip
 }
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "fast": {"pixels": 256 * 192, "patches": 16, "lifetime": 5, "removal": 7, "optimisation": 7},
+    "accurate": {"pixels": 448 * 336, "patches": 48, "updates": 2},
+}
+"""Settings that trade accuracy for speed, on top of those of the weights; ``dvo.load("small", preset="fast")``."""
+
+
+def preset_changes(name: str) -> dict[str, Any]:
+    """Settings of a preset.
+
+    Args:
+        name: in :data:`PRESETS`.
+
+    Returns:
+        Setting to value.
+
+    Raises:
+        DvoError: no such preset.
+    """
+    if not isinstance(name, str) or name not in PRESETS:
+        raise DvoError(f"unknown preset {name!r}", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from dvo.models.weights import LoadedWeights, load_weights
-from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig, preset_changes
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.registry import odometry_builder
 from dvo.settings import check_seed
@@ -37,7 +37,8 @@ def load(
         seed: of all random numbers of the odometry. The same seed on the same machine gives the same trajectory, bit
             for bit on the CPU with a fixed number of threads.
         config: settings, for ``patch_vo`` a :class:`dvo.odometry.config.TrackerConfig`; None for those of the preset.
-        overrides: single settings, for ``patch_vo`` by the names of :class:`dvo.odometry.config.TrackerConfig`.
+        overrides: single settings, for ``patch_vo`` by the names of :class:`dvo.odometry.config.TrackerConfig`, and
+            ``preset``: ``default``, ``fast`` or ``accurate`` (:data:`dvo.odometry.config.PRESETS`).
 
     Returns:
         The odometry; its poses are ``T_wc`` in the world of the first keyframe, up to scale.
@@ -90,6 +91,7 @@ def patch_odometry(
     device: torch.device | str = "cpu",
     seed: int = 0,
     config: TrackerConfig | None = None,
+    preset: str = "default",
     **overrides: Any,
 ) -> PatchOdometry:
     """Build the tracker of a ``patch_vo`` network.
@@ -98,8 +100,9 @@ def patch_odometry(
         weights: the network, a :class:`dvo.models.patch_vo.PatchVO`.
         device: of all computation.
         seed: of the patch centres.
-        config: settings; None for those of the preset.
-        overrides: single settings, by the names of :class:`dvo.odometry.config.TrackerConfig`.
+        config: settings; None for those of the weights.
+        preset: settings on top of these, a name in :data:`dvo.odometry.config.PRESETS`.
+        overrides: single settings, by the names of :class:`dvo.odometry.config.TrackerConfig`; they win.
 
     Returns:
         The tracker.
@@ -114,5 +117,7 @@ def patch_odometry(
     config = config or TRACKER_PRESETS.get(weights.preset, TrackerConfig())
     if overrides:
         TrackerConfig.from_dict(dict(overrides))
-        config = replace(config, **overrides)
+    changes = {**preset_changes(preset), **overrides}
+    if changes:
+        config = replace(config, **changes)
     return PatchOdometry(weights.model, config, seed=seed, device=device, name=f"dvo-{weights.name}")

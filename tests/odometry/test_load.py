@@ -7,7 +7,7 @@ from dvo.errors import DvoError
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights
 from dvo.nets.config import ModelConfig, preset
-from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.config import PRESETS, TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.load import build_odometry
 from dvo.odometry.registry import ODOMETRIES, odometry_builder
 from dvo.odometry.tracker import PatchOdometry
@@ -20,6 +20,16 @@ def test_shipped_weights_give_the_tracker_with_the_settings_of_their_preset():
     given = TrackerConfig(updates=2)
     assert dvo.load("small", config=given).config == given
     assert not odometry.model.training
+
+
+def test_presets_change_the_settings_of_the_weights_and_single_settings_win():
+    fast = dvo.load("small", preset="fast", patches=20).config
+    assert (fast.pixels, fast.patches) == (PRESETS["fast"]["pixels"], 20)
+    assert dvo.load("small", preset="default").config == TRACKER_PRESETS["small"]
+    assert dvo.load("small", preset="accurate").config.updates == 2
+    for name in ("slow", 3, None):
+        with pytest.raises(DvoError, match="preset: unknown preset.*default, fast, accurate"):
+            dvo.load("small", preset=name)
 
 
 def test_a_network_in_memory():

@@ -134,6 +134,8 @@ def print_report(folder: Path, run: Run, scores: Scores) -> None:
             f"{len(result.segments)} segments, each with a world and a scale of its own; {results.TRAJECTORY} and "
             f"{results.MAP} hold the longest, segment {result.longest}"
         )
+    if result.info.get("readout_from") == "images":
+        say(f"rolling shutter with a readout of {1000 * result.info['readout']:.1f} ms, estimated from the images")
     if metrics is not None and metrics.reason:
         say(f"no error against ground truth: {metrics.reason}")
     elif metrics is not None:

@@ -134,14 +134,16 @@ class KeyframeGraph:
         self._archive_edges(~mask)
         self.window.keep(mask)
 
-    def drop(self, position: int) -> None:
+    def drop(self, position: int, still: bool = False) -> None:
         """Remove a redundant keyframe; its frames become relative to the keyframe before it.
 
         Args:
             position: of the keyframe in the window, at least 1.
+            still: it takes the pose of the keyframe before it, in place of its own.
         """
         window = self.window
-        relative = se3.relative(window.poses_cw[position - 1], window.poses_cw[position]).double().cpu().numpy()
+        pose = window.poses_cw[position - 1 if still else position]
+        relative = se3.relative(window.poses_cw[position - 1], pose).double().cpu().numpy()
         anchor = window.frames[position - 1].identifier
         self._archive_edges(window.touching(position))
         self._archive_keyframe(position, relative, anchor)
@@ -210,6 +212,24 @@ class KeyframeGraph:
             colors.append(keyframe.colors[near])
         return np.concatenate(points), np.concatenate(colors)
 
+    def members(self, segment: int) -> list[ArchivedKeyframe]:
+        """Archived keyframes of a segment that have patches, and a pose.
+
+        Args:
+            segment: its number.
+
+        Returns:
+            By increasing identifier, dropped ones included; those whose patches have been released are left out, and
+            dropped ones whose anchor is not archived.
+        """
+        return [
+            frame
+            for frame in self.archive
+            if self.segment_of(frame.identifier) == segment
+            and len(frame.inverse_depth)
+            and (frame.anchor is None or frame.anchor in self.archive)
+        ]
+
     def poses_cw(self, identifiers: np.ndarray) -> Tensor:
         """Poses of archived keyframes, dropped or not.
 
@@ -240,19 +260,16 @@ class KeyframeGraph:
                 edge with it. None: to the end.
 
         Returns:
-            The problem, on the CPU; keyframes whose patches have been released are left out, and dropped ones whose
-            anchor is still in the window.
+            The problem of the :meth:`members`, on the CPU.
         """
         edges = self.archive.edges(first, last)
         linked = set(np.unique(np.concatenate([edges.source, edges.target])).tolist()) if first > 0 else set()
         frames = [
             frame
-            for frame in self.archive
-            if self.segment_of(frame.identifier) == segment
-            and (frame.identifier >= first or frame.identifier in linked)
+            for frame in self.members(segment)
+            if (frame.identifier >= first or frame.identifier in linked)
             and (last is None or frame.identifier <= last)
-            and len(frame.inverse_depth)
-            and (frame.anchor is None or (dropped and frame.anchor in self.archive))
+            and (dropped or frame.anchor is None)
         ]
         m = self.window.per_frame
         identifiers = np.array([frame.identifier for frame in frames], dtype=np.int64)

@@ -101,7 +101,7 @@ class KeyframeLog:
             reason: cause.
         """
         for record in reversed(self.frames):
-            if record.anchor == keyframe:
+            if record.anchor is not None and self._carrier(record.anchor)[0] == keyframe:
                 record.anchor, record.relative, record.lost, record.reason = None, None, True, reason
             elif record.anchor is not None and record.anchor < keyframe:
                 break

@@ -87,16 +87,16 @@ def adjust_segment(
         >>> run = dvo.run(odometry, dvo.open("video.mp4", calib="calib.txt"))
         >>> adjust_segment(odometry.graph, segment=0)
     """
-    frames = [frame for frame in graph.archive if graph.segment_of(frame.identifier) == segment]
-    solvable = [frame for frame in frames if len(frame.inverse_depth)]
-    identifiers = np.array([frame.identifier for frame in solvable])
+    frames = graph.members(segment)
+    identifiers = np.array([frame.identifier for frame in frames])
     if len(identifiers) < 3:
         return 0
-    times = torch.tensor([frame.timestamp for frame in solvable], dtype=torch.float64)
+    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
     old = graph.poses_cw(identifiers)
     now = old.clone()
     # With frames before it that stay, the first block starts from several held frames, which hold its scale.
-    held = 1 if len(identifiers) == len(frames) else min(options.overlap, len(identifiers) - 1)
+    released = any(not len(k.inverse_depth) for k in graph.archive if graph.segment_of(k.identifier) == segment)
+    held = min(options.overlap, len(identifiers) - 1) if released else 1
     start = solved = held
     change, last = _Change(old[held - 1], old[held - 1], 1.0), replace(options, kernels=options.kernels[-1:])
     while solved < len(identifiers):

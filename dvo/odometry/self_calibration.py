@@ -92,8 +92,7 @@ def find_readout(
     Returns:
         The readout time between 0 and a frame interval; 0 with a gain of 0 for too few frames.
     """
-    frames = [frame for frame in graph.archive if graph.segment_of(frame.identifier) == segment]
-    frames = [frame for frame in frames if len(frame.inverse_depth)]
+    frames = graph.members(segment)
     if len(frames) < _FEWEST:
         return Minimum(0.0, np.inf, 0.0)
     identifiers = np.array([frame.identifier for frame in frames])

@@ -216,9 +216,10 @@ class PatchOdometry:
             revision = self._step.revise()
             confidence = newest_confidence(revision, window)
             if confidence >= config.lost_confidence and median_revision(revision, window) < config.initial_motion:
-                # Too little motion for initialisation: the frame shares the pose of the keyframe before it.
-                self.graph.discard(len(window) - 1)
-                self._place(record, window.frames[-1].identifier)
+                # Too little motion to initialise: until the final adjustment it shares the pose of the last keyframe.
+                self._step.store(revision)
+                self.graph.drop(len(window) - 1, still=True)
+                self._place(record, keyframe.identifier)
                 return self._estimate(record, None, Status.INITIALISING, confidence)
         self._place(record, keyframe.identifier)
         if len(window) >= config.initial_frames:

@@ -88,6 +88,16 @@ class WindowStep:
         """
         return revise(self.model, self.state(), self.lookup)
 
+    def store(self, revision: Revision) -> None:
+        """Store the measurements of a revision as those of the window; poses and depths do not change.
+
+        Args:
+            revision: of :meth:`revise`.
+        """
+        window = self.window
+        window.targets, window.weights = revision.targets[0], revision.weights[0]
+        window.confidence = revision.weights[0]
+
     def __call__(self, options: StepOptions, align: bool = False) -> None:
         """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
 

@@ -189,3 +189,29 @@ def test_feature_maps_are_computed_again_and_forgotten():
     assert cache.maps(99) is None
     with pytest.raises(DvoError, match="capacity"):
         FeatureCache(graph.archive, encode, capacity=0)
+
+
+def test_a_frame_dropped_as_still_has_the_pose_of_its_keyframe_until_it_is_corrected():
+    graph, poses = scene()
+    graph.drop(3, still=True)
+    graph.drop(3)  # the frame after it
+    while len(graph.window):
+        graph.archive_oldest()
+    rows = graph.log.trajectory().poses_wc
+    np.testing.assert_array_equal(rows[3], rows[2])
+    assert not np.allclose(rows[4], rows[2])
+    graph.correct(3, poses[3].double().numpy())
+    found = torch.from_numpy(graph.log.trajectory().poses_wc[3])
+    torch.testing.assert_close(se3.inverse(found).float(), poses[3], atol=1e-6, rtol=1e-5)
+    assert graph.archive[3].anchor == 2
+
+
+def test_frames_carried_by_a_lost_keyframe_are_lost_with_it():
+    graph, _ = scene()
+    graph.drop(1)
+    graph.log.lose(graph.discard(0).identifier, "another scene")
+    while len(graph.window):
+        graph.archive_oldest()
+    assert [record.lost for record in graph.log.frames] == [True, True, False, False, False, False]
+    assert [frame.identifier for frame in graph.members(0)] == [2, 3, 4, 5]  # the anchor of 1 is not archived
+    assert graph.problem().identifiers.tolist() == [2, 3, 4, 5]

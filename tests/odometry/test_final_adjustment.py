@@ -56,3 +56,17 @@ def test_frames_dropped_on_a_slow_walk_get_the_scale_of_the_whole():
         done = run(dvo.load("small", seed=0, pixels=144 * 192, final_adjustment=final_adjustment), clip)
         errors.append(evaluate(done.result.trajectory, clip.groundtruth).ate_percent)
     assert errors[1] < 0.8 * errors[0]
+
+
+def test_frames_of_a_slow_start_get_poses_of_their_own():
+    """Before the initialisation a frame with little motion has the pose of the last keyframe; afterwards its own."""
+    clip = make_sequence(77, frames=40, height=144, width=192, fps=30.0, family="street", kind="handheld", apart=True)
+    shares, errors = [], []
+    for final_adjustment in (False, True):
+        done = run(dvo.load("small", seed=0, pixels=144 * 192, final_adjustment=final_adjustment), clip)
+        rows = done.result.trajectory.poses_wc
+        shares.append((np.diff(rows, axis=0) == 0).all(1).mean())
+        errors.append(evaluate(done.result.trajectory, clip.groundtruth).rpe_rot_deg_rmse)
+        assert len(rows) == 40
+    assert shares[0] > 0.2 and shares[1] == 0
+    assert errors[1] < 0.5 * errors[0]

@@ -13,7 +13,7 @@ from dvo.settings import check_names, check_settings
 _RANGES = {
     "pixels": (0, 2**28),
     "patches": (1, 2**14),
-    "align_gain": (0, 1e6),
+    "align_gain": (0, 1e4),
     "align_reach": (0, 100),
     "lifetime": (1, 1000),
     "removal": (1, 1000),

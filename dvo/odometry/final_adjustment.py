@@ -80,7 +80,7 @@ def adjust_segment(
         shutter: timing of the rows; None, or a readout time of 0, for a global shutter.
 
     Returns:
-        Number of keyframes that were solved for, dropped ones included. Those whose patches have been released to save
+        Number of keyframes with patches, dropped ones included. Those whose measurements have been released to save
         memory keep their poses.
 
     Example:
@@ -94,9 +94,12 @@ def adjust_segment(
     times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
     old = graph.poses_cw(identifiers)
     now = old.clone()
-    # With frames before it that stay, the first block starts from several held frames, which hold its scale.
-    released = any(not len(k.inverse_depth) for k in graph.archive if graph.segment_of(k.identifier) == segment)
-    held = min(options.overlap, len(identifiers) - 1) if released else 1
+    # Frames whose measurements have been released to save memory stay; with some more they hold the scale of the rest.
+    edges = graph.archive.edges()
+    linked = np.isin(identifiers, np.concatenate([edges.source, edges.target]))
+    if not linked.any():
+        return 0
+    held = min(int(linked.argmax()) + options.overlap, len(identifiers) - 1) if not linked[0] else 1
     start = solved = held
     change, last = _Change(old[held - 1], old[held - 1], 1.0), replace(options, kernels=options.kernels[-1:])
     while solved < len(identifiers):

@@ -23,6 +23,7 @@ _FRAMES = 150  # of a segment that are looked at, those with most motion
 _FEWEST = 20  # frames below which nothing is concluded
 _GAIN = 0.02  # relative decrease of the cost below which a readout time is not believed
 _STEP = 0.2  # distance of the values that are tried, frame intervals
+_LONGEST = 1.2  # end of the range, frame intervals: a minimum near one interval needs a neighbour on both sides
 _ITERATIONS = 4
 
 
@@ -90,7 +91,8 @@ def find_readout(
         options: of the adjustment.
 
     Returns:
-        The readout time between 0 and a frame interval; 0 with a gain of 0 for too few frames.
+        The readout time, with an infinite deviation if the cost still falls beyond the frame interval; 0 with a gain of
+        0 for too few frames.
     """
     frames = graph.members(segment)
     if len(frames) < _FEWEST:
@@ -116,7 +118,7 @@ def find_readout(
         return found
 
     interval = float((times[1:] - times[:-1]).median())
-    return profile_minimum(cost, 0.0, _STEP * interval, 0.0, interval, depths.numel())
+    return profile_minimum(cost, 0.0, _STEP * interval, 0.0, _LONGEST * interval, depths.numel())
 
 
 def adjust_segments(
@@ -137,7 +139,7 @@ def adjust_segments(
     sizes = {segment: adjust_segment(graph, segment, shutter=shutter) for segment in segments}
     if estimate and source == "none" and sizes:
         found = find_readout(graph, max(sizes, key=lambda segment: sizes[segment]), shutter.rows)
-        if found.gain >= _GAIN and found.value > 0:
+        if found.gain >= _GAIN and found.value > 0 and np.isfinite(found.deviation):
             shutter, source = replace(shutter, readout=found.value), "images"
             for segment in segments:
                 adjust_segment(graph, segment, shutter=shutter)

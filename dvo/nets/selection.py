@@ -125,7 +125,7 @@ def structure_score(images: Float[Tensor, "B N 3 H W"]) -> Float[Tensor, "B N h 
     gy = (around[..., 2:, 1:-1] - around[..., :-2, 1:-1]) / 2
     half = _BOX // 2
     products = F.pad(torch.cat([gx * gx, gy * gy, gx * gy], 1), (half, half, half, half))
-    xx, yy, xy = F.avg_pool2d(products, _BOX, 1)[..., ::_STRIDE, ::_STRIDE].unbind(1)
+    xx, yy, xy = F.avg_pool2d(products, _BOX, _STRIDE).unbind(1)
     least = (xx + yy) / 2 - ((xx - yy).square() / 4 + xy.square()).sqrt()
     return least.clamp(min=0).unflatten(0, images.shape[:2])
 

@@ -32,14 +32,17 @@ class AdjustmentOptions:
             the root of the weight. The first is wide, for poses that are far off; the last decides.
         max_residual: feature pixels; a longer residual has no influence.
         iterations: Levenberg-Marquardt steps of a block with each kernel, at most.
+        tolerance: relative decrease of the cost by a step below which a solution has converged.
         block: largest number of frames that are solved for at once.
         overlap: frames at the end of a block that the next block solves for again.
         shutter_rounds: solutions with measurements corrected for a rolling shutter, each from the motion of the last.
+            They take the last kernel, and the solution before them the others.
     """
 
     kernels: tuple[Kernel, ...] = (Kernel("huber", 0.5), Kernel("cauchy", 0.1))
     max_residual: float = 32.0
     iterations: int = 10
+    tolerance: float = 1e-3
     block: int = 600
     overlap: int = 60
     shutter_rounds: int = 2
@@ -101,7 +104,10 @@ def adjust_segment(
         return 0
     held = min(int(linked.argmax()) + options.overlap, len(identifiers) - 1) if not linked[0] else 1
     start = solved = held
-    change, last = _Change(old[held - 1], old[held - 1], 1.0), replace(options, kernels=options.kernels[-1:])
+    change, first, last = _Change(old[held - 1], old[held - 1], 1.0), options, options
+    rolling = shutter if shutter is not None and shutter.readout > 0 else None
+    if rolling is not None:
+        first, last = replace(options, kernels=options.kernels[:-1]), replace(options, kernels=options.kernels[-1:])
     while solved < len(identifiers):
         end = min(max(start + options.block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
@@ -111,13 +117,12 @@ def adjust_segment(
         now[solved:end] = change(old[solved:end])
         depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1).clone()
         depths[new] /= change.scale
-        poses, found, _ = solve_part(part, now[rows], depths, fixed, options)
-        for _ in range(options.shutter_rounds):
-            if shutter is None or shutter.readout == 0:
-                break
+        poses, found, _ = solve_part(part, now[rows], depths, fixed, first)
+        for _ in range(options.shutter_rounds if rolling is not None else 0):
+            assert rolling is not None
             now[rows] = poses
             track = PoseTrack.through(times[:end], now[:end])
-            corrected = as_global_shutter(part, poses, found, rows, track, shutter)
+            corrected = as_global_shutter(part, poses, found, rows, track, rolling)
             poses, found, _ = solve_part(corrected, poses, found, fixed, last)
         now[rows] = poses
         change = _Change(old[end - 1], now[end - 1], change.scale * float((depths[new] / found[new]).median()))
@@ -147,7 +152,7 @@ def solve_part(
         return poses_cw, depths, cost
     patches = torch.cat([part.patches[:, :2], depths.reshape(-1, 1, 1, 1)], 1)
     measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
-    solver = LMOptions(max_iterations=options.iterations)
+    solver = LMOptions(max_iterations=options.iterations, tolerance=options.tolerance)
     for kernel in options.kernels:
         settings = GlobalBAOptions(fixed=fixed, kernel=kernel, max_residual=options.max_residual, solver=solver)
         found = global_bundle_adjust(poses_cw, patches, *measured, settings)

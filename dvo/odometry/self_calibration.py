@@ -141,8 +141,10 @@ def adjust_segments(
         found = find_readout(graph, max(sizes, key=lambda segment: sizes[segment]), shutter.rows)
         if found.gain >= _GAIN and found.value > 0 and np.isfinite(found.deviation):
             shutter, source = replace(shutter, readout=found.value), "images"
+            options = AdjustmentOptions()
+            corrected = replace(options, kernels=options.kernels[-1:])  # they are near the solution already
             for segment in segments:
-                adjust_segment(graph, segment, shutter=shutter)
+                adjust_segment(graph, segment, corrected, shutter)
     return {"readout": shutter.readout, "readout_from": source}
 
 

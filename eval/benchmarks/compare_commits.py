@@ -43,6 +43,7 @@ class Settings:
         clip, frames: clip of the tracking benchmark, and number of its frames; None for all.
         steps: training steps of one measurement.
         clips: clips whose trajectories are compared.
+        preset: of the tracker in this checkout; the base, which may not know it, tracks with its default.
     """
 
     data: Path
@@ -50,6 +51,7 @@ class Settings:
     frames: int | None = None
     steps: int = 15
     clips: tuple[str, ...] = CLIPS
+    preset: str = "default"
 
 
 @contextmanager
@@ -91,7 +93,9 @@ def seconds(what: str, tree: Path, settings: Settings) -> float:
     """
     clip = [str(settings.data / settings.clip)] if what == "tracking" else []
     frames = ["--frames", str(settings.frames)] if settings.frames else []
-    output = _run([sys.executable, _SCRIPT, what, *clip, *frames], tree)
+    changed = what == "tracking" and tree == ROOT and settings.preset != "default"
+    preset = ["--preset", settings.preset] if changed else []
+    output = _run([sys.executable, _SCRIPT, what, *clip, *frames, *preset], tree)
     found = _SECONDS.search(output)
     if found is None:
         raise DvoError("output without a time", file=tree, field=what, remedy="run the measurement by hand")
@@ -260,6 +264,7 @@ def main(arguments: list[str] | None = None) -> int:
         default=",".join(CLIPS),
         help="clips whose trajectories are compared, separated by commas; '' for none",
     )
+    line.add_argument("--preset", default=Settings.preset, help="of the tracker in this checkout (%(default)s)")
     given = line.parse_args(arguments)
     try:
         names = [name for name in given.what.split(",") if name]
@@ -269,7 +274,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise DvoError(f"must be 1 or more, got {given.pairs}", field="--pairs", remedy="give a whole number")
         data = data_root(given.data).resolve() if "tracking" in names else Path()
         clips = tuple(name for name in given.clips.split(",") if name)
-        settings = Settings(data, given.clip, given.frames, given.steps, clips)
+        settings = Settings(data, given.clip, given.frames, given.steps, clips, given.preset)
         with worktree(given.base) as base:
             for name in names:
                 _compare(name, base, settings, given.pairs)

@@ -20,18 +20,19 @@ import torch
 import dvo
 
 
-def tracking(clip: str, frames: int | None) -> float:
+def tracking(clip: str, frames: int | None, preset: str | None = None) -> float:
     """Track and finish a clip with the weights ``small``.
 
     Args:
         clip: folder of the clip.
         frames: number of its frames; None for all.
+        preset: of the tracker; None for a version without presets.
 
     Returns:
         Processor time without reading, seconds.
     """
     images = list(islice(dvo.open(clip), frames))
-    odometry = dvo.load("small", seed=0)
+    odometry = dvo.load("small", seed=0, **({"preset": preset} if preset else {}))
     start = time.process_time()
     for frame in images:
         odometry.track(frame)
@@ -137,6 +138,7 @@ def main() -> None:
     line.add_argument("what", choices=("tracking", "ba", "training"))
     line.add_argument("clip", nargs="?")
     line.add_argument("--frames", type=int)
+    line.add_argument("--preset")
     line.add_argument("--repeats", type=int, default=30)
     given = line.parse_args()
     torch.set_num_threads(1)
@@ -153,7 +155,11 @@ def main() -> None:
         for _ in sys.stdin:  # one step for every line, so that two processes can take turns
             print(f"SECONDS {step():.9f}", flush=True)
         return
-    seconds = tracking(given.clip, given.frames) if given.what == "tracking" else bundle_adjustment(given.repeats)
+    seconds = (
+        tracking(given.clip, given.frames, given.preset)
+        if given.what == "tracking"
+        else bundle_adjustment(given.repeats)
+    )
     print(f"SECONDS {seconds:.9f}")
 
 

@@ -33,8 +33,10 @@ def archived_walk(
     dropped: tuple[int, ...] = (),
     archive: ArchiveConfig | None = None,
     readout: float = 0.0,
+    interval: float = INTERVAL,
+    archived: bool = True,
 ) -> tuple[KeyframeGraph, Trajectory]:
-    """Graph of a walk, all archived, with poses that drift in scale; and the true trajectory.
+    """Graph of a walk with poses that drift in scale; and the true trajectory.
 
     Args:
         frames: number of keyframes.
@@ -42,9 +44,11 @@ def archived_walk(
         dropped: frames that are dropped.
         archive: bound of its memory.
         readout: of the rolling shutter that the measurements were made with, seconds.
+        interval: between frames, seconds.
+        archived: all frames have left the window.
     """
     g = torch.Generator().manual_seed(0)
-    times = INTERVAL * torch.arange(frames, dtype=torch.float64)
+    times = interval * torch.arange(frames, dtype=torch.float64)
     true = pose_at(times)
     centres = torch.randint(6, 54, (1, frames, M, 2), generator=g)
     depth = 0.3 + 0.4 * torch.rand(1, frames * M, generator=g)
@@ -78,6 +82,6 @@ def archived_walk(
     graph.window.weights = torch.full((len(kk), 2), 0.5)
     for i in sorted(dropped, reverse=True):
         graph.drop(i)
-    while len(graph.window):
+    while archived and len(graph.window):
         graph.archive_oldest()
     return graph, Trajectory(times.numpy(), se3.inverse(true).numpy())

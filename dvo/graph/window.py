@@ -188,6 +188,25 @@ class Window:
         self.confidence = torch.cat([self.confidence, self.confidence.new_zeros(count, 2)])
         return slots
 
+    def connect_newest(self, lifetime: int, own: bool) -> Tensor:
+        """Add edges from recent patches to the newest frame, and from its patches to recent frames.
+
+        Args:
+            lifetime: number of frames before the newest that take part.
+            own: also from its patches to itself.
+
+        Returns:
+            Slots of the new edges.
+        """
+        m, n, device = self.per_frame, len(self), self.jj.device
+        first = max(0, n - 1 - lifetime)
+        old = torch.arange(first * m, (n - 1) * m, device=device)
+        slots = [self.connect(old, torch.full_like(old, n - 1))]
+        new = torch.arange((n - 1) * m, n * m, device=device)
+        targets = torch.arange(first, n if own else n - 1, device=device)
+        slots.append(self.connect(new.repeat_interleave(len(targets)), targets.repeat(m)))
+        return torch.cat(slots)
+
     def keep(self, mask: Tensor) -> None:
         """Remove edges.
 

@@ -13,6 +13,7 @@ from typing import Literal, Protocol
 
 from torch import Tensor
 
+from dvo.ba.kernels import Kernel
 from dvo.ba.layer import bundle_adjust
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.problem import Factor
@@ -83,6 +84,7 @@ class StepOptions:
         bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.bundle_adjust`.
         check: indices and weights, see :class:`dvo.ba.options.BAOptions`.
         factors: further measurements for bundle adjustment, for example of depth or of an inertial sensor.
+        kernel: robust kernel of the weighted residuals in bundle adjustment.
     """
 
     mode: Mode = "joint"
@@ -92,6 +94,7 @@ class StepOptions:
     bounds: tuple[float, float] | None = None
     check: bool | None = False
     factors: tuple[Factor, ...] = ()
+    kernel: Kernel = Kernel()
 
 
 @dataclass(frozen=True)
@@ -227,6 +230,7 @@ def step(
             structure_only=options.mode == "structure",
             bounds=options.bounds,
             check=options.check,
+            kernel=options.kernel,
         ),
         factors=options.factors,
     )

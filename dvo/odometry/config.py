@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 from dvo.nets.alignment import AlignmentOptions
 from dvo.settings import check_names, check_settings
@@ -17,6 +18,7 @@ _RANGES = {
     "align_reach": (0, 100),
     "lifetime": (1, 1000),
     "removal": (1, 1000),
+    "robust": (0, 1e4),
     "optimisation": (1, 1000),
     "initial_frames": (2, 1000),
     "initial_updates": (1, 1000),
@@ -58,6 +60,9 @@ class TrackerConfig:
             (:mod:`dvo.odometry.final_adjustment`).
         estimate_readout: look for a rolling shutter in the final adjustment if the camera states no readout time
             (:mod:`dvo.odometry.self_calibration`).
+        robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
+        restart: start the window anew, some frames after the initialisation, if that leads to a better solution
+            (:mod:`dvo.ba.restart`).
         initial_frames: keyframes before the first joint optimisation.
         initial_updates, final_updates: updates at initialisation and in ``finish``.
         updates: updates of each frame.
@@ -101,6 +106,8 @@ class TrackerConfig:
     final_updates: int = 8
     final_adjustment: bool = True
     estimate_readout: bool = True
+    robust: float = 0.3
+    restart: bool = True
     updates: int = 1
     initial_motion: float = 0.5
     initial_parallax: float = 1.0
@@ -117,6 +124,11 @@ class TrackerConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, _RANGES)
+
+    @property
+    def kernel(self) -> Kernel:
+        """Robust kernel of bundle adjustment in ``track``."""
+        return Kernel("cauchy", self.robust) if self.robust > 0 else Kernel()
 
     @property
     def alignment(self) -> AlignmentOptions:

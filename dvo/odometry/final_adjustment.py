@@ -18,6 +18,7 @@ from torch import Tensor
 from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.ba.kernels import Kernel
 from dvo.ba.levenberg import LMOptions
+from dvo.ba.restart import RestartOptions, better_start, restart
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import GraphProblem, KeyframeGraph
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
@@ -37,6 +38,7 @@ class AdjustmentOptions:
         overlap: frames at the end of a block that the next block solves for again.
         shutter_rounds: solutions with measurements corrected for a rolling shutter, each from the motion of the last.
             They take the last kernel, and the solution before them the others.
+        restart_frames: frames at the beginning that decide whether the solution is started anew.
     """
 
     kernels: tuple[Kernel, ...] = (Kernel("huber", 0.5), Kernel("cauchy", 0.1))
@@ -46,6 +48,7 @@ class AdjustmentOptions:
     block: int = 600
     overlap: int = 60
     shutter_rounds: int = 2
+    restart_frames: int = 60
 
 
 @dataclass(frozen=True)
@@ -118,6 +121,8 @@ def adjust_segment(
         depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1).clone()
         depths[new] /= change.scale
         poses, found, _ = solve_part(part, now[rows], depths, fixed, first)
+        if start == 1:
+            poses, found = _leave_minimum(part, poses, found, fixed, options)
         for _ in range(options.shutter_rounds if rolling is not None else 0):
             assert rolling is not None
             now[rows] = poses
@@ -130,6 +135,37 @@ def adjust_segment(
             graph.correct(int(part.identifiers[row]), poses[row].numpy(), found[row].numpy())
         solved, start = end, max(end - options.overlap, start + 1)
     return len(identifiers)
+
+
+def _leave_minimum(
+    part: GraphProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
+) -> tuple[Tensor, Tensor]:
+    """Start the first block anew if that is better for its first frames; see :mod:`dvo.ba.restart`.
+
+    Args:
+        part, poses_cw, depths, fixed: block with its solution.
+        options: kernels and iterations.
+
+    Returns:
+        Poses ``(N, 7)`` and inverse depths ``(N, M)`` of the better solution.
+    """
+    early = (part.ii < options.restart_frames) & (part.jj < options.restart_frames)
+    if not early.any():
+        return poses_cw, depths
+    n, m = min(options.restart_frames, len(depths)), depths.shape[1]
+    patches = torch.cat([part.patches[:, :2], depths.reshape(-1, 1, 1, 1)], 1)
+    measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
+    settings = RestartOptions(options.kernels[0], options.kernels[-1], options.max_residual)
+    targets, weights, ii, jj, kk = (x[early] for x in measured[1:])
+    some = (part.intrinsics[:n], targets, weights, ii, jj, kk)
+    better = better_start(poses_cw[:n], patches[: n * m], some, fixed[:n], settings)
+    if better is None:
+        return poses_cw, depths
+    settings = replace(settings, iterations=3 * options.iterations)
+    known = replace(options, kernels=options.kernels[-1:])
+    poses_cw, depths, cost = solve_part(part, poses_cw, depths, fixed, known)
+    poses, found, new = restart(poses_cw, patches, measured, fixed, better[0], settings)
+    return (poses, found[:, 2, 0, 0].reshape_as(depths)) if new < cost else (poses_cw, depths)
 
 
 def solve_part(

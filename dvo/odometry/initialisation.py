@@ -1,8 +1,11 @@
-"""Initialisation of the tracker: test for motion, and the first joint optimisation."""
+"""Initialisation of the tracker: test for motion, the first joint optimisation, and its revision after some frames."""
 
 from __future__ import annotations
 
+import torch
+
 from dvo.ba.cold_start import damping_at, robust_cost, solve_from_nothing
+from dvo.ba.restart import better_start
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
@@ -11,6 +14,9 @@ from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, last_unrelated
 from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
+
+RESTARTS = frozenset({2, 4, 8, 16, 32, 64})
+"""Frames after the initialisation at which its solution is questioned."""
 
 
 def median_revision(revision: Revision, window: Window) -> float:
@@ -89,3 +95,27 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
     """
     for _ in range(last_unrelated(step, config)):
         graph.log.lose(graph.discard(0).identifier, NO_MATCH)
+
+
+def leave_minimum(window: Window, age: int) -> bool:
+    """Start the window anew if that leads to a better solution (:mod:`dvo.ba.restart`).
+
+    The first frames have too little parallax to tell a relief from the reversed one; later frames have more.
+
+    Args:
+        window: of an initialised tracker; poses and inverse depths are changed in place.
+        age: number of frames since the initialisation; nothing is tried but at :data:`RESTARTS`.
+
+    Returns:
+        True if they were changed.
+    """
+    if age not in RESTARTS:
+        return False
+    measured = (window.intrinsics, window.targets, window.weights)
+    real = (x.double() for x in (window.poses_cw, window.patches, *measured))
+    poses, patches, intrinsics, targets, weights = real
+    fixed = torch.arange(len(window), device=poses.device) < 1
+    found = better_start(poses, patches, (intrinsics, targets, weights, window.ii, window.jj, window.kk), fixed)
+    if found is not None:
+        window.poses_cw, window.patches = found[1].to(window.poses_cw), found[2].to(window.patches)
+    return found is not None

@@ -30,7 +30,7 @@ from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
-from dvo.odometry.initialisation import drop_unrelated, initialise, median_revision, newest_confidence
+from dvo.odometry.initialisation import drop_unrelated, initialise, leave_minimum, median_revision, newest_confidence
 from dvo.odometry.motion import flow_magnitude, predict_pose
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.rolling_shutter import Shutter
@@ -86,8 +86,10 @@ class PatchOdometry:
         self.graph = KeyframeGraph(*sizes, self.device, archive, lambda edges: self._step.finalise(edges))
         self.correlation = WindowCorrelation(self.window, c, self.device)
         align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
-        self._step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final")
-        self._count = 0
+        self._step = WindowStep(
+            self.model, self.window, self.correlation, align, config.align == "final", config.kernel
+        )
+        self._count = self._tracked = 0  # keyframes, and frames of the segment since its initialisation
         self._initialised = self._finished = False
         self._adjustable: list[int] = []  # segments that were initialised
         self._sequence = FrameSequence(config.max_gap)
@@ -186,7 +188,7 @@ class PatchOdometry:
         """Add a frame with content to the window, and estimate its pose."""
         window, config, record = self.window, self.config, view.records[0]
         keyframe = self._append(view)
-        self._connect()
+        self._step.forget(window.connect_newest(config.lifetime, self.model.config.self_edges))
         if not self._initialised:
             return self._initialise(view, keyframe)
         before = window.snapshot()
@@ -204,6 +206,9 @@ class PatchOdometry:
         self._place(record, keyframe.identifier, self._joining if self._skipped else "")
         self._joining, self._skipped = "", False
         self._waiting.clear()
+        self._tracked += 1
+        if config.restart:
+            leave_minimum(window, self._tracked)
         pose_wc = self._pose_wc(len(window) - 1)
         self._reduce()
         return self._estimate(record, pose_wc, Status.TRACKING, evidence.confidence)
@@ -289,7 +294,7 @@ class PatchOdometry:
         while len(window):
             self.graph.archive_oldest()
         self.graph.begin_segment(self._count, supported, "too few frames with content")
-        self._initialised, self._joining, self._skipped = False, "", False
+        self._initialised, self._joining, self._skipped, self._tracked = False, "", False, 0
 
     def _append(self, view: View) -> Keyframe:
         """Add a frame to the window, with predicted pose and the median depth of the frames before it."""
@@ -307,17 +312,6 @@ class PatchOdometry:
         )
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe
-
-    def _connect(self) -> None:
-        """Join recent patches with the newest frame, and its patches with recent frames."""
-        m, n, device = self.config.patches, len(self.window), self.device
-        first = max(0, n - 1 - self.config.lifetime)
-        old = torch.arange(first * m, (n - 1) * m, device=device)
-        slots = [self.window.connect(old, torch.full_like(old, n - 1))]
-        new = torch.arange((n - 1) * m, n * m, device=device)
-        targets = torch.arange(first, n if self.model.config.self_edges else n - 1, device=device)
-        slots.append(self.window.connect(new.repeat_interleave(len(targets)), targets.repeat(m)))
-        self._step.forget(torch.cat(slots))
 
     def _update(self, age: int = COLD_UPDATES) -> None:
         """Take a step on the window; ``age``, the number of earlier steps, sets the damping of bundle adjustment."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from dvo.ba.kernels import Kernel
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepModel, StepOptions, UpdateState, revise, step
 from dvo.odometry.front_end import Observation
@@ -22,6 +23,7 @@ class WindowStep:
         lookup: correlation of the window's edges.
         align: sub-pixel alignment of its measurements, None for none.
         final: align the measurements that leave the window (:meth:`finalise`), instead of those of every step.
+        kernel: robust kernel of bundle adjustment, which takes the influence from moving bodies and wrong matches.
 
     Attributes:
         bounds: ``(width, height)`` of the feature map.
@@ -34,8 +36,10 @@ class WindowStep:
         lookup: WindowCorrelation,
         align: WindowAlignment | None = None,
         final: bool = True,
+        kernel: Kernel = Kernel(),  # noqa: B008 (frozen)
     ) -> None:
         self.model, self.window, self.lookup, self.align, self.final = model, window, lookup, align, final
+        self.kernel = kernel
         self.bounds = (0, 0)
 
     def keep_frame(self, map_slot: int, seen: Observation) -> None:
@@ -102,12 +106,14 @@ class WindowStep:
         """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
 
         Args:
-            options: of the step; ``bounds`` are replaced by those of the feature map.
+            options: of the step; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that of the
+                tracker.
             align: use the sub-pixel alignment, if it takes part in every step. Its large weights would keep the first
                 solution of a window from leaving a wrong minimum.
         """
         refine = self.align if align and not self.final else None
-        after = step(self.model, self.state(), self.lookup, replace(options, bounds=self.bounds), refine)
+        options = replace(options, bounds=self.bounds, kernel=self.kernel)
+        after = step(self.model, self.state(), self.lookup, options, refine)
         assert after.targets is not None and after.weights is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
 import dvo
+from dvo.ba.restart import restart
 from dvo.graph.archive import ArchiveConfig
 from dvo.metrics import evaluate
 from dvo.odometry.final_adjustment import AdjustmentOptions, adjust_segment
@@ -39,6 +41,20 @@ def test_frames_whose_measurements_are_released_stay_and_hold_the_scale():
     assert np.array_equal(before.poses_wc[:held], after.poses_wc[:held])
     assert not np.isclose(before.poses_wc[held:], after.poses_wc[held:]).all()
     assert np.isfinite(after.poses_wc).all() and len(after) == len(truth)
+
+
+def test_a_reversed_relief_is_left():
+    """Frames of a short base line that were tracked with the second solution get the first one."""
+    for restart_frames, exact in ((0, False), (60, True), (3, True)):
+        graph, truth = archived_walk(frames=6, interval=0.03)
+        part = graph.problem(True, 0)
+        measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
+        poses, patches, _ = restart(part.poses_cw, part.patches, measured, torch.arange(6) < 1, "reversed")
+        for i in range(6):
+            graph.correct(i, poses[i].numpy(), patches[8 * i : 8 * i + 8, 2, 0, 0].numpy())
+        adjust_segment(graph, 0, AdjustmentOptions(restart_frames=restart_frames, iterations=30))
+        found = evaluate(graph.log.trajectory(), truth)
+        assert (found.rpe_rot_deg < 0.01) == exact
 
 
 def test_a_segment_too_short_or_unknown_is_left_alone():

@@ -49,8 +49,8 @@ class RestartOptions:
         max_residual: pixels; a longer residual has a constant cost.
         resection: iterations for the poses alone.
         iterations: of the solution, at most.
-        hopeless: after half of the iterations a start is given up in :func:`better_start` if its cost is above that of the
-            present solution by this factor.
+        hopeless: a start is given up after half of the iterations if its cost is above that of the present solution by
+            this factor.
         tolerance: relative decrease of the cost by a step below which a solution has converged.
         margin: a new solution is preferred if its cost is below this share of the cost of the old one.
     """

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 from dvo.nets.alignment import AlignmentOptions
+from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.settings import check_names, check_settings
 
 _RANGES = {
@@ -61,8 +62,8 @@ class TrackerConfig:
         estimate_readout: look for a rolling shutter in the final adjustment if the camera states no readout time
             (:mod:`dvo.odometry.self_calibration`).
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
-        restart: start the window anew, some frames after the initialisation, if that leads to a better solution
-            (:mod:`dvo.ba.restart`).
+        restart: start the window anew, some frames after the initialisation, and the final adjustment, if that leads to
+            a better solution (:mod:`dvo.ba.restart`).
         initial_frames: keyframes before the first joint optimisation.
         initial_updates, final_updates: updates at initialisation and in ``finish``.
         updates: updates of each frame.
@@ -134,6 +135,11 @@ class TrackerConfig:
     def alignment(self) -> AlignmentOptions:
         """Options of the sub-pixel alignment."""
         return AlignmentOptions(gain=self.align_gain, reach=self.align_reach)
+
+    @property
+    def adjustment(self) -> AdjustmentOptions:
+        """Options of the final adjustment."""
+        return AdjustmentOptions() if self.restart else AdjustmentOptions(restart_frames=0)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> TrackerConfig:

@@ -122,7 +122,11 @@ def find_readout(
 
 
 def adjust_segments(
-    graph: KeyframeGraph, segments: Sequence[int], shutter: Shutter, estimate: bool
+    graph: KeyframeGraph,
+    segments: Sequence[int],
+    shutter: Shutter,
+    estimate: bool,
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
 ) -> dict[str, float | str]:
     """Final adjustment of segments; the readout time is that of the camera, or is estimated if the camera states none.
 
@@ -131,18 +135,20 @@ def adjust_segments(
         segments: their numbers.
         shutter: of the camera; a readout time of 0 is estimated from the longest segment.
         estimate: whether it is estimated, or a global shutter is assumed.
+        options: of the adjustment.
 
     Returns:
         ``readout`` in seconds, and ``readout_from``: ``camera``, ``images``, or ``none`` for a global shutter.
     """
     source = "camera" if shutter.readout > 0 else "none"
-    sizes = {segment: adjust_segment(graph, segment, shutter=shutter) for segment in segments}
+    sizes = {segment: adjust_segment(graph, segment, options, shutter) for segment in segments}
     if estimate and source == "none" and sizes:
-        found = find_readout(graph, max(sizes, key=lambda segment: sizes[segment]), shutter.rows)
+        found = find_readout(graph, max(sizes, key=lambda segment: sizes[segment]), shutter.rows, options)
         if found.gain >= _GAIN and found.value > 0 and np.isfinite(found.deviation):
             shutter, source = replace(shutter, readout=found.value), "images"
-            options = AdjustmentOptions()
-            corrected = replace(options, kernels=options.kernels[-1:])  # they are near the solution already
+            corrected = replace(
+                options, kernels=options.kernels[-1:], restart_frames=0
+            )  # they are near the solution already
             for segment in segments:
                 adjust_segment(graph, segment, corrected, shutter)
     return {"readout": shutter.readout, "readout_from": source}

@@ -163,7 +163,10 @@ class PatchOdometry:
                 self._begin_segment()
             self._close_segment(last=True)
             if self.config.final_adjustment and self._adjustable:
-                self._info |= adjust_segments(self.graph, self._adjustable, self._shutter, self.config.estimate_readout)
+                c = self.config
+                self._info |= adjust_segments(
+                    self.graph, self._adjustable, self._shutter, c.estimate_readout, c.adjustment
+                )
         return self._result({})
 
     @torch.inference_mode()

@@ -2,8 +2,11 @@
 
 import torch
 
+from dvo.ba.kernels import Kernel
 from dvo.ba.restart import restart
 from dvo.geometry import se3
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.odometry.initialisation import RESTARTS, leave_minimum
 from tests.archived_walk import archived_walk, pose_at
 
@@ -39,3 +42,10 @@ def test_nothing_is_tried_at_other_frames():
     poses = window.poses_cw
     assert not any(leave_minimum(window, age) for age in range(1, 100) if age not in RESTARTS)
     assert window.poses_cw is poses
+
+
+def test_settings_turn_kernel_and_restart_off():
+    config = TrackerConfig(robust=0, restart=False)
+    assert config.kernel == Kernel("none") and config.adjustment.restart_frames == 0
+    assert TrackerConfig(robust=0.2).kernel == Kernel("cauchy", 0.2)
+    assert TrackerConfig().adjustment == AdjustmentOptions()

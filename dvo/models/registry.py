@@ -13,7 +13,14 @@ from dvo.registry import Registry
 DEFAULT_ARCHITECTURE = "patch_vo"
 """Architecture of weights files and training states that name none: they are older than the name."""
 
-ARCHITECTURES = Registry("architecture", "dvo.architectures", {"patch_vo": "dvo.models.patch_vo:PatchVO"})
+ARCHITECTURES = Registry(
+    "architecture",
+    "dvo.architectures",
+    {
+        "patch_vo": "dvo.models.patch_vo:PatchVO",
+        "deepvo": "dvo.models.deepvo:DeepVO",
+    },
+)
 """Architecture name to ``"module:Class"`` of the network, a :class:`Network`."""
 
 

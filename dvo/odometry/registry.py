@@ -9,7 +9,14 @@ from dvo.models.weights import LoadedWeights
 from dvo.odometry.protocol import Odometry
 from dvo.registry import Registry
 
-ODOMETRIES = Registry("odometry", "dvo.odometries", {"patch_vo": "dvo.odometry.load:patch_odometry"})
+ODOMETRIES = Registry(
+    "odometry",
+    "dvo.odometries",
+    {
+        "patch_vo": "dvo.odometry.load:patch_odometry",
+        "deepvo": "dvo.odometry.deepvo:deepvo_odometry",
+    },
+)
 """Architecture name to ``"module:function"`` or ``"module:Class"`` of an :class:`OdometryBuilder`."""
 
 

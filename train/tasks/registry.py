@@ -10,7 +10,14 @@ from train.tasks.task import Task
 DEFAULT_TASK = "patch_vo"
 """Task of configurations and training states that name none."""
 
-TASKS = Registry("task", "dvo.tasks", {"patch_vo": "train.tasks.patch_vo.task:PatchVOTask"})
+TASKS = Registry(
+    "task",
+    "dvo.tasks",
+    {
+        "patch_vo": "train.tasks.patch_vo.task:PatchVOTask",
+        "deepvo": "train.tasks.deepvo.task:DeepVOTask",
+    },
+)
 """Task name to ``"module:Class"`` of a :class:`train.tasks.task.Task`."""
 
 

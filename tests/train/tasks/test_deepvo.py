@@ -1,0 +1,109 @@
+"""The task of the pose-regression network: its loss, its measures, equal and resumed runs."""
+
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+
+from dvo.errors import DvoError
+from dvo.models.deepvo import TRANSLATION_UNIT, chain, true_steps
+from train.data.augment import Augmentation
+from train.engine.build import make_program
+from train.tasks.deepvo.objective import LossConfig, step_errors
+from train.tasks.deepvo.task import DeepVOTask
+
+
+def program(**changes):
+    torch.manual_seed(0)
+    return make_program("deepvo", **({"model": "tiny", "learning_rate": 2e-3, "warmup": 1} | changes))
+
+
+def steps(seed, clips=2, count=3):
+    return 0.3 * torch.randn(clips, count, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_gradient_of_the_loss():
+    found, truth = steps(0).requires_grad_(), steps(1)
+    assert torch.autograd.gradcheck(lambda x: step_errors(x, truth).total(LossConfig()), found)
+
+
+def test_the_gradient_through_the_trajectory():
+    """Of the product of the steps, on which a loss over several frames would rest."""
+    poses_cw = chain(steps(1))
+    truth = true_steps(poses_cw)
+    total = lambda x: step_errors(true_steps(chain(x)), truth).total(LossConfig())  # noqa: E731
+    assert torch.autograd.gradcheck(total, steps(0).requires_grad_())
+
+
+def test_the_loss_is_the_published_one():
+    """Squared error of the position plus kappa times that of the orientation, position in its unit."""
+    truth = steps(1)
+    off = truth + torch.tensor([TRANSLATION_UNIT, 0, 0, 0, 0, 0])
+    assert step_errors(off, truth).total(LossConfig()) == pytest.approx(1)
+    off = truth + torch.tensor([0, 0, 0, 0, 0.1, 0])
+    assert step_errors(off, truth).total(LossConfig()) == pytest.approx(1)
+    assert step_errors(off, truth).total(LossConfig(kappa=30.0)) == pytest.approx(0.3)
+    assert step_errors(truth, truth).total(LossConfig()) == 0
+    for kappa in (-1.0, "much"):
+        with pytest.raises(DvoError, match="kappa"):
+            LossConfig(kappa=kappa)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_resuming_those_of_not_having_stopped(tmp_path, runs):
+    options = {"both_ways": True, "augmentation": Augmentation(colour=0.0, zoom=0.0, exposure=1.0)}
+    for name in "abc":
+        (tmp_path / name).mkdir()
+    whole, losses = runs.fit(tmp_path / "a", 4, program(**options))
+    again, same = runs.fit(tmp_path / "c", 4, program(**options))
+    assert losses == same
+    saver = ModelCheckpoint(tmp_path / "b", filename="step", every_n_train_steps=2, save_top_k=1)
+    _, first = runs.fit(tmp_path / "b", 3, program(**options), callbacks=[saver])
+    resumed, then = runs.fit(tmp_path / "b", 4, program(**options), tmp_path / "b" / "step.ckpt")
+    assert first == losses[:3] and then == losses[2:]
+    for (name, a), b, c in zip(
+        whole.state_dict().items(), again.state_dict().values(), resumed.state_dict().values(), strict=True
+    ):
+        assert torch.equal(a, b) and torch.equal(a, c), name
+
+
+def test_the_loss_of_one_clip_falls(tmp_path, runs):
+    task = program()
+    batch = runs.batch()
+    optimizer = torch.optim.Adam(task.net.parameters(), 2e-3)
+    losses = []
+    for _ in range(40):
+        optimizer.zero_grad()
+        found = task.task.compute_loss(task.context, batch)
+        found.loss.backward()
+        optimizer.step()
+        losses.append(float(found.loss.detach()))
+    assert losses[-1] < 0.2 * losses[0]
+
+
+def test_both_ways_is_the_mean_over_the_clips_and_their_reversals(runs):
+    batch = runs.batch(0, 2)
+    reverse = {name: value.flip(1) for name, value in batch.items()}
+    one, both = program(), program(both_ways=True)
+    apart = [one.task.compute_loss(one.context, clips).loss for clips in (batch, reverse)]
+    torch.testing.assert_close(both.task.compute_loss(both.context, batch).loss, sum(apart) / 2)
+
+
+def test_measures_of_a_held_out_clip(runs):
+    made = program()
+    found = made.task.measure(made.net, runs.batch(), 0)
+    assert set(found) == {"loss", "pose", "translation", "rotation_deg", "rotation_ratio", "step_ratio"}
+    truth = runs.batch()["poses_cw"]
+    exact = DeepVOTask.errors(true_steps(truth), truth)
+    assert all(float(value) < 1e-2 for value in exact.values()), exact
+    still = DeepVOTask.errors(torch.zeros(1, truth.shape[1] - 1, 6), truth)
+    assert float(still["rotation_ratio"]) == pytest.approx(1) and float(still["step_ratio"]) == pytest.approx(1)
+
+
+def test_mixed_precision_stays_near_full_precision(tmp_path, runs):
+    _, exact = runs.fit(tmp_path, 2, program())
+    _, mixed = runs.fit(tmp_path, 2, program(), precision="bf16-mixed")
+    assert mixed[0] == pytest.approx(exact[0], rel=0.05)
+
+
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(DvoError, match="no preset 'huge'.*tiny"):
+        DeepVOTask("huge")

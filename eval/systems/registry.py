@@ -153,7 +153,7 @@ def _learned(weights: str, name: str | None = None) -> System:
         name or f"dvo:{Path(weights).stem}",
         LEARNED,
         {"weights": weights},
-        about="learned patch flow and differentiable bundle adjustment",
+        about="learned odometry; the weights name the network",
         version_from="eval.systems.learned:version",
         missing_from="eval.systems.learned:missing",
     )

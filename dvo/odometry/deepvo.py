@@ -87,7 +87,7 @@ class DeepVOOdometry:
         self.model = model.to(self.device).eval()
         self._sequence = FrameSequence(config.max_gap)
         self._times: list[float] = []
-        self._poses: list[np.ndarray] = []  # T_wc; of a lost frame that of the frame before it, which nobody reads
+        self._poses: list[np.ndarray] = []  # T_wc; that of a lost frame is not used
         self._owner: list[int] = []  # segments
         self._reasons: dict[float, str] = {}
         self._segment = _NONE  # number of the newest segment

@@ -1,15 +1,25 @@
 """The task of the pose-regression network: its loss, its measures, equal and resumed runs."""
 
+import sys
+from pathlib import Path
+
 import pytest
 import torch
+import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint
 
+import dvo
 from dvo.errors import DvoError
 from dvo.models.deepvo import TRANSLATION_UNIT, chain, true_steps
+from dvo.synth.sequence import make_sequence
+from train.__main__ import main
 from train.data.augment import Augmentation
 from train.engine.build import make_program
+from train.engine.checkpoint import read_state
 from train.tasks.deepvo.objective import LossConfig, step_errors
 from train.tasks.deepvo.task import DeepVOTask
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def program(**changes):
@@ -63,6 +73,47 @@ def test_the_same_seed_gives_the_same_bytes_and_resuming_those_of_not_having_sto
         whole.state_dict().items(), again.state_dict().values(), resumed.state_dict().values(), strict=True
     ):
         assert torch.equal(a, b) and torch.equal(a, c), name
+
+
+def test_the_shipped_configuration_trains_resumes_and_gives_weights_that_track(tmp_path, monkeypatch):
+    """By the ordinary commands, with smaller sizes on top."""
+    watch = {"every": 2, "rendered": 1, "frames": 4, "size": [48, 64]}
+    smaller = {
+        "trainer": {
+            "accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False, "log_every_n_steps": 1,
+            "default_root_dir": str(tmp_path),
+            "callbacks": [
+                {"class_path": "lightning.pytorch.callbacks.ModelCheckpoint",
+                 "init_args": {"save_last": True, "every_n_train_steps": 1, "enable_version_counter": False}},
+                {"class_path": "train.validation.watch.TrackWhileTraining", "init_args": watch},
+            ],
+        },
+        "model": {"model": "tiny"},
+        "data": {"batch_size": 1, "frames": 4, "sizes": [[48, 64]], "workers": 0},
+    }  # fmt: skip
+    file = tmp_path / "smaller.yaml"
+    file.write_text(yaml.safe_dump(smaller))
+
+    def command(*arguments):
+        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
+        main()
+
+    fit = ("fit", "--config", ROOT / "configs" / "train" / "deepvo.yaml", "--config", file)
+    command(*fit, "--name", "whole", "--trainer.max_steps=4")
+    command(*fit, "--name", "parts", "--trainer.max_steps=2")
+    command(*fit, "--name", "parts", "--trainer.max_steps=4", "--resume")
+    whole, parts = (read_state(tmp_path / name / "last.ckpt") for name in ("whole", "parts"))
+    assert whole["task"] == "deepvo" and whole["Renderings"] == parts["Renderings"] == {"clips_seen": 4}
+    for name, tensor in whole["state_dict"].items():
+        assert torch.equal(tensor, parts["state_dict"][name]), name
+    logged = (tmp_path / "whole" / "csv" / "version_0" / "metrics.csv").read_text().splitlines()[0]
+    expected = {"loss", "rotation_ratio", "gradient_norm_encoder", "track/rendered0/ate_percent"}
+    assert expected <= set(logged.split(","))
+    command("export", tmp_path / "whole" / "last.ckpt", tmp_path / "motion.safetensors")
+    odometry = dvo.load(str(tmp_path / "motion.safetensors"))
+    assert odometry.name == "dvo-motion"
+    for frame in make_sequence(7, frames=3, height=48, width=64, fps=10.0):
+        assert odometry.track(frame).pose_wc is not None
 
 
 def test_the_loss_of_one_clip_falls(tmp_path, runs):

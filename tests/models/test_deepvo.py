@@ -1,5 +1,8 @@
 """The pose-regression network, and the product of its steps."""
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -7,6 +10,24 @@ from dvo.geometry import se3
 from dvo.models.deepvo import DeepVO, chain, pose_step, step_pose, true_steps
 from dvo.models.registry import build_network
 from dvo.models.weights import load_weights, save_weights
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_page_lists_exactly_the_files_that_name_the_network():
+    """docs/add_a_network.md promises that a member touches its own files and one line in each registry."""
+    page = (ROOT / "docs" / "add_a_network.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| `([\w/.]+)` \|", page, re.MULTILINE))
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for room in ("dvo", "train", "configs/train")
+        for path in (ROOT / room).rglob("*")
+        if path.suffix in (".py", ".yaml")
+        and ("deepvo" in str(path.relative_to(ROOT)) or "deepvo" in path.read_text(encoding="utf-8").lower())
+    }
+    assert listed == found
+    for line in re.findall(r"`(\"deepvo\": \"[\w.:]+\")`", page):
+        assert sum(line in (ROOT / name).read_text(encoding="utf-8") for name in listed) == 1, line
 
 
 @pytest.fixture

@@ -1,0 +1,206 @@
+"""Sizes and pose network of TartanVO (Wang, Hu, Scherer, "TartanVO: A Generalizable Learning-based VO", CoRL 2020).
+
+The pose network reads a flow together with the intrinsics layer, two channels that hold the ray of each pixel, so that
+one network serves all cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from dvo.errors import DvoError
+from dvo.nets.encoder import ResidualBlock
+from dvo.nets.flow_pyramid import STRIDE, initialise
+from dvo.settings import check_names, check_settings, shown
+
+FlowUnits = Literal["pixels", "rays"]
+"""Units of the flow that the pose network reads: feature pixels (TartanVO), or pixels over the focal length."""
+
+RANGES = {"stem_channels": (1, 512), "radius": (1, 8), "decoder_channels": (1, 512), "head_channels": (1, 2048)}
+LEVELS, CHANNELS, GRID = 6, 1024, 32
+_PIXELS, _RAYS = 0.1, 10.0  # factors that bring usual flows near one: some ten feature pixels, a tenth of a radian
+_ROTATION = 0.05  # radians to a unit of the output, as TartanVO's scale of its output
+
+
+@dataclass(frozen=True)
+class TartanVOConfig:
+    """Sizes of :class:`dvo.models.tartanvo.TartanVO`.
+
+    Attributes:
+        stem_channels: encoder channels at half of the resolution.
+        feature_channels: matching features at 1/4, 1/8, ... of the resolution.
+        radius: of the correlation, in feature pixels of each level.
+        decoder_channels: of the flow decoders.
+        pose_channels: of the stages of the pose network, each at half of the resolution of the one before.
+        grid: rows and columns to which the last stage is averaged, whatever the size of the image.
+        head_channels: hidden channels of the two heads, translation and rotation.
+        flow_units: see :data:`FlowUnits`.
+
+    Raises:
+        DvoError: a size of another type or out of range.
+    """
+
+    stem_channels: int = 16
+    feature_channels: tuple[int, ...] = (32, 48, 64)
+    radius: int = 3
+    decoder_channels: int = 48
+    pose_channels: tuple[int, ...] = (32, 48, 64, 96)
+    grid: tuple[int, ...] = (3, 4)
+    head_channels: int = 64
+    flow_units: FlowUnits = "pixels"
+
+    def __post_init__(self) -> None:
+        check_settings(self, RANGES)
+        _check_sizes(self.feature_channels, "feature_channels", (1, LEVELS), CHANNELS)
+        _check_sizes(self.pose_channels, "pose_channels", (1, LEVELS), CHANNELS)
+        _check_sizes(self.grid, "grid", (2, 2), GRID)
+        if self.flow_units not in get_args(FlowUnits):
+            remedy = f"use one of {', '.join(get_args(FlowUnits))}"
+            raise DvoError(f"unknown: {shown(self.flow_units)}", field="flow_units", remedy=remedy)
+
+    @property
+    def smallest_side(self) -> int:
+        """Smallest height and width of an image, pixels: two pixels of the coarsest level."""
+        return 2 ** (len(self.feature_channels) + 2)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for the metadata of weights.
+
+        Returns:
+            Attribute name to value.
+        """
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TartanVOConfig:
+        """Build from plain values, for instance of weights metadata.
+
+        Args:
+            values: attribute name to value; attributes that are missing take their defaults.
+
+        Returns:
+            The configuration.
+
+        Raises:
+            DvoError: an unknown attribute, or an invalid size.
+        """
+        check_names(cls, values)
+        plain: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
+        return cls(**plain)
+
+
+def _check_sizes(sizes: Any, field: str, count: tuple[int, int], largest: int) -> None:
+    low, high = count
+    if not isinstance(sizes, tuple) or not low <= len(sizes) <= high:
+        wanted = f"{low}" if low == high else f"{low} to {high}"
+        raise DvoError(f"not a list of {wanted} sizes: {shown(sizes)}", field=field, remedy=f"give {wanted} numbers")
+    if not all(isinstance(size, int) and not isinstance(size, bool) and 1 <= size <= largest for size in sizes):
+        remedy = f"give whole numbers from 1 to {largest}"
+        raise DvoError(f"out of range: {shown(sizes)}", field=field, remedy=remedy)
+
+
+PRESETS: dict[str, TartanVOConfig] = {
+    # Sized to track 320x240 video on two CPU cores.
+    "small": TartanVOConfig(),
+    # For tests and controlled studies.
+    "tiny": TartanVOConfig(
+        stem_channels=8,
+        feature_channels=(16, 16, 24),
+        radius=2,
+        decoder_channels=16,
+        pose_channels=(16, 24, 32),
+        grid=(2, 3),
+        head_channels=16,
+    ),
+}
+
+
+def preset(name: str) -> TartanVOConfig:
+    """Configuration of a preset.
+
+    Args:
+        name: key of :data:`PRESETS`.
+
+    Returns:
+        The configuration.
+
+    Raises:
+        DvoError: no such preset.
+    """
+    if name not in PRESETS:
+        raise DvoError(f"no preset '{name}'", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def intrinsics_layer(intrinsics: Float[Tensor, "B 4"], height: int, width: int) -> Float[Tensor, "B 2 h w"]:
+    """Rays of the pixels of a map, ``(x - cx) / fx`` and ``(y - cy) / fy`` (TartanVO 3.3).
+
+    Args:
+        intrinsics: ``fx fy cx cy`` in pixels of the map; pixel centres at integers.
+        height, width: of the map.
+
+    Returns:
+        The two channels, differentiable by the intrinsics.
+    """
+    fx, fy, cx, cy = (value[:, None, None] for value in intrinsics.unbind(-1))
+    x = (torch.arange(width, device=intrinsics.device, dtype=intrinsics.dtype) - cx) / fx
+    y = (torch.arange(height, device=intrinsics.device, dtype=intrinsics.dtype)[:, None] - cy) / fy
+    return torch.stack([x.expand(-1, height, -1), y.expand(-1, -1, width)], 1)
+
+
+class PoseNetwork(nn.Module):
+    """Motion of the camera from a flow and the intrinsics layer.
+
+    Args:
+        config: sizes.
+    """
+
+    def __init__(self, config: TartanVOConfig) -> None:
+        super().__init__()
+        self.config = config
+        first, *others = config.pose_channels
+        self.conv1 = nn.Conv2d(4, first, 3, padding=1)
+        self.stages = nn.Sequential(
+            *(ResidualBlock(a, b, 2, "none") for a, b in zip(config.pose_channels, others, strict=False))
+        )
+        rows, columns = config.grid
+        inputs = config.pose_channels[-1] * rows * columns
+        self.translation = _head(inputs, config.head_channels)
+        self.rotation = _head(inputs, config.head_channels)
+        initialise(self)
+        with torch.no_grad():
+            for head in (self.translation, self.rotation):
+                list(head.parameters())[-2].mul_(0.1)  # an untrained network answers near zero
+
+    def forward(
+        self, flow: Float[Tensor, "B 2 h w"], intrinsics: Float[Tensor, "B 4"]
+    ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
+        """Compute the motion of the camera.
+
+        Args:
+            flow: from the first image to the second, feature pixels.
+            intrinsics: ``fx fy cx cy`` of the image, image pixels.
+
+        Returns:
+            Translation, up to scale, and rotation vector, radians, of the pose of the second camera in the coordinates
+            of the first one: ``T_ab``, with ``T_wc[b] = T_wc[a] T_ab``.
+        """
+        small = intrinsics.float() / STRIDE
+        rays = intrinsics_layer(small, *flow.shape[-2:])
+        unit = _RAYS / small[:, :2, None, None] if self.config.flow_units == "rays" else _PIXELS
+        x = F.relu(self.conv1(torch.cat([flow.float() * unit, rays], 1)))
+        rows, columns = self.config.grid
+        x = F.adaptive_avg_pool2d(self.stages(x), (rows, columns)).flatten(1)
+        return self.translation(x).float(), self.rotation(x).float() * _ROTATION
+
+
+def _head(inputs: int, hidden: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3)
+    )

@@ -1,0 +1,167 @@
+"""Two-frame visual odometry as one network (TartanVO: Wang, Hu, Scherer, CoRL 2020).
+
+A matching network gives the flow between two images, and a pose network reads that flow together with the rays of the
+pixels (the intrinsics layer) and gives the motion of the camera, its translation up to scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dvo.errors import DvoError
+from dvo.geometry import so3
+from dvo.nets.flow_pyramid import STRIDE, Flows, MatchingNetwork
+from dvo.nets.patchifier import normalise_images
+from dvo.nets.tartanvo import PRESETS, PoseNetwork, TartanVOConfig
+
+__all__ = ["TartanVO", "TwoFrameMotion"]
+
+
+@dataclass(frozen=True)
+class TwoFrameMotion:
+    """Flow and motion between the two images of each pair, from ``a`` to ``b``.
+
+    Attributes:
+        translation: ``(B, 3)`` position of camera ``b`` in the coordinates of camera ``a``, up to scale: only its
+            direction is trained.
+        rotation: ``(B, 3)`` rotation vector of camera ``b`` in the coordinates of camera ``a``, radians.
+        flows: of all levels, feature pixels.
+    """
+
+    translation: Tensor
+    rotation: Tensor
+    flows: Flows
+
+    def poses_ab(self, lengths: Tensor | float = 1.0) -> Float[Tensor, "B 7"]:
+        """Motions as poses ``T_ab``, camera ``b`` in the coordinates of camera ``a``: ``T_wc[b] = T_wc[a] T_ab``.
+
+        Args:
+            lengths: length of each translation, ``(B,)`` or one number.
+
+        Returns:
+            ``tx ty tz qx qy qz qw``.
+        """
+        direction = nn.functional.normalize(self.translation, dim=-1, eps=1e-6)
+        length = torch.as_tensor(lengths, dtype=direction.dtype, device=direction.device)
+        return torch.cat([direction * length.reshape(-1, 1), so3.exp(self.rotation)], -1)
+
+
+class TartanVO(nn.Module):
+    """Matching network and pose network.
+
+    Images of any size from :attr:`dvo.nets.tartanvo.TartanVOConfig.smallest_side` on, and any pinhole camera.
+
+    Args:
+        config: sizes, see :class:`dvo.nets.tartanvo.TartanVOConfig`.
+
+    Example:
+        >>> model = TartanVO(preset("tiny"))
+        >>> a, b = torch.zeros(2, 1, 3, 96, 128, dtype=torch.uint8)
+        >>> model.flow(a, b).shape
+        torch.Size([1, 2, 24, 32])
+        >>> model(a, b, torch.tensor([[80.0, 80.0, 64.0, 48.0]])).poses_ab().shape
+        torch.Size([1, 7])
+    """
+
+    architecture = "tartanvo"
+    config_type = TartanVOConfig
+    presets = PRESETS
+    STRIDE = STRIDE
+
+    def __init__(self, config: TartanVOConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.matching = MatchingNetwork(
+            config.stem_channels, config.feature_channels, config.radius, config.decoder_channels
+        )
+        self.pose = PoseNetwork(config)
+
+    def encode(self, images: Float[Tensor, "n 3 H W"]) -> list[Tensor]:
+        """Matching features of images, which serve as either image of a pair.
+
+        Args:
+            images: RGB, uint8 or float in the same range.
+
+        Returns:
+            Features of each level, from fine to coarse.
+
+        Raises:
+            DvoError: images too small for the levels of the network.
+        """
+        least = self.config.smallest_side
+        if min(images.shape[-2:]) < least:
+            height, width = images.shape[-2:]
+            raise DvoError(
+                f"{width}x{height} pixels are too few for the network",
+                field="images",
+                remedy=f"give images of at least {least}x{least} pixels",
+            )
+        return self.matching.encode(normalise_images(images))
+
+    def flow(self, a: Float[Tensor, "B 3 H W"], b: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 2 h w"]:
+        """Optical flow from images ``a`` to images ``b``, at a quarter of the resolution.
+
+        Args:
+            a, b: RGB, uint8 or float in the same range; of one size.
+
+        Returns:
+            Displacements ``x, y`` in pixels of the image, ``h = ceil(H / 4)`` and ``w = ceil(W / 4)``: what is seen at
+            pixel ``(4u, 4v)`` of ``a`` is seen at ``(4u, 4v) + flow[:, :, v, u]`` of ``b``.
+
+        Raises:
+            DvoError: images of different sizes, or too small for the levels of the network.
+
+        Example:
+            >>> flow = dvo.load_model("tartanvo.safetensors").flow(a, b)
+        """
+        if a.shape != b.shape:
+            raise DvoError(
+                f"{tuple(a.shape)} and {tuple(b.shape)} differ", field="a, b", remedy="give images of one size"
+            )
+        return self.matching.match(self.encode(a), self.encode(b)).flow * STRIDE
+
+    def motion(
+        self, flow: Float[Tensor, "B 2 h w"], intrinsics: Float[Tensor, "B 4"]
+    ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
+        """Motion of the camera from a flow, see :class:`dvo.nets.tartanvo.PoseNetwork`.
+
+        Args:
+            flow: at a quarter of the resolution, feature pixels.
+            intrinsics: ``fx fy cx cy`` in image pixels.
+
+        Returns:
+            Translation, up to scale, and rotation vector of ``T_ab``, radians.
+        """
+        return self.pose(flow, intrinsics)
+
+    def between(self, first: list[Tensor], second: list[Tensor], intrinsics: Float[Tensor, "B 4"]) -> TwoFrameMotion:
+        """Flow and motion between images whose features are known.
+
+        Args:
+            first, second: features of :meth:`encode`.
+            intrinsics: ``fx fy cx cy`` in image pixels.
+
+        Returns:
+            Flow and motion.
+        """
+        flows = self.matching.match(first, second)
+        translation, rotation = self.pose(flows.flow, intrinsics)
+        return TwoFrameMotion(translation, rotation, flows)
+
+    def forward(
+        self, a: Float[Tensor, "B 3 H W"], b: Float[Tensor, "B 3 H W"], intrinsics: Float[Tensor, "B 4"]
+    ) -> TwoFrameMotion:
+        """Flow and motion between two images.
+
+        Args:
+            a, b: RGB, uint8 or float in the same range; of one size.
+            intrinsics: ``fx fy cx cy`` in image pixels.
+
+        Returns:
+            Flow from ``a`` to ``b`` and pose of camera ``b`` in the coordinates of camera ``a``.
+        """
+        return self.between(self.encode(a), self.encode(b), intrinsics)

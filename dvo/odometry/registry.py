@@ -15,6 +15,7 @@ ODOMETRIES = Registry(
     {
         "patch_vo": "dvo.odometry.load:patch_odometry",
         "deepvo": "dvo.odometry.deepvo:deepvo_odometry",
+        "tartanvo": "dvo.odometry.tartanvo:tartan_odometry",
     },
 )
 """Architecture name to ``"module:function"`` or ``"module:Class"`` of an :class:`OdometryBuilder`."""

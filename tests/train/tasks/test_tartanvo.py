@@ -1,0 +1,191 @@
+"""The task of the two-frame network: exact estimates, learning, resuming, augmentation, configuration."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+import dvo
+from dvo.errors import DvoError
+from dvo.geometry import se3, so3
+from dvo.models.tartanvo import TwoFrameMotion
+from dvo.nets.flow_pyramid import Flows
+from dvo.synth.clip import flow_field, make_clip
+from train.__main__ import main
+from train.data.augment import Augmentation, crop_and_resize
+from train.engine.build import make_program
+from train.engine.checkpoint import read_state
+from train.tasks.tartanvo.objective import LossConfig, objective, truth_of
+from train.tasks.tartanvo.task import TartanVOTask
+from train.tasks.task import StepContext
+
+
+def program(**changes):
+    torch.manual_seed(0)
+    return make_program("tartanvo", **({"model": "tiny", "learning_rate": 2e-3, "warmup": 5} | changes))
+
+
+def exact(truth, levels=3):
+    """Output of a network that knows the truth; its translation is of another length."""
+    flows = [truth.flow[..., :: 2**k, :: 2**k] / 2**k for k in reversed(range(levels))]
+    return TwoFrameMotion(0.3 * truth.translation, truth.rotation, Flows(tuple(flows), truth.flow))
+
+
+@pytest.mark.parametrize("form", ["distance", "cosine"])
+def test_exact_estimates_cost_nothing(runs, form):
+    truth = truth_of(runs.batch(0, 1, sizes=[(48, 64)]), 4, 16.0)
+    assert truth.valid.float().mean() > 0.7
+    loss, found = objective(exact(truth), truth, LossConfig(form=form))
+    assert loss < 1e-3
+    assert found["px<1"] == 1 and found["flow"] == 0 and found["direction_deg"] < 0.1 and found["rotation_deg"] < 1e-3
+
+
+def test_the_true_flow_is_that_of_the_renderer():
+    clip = make_clip(11, 0, sensor=False, frames=3, height=48, width=64)
+    names = ("images", "depth", "poses_cw", "intrinsics")
+    batch = {name: torch.as_tensor(getattr(clip, name))[None] for name in names}
+    truth = truth_of(batch, 4, 1e9)
+    poses_wc = se3.inverse(batch["poses_cw"][0].double()).numpy()
+    flow, _ = flow_field(batch["depth"][0].double().numpy(), poses_wc, batch["intrinsics"][0, 0].double().numpy())
+    wanted = torch.from_numpy(flow)[:, ::4, ::4].permute(0, 3, 1, 2).float() / 4
+    assert truth.valid.float().mean() > 0.9
+    where = truth.valid[:, None].expand_as(wanted)
+    torch.testing.assert_close(truth.flow[where], wanted[where], atol=1e-3, rtol=1e-3)
+
+
+def test_a_crop_changes_flow_and_intrinsics_together(runs):
+    """Pose and rays stay; what is seen in the enlarged window moves by as much more."""
+    batch = runs.batch(0, sizes=[(48, 64)])
+    scale, left, top = 2.0, 15.5, 11.5
+    clip = {name: value[0] for name, value in batch.items()}
+    crop = {name: value[None] for name, value in (clip | crop_and_resize(clip, scale, left, top)).items()}
+    before, after = truth_of(batch, 1, 1e9), truth_of(crop, 1, 1e9)
+    torch.testing.assert_close(before.rotation, after.rotation)
+    x, y = 20, 14  # (u + 0.5 - left) scale - 0.5 of a whole pixel of the image
+    u, v = round((x + 0.5 - left) * scale - 0.5), round((y + 0.5 - top) * scale - 0.5)
+    depth = batch["depth"][0, 0, y, x]
+    assert crop["depth"][0, 0, v, u] == depth
+    ratio = after.flow[0, :, v, u] / before.flow[0, :, y, x]
+    torch.testing.assert_close(ratio, torch.full((2,), scale), atol=0.1, rtol=0.05)
+
+
+def test_the_loss_falls_within_some_steps(runs):
+    one = program()
+    batch = runs.batch(0, 1, sizes=[(64, 96)])
+    optimizer = torch.optim.AdamW(one.net.parameters(), 2e-3)
+    losses = []
+    for step in range(40):
+        found = one.task.compute_loss(StepContext(one.net, step, {}), batch)
+        optimizer.zero_grad()
+        found.loss.backward()
+        torch.nn.utils.clip_grad_norm_(one.net.parameters(), 10.0)
+        optimizer.step()
+        losses.append((float(found.loss.detach()), float(found.shown["flow"])))
+    assert losses[-1][0] < 0.7 * losses[0][0] and losses[-1][1] < 0.5 * losses[0][1]
+
+
+def test_resumed_training_equals_uninterrupted_training(tmp_path, runs):
+    pytest.importorskip("kornia")
+    options = {"augmentation": Augmentation(zoom=1.0, zoom_range=1.3), "true_flow_until": 2}
+    for name in ("whole", "again", "parts"):
+        (tmp_path / name).mkdir()
+    whole, losses = runs.fit(tmp_path / "whole", 4, program(**options))
+    _, same = runs.fit(tmp_path / "again", 4, program(**options))
+    assert losses == same  # the same seed, the same bytes
+    _, first = runs.fit(tmp_path / "parts", 2, program(**options))
+    resumed, then = runs.fit(tmp_path / "parts", 4, program(**options), tmp_path / "parts" / "last.ckpt")
+    assert first + then == losses
+    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_the_true_flow_is_read_at_first_only(runs):
+    batch = runs.batch(0)
+    gradients = []
+    for step in (0, 1):
+        one = program(true_flow_until=1, loss={"flow": 0.0})
+        one.task.compute_loss(StepContext(one.net, step, {}), batch).loss.backward()
+        gradients.append(float(one.net.matching.encoder.conv1.weight.grad.abs().sum()))
+    assert gradients[0] == 0 and gradients[1] > 0
+
+
+def test_clips_without_depth_train_the_motion_alone(runs):
+    batch = runs.batch(0)
+    batch["depth"] = torch.full_like(batch["depth"], torch.nan)
+    one = program()
+    found = one.task.compute_loss(StepContext(one.net, 0, {}), batch)
+    assert torch.isfinite(found.loss) and found.measures["loss_flow"] == 0 and found.measures["loss_rotation"] > 0
+    found.loss.backward()
+    assert all(torch.isfinite(p.grad).all() for p in one.net.parameters() if p.grad is not None)
+
+
+def test_bfloat16_stays_near_full_precision(runs):
+    one, batch = program(), runs.batch(0)
+    plain = one.task.compute_loss(StepContext(one.net, 0, {}), batch).loss
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = one.task.compute_loss(StepContext(one.net, 0, {}), batch)
+    assert mixed.loss.dtype == torch.float32 and float(mixed.loss.detach()) == pytest.approx(
+        float(plain.detach()), rel=0.1
+    )
+
+
+def test_measures_of_a_clip(runs):
+    task, batch = TartanVOTask("tiny"), runs.batch(0)
+    torch.manual_seed(0)
+    net = task.network()
+    found = task.measure(net, batch, seed=0)
+    assert found == task.measure(net, batch, seed=1)
+    assert {"pose", "flow", "direction_deg", "rotation_deg", "rotation_ratio"} <= set(found)
+    assert 0 <= found["direction_deg"] <= 180
+    variants = task.loss_variants(net, batch, seed=0)
+    assert list(variants) == ["joint", "distance", "cosine"] and all(v.requires_grad for v in variants.values())
+    assert set(task.parts(net)) == {"matching", "pose"}
+
+
+@pytest.mark.parametrize("change", [{"form": 1}, {"rotation": "much"}, {"margin": float("nan")}])
+def test_bad_weights_of_the_loss_are_refused(change):
+    with pytest.raises(DvoError, match=next(iter(change))):
+        LossConfig(**change)
+
+
+def test_the_shipped_configuration_trains_and_resumes(tmp_path, monkeypatch, repository):
+    """With sizes for a test; the network is exported, loaded and gives a flow."""
+    pytest.importorskip("kornia")
+    settings = yaml.safe_load((Path(repository) / "configs/train/tartanvo.yaml").read_text())
+    assert settings["task"] == "tartanvo" and settings["model"]["model"] == "small"
+    settings["trainer"] |= {
+        "max_steps": 2, "accelerator": "cpu", "log_every_n_steps": 1, "default_root_dir": str(tmp_path),
+        "enable_progress_bar": False, "enable_model_summary": False,
+    }  # fmt: skip
+    saver = settings["trainer"]["callbacks"][0]
+    saver["init_args"]["every_n_train_steps"] = 1
+    settings["trainer"]["callbacks"] = [saver]
+    settings["model"]["model"] = "tiny"
+    settings["data"] |= {"batch_size": 1, "frames": 3, "sizes": [[48, 64]], "workers": 0}
+    file = tmp_path / "settings.yaml"
+    file.write_text(yaml.safe_dump(settings))
+    for steps in (2, 4):
+        settings["trainer"]["max_steps"] = steps
+        file.write_text(yaml.safe_dump(settings))
+        resume = ["--resume"] if steps > 2 else []
+        monkeypatch.setattr(sys, "argv", ["train", "fit", "--config", str(file), *resume])
+        main()
+    state = read_state(tmp_path / "tartanvo" / "last.ckpt")
+    assert state["global_step"] == 4 and state["task"] == "tartanvo" and state["Renderings"] == {"clips_seen": 4}
+    weights = tmp_path / "two.safetensors"
+    monkeypatch.setattr(sys, "argv", ["train", "export", str(tmp_path / "tartanvo" / "last.ckpt"), str(weights)])
+    main()
+    flow = dvo.load_model(weights).flow(torch.zeros(1, 3, 48, 64), torch.zeros(1, 3, 48, 64))
+    assert flow.shape == (1, 2, 12, 16)
+
+
+def test_rotation_vectors_are_those_of_the_second_camera(runs):
+    batch = runs.batch(0)
+    truth = truth_of(batch, 4, 16.0)
+    poses_wc = se3.inverse(batch["poses_cw"][0])
+    poses_ab = torch.cat([truth.translation, so3.exp(truth.rotation)], -1)
+    torch.testing.assert_close(
+        se3.matrix(se3.compose(poses_wc[:-1], poses_ab)), se3.matrix(poses_wc[1:]), atol=1e-5, rtol=1e-5
+    )

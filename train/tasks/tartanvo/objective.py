@@ -1,0 +1,154 @@
+"""Objective of TartanVO: flow of all levels, direction of the translation, and rotation, trained together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import get_args
+
+import torch
+from torch import Tensor
+
+from dvo.errors import DvoError
+from dvo.geometry import so3
+from dvo.geometry.precision import full_precision
+from dvo.losses.two_frame import (
+    UpToScale,
+    flow_errors,
+    relative_motion,
+    rotation_loss,
+    translation_loss,
+    true_flow,
+)
+from dvo.models.tartanvo import TwoFrameMotion
+from dvo.settings import check_settings, shown
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the terms.
+
+    Attributes:
+        flow: of the end-point error, feature pixels, summed over the levels.
+        level_decay: factor of the weight from each level to the next coarser one.
+        translation: of the error of the direction of the translation, in [0, 2].
+        rotation: of the error of the rotation vector, radians.
+        form: of the translation error, see :data:`dvo.losses.two_frame.UpToScale`.
+        still: length of a true step, in median depths, up to which its direction does not count.
+        margin: a flow counts while it ends within this many feature pixels of the map.
+
+    Raises:
+        DvoError: a value of another type, not finite, or an unknown form.
+    """
+
+    flow: float = 0.2
+    level_decay: float = 0.7
+    translation: float = 1.0
+    rotation: float = 20.0
+    form: UpToScale = "distance"
+    still: float = 1e-3
+    margin: float = 16.0
+
+    def __post_init__(self) -> None:
+        check_settings(self, {})
+        if self.form not in get_args(UpToScale):
+            remedy = f"use one of {', '.join(get_args(UpToScale))}"
+            raise DvoError(f"unknown: {shown(self.form)}", field="form", remedy=remedy)
+
+
+@dataclass(frozen=True)
+class PairTruth:
+    """Ground truth of pairs of neighbouring frames, in feature pixels and median scene depths.
+
+    Attributes:
+        translation, rotation: ``(P, 3)`` of ``T_ab``, the second camera in the coordinates of the first one.
+        flow: ``(P, 2, h, w)`` from the first frame to the second.
+        valid: ``(P, h, w)`` bool, where the flow is known and counts.
+    """
+
+    translation: Tensor
+    rotation: Tensor
+    flow: Tensor
+    valid: Tensor
+
+
+def truth_of(batch: dict[str, Tensor], stride: int, margin: float) -> PairTruth:
+    """Ground truth of the neighbouring frames of a batch of clips, clip by clip.
+
+    Args:
+        batch: ``depth (B, N, H, W)`` in median scene depths, nan where it is not known; ``poses_cw (B, N, 7)``;
+            ``intrinsics (B, N, 4)`` in image pixels.
+        stride: image pixels to a feature pixel; feature ``(u, v)`` is centred on image pixel ``(4u, 4v)``.
+        margin: see :class:`LossConfig`.
+
+    Returns:
+        ``P = B (N - 1)`` pairs.
+    """
+    with full_precision(batch["depth"].device):
+        translation, rotation = (value.flatten(0, 1) for value in relative_motion(batch["poses_cw"].float()))
+        depth = batch["depth"][:, :-1, ::stride, ::stride].flatten(0, 1).float()
+        intrinsics = batch["intrinsics"][:, :-1].flatten(0, 1).float() / stride
+        poses_ab = torch.cat([translation, so3.exp(rotation)], -1)
+        flow, valid = true_flow(depth, poses_ab, intrinsics)
+    h, w = depth.shape[-2:]
+    x = flow[:, 0] + torch.arange(w, device=flow.device)
+    y = flow[:, 1] + torch.arange(h, device=flow.device)[:, None]
+    valid = valid & (x > -margin) & (x < w - 1 + margin) & (y > -margin) & (y < h - 1 + margin)
+    return PairTruth(translation, rotation, flow, valid)
+
+
+def objective(motion: TwoFrameMotion, truth: PairTruth, config: LossConfig) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss of a batch of pairs, and measures for the log.
+
+    Args:
+        motion: of the network.
+        truth: of the same pairs.
+        config: weights of the terms.
+
+    Returns:
+        Scalar with a graph, and detached measures: those of :func:`measures` and the weighted terms ``loss_flow``,
+        ``loss_translation`` and ``loss_rotation``.
+    """
+    levels = [*motion.flows.levels[:-1], motion.flows.coarse, motion.flows.levels[-1]]
+    errors = flow_errors(levels, truth.flow, truth.valid)
+    decay = [config.level_decay**k for k in reversed(range(len(levels)))]
+    terms = {
+        "flow": config.flow * (errors * errors.new_tensor(decay)).sum(),
+        "translation": config.translation
+        * translation_loss(motion.translation, truth.translation, config.form, config.still).mean(),
+        "rotation": config.rotation * rotation_loss(motion.rotation, truth.rotation).mean(),
+    }
+    loss = torch.stack(list(terms.values())).sum()
+    found = measures(motion, truth, config.still) | {f"loss_{name}": value.detach() for name, value in terms.items()}
+    return loss, found
+
+
+@torch.no_grad()
+def measures(motion: TwoFrameMotion, truth: PairTruth, still: float) -> dict[str, Tensor]:
+    """Errors of a batch of pairs.
+
+    Args:
+        motion: of the network.
+        truth: of the same pairs.
+        still: see :class:`LossConfig`.
+
+    Returns:
+        ``flow`` (mean end-point error, feature pixels), ``direction_deg`` (angle between the translations, of pairs
+        that move), ``rotation_deg``, ``rotation_ratio`` (error over true motion), and the shares of flow ``px<1`` and
+        ``px<4``.
+    """
+    moving = truth.translation.norm(dim=-1) > still
+    cosine = torch.cosine_similarity(motion.translation, truth.translation, dim=-1).clamp(-1, 1)
+    turn = so3.multiply(so3.conjugate(so3.exp(truth.rotation)), so3.exp(motion.rotation))
+    error = so3.angle(turn)
+    distance = (motion.flows.flow - truth.flow).norm(dim=1)[truth.valid]
+    count = max(1, distance.numel())
+    degrees = 180 / math.pi
+    return {
+        "flow": distance.sum() / count,
+        "direction_deg": torch.where(moving, cosine.acos(), 0.0).sum() / moving.sum().clamp(min=1) * degrees,
+        "rotation_deg": error.mean() * degrees,
+        "rotation_ratio": error.mean() / truth.rotation.norm(dim=-1).mean().clamp(min=1e-9),
+        "px<1": (distance < 1).sum() / count,
+        "px<4": (distance < 4).sum() / count,
+    }

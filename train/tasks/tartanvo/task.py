@@ -1,0 +1,108 @@
+"""Training task of :class:`dvo.models.tartanvo.TartanVO`: flow and motion of neighbouring frames, trained together."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from dvo.models.tartanvo import TartanVO, TwoFrameMotion
+from dvo.nets.tartanvo import preset
+from train.data.augment import Augmentation, augment
+from train.data.clips import Renderings
+from train.tasks.tartanvo.objective import LossConfig, PairTruth, measures, objective, truth_of
+from train.tasks.task import Batch, StepContext, StepLoss, Task
+
+
+class TartanVOTask(Task):
+    """Trains a preset of the two-frame network on the neighbouring frames of clips.
+
+    Random crop-and-resize (TartanVO 3.3) is the ``zoom`` of the augmentation, which carries the intrinsics along;
+    ``zoom_range: 1.3`` enlarges by up to 2.5, as in the paper.
+
+    Args:
+        model: name of the preset.
+        seed: of the augmentation; step ``n`` draws the same whenever it is run.
+        loss: weights of the terms, and the form of the translation loss.
+        augmentation: random changes of the clips, None for none.
+        true_flow_until: step up to which the pose network reads the true flow where it is known, as in the first part
+            of TartanVO's training; from then on it reads the estimate, and its loss reaches the matching network.
+    """
+
+    data_type = Renderings
+
+    def __init__(
+        self,
+        model: str = "small",
+        seed: int = 0,
+        loss: LossConfig | None = None,
+        augmentation: Augmentation | None = None,
+        true_flow_until: int = 0,
+    ) -> None:
+        self.model, self.seed = model, seed
+        self.loss = loss or LossConfig()
+        self.augmentation = augmentation
+        self.true_flow_until = true_flow_until
+
+    def network(self) -> nn.Module:
+        """New network of the preset."""
+        return TartanVO(preset(self.model))
+
+    def parts(self, net: nn.Module) -> dict[str, nn.Module]:
+        """Matching network and pose network."""
+        net = cast(TartanVO, net)
+        return {"matching": net.matching, "pose": net.pose}
+
+    def compute_loss(self, context: StepContext, batch: Batch) -> StepLoss:
+        """Loss of all pairs of neighbouring frames of the clips."""
+        if self.augmentation is not None:
+            batch = augment(batch, self.augmentation, self.seed, context.step)
+        net = cast(TartanVO, context.net)
+        truth = truth_of(batch, net.STRIDE, self.loss.margin)
+        motion = self._motion(net, batch, truth if context.step < self.true_flow_until else None)
+        loss, found = objective(motion, truth, self.loss)
+        shown = {name: found.pop(name) for name in ("flow", "direction_deg", "rotation_deg")}
+        return StepLoss(loss, found, shown)
+
+    def _motion(self, net: TartanVO, batch: Batch, truth: PairTruth | None = None) -> TwoFrameMotion:
+        """Flow and motion of the pairs, in the order of :func:`train.tasks.tartanvo.objective.truth_of`."""
+        b, n = batch["images"].shape[:2]
+        features = [level.unflatten(0, (b, n)) for level in net.encode(batch["images"].flatten(0, 1))]
+        first = [level[:, :-1].flatten(0, 1) for level in features]
+        second = [level[:, 1:].flatten(0, 1) for level in features]
+        intrinsics = batch["intrinsics"][:, :-1].flatten(0, 1)
+        if truth is None:
+            return net.between(first, second, intrinsics)
+        flows = net.matching.match(first, second)
+        flow = torch.where(truth.valid[:, None], truth.flow, flows.flow.detach())
+        return TwoFrameMotion(*net.motion(flow, intrinsics), flows)
+
+    @torch.no_grad()
+    def measure(self, net: nn.Module, batch: Batch, seed: int) -> dict[str, float]:
+        """Errors of a clip.
+
+        Args:
+            net: the network.
+            batch: one clip, as a batch of one.
+            seed: not used; nothing is drawn.
+
+        Returns:
+            ``pose`` (error of the direction of the translation, in [0, 2], plus rotation in radians, unweighted) and
+            the measures of :func:`train.tasks.tartanvo.objective.measures`.
+        """
+        net = cast(TartanVO, net)
+        truth = truth_of(batch, net.STRIDE, self.loss.margin)
+        motion = self._motion(net, batch)
+        found = {name: float(value) for name, value in measures(motion, truth, self.loss.still).items()}
+        plain = LossConfig(flow=0.0, translation=1.0, rotation=1.0, still=self.loss.still, margin=self.loss.margin)
+        return {"pose": float(objective(motion, truth, plain)[0])} | found
+
+    def loss_variants(self, net: nn.Module, batch: Batch, seed: int) -> dict[str, Tensor]:
+        """Weighted sum of all terms, and the terms of the motion in both forms of the translation loss."""
+        net = cast(TartanVO, net)
+        truth = truth_of(batch, net.STRIDE, self.loss.margin)
+        motion = self._motion(net, batch)
+        pose = {"distance": LossConfig(flow=0.0, form="distance"), "cosine": LossConfig(flow=0.0, form="cosine")}
+        joint = {"joint": objective(motion, truth, self.loss)[0]}
+        return joint | {name: objective(motion, truth, config)[0] for name, config in pose.items()}

@@ -46,7 +46,7 @@ class Parallax:
             longest: limit of the result.
 
         Returns:
-            At least 0: a camera at rest, or a flow that is opposed to the motion, gives no step.
+            At least 0; a flow that is opposed to the motion counts as one along it, since it tells the length as well.
         """
         weight = np.linalg.norm(self.direction, axis=-1)
         total = weight.sum()
@@ -55,7 +55,7 @@ class Parallax:
         ratio = (self.motion * self.direction).sum(-1) / np.maximum(weight**2, 1e-12)
         order = np.argsort(ratio, kind="stable")
         middle = np.searchsorted(np.cumsum(weight[order]), total / 2)
-        return float(np.clip(ratio[order][min(middle, len(order) - 1)], 0.0, longest))
+        return float(min(abs(ratio[order][min(middle, len(order) - 1)]), longest))
 
     def agreement(self) -> float:
         """Share of the flows that lie on their epipolar lines, see :data:`AGREEMENT`.

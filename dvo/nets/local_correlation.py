@@ -50,7 +50,7 @@ def local_correlation(
 def local_correlation_plain(
     first: Float[Tensor, "B C h w"], second: Float[Tensor, "B C h w"], radius: int
 ) -> Float[Tensor, "B K h w"]:
-    """Compute :func:`local_correlation` one displacement at a time; slow, for tests.
+    """Compute :func:`local_correlation` one displacement at a time; for tests, since its gradient takes longer.
 
     Args:
         first, second, radius: as there.

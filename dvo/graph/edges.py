@@ -5,7 +5,7 @@ An edge ``e`` joins patch ``kk[e]``, extracted in frame ``ii[e]``, with a target
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Int
@@ -72,6 +72,21 @@ def group_edges(keys: Int[Tensor, " E"]) -> Groups:
     members = order[(first[:, None] + slots).clamp(max=max(len(keys) - 1, 0))] if len(keys) else slots[None, :0]
     members = torch.where(mask, members, torch.zeros_like(members))
     return Groups(members, mask[..., None], group, bool(mask.all()))
+
+
+def ordered(groups: Groups, rank: Int[Tensor, " E"]) -> Groups:
+    """Sort the members of each group.
+
+    Args:
+        groups: partition of the ``E`` edges.
+        rank: of each edge, by which members are sorted; edges of equal rank keep their order.
+
+    Returns:
+        The same groups, their members by increasing rank and the padding last. If no two members of a group have the
+        same rank, the order does not depend on the order of the edges.
+    """
+    ranks = rank[groups.members].masked_fill(~groups.mask[..., 0], torch.iinfo(rank.dtype).max)
+    return replace(groups, members=groups.members.gather(1, torch.argsort(ranks, dim=1, stable=True)))
 
 
 def build_graph(ii: Int[Tensor, " E"], jj: Int[Tensor, " E"], kk: Int[Tensor, " E"]) -> PatchGraph:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from dvo.errors import DvoError
@@ -130,6 +130,9 @@ PRESETS: dict[str, ModelConfig] = {
         self_edges=False,
     ),
 }
+
+# The small sizes with the state-space update operator.
+PRESETS["mamba"] = replace(PRESETS["small"], update_operator="mamba")
 
 
 def preset(name: str) -> ModelConfig:

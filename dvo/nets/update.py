@@ -18,7 +18,11 @@ from dvo.nets.config import ModelConfig
 from dvo.nets.correlation import Correlation
 from dvo.registry import Registry
 
-UPDATE_OPERATORS = Registry("update operator", "dvo.update_operators", {"gated": "dvo.nets.update:Update"})
+UPDATE_OPERATORS = Registry(
+    "update operator",
+    "dvo.update_operators",
+    {"gated": "dvo.nets.update:Update", "mamba": "dvo.nets.mamba:MambaUpdate"},
+)
 """Names to ``"module:Class"`` of an :class:`UpdateOperator` whose constructor takes a :class:`ModelConfig`."""
 
 
@@ -130,6 +134,82 @@ class SoftAggregation(nn.Module):
         return self.h(pooled).index_select(1, groups.group)
 
 
+def correlation_layers(config: ModelConfig) -> nn.Sequential:
+    """Layers from the correlation of an edge to as many features as its state has, for :func:`encode_correlation`.
+
+    Args:
+        config: sizes of the network.
+
+    Returns:
+        The layers, with random weights.
+    """
+    dim = config.hidden_channels
+    return nn.Sequential(
+        nn.Linear(config.correlation_channels, dim),
+        nn.ReLU(),
+        nn.Linear(dim, dim),
+        nn.LayerNorm(dim, eps=1e-3),
+        nn.ReLU(),
+        nn.Linear(dim, dim),
+    )
+
+
+def first_layer(layer: nn.Linear, correlation: Correlation, taps: int) -> Tensor:
+    """Apply the first layer, level by level, because DPVO's weights interleave the levels (level fastest).
+
+    Args:
+        layer: of all correlation channels.
+        correlation: see :mod:`dvo.nets.correlation`.
+        taps: side of the window of offsets, ``2 radius + 1``.
+
+    Returns:
+        ``(B, E, D)``.
+    """
+    levels = correlation.levels
+    table = layer.weight.unflatten(1, (-1, len(levels)))
+    if correlation.order == "pixels_first":
+        table = table.unflatten(1, (taps, taps, -1)).permute(0, 3, 2, 1, 4).flatten(1, 3)
+    weights = table.unbind(-1)
+    out = functional.linear(levels[0], weights[0], layer.bias)
+    for level, weight in zip(levels[1:], weights[1:], strict=True):
+        out = out + functional.linear(level, weight)
+    return out
+
+
+def encode_correlation(layers: nn.Sequential, correlation: Correlation, taps: int) -> Tensor:
+    """Encode the correlation of every edge.
+
+    Args:
+        layers: see :func:`correlation_layers`.
+        correlation: see :mod:`dvo.nets.correlation`.
+        taps: see :func:`first_layer`.
+
+    Returns:
+        ``(B, E, D)``.
+    """
+    first = layers[0]
+    assert isinstance(first, nn.Linear)
+    return layers[1:](first_layer(first, correlation, taps))
+
+
+def revision_head(channels: int) -> nn.Sequential:
+    """Layers from the features of an edge to its flow revision, feature pixels.
+
+    Args:
+        channels: of the features.
+    """
+    return nn.Sequential(nn.ReLU(), nn.Linear(channels, 2), GradientClamp())
+
+
+def confidence_head(channels: int) -> nn.Sequential:
+    """Layers from the features of an edge to its confidence, in (0, 1).
+
+    Args:
+        channels: of the features.
+    """
+    return nn.Sequential(nn.ReLU(), nn.Linear(channels, 2), GradientClamp(), nn.Sigmoid())
+
+
 class Update(nn.Module):
     """Update operator of DPVO; submodules have the names of DPVO's checkpoint.
 
@@ -160,29 +240,8 @@ class Update(nn.Module):
         self.gru = nn.Sequential(
             nn.LayerNorm(dim, eps=1e-3), GatedResidual(dim), nn.LayerNorm(dim, eps=1e-3), GatedResidual(dim)
         )
-        self.corr = nn.Sequential(
-            nn.Linear(config.correlation_channels, dim),
-            nn.ReLU(),
-            nn.Linear(dim, dim),
-            nn.LayerNorm(dim, eps=1e-3),
-            nn.ReLU(),
-            nn.Linear(dim, dim),
-        )
-        self.d = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp())
-        self.w = nn.Sequential(nn.ReLU(), nn.Linear(dim, 2), GradientClamp(), nn.Sigmoid())
-
-    def _encode_correlation(self, correlation: Correlation) -> Tensor:
-        """First layer, level by level, because DPVO's weights interleave the levels (level fastest)."""
-        levels, first = correlation.levels, self.corr[0]
-        assert isinstance(first, nn.Linear)
-        table = first.weight.unflatten(1, (-1, len(levels)))
-        if correlation.order == "pixels_first":
-            table = table.unflatten(1, (self.taps, self.taps, -1)).permute(0, 3, 2, 1, 4).flatten(1, 3)
-        weights = table.unbind(-1)
-        out = functional.linear(levels[0], weights[0], first.bias)
-        for level, weight in zip(levels[1:], weights[1:], strict=True):
-            out = out + functional.linear(level, weight)
-        return out
+        self.corr = correlation_layers(config)
+        self.d, self.w = revision_head(dim), confidence_head(dim)
 
     def forward(
         self,
@@ -202,7 +261,7 @@ class Update(nn.Module):
         Returns:
             New state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
         """
-        net = self.norm(hidden + context + self.corr[1:](self._encode_correlation(correlation)))
+        net = self.norm(hidden + context + encode_correlation(self.corr, correlation, self.taps))
         # The mask multiplies the input, so an edge without a neighbour still receives c(0) (as DPVO's weights expect).
         net = net + self.c1(net.index_select(1, graph.previous) * graph.has_previous)
         net = net + self.c2(net.index_select(1, graph.following) * graph.has_following)

@@ -160,6 +160,7 @@ class TrackerConfig:
 
 TRACKER_PRESETS: dict[str, TrackerConfig] = {
     "small": TrackerConfig(),
+    "mamba": TrackerConfig(),
     "tiny": TrackerConfig(pixels=160 * 120, patches=16),
     # DPVO's "fast" setting.
     "full": TrackerConfig(

@@ -30,10 +30,10 @@ def clip():
     return make_clip(3, 1, frames=FRAMES, height=96, width=128, flow_range=(2.0, 4.0))
 
 
-@pytest.fixture(scope="module")
-def model():
+@pytest.fixture(scope="module", params=["gated", "mamba"])
+def model(request):
     torch.manual_seed(0)
-    return PatchVO(replace(preset("tiny"), training_patches=PATCHES)).eval()
+    return PatchVO(replace(preset("tiny"), training_patches=PATCHES, update_operator=request.param)).eval()
 
 
 def as_window(model, clip, generator):

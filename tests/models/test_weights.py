@@ -15,6 +15,10 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.registry import ARCHITECTURES, as_network
 from dvo.models.weights import import_checkpoint, load_weights, save_weights, weights_info
 from dvo.nets.config import PRESETS, ModelConfig, preset
+from dvo.nets.mamba import MambaUpdate
+from dvo.nets.update import Update
+from dvo.odometry.config import TRACKER_PRESETS
+from dvo.odometry.load import build_odometry
 
 
 def dpvo_table() -> dict[str, tuple[int, ...]]:
@@ -88,6 +92,30 @@ def test_half_precision_round_trip_keeps_card_and_architecture(tmp_path):
 def metadata(path):
     with safe_open(path, "pt") as file:
         return file.metadata()
+
+
+def test_sizes_without_an_update_operator_are_of_the_gated_one(tmp_path):
+    """Weights that are older than the word load as before, and give the same revisions."""
+    torch.manual_seed(0)
+    model = PatchVO(preset("tiny")).eval()
+    values = {name: value for name, value in model.config.to_dict().items() if name != "update_operator"}
+    said = {"config": json.dumps(values), "card": "{}", "format": "pt"}
+    save_file(model.state_dict(), tmp_path / "old.safetensors", said)
+    old = load_weights(tmp_path / "old.safetensors")
+    assert old.preset == "tiny" and type(old.model.update) is Update
+    images, intrinsics = torch.randint(0, 256, (1, 4, 3, 48, 64), dtype=torch.uint8), torch.tensor([50.0, 50, 32, 24])
+    states = [
+        network(images, intrinsics.expand(1, 4, 4), updates=2, generator=torch.Generator().manual_seed(1))
+        for network in (model, old.model)
+    ]
+    assert torch.equal(states[0].targets, states[1].targets) and torch.equal(states[0].poses_cw, states[1].poses_cw)
+
+
+def test_the_state_space_operator_is_carried_by_its_weights(tmp_path):
+    save_weights(tmp_path / "m.safetensors", PatchVO(preset("mamba")), {})
+    loaded = load_weights(tmp_path / "m.safetensors")
+    assert loaded.preset == "mamba" and type(loaded.model.update) is MambaUpdate
+    assert build_odometry(loaded).config == TRACKER_PRESETS["mamba"]
 
 
 def test_a_file_names_its_architecture_and_one_without_is_patch_vo(tmp_path):

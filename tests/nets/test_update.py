@@ -8,7 +8,7 @@ from dvo.graph.edges import build_graph, group_edges
 from dvo.models.schedule import full_graph, training_schedule
 from dvo.nets.config import preset
 from dvo.nets.correlation import Correlation
-from dvo.nets.update import GradientClamp, SoftAggregation, Update
+from dvo.nets.update import GradientClamp, SoftAggregation, Update, first_layer
 
 
 def plain_aggregation(layer: SoftAggregation, x: torch.Tensor, keys: torch.Tensor) -> torch.Tensor:
@@ -77,10 +77,12 @@ def test_first_layer_by_levels_equals_dpvos_interleaved_channels():
     update = Update(preset("tiny")).double()
     levels = [torch.randn(1, 5, 441).double() for _ in range(2)]
     interleaved = torch.stack(levels, -1).flatten(2)
-    torch.testing.assert_close(update._encode_correlation(Correlation(levels)), update.corr[0](interleaved))
+    torch.testing.assert_close(
+        first_layer(update.corr[0], Correlation(levels), update.taps), update.corr[0](interleaved)
+    )
     turned = [level.view(1, 5, 7, 7, 9).permute(0, 1, 4, 3, 2).flatten(2) for level in levels]  # pixel, y, x
     torch.testing.assert_close(
-        update._encode_correlation(Correlation(turned, "pixels_first")), update.corr[0](interleaved)
+        first_layer(update.corr[0], Correlation(turned, "pixels_first"), update.taps), update.corr[0](interleaved)
     )
 
 

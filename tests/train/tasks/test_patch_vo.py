@@ -90,3 +90,12 @@ def test_augmentation_is_part_of_a_step_and_repeats(tmp_path, runs):
 def test_the_selection_of_patches_is_that_of_the_run():
     assert PatchVOTask("tiny").network().config.selection == "random"
     assert PatchVOTask("tiny", selection="structure").network().config.selection == "structure"
+
+
+def test_the_update_operator_is_that_of_the_run(runs):
+    assert PatchVOTask("tiny").network().config.update_operator == "gated"
+    program = make_program(model="tiny", updates=3, warmup_until=0.0, update_operator="mamba")
+    program.log_dict = lambda *a, **k: None
+    program.training_step(runs.batch(), 0).backward()
+    idle = [name for name, p in program.net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert program.net.config.update_operator == "mamba" and idle == []

@@ -51,6 +51,7 @@ class PatchVOTask(Task):
         augmentation: random changes of the clips, None for none.
         patches: patches a frame; None: those of the preset.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; None: that of the preset.
+        update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`; None: that of the preset.
 
     Attributes:
         beta, rotation: weights of the flow and of the rotation, which V2V's balance moves.
@@ -73,9 +74,10 @@ class PatchVOTask(Task):
         augmentation: Augmentation | None = None,
         patches: int | None = None,
         selection: str | None = None,
+        update_operator: str | None = None,
     ) -> None:
         self.model, self.seed = model, seed
-        self.changes = {"training_patches": patches, "selection": selection}
+        self.changes = {"training_patches": patches, "selection": selection, "update_operator": update_operator}
         self.updates, self.initial, self.settle = updates, initial, settle
         self.warmup_mode, self.warmup_until, self.warmup_steps = warmup_mode, warmup_until, warmup_steps
         self.correlation_gradient = correlation_gradient

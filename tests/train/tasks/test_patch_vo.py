@@ -1,8 +1,11 @@
 """The task of the patch-flow network: warm-up, modes, precision, augmentation."""
 
+import math
+
 import pytest
 import torch
 
+from dvo.errors import DvoError
 from train.data.augment import Augmentation
 from train.engine.build import make_program
 from train.tasks.patch_vo.objective import LossConfig
@@ -99,3 +102,31 @@ def test_the_update_operator_is_that_of_the_run(runs):
     program.training_step(runs.batch(), 0).backward()
     idle = [name for name, p in program.net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     assert program.net.config.update_operator == "mamba" and idle == []
+
+
+TREND = LossConfig(balance="trend", balance_every=2, trend_window=1, pose_from=1)
+
+
+def test_the_penalty_for_trends_weights_the_flow_and_is_off_by_default(tmp_path, runs):
+    program, losses = runs.fit(tmp_path, 3, runs.module(loss=TREND))
+    task = program.task
+    assert len(task.trend.flow) == len(task.trend.pose) == 1 and task.trend.value != 1
+    assert len(task.beta.recent) == 1 and task.rotation.value == 1
+    assert all(math.isfinite(loss) for loss in losses)
+    _, plain = runs.fit(tmp_path, 3, runs.module(loss=LossConfig(pose_from=1)))
+    assert losses[0] == plain[0] and losses[1] != plain[1]
+    assert runs.module().task.loss.balance == "none" and runs.module().task.trend.value == 1
+
+
+def test_the_penalty_goes_on_after_a_stop(tmp_path, runs):
+    whole, losses = runs.fit(tmp_path, 4, runs.module(loss=TREND))
+    runs.fit(tmp_path, 2, runs.module(loss=TREND))
+    resumed, then = runs.fit(tmp_path, 4, runs.module(loss=TREND), tmp_path / "last.ckpt")
+    assert then == losses[2:] and resumed.task.trend == whole.task.trend
+
+
+def test_a_balance_on_a_parameter_that_is_not_there_is_refused():
+    with pytest.raises(DvoError, match="balance_parameter: no parameter 'update.gru.1.res.0.weight'"):
+        PatchVOTask("tiny", update_operator="mamba", loss=LossConfig(balance="v2v")).network()
+    loss = LossConfig(balance="v2v", balance_parameter="update.history.enter.weight")
+    assert PatchVOTask("tiny", update_operator="mamba", loss=loss).network() is not None

@@ -37,11 +37,13 @@ class LossConfig:
         weighted: the flow error is weighted by the confidence, held constant, over all edges (V2V); otherwise it is
             the plain one over edges of one or two frames (DPVO).
         balance: ``none``; ``fixed`` multiplies the flow by ``beta`` and the rotation by ``rotation``; ``v2v`` starts
-            there and follows the gradients.
+            there and follows the gradients; ``trend`` starts there, follows the gradients with the flow alone, and
+            multiplies it by MambaVO's penalty for trends (:mod:`dvo.losses.trend`).
         beta, rotation: see ``balance``.
         balance_parameter: name of the parameter on which gradients are compared.
         balance_every: steps between comparisons.
         balance_window: comparisons in the running mean.
+        trend_window: steps in the mean that the losses of a step are compared with.
     """
 
     pose: float = 10.0
@@ -51,15 +53,21 @@ class LossConfig:
     pose_from: int = 2
     margin: float = 4.0
     weighted: bool = False
-    balance: Literal["none", "fixed", "v2v"] = "none"
+    balance: Literal["none", "fixed", "v2v", "trend"] = "none"
     beta: float = 1.0
     rotation: float = 1.0
     balance_parameter: str = PARAMETER
     balance_every: int = 20
     balance_window: int = 50
+    trend_window: int = 4
 
     def __post_init__(self) -> None:
-        check_settings(self, {})
+        check_settings(self, {"trend_window": (1, 10_000)})
+
+    @property
+    def follows_gradients(self) -> bool:
+        """Whether the balance compares gradients."""
+        return self.balance in ("v2v", "trend")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Training task of :class:`dvo.models.patch_vo.PatchVO`: DPVO's loss, V2V's weighting and balance, warm-up modes."""
+"""Training task of :class:`dvo.models.patch_vo.PatchVO`: DPVO's loss, V2V's weighting and balance, MambaVO's
+penalty for trends, warm-up modes."""
 
 from __future__ import annotations
 
@@ -9,9 +10,11 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.losses.balance import Coefficient, gradient
 from dvo.losses.pose import pose_errors
+from dvo.losses.trend import TrendPenalty
 from dvo.models.patch_vo import Mode, PatchVO
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.nets.config import preset
@@ -55,6 +58,7 @@ class PatchVOTask(Task):
 
     Attributes:
         beta, rotation: weights of the flow and of the rotation, which V2V's balance moves.
+        trend: further weight of the flow, which the trends of the losses move.
     """
 
     data_type = Renderings
@@ -86,14 +90,24 @@ class PatchVOTask(Task):
         fixed = self.loss.balance != "none"
         self.beta = Coefficient(self.loss.beta if fixed else 1.0, self.loss.balance_window)
         self.rotation = Coefficient(self.loss.rotation if fixed else 1.0, self.loss.balance_window)
+        self.trend = TrendPenalty(self.loss.trend_window)
         self._stages: dict[tuple[int, int, Mode, torch.device], list[Stage]] = {}
 
     # -- the network and its state -------------------------------------------------------------------------------
 
     def network(self) -> nn.Module:
-        """New network of the preset."""
+        """New network of the preset.
+
+        Raises:
+            DvoError: it lacks the parameter on which gradients are compared.
+        """
         changes = {name: value for name, value in self.changes.items() if value is not None}
-        return PatchVO(replace(preset(self.model), **changes))
+        net = PatchVO(replace(preset(self.model), **changes))
+        wanted = self.loss.balance_parameter
+        if self.loss.follows_gradients and wanted not in dict(net.named_parameters()):
+            remedy = "name one of this update operator, such as update.history.enter.weight of 'mamba'"
+            raise DvoError(f"no parameter '{wanted}'", field="balance_parameter", remedy=remedy)
+        return net
 
     def parts(self, net: nn.Module) -> dict[str, nn.Module]:
         """Encoder and update operator."""
@@ -110,13 +124,16 @@ class PatchVOTask(Task):
 
     def state_dict(self) -> dict[str, Any]:
         """State of the balance."""
-        return {"beta": self.beta.state_dict(), "rotation": self.rotation.state_dict()}
+        parts = {"beta": self.beta, "rotation": self.rotation, "trend": self.trend}
+        return {name: part.state_dict() for name, part in parts.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the balance, if there is one."""
-        if self.loss.balance == "v2v":
+        if self.loss.follows_gradients:
             self.beta.load_state_dict(state["beta"])
             self.rotation.load_state_dict(state["rotation"])
+        if self.loss.balance == "trend" and "trend" in state:  # states of other balances may be older than it
+            self.trend.load_state_dict(state["trend"])
 
     # -- a step --------------------------------------------------------------------------------------------------
 
@@ -167,7 +184,7 @@ class PatchVOTask(Task):
             batch = augment(batch, self.augmentation, self.seed, context.step)
         terms, measures, truth = self.terms(context, batch, mode)
         share = measures.pop("target_px<0.25")
-        total = terms.total(self.loss, self.beta.value, self.rotation.value)
+        total = terms.total(self.loss, self.beta.value * self.trend.value, self.rotation.value)
         return StepLoss(total, measures, {"target_px<0.25": share}, _Detail(terms, truth, mode, share))
 
     def accept_loss(self, context: StepContext, found: StepLoss) -> StepLoss:
@@ -177,10 +194,16 @@ class PatchVOTask(Task):
         rotation = self.rotation.value  # of the last comparison: V2V has summed the pose loss when it compares anew
         if self._compares(detail.mode, context.step):
             measures |= self._compare(context.net, detail.terms, rotation)
-        loss = detail.terms.total(self.loss, self.beta.value, rotation)
+        sums = {name: value.detach() for name, value in detail.terms.sums(self.loss).items()}
+        if self.loss.balance == "trend" and detail.mode == "joint":
+            pose = mean_over_ranks(sums["translation"] + rotation * sums["rotation"])
+            measures["trend_penalty"] = torch.tensor(
+                self.trend.follow(float(pose), float(mean_over_ranks(sums["flow"])))
+            )
+        loss = detail.terms.total(self.loss, self.beta.value * self.trend.value, rotation)
         if torch.isfinite(detail.truth.inverse_depth).any():
             self.follow(context, mean_over_ranks(detail.share))
-        measures |= {f"loss_{name}": value.detach() for name, value in detail.terms.sums(self.loss).items()}
+        measures |= {f"loss_{name}": value for name, value in sums.items()}
         measures |= {"beta": torch.tensor(self.beta.value), "rotation_coefficient": torch.tensor(rotation)}
         measures |= {"warming": context.buffers["warming"].float(), "within_quarter": context.buffers["within_quarter"]}
         return replace(found, loss=loss, measures=measures)
@@ -192,13 +215,14 @@ class PatchVOTask(Task):
         if within > self.warmup_until:
             context.buffers["warming"].fill_(False)
 
-    # -- V2V's balance -------------------------------------------------------------------------------------------
+    # -- balance by gradients ------------------------------------------------------------------------------------
 
     def _compares(self, mode: Mode, step: int) -> bool:
-        return self.loss.balance == "v2v" and mode == "joint" and step > 0 and step % self.loss.balance_every == 0
+        every = self.loss.balance_every
+        return self.loss.follows_gradients and mode == "joint" and step > 0 and step % every == 0
 
     def _compare(self, net: nn.Module, terms: Terms, rotation: float) -> dict[str, Tensor]:
-        """Measure gradients on one parameter and move both coefficients."""
+        """Measure gradients on one parameter and move the coefficients."""
         parameter = net.get_parameter(self.loss.balance_parameter)
         sums = terms.sums(self.loss)
         g = {name: gradient(sums[name], parameter) for name in ("flow", "translation", "rotation")}
@@ -206,7 +230,8 @@ class PatchVOTask(Task):
         norms["pose"] = float((g["translation"] + rotation * g["rotation"]).norm())
         if all(torch.isfinite(value).all() for value in g.values()):
             self.beta.follow(norms["pose"], norms["flow"])
-            self.rotation.follow(norms["translation"], norms["rotation"])
+            if self.loss.balance == "v2v":
+                self.rotation.follow(norms["translation"], norms["rotation"])
         return {f"balance_gradient_{name}": torch.tensor(value) for name, value in norms.items()}
 
     # -- studies -------------------------------------------------------------------------------------------------

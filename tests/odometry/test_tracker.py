@@ -34,9 +34,9 @@ def frames(count, seed=0, size=(96, 72)):
     return [Frame(i, 0.1 * i, np.ascontiguousarray(wall[:, 4 * i : 4 * i + width]), camera) for i in range(count)]
 
 
-def tracker(config=SMALL, seed=0):
+def tracker(config=SMALL, seed=0, operator="gated"):
     torch.manual_seed(0)
-    return PatchOdometry(PatchVO(preset("tiny")), config, seed=seed)
+    return PatchOdometry(PatchVO(replace(preset("tiny"), update_operator=operator)), config, seed=seed)
 
 
 def run(odometry, images):
@@ -63,6 +63,17 @@ def test_same_seed_same_bytes_and_another_seed_another_trajectory():
     first, second, other = (run(tracker(seed=s), frames(12))[1].trajectory.poses_wc for s in (3, 3, 4))
     assert first.tobytes() == second.tobytes()
     assert first.tobytes() != other.tobytes()
+
+
+def test_the_state_space_operator_tracks_and_its_states_stay_bounded():
+    odometry = tracker(operator="mamba")
+    estimates = [odometry.track(frame) for frame in frames(30)]
+    assert estimates[-1].status is Status.TRACKING
+    assert 0 < float(odometry.window.hidden.abs().max()) < 100
+    result = odometry.finish()
+    assert result.frames_lost == 0 and np.isfinite(result.trajectory.poses_wc).all()
+    _, again = run(tracker(operator="mamba"), frames(30))
+    assert again.trajectory.poses_wc.tobytes() == result.trajectory.poses_wc.tobytes()
 
 
 def test_dropped_keyframes_keep_their_frames():

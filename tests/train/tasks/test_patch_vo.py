@@ -61,16 +61,17 @@ def test_the_full_network_takes_a_step_of_dpvos_recipe(tmp_path, runs):
 
 
 @pytest.mark.parametrize(
-    "loss",
+    "changes",
     [
-        pytest.param(LossConfig(), id="plain", marks=pytest.mark.slow),
-        pytest.param(LossConfig(weighted=True, balance="v2v", balance_every=1), id="v2v"),
+        pytest.param({"loss": LossConfig()}, id="plain", marks=pytest.mark.slow),
+        pytest.param({"loss": LossConfig(weighted=True, balance="v2v", balance_every=1)}, id="v2v"),
+        pytest.param({"update_operator": "mamba"}, id="mamba"),
     ],
 )
-def test_mixed_precision_stays_near_full_precision(tmp_path, runs, loss):
+def test_mixed_precision_stays_near_full_precision(tmp_path, runs, changes):
     """Encoder and update operator in bfloat16; poses, bundle adjustment and loss in float32."""
-    _, exact = runs.fit(tmp_path, 2, runs.module(loss=loss))
-    program, mixed = runs.fit(tmp_path, 2, runs.module(loss=loss), precision="bf16-mixed")
+    _, exact = runs.fit(tmp_path, 2, runs.module(**changes))
+    program, mixed = runs.fit(tmp_path, 2, runs.module(**changes), precision="bf16-mixed")
     assert mixed[0] == pytest.approx(exact[0], rel=0.05) and mixed != exact
     assert int(program.skipped) == 0 and all(p.dtype == torch.float32 for p in program.parameters())
     seen = []

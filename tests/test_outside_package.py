@@ -1,6 +1,6 @@
 """A package outside ``dvo``, ``train`` and ``eval`` (``tests/outside``) brings a network, an odometry, a training task,
-a factor, a reader, a system and a scene family. It is announced by entry points, as an installed package is, and each
-part is run by the ordinary commands without editing a file."""
+an update operator, a factor, a reader, a system and a scene family. It is announced by entry points, as an installed
+package is, and each part is run by the ordinary commands without editing a file."""
 
 import json
 import os
@@ -57,6 +57,18 @@ def test_parts_are_announced_without_a_call():
         "    ('shed', FAMILIES), ('distance_vo', TASKS), ('standing-still', SYSTEMS))])"
     ))  # fmt: skip
     assert listed.strip() == str([True] * 6)
+
+
+def test_the_update_operator_is_chosen_by_a_word():
+    found = command("-c", (
+        "import torch; from dataclasses import replace; from dvo.nets.config import preset\n"
+        "from dvo.models.patch_vo import PatchVO\n"
+        "model = PatchVO(replace(preset('tiny'), update_operator='still'))\n"
+        "intrinsics = torch.tensor([50.0, 50, 32, 24]).expand(1, 3, 4)\n"
+        "state = model(torch.zeros(1, 3, 3, 48, 64, dtype=torch.uint8), intrinsics, updates=2)\n"
+        "print(type(model.update).__name__, float(state.poses_cw[..., :3].abs().max()) < 1e-4)"
+    ))  # fmt: skip
+    assert found.strip() == "Still True"
 
 
 def test_train_export_and_run(recording, tmp_path):

@@ -9,9 +9,10 @@ and Dao, arXiv 2312.00752) and keeps a history of each point. Here the blocks wo
 - :class:`History` over the updates of an edge: the state of the operator is the state of this recurrence, kept from
   update to update. It takes the place of the gated units.
 
-Differences from MambaVO: an edge, and not a point, has the history; it is a state-space recurrence, where MambaVO joins
-cross attention and a gated unit to it; the zero-order hold is exact (:mod:`dvo.nets.selective_scan`); nearest-keyframe
-matching of a new frame is no part of the operator.
+Differences from MambaVO, as far as a reproduction by others (mohamyt/MambaVO-RRR) shows it: an edge, and not a point,
+has the history; the history is a state-space recurrence too, in place of cross attention and a gated unit; the
+zero-order hold is exact (:mod:`dvo.nets.selective_scan`); nearest-keyframe matching of a new frame is no part of the
+operator.
 
 Chosen by ``update_operator: mamba`` in :class:`dvo.nets.config.ModelConfig`.
 """
@@ -37,13 +38,13 @@ GROUP_STATES = 4
 HISTORY_STATES = 2
 """States of a channel in the history of an edge: ``hidden_channels`` numbers are this many of half as many channels."""
 STEPS = (0.05, 0.5)
-"""Steps at the start of training: with rates of 1 to 4, memories of 1 to 20 positions."""
+"""Steps at the start of training: with rates of 1 to 4, memories of half a position to 20 positions."""
 LOG_RATES = (-8.0, 8.0)
 """Range of the logarithm of the rates, which keeps rates and their reciprocals finite."""
 
 
 def initial_step_bias(channels: int) -> Tensor:
-    """Biases whose softplus is spread evenly, on a logarithmic scale, over :data:`STEPS` (Mamba's initialisation).
+    """Biases whose softplus is spread evenly, on a logarithmic scale, over :data:`STEPS`; Mamba draws them at random.
 
     Args:
         channels: number of biases.
@@ -59,9 +60,9 @@ class Selection(nn.Module):
     """Input-dependent parts of a selective state-space layer: steps and vectors, and its constant rates.
 
     Args:
-        channels: of the layer.
+        channels: of the layer, a multiple of the directions.
         states: of each channel.
-        directions: number of pairs of vectors.
+        directions: number of pairs of vectors; each is for as many channels, with the same steps at the start.
     """
 
     def __init__(self, channels: int, states: int, directions: int = 1) -> None:
@@ -72,7 +73,7 @@ class Selection(nn.Module):
         self.log_rate = nn.Parameter(torch.arange(1.0, states + 1).log()[:, None].repeat(1, channels))
         self.skip = nn.Parameter(torch.ones(channels))
         with torch.no_grad():
-            self.step.bias.copy_(initial_step_bias(channels))
+            self.step.bias.copy_(initial_step_bias(channels // directions).repeat(directions))
 
     @property
     def rate(self) -> Tensor:

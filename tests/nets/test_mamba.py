@@ -150,6 +150,8 @@ def test_initial_steps_are_spread_over_their_range():
     steps = torch.nn.functional.softplus(initial_step_bias(5).double())
     torch.testing.assert_close(steps[[0, -1]], torch.tensor(STEPS).double(), rtol=1e-5, atol=0)
     assert (steps.diff() > 0).all()
+    forwards, backwards = GroupScan(10, convolution=True).select.step.bias.chunk(2)
+    assert torch.equal(forwards, backwards)
 
 
 def test_sizes():

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import importlib
 import io
-import tarfile
 import tempfile
+import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -61,15 +61,16 @@ def run_packed(job: Job) -> bytes:
     with tempfile.TemporaryDirectory(prefix="dvo-eval-") as folder:
         predict(replace(job, folder=str(Path(folder) / "run")))
         buffer = io.BytesIO()
-        with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
-            archive.add(Path(folder) / "run", arcname=".")
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in sorted(path for path in (Path(folder) / "run").rglob("*") if path.is_file()):
+                archive.write(file, file.relative_to(Path(folder) / "run"))
         return buffer.getvalue()
 
 
 def unpack(packed: bytes, job: Job, key: dict[str, Any]) -> Prediction:
     """On the driver: put a packed run into its place."""
     part = part_folder(job)
-    with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
-        archive.extractall(part, filter="data")
+    with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+        archive.extractall(part)
     commit(part, Path(job.folder), key)
     return read_prediction(job.folder)

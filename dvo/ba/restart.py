@@ -1,6 +1,6 @@
 """Bundle adjustment started anew, to leave a wrong minimum.
 
-Over a short base line the images of a scene are nearly those of its relief reversed, seen under the opposite motion
+Over a short baseline the images of a scene are nearly those of its relief reversed, seen under the opposite motion
 (Koenderink and van Doorn, "Affine structure from motion", JOSA A 1991; Oliensis, "The least-squares error for structure
 from infinitesimal motion", IJCV 2005). Both are minima of the reprojection error, and iterations do not lead from one
 to the other. A tracker that began with the wrong one stays with it, although later frames fit it badly. A large moving
@@ -22,21 +22,35 @@ from dvo.geometry import se3
 
 
 def reversed_relief(inverse_depth: Tensor) -> Tensor:
-    """Inverse depths mirrored at their median, within 0.1 and 3 times it, of the same shape."""
+    """Mirror inverse depths at their median, within 0.1 and 3 times the median.
+
+    Args:
+        inverse_depth: of any shape.
+
+    Returns:
+        Values of the same shape.
+    """
     median = inverse_depth.median()
     return (2 * median - inverse_depth).clamp(0.1 * median, 3 * median)
 
 
 def equal_depths(inverse_depth: Tensor) -> Tensor:
-    """The median of the inverse depths, in their shape."""
+    """Replace inverse depths by their median.
+
+    Args:
+        inverse_depth: of any shape.
+
+    Returns:
+        Values of the same shape.
+    """
     return inverse_depth.median().expand_as(inverse_depth).clone()
 
 
 STARTS: dict[str, Callable[[Tensor], Tensor]] = {"reversed": reversed_relief, "equal": equal_depths}
 """Inverse depths to start from, by those of a solution."""
 
-
 Measured = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Intrinsics, targets, weights, ``ii``, ``jj``, ``kk``, see :func:`restart`."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +63,7 @@ class RestartOptions:
         max_residual: pixels; a longer residual has a constant cost.
         resection: iterations for the poses alone.
         iterations: of the solution, at most.
-        hopeless: a start is given up after half of the iterations if its cost is above that of the present solution by
+        abandon: a start is abandoned after half of the iterations if its cost is above that of the present solution by
             this factor.
         tolerance: relative decrease of the cost by a step below which a solution has converged.
         margin: a new solution is preferred if its cost is below this share of the cost of the old one.
@@ -60,7 +74,7 @@ class RestartOptions:
     max_residual: float = 32.0
     resection: int = 4
     iterations: int = 8
-    hopeless: float = 2.0
+    abandon: float = 2.0
     tolerance: float = 1e-3
     margin: float = 0.95
 
@@ -117,7 +131,7 @@ def better_start(
     best, limit = None, options.margin * now
     for start in STARTS:
         part = restart(poses_cw, patches, measured, fixed, start, replace(options, iterations=half))
-        if part[2] > options.hopeless * now:
+        if part[2] > options.abandon * now:
             continue
         poses, depths, cost = _solve(part[0], part[1], measured, fixed, options, rest)
         if cost < limit:

@@ -16,7 +16,7 @@ from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
 
 RESTARTS = frozenset({2, 4, 8, 16, 32, 64})
-"""Frames after the initialisation at which its solution is questioned."""
+"""Numbers of frames after the initialisation at which its solution is compared with others."""
 
 
 def median_revision(revision: Revision, window: Window) -> float:
@@ -112,10 +112,12 @@ def leave_minimum(window: Window, age: int) -> bool:
     if age not in RESTARTS:
         return False
     measured = (window.intrinsics, window.targets, window.weights)
-    real = (x.double() for x in (window.poses_cw, window.patches, *measured))
+    # On the CPU in double precision, which not every accelerator has; the problem is small.
+    real = (x.cpu().double() for x in (window.poses_cw, window.patches, *measured))
     poses, patches, intrinsics, targets, weights = real
-    fixed = torch.arange(len(window), device=poses.device) < 1
-    found = better_start(poses, patches, (intrinsics, targets, weights, window.ii, window.jj, window.kk), fixed)
+    fixed = torch.arange(len(window)) < 1
+    edges = (window.ii.cpu(), window.jj.cpu(), window.kk.cpu())
+    found = better_start(poses, patches, (intrinsics, targets, weights, *edges), fixed)
     if found is not None:
         window.poses_cw, window.patches = found[1].to(window.poses_cw), found[2].to(window.patches)
     return found is not None

@@ -146,9 +146,8 @@ def adjust_segments(
         found = find_readout(graph, max(sizes, key=lambda segment: sizes[segment]), shutter.rows, options)
         if found.gain >= _GAIN and found.value > 0 and np.isfinite(found.deviation):
             shutter, source = replace(shutter, readout=found.value), "images"
-            corrected = replace(
-                options, kernels=options.kernels[-1:], restart_frames=0
-            )  # they are near the solution already
+            # All segments are near their solution already.
+            corrected = replace(options, kernels=options.kernels[-1:], restart_frames=0)
             for segment in segments:
                 adjust_segment(graph, segment, corrected, shutter)
     return {"readout": shutter.readout, "readout_from": source}

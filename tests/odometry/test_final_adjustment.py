@@ -44,7 +44,7 @@ def test_frames_whose_measurements_are_released_stay_and_hold_the_scale():
 
 
 def test_a_reversed_relief_is_left():
-    """Frames of a short base line that were tracked with the second solution get the first one."""
+    """Frames of a short baseline that were tracked with the second solution get the first one."""
     for restart_frames, exact in ((0, False), (60, True), (3, True)):
         graph, truth = archived_walk(frames=6, interval=0.03)
         part = graph.problem(True, 0)

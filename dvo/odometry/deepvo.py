@@ -12,20 +12,18 @@ from torch import Tensor
 
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.deepvo import DeepVO, RecurrentState, step_pose
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.evidence import missing_content
 from dvo.odometry.frame_sequence import FrameSequence
-from dvo.odometry.protocol import Estimate, Result, Segment, SparseMap, Status
-from dvo.odometry.segments import find_breaks
+from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.segments import result_of_estimates
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_names, check_settings
 
 _RANGES = {"pixels": (0, 2**28), "max_gap": (1, math.inf)}
-_NONE = -1  # segment of a frame without a pose
 
 
 @dataclass(frozen=True)
@@ -86,11 +84,9 @@ class DeepVOOdometry:
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
         self._sequence = FrameSequence(config.max_gap)
-        self._times: list[float] = []
-        self._poses: list[np.ndarray] = []  # T_wc; that of a lost frame is not used
-        self._owner: list[int] = []  # segments
+        self._estimates: list[Estimate] = []
         self._reasons: dict[float, str] = {}
-        self._segment = _NONE  # number of the newest segment
+        self._segment = -1  # number of the newest segment; -1 before the first one
         self._pose_wc = se3.identity(dtype=torch.float64)  # of the newest frame with a pose
         self._before: Tensor | None = None  # image (3, H, W) that the next step begins with; None: a segment begins
         self._state: RecurrentState | None = None
@@ -120,19 +116,19 @@ class DeepVOOdometry:
         self._sequence.check(frame)
         if self._last is not None and np.array_equal(image, self._last):
             self._sequence.repeat(frame.timestamp)
-            owner = self._owner[-1]
-            return self._record(frame.timestamp, owner, self._reasons[self._times[-1]] if owner == _NONE else "")
+            last = self._estimates[-1]
+            return self._record(frame.timestamp, last.pose_wc is None, last.reason)
         self._last = image
         gap = self._sequence.tick(frame.timestamp)
         problem = missing_content(image)
         if problem:
             self._before = self._state = None
-            return self._record(frame.timestamp, _NONE, problem)
+            return self._record(frame.timestamp, True, problem)
         reason = ""
         if gap and not gap.frozen and self._before is not None:
             self._before, reason = None, str(gap)
         self._advance(torch.from_numpy(image).to(self.device).permute(2, 0, 1))
-        return self._record(frame.timestamp, self._segment, reason)
+        return self._record(frame.timestamp, False, reason)
 
     def finish(self) -> Result:
         """End the sequence. Frames are refused afterwards; a second call gives the same result.
@@ -149,26 +145,11 @@ class DeepVOOdometry:
         Returns:
             As :meth:`finish`.
         """
-        times, owner = np.array(self._times, dtype=np.float64), np.array(self._owner, dtype=np.int64)
-        poses_wc = np.array(self._poses, dtype=np.float64).reshape(-1, 7)
-        segments = []
-        for number in range(self._segment + 1):
-            rows = Trajectory(times[owner == number], poses_wc[owner == number])
-            segments.append(Segment(rows, float(rows.timestamps[0]), float(rows.timestamps[-1])))
-        longest = max(segments, key=len, default=None)  # the first of them
         info = {
             "working_size": [self.model.config.width, self.model.config.height], "seed": self.seed,
             "config": asdict(self.config),
         }  # fmt: skip
-        return Result(
-            longest.trajectory if longest else Trajectory(times[:0], poses_wc[:0]),
-            SparseMap(),
-            len(times),
-            int((owner == _NONE).sum()),
-            info,
-            tuple(segments),
-            find_breaks(times, owner, self._reasons),
-        )
+        return result_of_estimates(self._estimates, self._reasons, info)
 
     def _advance(self, image: Tensor) -> None:
         """Move on to an image, or begin a segment with it."""
@@ -179,23 +160,22 @@ class DeepVOOdometry:
             self._pose_wc = se3.normalise(se3.compose(self._pose_wc, step_pose(steps[0, 0].cpu().double())))
         self._before = image
 
-    def _record(self, time: float, owner: int, reason: str) -> Estimate:
+    def _record(self, time: float, lost: bool, reason: str) -> Estimate:
         """Note a frame.
 
         Args:
             time: of the frame, seconds.
-            owner: its segment.
+            lost: it has no pose.
             reason: cause of a loss, or of a new segment.
         """
-        pose_wc = self._pose_wc.numpy()
-        self._times.append(time)
-        self._poses.append(pose_wc)
-        self._owner.append(owner)
         if reason:
             self._reasons[time] = reason
-        if owner == _NONE:
-            return Estimate(time, None, Status.LOST, 0.0, max(0, self._segment), reason)
-        return Estimate(time, pose_wc.copy(), Status.TRACKING, 1.0, owner)
+        if lost:
+            estimate = Estimate(time, None, Status.LOST, 0.0, max(0, self._segment), reason)
+        else:
+            estimate = Estimate(time, self._pose_wc.numpy().copy(), Status.TRACKING, 1.0, self._segment)
+        self._estimates.append(estimate)
+        return estimate
 
 
 def deepvo_odometry(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.keyframe_log import KeyframeLog
-from dvo.odometry.protocol import Break, Result, Segment, SparseMap
+from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap
 
 
 def segments_of(log: KeyframeLog, poses: Mapping[int, np.ndarray] | None = None) -> tuple[Segment, ...]:
@@ -87,3 +87,27 @@ def result_of(graph: KeyframeGraph, info: dict[str, Any], poses: Mapping[int, np
     read, tracked = len(graph.log.frames), sum(len(segment) for segment in segments)
     points = SparseMap(*graph.points(main))
     return Result(trajectory, points, read, read - tracked, info, segments, breaks_of(graph.log))
+
+
+def result_of_estimates(estimates: Sequence[Estimate], reasons: Mapping[float, str], info: dict[str, Any]) -> Result:
+    """Result of an odometry whose estimates are final, without a map.
+
+    Args:
+        estimates: of all frames, in order of time.
+        reasons: causes by timestamp, see :func:`find_breaks`.
+        info: metadata for run.json.
+
+    Returns:
+        All segments, with the trajectory of the first of the longest.
+    """
+    times = np.array([estimate.timestamp for estimate in estimates], dtype=np.float64)
+    owner = np.array([-1 if e.pose_wc is None else e.segment for e in estimates], dtype=np.int64)
+    segments = []
+    for number in np.unique(owner[owner >= 0]):
+        poses = [e.pose_wc for e in estimates if e.segment == number and e.pose_wc is not None]
+        rows = Trajectory(times[owner == number], np.stack(poses))
+        segments.append(Segment(rows, float(rows.timestamps[0]), float(rows.timestamps[-1])))
+    longest = max(segments, key=len, default=None)
+    trajectory = longest.trajectory if longest else Trajectory(np.zeros(0), np.zeros((0, 7)))
+    breaks, lost = find_breaks(times, owner, reasons), int((owner < 0).sum())
+    return Result(trajectory, SparseMap(), len(times), lost, info, tuple(segments), breaks)

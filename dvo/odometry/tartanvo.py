@@ -18,15 +18,14 @@ from torch import Tensor
 
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.tartanvo import TartanVO
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.evidence import missing_content
 from dvo.odometry.frame_sequence import FrameSequence
-from dvo.odometry.protocol import Estimate, Result, Segment, SparseMap, Status
-from dvo.odometry.segments import find_breaks
+from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.segments import result_of_estimates
 from dvo.odometry.two_view import parallax_of, returning_share
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_names, check_seed, check_settings, shown
@@ -228,19 +227,8 @@ class TartanOdometry:
         Returns:
             As :meth:`finish`.
         """
-        times = np.array([estimate.timestamp for estimate in self._estimates], dtype=np.float64)
-        owner = np.array([-1 if e.pose_wc is None else e.segment for e in self._estimates], dtype=np.int64)
-        segments = []
-        for number in np.unique(owner[owner >= 0]):
-            poses = [e.pose_wc for e in self._estimates if e.segment == number and e.pose_wc is not None]
-            rows = Trajectory(times[owner == number], np.stack(poses))
-            segments.append(Segment(rows, float(rows.timestamps[0]), float(rows.timestamps[-1])))
-        longest = max(segments, key=len, default=None)  # the first one of several
-        trajectory = longest.trajectory if longest else Trajectory(np.zeros(0), np.zeros((0, 7)))
         info = {**self._info, "seed": self.seed, "config": asdict(self.config)}
-        breaks = find_breaks(times, owner, self._reasons)
-        lost = int((owner < 0).sum())
-        return Result(trajectory, SparseMap(), len(times), lost, info, tuple(segments), breaks)
+        return result_of_estimates(self._estimates, self._reasons, info)
 
     def _place(self, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Estimate:
         """Estimate the pose of a frame with content."""

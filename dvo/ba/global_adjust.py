@@ -19,7 +19,8 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.linearisation import Linearisation
 from dvo.ba.problem import Factor
-from dvo.ba.sparse import SchurPattern, SparseSystem, make_schur_pattern
+from dvo.ba.schur_pattern import SchurPattern, make_schur_pattern
+from dvo.ba.sparse import SparseSystem
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.precision import full_precision

@@ -17,7 +17,7 @@ from dvo.ba.edges import EdgePlan
 from dvo.ba.kernels import Kernel
 from dvo.ba.levenberg import robust_cost, robust_weight
 from dvo.ba.normal_equations import Gate, View, counts, pose_jacobian, relative_motion, view
-from dvo.ba.sparse import SchurPattern
+from dvo.ba.schur_pattern import SchurPattern
 from dvo.geometry import so3
 
 
@@ -69,7 +69,9 @@ class ReprojectionEdges:
         use = counts(v, residual, Gate(self.max_residual, focal), slice(None))
         residual = torch.where(use, residual, 0.0)
         weight = torch.where(use, pixel_weight * (focal * focal), 0.0)
-        s = (weight * residual * residual).sum(-2, keepdim=True)
+        # The two axes are added by slices, here and below: a sum over a dimension of two is slow.
+        square = weight * residual * residual
+        s = square[..., :1, :] + square[..., 1:, :]
         longest = pixel_weight.amax(-2, keepdim=True) * self.max_residual**2
         return v, residual, weight, torch.where(use, s, longest)
 
@@ -138,7 +140,7 @@ class ReprojectionEdges:
             flat = f.view(len(f), 8, 2 * plan.size)
             by_pair.index_add_(0, group, (flat[:, :6] * weight[0].flatten(-2)[:, None]) @ flat[:, :7].mT)
             wd = (weight * j_d)[0]
-            products = (f.unflatten(-2, (8, 2)) * wd[:, None]).sum(-2).mT  # (G, M, 8)
+            products = (f[:, 0::2] * wd[:, :1] + f[:, 1::2] * wd[:, 1:]).mT  # (G, M, 8)
             by_depth.index_add_(0, plan.kk[places], products[..., 6:].reshape(-1, 2))
             target = products[..., :6]
             h_pl.index_add_(0, at[0][places], target.reshape(-1, 6))

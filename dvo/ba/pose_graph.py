@@ -19,7 +19,8 @@ from torch import Tensor
 from dvo.ba.edges import free_slots
 from dvo.ba.kernels import Kernel
 from dvo.ba.levenberg import LMOptions, levenberg_marquardt, robust_cost, robust_weight
-from dvo.ba.sparse import SparseSystem, make_schur_pattern
+from dvo.ba.schur_pattern import make_schur_pattern
+from dvo.ba.sparse import SparseSystem
 from dvo.errors import DvoError
 from dvo.geometry import se3, sim3, so3
 from dvo.geometry.precision import full_precision

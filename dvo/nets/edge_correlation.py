@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 _NOWHERE = -(10**6)
+FIRST_MAPS = 8  # map slots that memory is reserved for at first
 PIECE = 256  # edges processed at once, so that the working set fits in the processor's cache
 
 
@@ -54,7 +55,7 @@ class EdgeCorrelation:
         return len(self._origin)
 
     def keep_map(self, slot: int, level: Float[Tensor, "C h w"]) -> None:
-        """Store the features of a frame; the storage grows with the largest slot.
+        """Store the features of a frame; the storage grows with the largest slot, by doubling.
 
         Args:
             slot: map slot of the frame; its content is overwritten.
@@ -63,7 +64,7 @@ class EdgeCorrelation:
         c, h, w = level.shape
         have, s = len(self._maps), self.side
         if slot >= have:
-            grown = level.new_zeros(slot + 1, h + 2 * s, w + 2 * s, c)
+            grown = level.new_zeros(max(slot + 1, 2 * have, FIRST_MAPS), h + 2 * s, w + 2 * s, c)
             if have:
                 grown[:have] = self._maps
             self._maps = grown

@@ -150,6 +150,7 @@ def _leave_minimum(
         Poses ``(N, 7)`` and inverse depths ``(N, M)`` of the better solution.
     """
     early = (part.ii < options.restart_frames) & (part.jj < options.restart_frames)
+    early &= part.kk % 2 == 0  # half of the patches tell two solutions apart as well
     if not early.any():
         return poses_cw, depths
     n, m = min(options.restart_frames, len(depths)), depths.shape[1]

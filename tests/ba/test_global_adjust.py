@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dvo.ba import sparse
+from dvo.ba import schur_pattern, sparse
 from dvo.ba.factors import DepthPrior, PosePrior, RelativePose
 from dvo.ba.global_adjust import GlobalBAOptions, GlobalBAResult, global_bundle_adjust
 from dvo.ba.kernels import Kernel
@@ -168,7 +168,7 @@ def test_the_reduced_system_stays_sparse():
         jj = (torch.arange(frames)[:, None] + around).flatten()
         patch = torch.arange(frames).repeat_interleave(len(around))
         jj, patch = jj[(jj >= 0) & (jj < frames)], patch[(jj >= 0) & (jj < frames)]
-        pattern = sparse.make_schur_pattern(frames, torch.arange(frames), jj, patch, jj, patch)
+        pattern = schur_pattern.make_schur_pattern(frames, torch.arange(frames), jj, patch, jj, patch)
         assert pattern.explicit
         counts.append(pattern.reduced.count)
         factors.append(pattern.reduced.cholesky_plan(6).numbers(6))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
+from dvo.errors import DvoError
 from dvo.settings import Range, from_table
 from dvo.yaml_files import read_yaml
 from train.tasks.registry import DEFAULT_TASK
@@ -30,6 +31,8 @@ class StudyConfig:
             head alone.
         start_steps: length of the start, steps.
         start_rate: learning rate of the start.
+        state: training state whose weights all arms start from, in place of the shared start; empty for none. It is of
+            the size ``model``.
         steps: steps of an arm, one OneCycle.
         rates: learning rates; every arm is run with each of them.
         seeds: every arm is run with each of them.
@@ -38,6 +41,9 @@ class StudyConfig:
         validation_clips: held-out clips of a measurement.
         base: settings of the loss that all arms share.
         arms: name to settings of the loss.
+        arm_settings: name of an arm to settings of the task that are its own.
+        clip_options: further options of the clips (:func:`dvo.synth.clip.make_clip`), held-out ones included.
+        arm_clips: name of an arm to options of its training clips that are its own.
         measures: name of a measure of the task to the label of its curves; the report compares by the first one, and
             names the second beside it.
     """
@@ -71,6 +77,7 @@ class StudyConfig:
     start: dict[str, Any] = field(default_factory=lambda: {"warmup_until": 2.0, "loss": {"target": 1.0}})
     start_steps: int = 300
     start_rate: float = 2e-3
+    state: str = ""
     steps: int = 1000
     rates: tuple[float, ...] = (4e-4, 2e-3)
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -85,12 +92,23 @@ class StudyConfig:
             "V2V weighting + balance": {"weighted": True, "balance": "v2v"},
         }
     )
+    arm_settings: dict[str, dict[str, Any]] = field(default_factory=dict)
+    clip_options: dict[str, Any] = field(default_factory=dict)
+    arm_clips: dict[str, dict[str, Any]] = field(default_factory=dict)
     measures: dict[str, str] = field(
         default_factory=lambda: {
             "pose": "pose error (median depths + rad)",
             "rotation_ratio": "rotation error / motion",
         }
     )
+
+    def __post_init__(self) -> None:
+        for name in ("arm_settings", "arm_clips"):
+            unknown = set(getattr(self, name)) - set(self.arms)
+            if unknown:
+                raise DvoError(
+                    f"no such arm: {', '.join(sorted(unknown))}", field=name, remedy="name one that stands under arms"
+                )
 
     @classmethod
     def read(cls, file: Path) -> StudyConfig:

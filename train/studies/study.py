@@ -22,9 +22,11 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
+from dvo.errors import DvoError
 from dvo.synth.dataset import ClipDataset
 from train.data.stream import ClipStream, StreamSampler
 from train.engine.build import make_program, task_settings
+from train.engine.checkpoint import network_of, read_state
 from train.engine.program import TrainingProgram
 from train.studies.config import StudyConfig
 from train.studies.report import write_report
@@ -34,14 +36,24 @@ VALIDATION_SEED = 920_001
 
 
 class DiskClips(Dataset[dict[str, Tensor]]):
-    """Rendered clips that are kept on disk, so that the arms pay for rendering once; index modulo ``count``."""
+    """Rendered clips that are kept on disk, so that the arms pay for rendering once; index modulo ``count``.
 
-    def __init__(self, folder: Path, seed: int, count: int, config: StudyConfig) -> None:
+    Args:
+        folder: of the clips of a study.
+        seed: of the stream.
+        count: number of clips.
+        config: sizes and options of the clips.
+        arm: whose options are used as well; None for none.
+    """
+
+    def __init__(self, folder: Path, seed: int, count: int, config: StudyConfig, arm: str | None = None) -> None:
         height, width = config.size
+        options = config.clip_options | (config.arm_clips.get(arm, {}) if arm else {})
         name = f"{seed}_{config.frames}x{height}x{width}_{config.flow[0]:g}-{config.flow[1]:g}"
+        name += "".join(f"_{key}-{options[key]}" for key in sorted(options))
         self.folder, self.count = folder / name, count
         self.rendered = ClipDataset(
-            seed, count, frames=config.frames, height=height, width=width, flow_range=tuple(config.flow)
+            seed, count, frames=config.frames, height=height, width=width, flow_range=tuple(config.flow), **options
         )
 
     def __len__(self) -> int:
@@ -95,17 +107,19 @@ class Curve(L.Callback):
     Args:
         clips: held out.
         every: steps between measurements.
+        judged: network with the settings that all arms are judged with; it gets the weights of the arm.
     """
 
-    def __init__(self, clips: DiskClips, every: int) -> None:
-        self.clips, self.every = clips, every
+    def __init__(self, clips: DiskClips, every: int, judged: nn.Module) -> None:
+        self.clips, self.every, self.judged = clips, every, judged
         self.rows: list[dict[str, float]] = []
         self.train_seconds = 0.0
         self._clock = 0.0
 
     def _measure(self, step: int, program: Any) -> None:
         if not self.rows or self.rows[-1]["step"] < step:
-            self.rows.append({"step": float(step)} | validation_error(program.task, program.net, self.clips))
+            self.judged.load_state_dict(program.net.state_dict())
+            self.rows.append({"step": float(step)} | validation_error(program.task, self.judged, self.clips))
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         self._measure(trainer.global_step, pl_module)
@@ -151,6 +165,9 @@ def _program(config: StudyConfig, seed: int, **settings: Any) -> TrainingProgram
 
 def _start_of(seed: int, config: StudyConfig, clips: DiskClips) -> dict[str, Tensor]:
     """Weights that all arms of a seed start from."""
+    if config.state:
+        net = network_of(read_state(config.state), "net", config.state)
+        return net.state_dict()
     folder = Path(config.folder) / f"start_seed{seed}"
     done = folder / "done.pt"
     if not done.is_file():
@@ -180,16 +197,24 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
     done = folder / "result.json"
     if done.is_file():
         return json.loads(done.read_text(encoding="utf-8"))
-    clips = DiskClips(Path(config.folder) / "clips", 31 + seed, config.clips, config)
+    clips = DiskClips(Path(config.folder) / "clips", 31 + seed, config.clips, config, arm)
     held_out = DiskClips(Path(config.folder) / "clips", VALIDATION_SEED, config.validation_clips, config)
     start = _start_of(seed, config, clips)
     trained = {"warmup_until": 0.0} if "warmup_until" in task_settings(config.task) else {}
+    trained |= config.arm_settings.get(arm, {})
     program = _program(
         config, seed, learning_rate=rate, cycle=config.steps, loss=config.base | config.arms[arm], **trained
     )
-    program.net.load_state_dict(start)
+    try:
+        program.net.load_state_dict(start)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[0]
+        raise DvoError(
+            f"does not fit the network ({reason})", file=config.state, field="state",
+            remedy=f"give a state of the size '{config.model}'",
+        ) from error  # fmt: skip
     program.average.load_state_dict(start)
-    curve = Curve(held_out, config.validate_every)
+    curve = Curve(held_out, config.validate_every, _program(config, seed).net)
     _train(folder, program, clips, config.steps, [curve], config.validate_every)
     result = {
         "arm": arm, "rate": rate, "seed": seed, "curve": curve.rows, "skipped": int(program.skipped),

@@ -54,6 +54,29 @@ def test_a_study_runs_resumes_and_reports(tmp_path, monkeypatch):
     assert json.loads((run / "result.json").read_text())["arm"] == names[1]
 
 
+def test_arms_start_from_a_state_with_settings_and_clips_of_their_own(tmp_path):
+    arms = {"all": {}, "random": {}, "still": {}}
+    changes = {
+        "state": str(tmp_path / "start.ckpt"), "arms": arms, "steps": 1,
+        "settings": {"selection": "structure", "warmup_until": 0.0},
+        "arm_settings": {"random": {"selection": "random"}}, "clip_options": {"movers": 1.0},
+        "arm_clips": {"still": {"movers": 0.0}},
+    }  # fmt: skip
+    config = small_study(tmp_path / "study", **changes)
+    program = study._program(config, 5)
+    study._train(tmp_path, program, study.DiskClips(tmp_path, 0, 1, config), 1, [], 1)
+    (tmp_path / "last.ckpt").rename(config.state)
+    curves = [study.run_arm(arm, 1e-3, 0, config)["curve"] for arm in arms]
+    assert curves[0][0] == curves[1][0] == curves[2][0]  # judged with the same settings on the same clips
+    assert curves[0][1] != curves[1][1] and curves[0][1] != curves[2][1]
+    trained = {folder.name for folder in (tmp_path / "study" / "clips").iterdir()}
+    assert sum("movers-0" in name for name in trained) == 1 and len(trained) == 3
+    with pytest.raises(DvoError, match="state"):
+        study.run_arm("all", 1e-3, 0, small_study(tmp_path / "other", **changes | {"model": "small"}))
+    with pytest.raises(DvoError, match="no such arm"):
+        small_study(tmp_path, arm_clips={"absent": {}})
+
+
 def test_a_study_with_unknown_settings_is_refused(tmp_path):
     file = tmp_path / "study.yaml"
     file.write_text("stpes: 3")

@@ -124,7 +124,7 @@ class EdgeCorrelation:
             part = slice(a, a + PIECE)
             values = runs.index_select(0, index[part].flatten()).view(-1, self.pixels, taps, taps)
             rows = torch.lerp(values[..., :-1, :], values[..., 1:, :], fy[part])
-            out[part] = torch.lerp(rows[..., :-1], rows[..., 1:], fx[part])
+            torch.lerp(rows[..., :-1], rows[..., 1:], fx[part], out=out[part])
         return out.view(e, -1)
 
     def _refresh(self, at: Tensor, slots: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> None:
@@ -133,11 +133,12 @@ class EdgeCorrelation:
         _, height, width, c = self._maps.shape
         # A window beyond the border contains only zeros, at any position.
         limit = torch.tensor([width - 2 * s, height - 2 * s], device=at.device)
-        at = at.clamp(-1e5, 1e5).floor().long()  # far-away projections would overflow the integers
-        wanted = (at[:, self.pixels // 2] - (s // 2 - 1)).clamp(min=-s).minimum(limit)
+        at = at.clamp(-1e5, 1e5)  # far-away projections would overflow the integers
+        centre, low, high = (x.floor().long() for x in (at[:, self.pixels // 2], at.amin(1), at.amax(1)))
+        wanted = (centre - (s // 2 - 1)).clamp(min=-s).minimum(limit)
         origin = self._origin[slots]
         # A patch whose projection is larger than a window stays clamped; its centre alone decides on a refresh then.
-        outside = ((at.amin(1) - r < origin) | (at.amax(1) + r + 1 >= origin + s)).any(-1)
+        outside = ((low - r < origin) | (high + r + 1 >= origin + s)).any(-1)
         stale = (outside & (origin != wanted).any(-1)).nonzero()[:, 0]
         runs = self._maps.as_strided((self._maps.numel() // c - s + 1, s * c), (c, 1)) if len(stale) else self._maps
         x, y = (wanted + s).unbind(-1)

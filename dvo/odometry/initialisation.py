@@ -15,7 +15,7 @@ from dvo.odometry.evidence import NO_MATCH, last_unrelated
 from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
 
-RESTARTS = frozenset({2, 4, 8, 16, 32, 64})
+RESTARTS = frozenset({4, 8, 16, 32})
 """Numbers of frames after the initialisation at which its solution is compared with others."""
 
 

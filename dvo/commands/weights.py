@@ -42,7 +42,7 @@ def list_shipped(arguments: argparse.Namespace) -> int:
 
 
 def import_file(arguments: argparse.Namespace) -> int:
-    """Entry point of ``dvo weights import``: convert a DPVO checkpoint; an existing file is not overwritten.
+    """Entry point of ``dvo weights import``: convert a published checkpoint; an existing file is not overwritten.
 
     Args:
         arguments: of the command line.
@@ -55,7 +55,9 @@ def import_file(arguments: argparse.Namespace) -> int:
     """
     file = Path(arguments.file)
     if not file.is_file():
-        raise DvoError("no such file", file=arguments.file, remedy="give a DPVO checkpoint (dpvo.pth)")
+        raise DvoError(
+            "no such file", file=arguments.file, remedy="give a checkpoint of DPVO (dpvo.pth) or DROID-SLAM (droid.pth)"
+        )
     out = Path(arguments.out or file.with_suffix(".safetensors").name)
     if out.exists():
         raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")

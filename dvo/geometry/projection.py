@@ -127,7 +127,7 @@ def reproject(
 
     Args:
         poses_cw: ``(B, N, 7)`` world to camera.
-        patches: ``(B, K, 3, p, p)`` rows x, y (pixels), inverse depth.
+        patches: ``(B, K, 3, p, p)`` rows x, y (pixels), inverse depth; of any height and width, up to whole frames.
         intrinsics: ``(B, N, 4)`` fx fy cx cy in the same pixels.
         ii, jj, kk: ``(E,)`` source frame, target frame, patch; shared by the batch.
         jacobians: also fill ``jac_i``, ``jac_j``, ``jac_d``.
@@ -146,21 +146,21 @@ def reproject(
         >>> flow[~seen.valid] = 0
     """
     with full_precision(poses_cw.device):
-        b, k, _, p, _ = patches.shape
+        b, k, _, p, q = patches.shape
         matrices = motion_matrices(poses_cw, intrinsics, ii, jj)
-        source = gather(patches.reshape(b, k, 3 * p * p), kk).view(b, -1, 3, p * p)
+        source = gather(patches.reshape(b, k, 3 * p * q), kk).view(b, -1, 3, p * q)
         focal, principal = gather(intrinsics, jj)[..., None].split(2, 2)
         m = matrices.view(-1, 3, 4)
-        point = torch.baddbmm(m[..., 3:], m[..., :3], source.view(-1, 3, p * p)).view(source.shape)
+        point = torch.baddbmm(m[..., 3:], m[..., :3], source.view(-1, 3, p * q)).view(source.shape)
         z = point[..., 2:, :]
         uv = torch.addcmul(principal, focal, point[..., :2, :] / z.clamp(min=MIN_Z_DIVISION))
-        shape = (b, ii.shape[0], p, p)
+        shape = (b, ii.shape[0], p, q)
         coords = uv.mT.reshape(*shape, 2)
         depth = z.view(shape)
         valid = depth > MIN_Z_VALID
         if not jacobians:
             return Reprojection(coords, depth, valid)
-        centre = (p // 2) * p + p // 2
+        centre = (p // 2) * q + q // 2
         jac_j, jac_d = centre_jacobians(point[..., centre], source[..., 2, centre], matrices[..., 2], focal[..., 0])
         g_ij = se3.relative(poses_cw.index_select(1, ii), poses_cw.index_select(1, jj))
         jac_i = -jac_j @ se3.adjoint(g_ij)

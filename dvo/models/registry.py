@@ -20,6 +20,7 @@ ARCHITECTURES = Registry(
         "patch_vo": "dvo.models.patch_vo:PatchVO",
         "deepvo": "dvo.models.deepvo:DeepVO",
         "tartanvo": "dvo.models.tartanvo:TartanVO",
+        "droid": "dvo.models.droid:DroidVO",
     },
 )
 """Architecture name to ``"module:Class"`` of the network, a :class:`Network`."""

@@ -1,4 +1,4 @@
-"""Weights files: safetensors with architecture and sizes in the metadata; import of DPVO's pickled checkpoints."""
+"""Weights files: safetensors with architecture and sizes in the metadata; import of published checkpoints."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from dvo.errors import DvoError
 from dvo.models.pickles import check_plain, load_pickle
+from dvo.models.published import read_published
 from dvo.models.registry import (
     DEFAULT_ARCHITECTURE,
     NetworkConfig,
@@ -267,32 +268,30 @@ def save_weights(path: str | Path, model: nn.Module, card: dict[str, Any], half:
 
 
 def import_checkpoint(file: str | Path, out: str | Path) -> WeightsInfo:
-    """Convert an official DPVO checkpoint (a pickled state dict) into dvo weights of the ``full`` preset.
+    """Convert a published checkpoint (a pickled state dict) of DPVO or DROID-SLAM into weights of a ``full`` preset.
 
-    The pickle is read with ``weights_only=True``, which runs no code. The prefix ``module.`` and the unused
-    ``update.lmbda`` are dropped, and the input channels of the first convolutions are swapped, because DPVO is fed
-    BGR and dvo RGB.
+    The pickle is read with ``weights_only=True``, which runs no code. What is changed in the tensors:
+    :func:`dvo.models.published.read_published`; and the input channels of DPVO's first convolutions are swapped,
+    because DPVO is fed BGR and dvo RGB.
 
     Args:
-        file: the checkpoint, ``dpvo.pth``.
+        file: the checkpoint, ``dpvo.pth`` or ``droid.pth``.
         out: the safetensors file to write.
 
     Raises:
         DvoError: no such file, not such a checkpoint, or one that holds more than tensors.
     """
-    file, remedy = Path(file), "give an unmodified DPVO checkpoint (dpvo.pth)"
+    file, remedy = Path(file), "give an unmodified checkpoint of DPVO (dpvo.pth) or DROID-SLAM (droid.pth)"
     state = load_pickle(file, remedy)
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
     if not isinstance(state, dict) or not state:
         raise DvoError("holds no state dict", file=file, remedy=remedy)
     check_plain(state, file, remedy)
-    tensors = {key.removeprefix("module."): value.detach() for key, value in state.items()}
-    tensors.pop("update.lmbda", None)
-    model = build_network("patch_vo", network_class("patch_vo").presets["full"])
-    _compare(model, tensors, file)
-    for name in ("patchify.fnet.conv1.weight", "patchify.inet.conv1.weight"):
-        tensors[name] = tensors[name].flip(1)
+    found = read_published(state)
+    model = build_network(found.architecture, network_class(found.architecture).presets["full"])
+    _compare(model, found.tensors, file)
+    tensors = found.tensors | {name: found.tensors[name].flip(1) for name in found.bgr}
     _fill(model, tensors, file)
-    save_weights(out, model, {"origin": "DPVO checkpoint", "file": file.name}, half=False)
+    save_weights(out, model, {"origin": found.origin, "file": file.name}, half=False)
     return weights_info(out)

@@ -200,19 +200,19 @@ class CorrelationVolume:
     Memory is ``B * K * p^2 * N * h * w`` floats, summed over the levels.
 
     Args:
-        patches: ``(B, K, C, p, p)`` matching features of the patches.
+        patches: ``(B, K, C, p, p)`` matching features of the patches, of any height and width, up to whole frames.
         maps: ``(B, N, C, h, w)`` matching features of the frames.
         pyramid: down-sampling of each level relative to ``maps``.
         radius: correlation radius in pixels of each level.
     """
 
     def __init__(self, patches: Tensor, maps: Tensor, pyramid: tuple[int, ...] = (1, 4), radius: int = 3) -> None:
-        b, k, c, p, _ = patches.shape
+        b, k, c, p, q = patches.shape
         self.radius, self.pyramid, self.frames = radius, pyramid, maps.shape[1]
-        self.pixels, self.patches = p * p, k
+        self.pixels, self.patches = p * q, k
         if patches.dtype in (torch.float16, torch.bfloat16):  # too coarse to place a peak between two pixels
             patches, maps = patches.float(), maps.float()
-        rows = patches.permute(0, 1, 3, 4, 2).reshape(b, k * p * p, c)
+        rows = patches.permute(0, 1, 3, 4, 2).reshape(b, k * p * q, c)
         self.levels = []
         for level in pool_levels(maps, pyramid):
             columns = level.permute(0, 2, 1, 3, 4).reshape(b, c, -1)

@@ -128,6 +128,20 @@ class KeyframeLog:
         """
         self._poses[keyframe] = T_cw
 
+    def keyframe_pose(self, keyframe: int) -> np.ndarray:
+        """Pose of a keyframe that has one.
+
+        Args:
+            keyframe: its number.
+
+        Returns:
+            ``T_cw`` in the form that it was given in.
+
+        Raises:
+            KeyError: a keyframe without a pose.
+        """
+        return self._poses[keyframe]
+
     def add_points(self, points: np.ndarray, colors: np.ndarray) -> None:
         """Append world points.
 

@@ -1,4 +1,4 @@
-"""Pose loss over all ordered pairs of frames, after alignment of scale (DPVO 3.3)."""
+"""Pose losses: over all ordered pairs of frames after alignment of scale (DPVO 3.3), or over edges (DROID-SLAM 3.3)."""
 
 from __future__ import annotations
 
@@ -71,5 +71,25 @@ def pose_errors(estimate_cw: Float[Tensor, "B N 7"], truth_cw: Float[Tensor, "B 
     moved = se3.compose(se3.inverse(estimate)[:, i], estimate[:, j])
     wanted = se3.compose(se3.inverse(truth)[:, i], truth[:, j])
     error = se3.log(se3.compose(wanted, se3.inverse(moved)))
+    tau, phi = (error[..., :3].square().sum(-1) + 1e-16).sqrt(), (error[..., 3:].square().sum(-1) + 1e-16).sqrt()
+    return PoseErrors(tau.mean(1), phi.mean(1))
+
+
+def edge_pose_errors(
+    estimate_cw: Float[Tensor, "B N 7"], truth_cw: Float[Tensor, "B N 7"], ii: Tensor, jj: Tensor
+) -> PoseErrors:
+    """Errors of the relative motions of edges, in a scale that is known (geodesic loss of DROID-SLAM 3.3).
+
+    Args:
+        estimate_cw: estimated poses, world to camera.
+        truth_cw: true poses, world to camera.
+        ii, jj: ``(E,)`` frames of each edge.
+
+    Returns:
+        mean norms of the two halves of ``log(estimate_ij truth_ij^-1)`` with ``T_ij = T_cw[j] T_cw[i]^-1``, with
+        gradients to ``estimate_cw`` (finite also where the error is zero).
+    """
+    estimate, truth = (se3.relative(x[:, ii], x[:, jj]) for x in (estimate_cw, truth_cw))
+    error = se3.log(se3.compose(estimate, se3.inverse(truth)))
     tau, phi = (error[..., :3].square().sum(-1) + 1e-16).sqrt(), (error[..., 3:].square().sum(-1) + 1e-16).sqrt()
     return PoseErrors(tau.mean(1), phi.mean(1))

@@ -61,6 +61,29 @@ class SparseMap:
 
 
 @dataclass(frozen=True)
+class DepthMap:
+    """Depth of the pixels of a keyframe.
+
+    Attributes:
+        timestamp: seconds, of the keyframe.
+        segment: number of the segment whose world and scale it has.
+        pose_wc: ``(7,)`` float64 camera to world.
+        intrinsics: ``(4,)`` float32 fx fy cx cy in pixels of the map.
+        depth: ``(h, w)`` float32 along the optical axis, in the scale of the segment.
+        confidence: ``(h, w)`` float32 in [0, 1]; comparable within one run only.
+        reliable: ``(h, w)`` bool, depths that are confident and agree with those of neighbouring keyframes.
+    """
+
+    timestamp: float
+    segment: int
+    pose_wc: np.ndarray
+    intrinsics: np.ndarray
+    depth: np.ndarray
+    confidence: np.ndarray
+    reliable: np.ndarray
+
+
+@dataclass(frozen=True)
 class Segment:
     """Uninterrupted part of a trajectory, with a world and a scale of its own.
 
@@ -111,6 +134,7 @@ class Result:
         info: JSON-able metadata for run.json: working resolution, intrinsics, number of keyframes.
         segments: all segments in order of time; given none, the trajectory is the only one.
         breaks: intervals without poses, and changes of segment, in order of time.
+        depth: depth maps of the keyframes of all segments, in order of time; empty for systems without them.
     """
 
     trajectory: Trajectory
@@ -120,6 +144,7 @@ class Result:
     info: dict[str, Any] = field(default_factory=dict)
     segments: tuple[Segment, ...] = ()
     breaks: tuple[Break, ...] = ()
+    depth: tuple[DepthMap, ...] = ()
 
     def __post_init__(self) -> None:
         times = self.trajectory.timestamps

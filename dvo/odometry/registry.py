@@ -16,6 +16,7 @@ ODOMETRIES = Registry(
         "patch_vo": "dvo.odometry.load:patch_odometry",
         "deepvo": "dvo.odometry.deepvo:deepvo_odometry",
         "tartanvo": "dvo.odometry.tartanvo:tartan_odometry",
+        "droid": "dvo.odometry.droid:droid_odometry",
     },
 )
 """Architecture name to ``"module:function"`` or ``"module:Class"`` of an :class:`OdometryBuilder`."""

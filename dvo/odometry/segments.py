@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -81,12 +82,28 @@ def result_of(graph: KeyframeGraph, info: dict[str, Any], poses: Mapping[int, np
     Returns:
         All segments, with the trajectory and the map of the one with the most rows.
     """
-    segments = segments_of(graph.log, poses)
+    result, main = result_of_log(graph.log, info, poses)
+    return replace(result, map=SparseMap(*graph.points(main)))
+
+
+def result_of_log(
+    log: KeyframeLog, info: dict[str, Any], poses: Mapping[int, np.ndarray] | None = None
+) -> tuple[Result, int]:
+    """Result of an odometry that keeps a log, without a map.
+
+    Args:
+        log: of every frame, with its segment.
+        info: metadata for run.json.
+        poses: ``T_cw`` of keyframes that are still being optimised.
+
+    Returns:
+        All segments, with the trajectory of the first of the longest, and the number of that one.
+    """
+    segments = segments_of(log, poses)
     main = max(range(len(segments)), key=lambda number: (len(segments[number]), -number), default=0)
     trajectory = segments[main].trajectory if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
-    read, tracked = len(graph.log.frames), sum(len(segment) for segment in segments)
-    points = SparseMap(*graph.points(main))
-    return Result(trajectory, points, read, read - tracked, info, segments, breaks_of(graph.log))
+    read, tracked = len(log.frames), sum(len(segment) for segment in segments)
+    return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks_of(log)), main
 
 
 def result_of_estimates(estimates: Sequence[Estimate], reasons: Mapping[float, str], info: dict[str, Any]) -> Result:

@@ -17,6 +17,7 @@ TASKS = Registry(
         "patch_vo": "train.tasks.patch_vo.task:PatchVOTask",
         "deepvo": "train.tasks.deepvo.task:DeepVOTask",
         "tartanvo": "train.tasks.tartanvo.task:TartanVOTask",
+        "droid": "train.tasks.droid.task:DroidTask",
     },
 )
 """Task name to ``"module:Class"`` of a :class:`train.tasks.task.Task`."""

@@ -66,8 +66,12 @@ def build_parser() -> argparse.ArgumentParser:
     weights = commands.add_parser("weights", help="list, import or describe weights")
     verbs = weights.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("list", help="weights that ship with dvo").set_defaults(run="dvo.commands.weights:list_shipped")
-    importer = verbs.add_parser("import", help="convert a published checkpoint of DPVO or DROID-SLAM to safetensors")
-    importer.add_argument("file", metavar="FILE", help="checkpoint of DPVO (dpvo.pth) or DROID-SLAM (droid.pth)")
+    importer = verbs.add_parser(
+        "import", help="convert a published checkpoint of DPVO, DROID-SLAM or TartanVO to safetensors"
+    )
+    importer.add_argument(
+        "file", metavar="FILE", help="dpvo.pth, droid.pth, or tartanvo_1914.pkl (not tried with the real file)"
+    )
     importer.add_argument("--out", metavar="FILE", help="safetensors file to write (default: FILE's name, here)")
     importer.set_defaults(run="dvo.commands.weights:import_file")
     info = verbs.add_parser("info", help="architecture, size and origin of weights")

@@ -55,9 +55,7 @@ def import_file(arguments: argparse.Namespace) -> int:
     """
     file = Path(arguments.file)
     if not file.is_file():
-        raise DvoError(
-            "no such file", file=arguments.file, remedy="give a checkpoint of DPVO (dpvo.pth) or DROID-SLAM (droid.pth)"
-        )
+        raise DvoError("no such file", file=arguments.file, remedy="give a checkpoint of DPVO, DROID-SLAM or TartanVO")
     out = Path(arguments.out or file.with_suffix(".safetensors").name)
     if out.exists():
         raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")

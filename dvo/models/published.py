@@ -1,4 +1,4 @@
-"""Published checkpoints of DPVO and DROID-SLAM in the names and shapes of dvo's ``full`` presets."""
+"""Published checkpoints of DPVO, DROID-SLAM and TartanVO in the names and shapes of dvo's ``full`` presets."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 _DPVO_UNUSED = "update.lmbda"
 _DROID_SIGN = "update.agg.eta.0.weight"  # DPVO has no damping head
+_TARTANVO = {"flowNet.": "matching.", "flowPoseNet.": "pose."}  # prefixes of the published names to those of dvo
 _DROID_HEADS = ("update.weight.2", "update.delta.2")
 
 
@@ -32,15 +33,19 @@ def read_published(state: dict[str, Tensor]) -> Published:
     """Recognise a checkpoint and rename its tensors.
 
     The prefix ``module.`` is dropped. DPVO has an unused tensor and is fed BGR. DROID-SLAM's file has three channels in
-    its heads, of which its own code keeps the first two; it is fed RGB.
+    its heads, of which its own code keeps the first two; it is fed RGB. TartanVO's two networks have other names, and
+    it is fed BGR.
 
     Args:
         state: tensors by the names of the checkpoint.
 
     Returns:
-        The tensors; those of DPVO unless there is a damping head.
+        The tensors; those of DPVO unless there is a damping head, or a name of TartanVO.
     """
     tensors = {key.removeprefix("module."): value.detach() for key, value in state.items()}
+    if any(name.startswith(tuple(_TARTANVO)) for name in tensors):
+        renamed = {_tartanvo_name(name): value for name, value in tensors.items()}
+        return Published("tartanvo", "TartanVO checkpoint", renamed, ("matching.conv1a.0.weight",))
     if _DROID_SIGN not in tensors:
         tensors.pop(_DPVO_UNUSED, None)
         bgr = ("patchify.fnet.conv1.weight", "patchify.inet.conv1.weight")
@@ -50,3 +55,11 @@ def read_published(state: dict[str, Tensor]) -> Published:
             if name in tensors and tensors[name].dim() and tensors[name].shape[0] == 3:
                 tensors[name] = tensors[name][:2]
     return Published("droid", "DROID-SLAM checkpoint", tensors)
+
+
+def _tartanvo_name(name: str) -> str:
+    """Name in dvo of a tensor of TartanVO's checkpoint."""
+    for there, here in _TARTANVO.items():
+        if name.startswith(there):
+            return here + name.removeprefix(there)
+    return name

@@ -14,8 +14,9 @@ from torch import Tensor, nn
 
 from dvo.errors import DvoError
 from dvo.geometry import so3
+from dvo.nets.flow_pose_net import FlowPoseNet
 from dvo.nets.flow_pyramid import STRIDE, Flows, MatchingNetwork
-from dvo.nets.patchifier import normalise_images
+from dvo.nets.pwc_net import PWCNet
 from dvo.nets.tartanvo import PRESETS, PoseNetwork, TartanVOConfig
 
 __all__ = ["TartanVO", "TwoFrameMotion"]
@@ -75,10 +76,13 @@ class TartanVO(nn.Module):
     def __init__(self, config: TartanVOConfig) -> None:
         super().__init__()
         self.config = config
-        self.matching = MatchingNetwork(
-            config.stem_channels, config.feature_channels, config.radius, config.decoder_channels
-        )
-        self.pose = PoseNetwork(config)
+        self.matching: MatchingNetwork | PWCNet
+        self.pose: PoseNetwork | FlowPoseNet
+        if config.design == "published":
+            self.matching, self.pose = PWCNet(), FlowPoseNet()
+        else:
+            sizes = config.stem_channels, config.feature_channels, config.radius, config.decoder_channels
+            self.matching, self.pose = MatchingNetwork(*sizes), PoseNetwork(config)
 
     def encode(self, images: Float[Tensor, "n 3 H W"]) -> list[Tensor]:
         """Matching features of images, which serve as either image of a pair.
@@ -100,7 +104,7 @@ class TartanVO(nn.Module):
                 field="images",
                 remedy=f"give images of at least {least}x{least} pixels",
             )
-        return self.matching.encode(normalise_images(images))
+        return self.matching.encode(self.matching.normalise(images))
 
     def flow(self, a: Float[Tensor, "B 3 H W"], b: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 2 h w"]:
         """Optical flow from images ``a`` to images ``b``, at a quarter of the resolution.

@@ -268,20 +268,21 @@ def save_weights(path: str | Path, model: nn.Module, card: dict[str, Any], half:
 
 
 def import_checkpoint(file: str | Path, out: str | Path) -> WeightsInfo:
-    """Convert a published checkpoint (a pickled state dict) of DPVO or DROID-SLAM into weights of a ``full`` preset.
+    """Convert a published checkpoint (a pickled state dict) into weights of a ``full`` preset.
 
     The pickle is read with ``weights_only=True``, which runs no code. What is changed in the tensors:
-    :func:`dvo.models.published.read_published`; and the input channels of DPVO's first convolutions are swapped,
-    because DPVO is fed BGR and dvo RGB.
+    :func:`dvo.models.published.read_published`; and the input channels of the first convolutions of DPVO and TartanVO
+    are swapped, because these are fed BGR and dvo RGB. TartanVO's names, shapes and outputs are tested against the
+    published code; its checkpoint itself has not been tried.
 
     Args:
-        file: the checkpoint, ``dpvo.pth`` or ``droid.pth``.
+        file: the checkpoint, ``dpvo.pth``, ``droid.pth`` or ``tartanvo_1914.pkl``.
         out: the safetensors file to write.
 
     Raises:
         DvoError: no such file, not such a checkpoint, or one that holds more than tensors.
     """
-    file, remedy = Path(file), "give an unmodified checkpoint of DPVO (dpvo.pth) or DROID-SLAM (droid.pth)"
+    file, remedy = Path(file), "give an unmodified checkpoint of DPVO, DROID-SLAM or TartanVO"
     state = load_pickle(file, remedy)
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 
 from dvo.nets.encoder import ResidualBlock
 from dvo.nets.local_correlation import double, local_correlation, warp
+from dvo.nets.patchifier import normalise_images
 
 STRIDE = 4
 """Image pixels to a pixel of the finest level; feature ``(u, v)`` is centred on image pixel ``(4u, 4v)``."""
@@ -166,6 +167,10 @@ class MatchingNetwork(nn.Module):
         side = (2 * radius + 1) ** 2
         self.decoders = nn.ModuleList(FlowDecoder(side + c + 2, width) for c in channels)
         self.refiner = FlowRefiner(width + 2, width)
+
+    def normalise(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
+        """Images in the range of the encoder, see :func:`dvo.nets.patchifier.normalise_images`."""
+        return normalise_images(images)
 
     def encode(self, images: Float[Tensor, "n 3 H W"]) -> list[Tensor]:
         """Features of normalised images, see :class:`PyramidEncoder`."""

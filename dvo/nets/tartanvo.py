@@ -6,7 +6,7 @@ one network serves all cameras.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -21,6 +21,10 @@ from dvo.settings import check_names, check_settings, shown
 
 FlowUnits = Literal["pixels", "rays"]
 """Units of the flow that the pose network reads: feature pixels (TartanVO), or pixels over the focal length."""
+
+Design = Literal["compact", "published"]
+"""Layers: those of :mod:`dvo.nets.flow_pyramid` and :class:`PoseNetwork`, or those of the published code, PWC-Net
+(:mod:`dvo.nets.pwc_net`) and residual layers of one size (:mod:`dvo.nets.flow_pose_net`)."""
 
 RANGES = {"stem_channels": (1, 512), "radius": (1, 8), "decoder_channels": (1, 512), "head_channels": (1, 2048)}
 LEVELS, CHANNELS, GRID = 6, 1024, 32
@@ -41,9 +45,10 @@ class TartanVOConfig:
         grid: rows and columns to which the last stage is averaged, whatever the size of the image.
         head_channels: hidden channels of the two heads, translation and rotation.
         flow_units: see :data:`FlowUnits`.
+        design: see :data:`Design`; the sizes of ``published`` are fixed: the settings above keep their defaults.
 
     Raises:
-        DvoError: a size of another type or out of range.
+        DvoError: a size of another type or out of range, or one that the design does not have.
     """
 
     stem_channels: int = 16
@@ -54,6 +59,7 @@ class TartanVOConfig:
     grid: tuple[int, ...] = (3, 4)
     head_channels: int = 64
     flow_units: FlowUnits = "pixels"
+    design: Design = "compact"
 
     def __post_init__(self) -> None:
         check_settings(self, RANGES)
@@ -63,11 +69,18 @@ class TartanVOConfig:
         if self.flow_units not in get_args(FlowUnits):
             remedy = f"use one of {', '.join(get_args(FlowUnits))}"
             raise DvoError(f"unknown: {shown(self.flow_units)}", field="flow_units", remedy=remedy)
+        if self.design not in get_args(Design):
+            remedy = f"use one of {', '.join(get_args(Design))}"
+            raise DvoError(f"unknown: {shown(self.design)}", field="design", remedy=remedy)
+        if self.design == "published" and replace(self, design="compact") != TartanVOConfig():
+            remedy = "leave the other sizes at their defaults, or use compact"
+            raise DvoError("the sizes of the published network are fixed", field="design", remedy=remedy)
 
     @property
     def smallest_side(self) -> int:
         """Smallest height and width of an image, pixels: two pixels of the coarsest level."""
-        return 2 ** (len(self.feature_channels) + 2)
+        levels = 5 if self.design == "published" else len(self.feature_channels)
+        return 2 ** (levels + 2)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the metadata of weights.
@@ -118,6 +131,8 @@ PRESETS: dict[str, TartanVOConfig] = {
         grid=(2, 3),
         head_channels=16,
     ),
+    # The network of the paper, tensor for tensor.
+    "full": TartanVOConfig(design="published"),
 }
 
 

@@ -72,6 +72,11 @@ class TwoFrameConfig:
             raise DvoError(f"unknown: {shown(self.scale)}", field="scale", remedy=remedy)
 
 
+NETWORK_DEFAULTS: dict[str, TwoFrameConfig] = {
+    "full": TwoFrameConfig(pixels=640 * 480),  # it was trained on 640x448
+}
+"""Settings of a preset of the network; others have those of :class:`TwoFrameConfig`."""
+
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "fast": {"pixels": 256 * 192},
@@ -95,7 +100,7 @@ def tartan_odometry(
         weights: the network, a :class:`dvo.models.tartanvo.TartanVO`.
         device: of all computation.
         seed: is checked and reported; nothing is drawn at random.
-        config: settings; None for the defaults.
+        config: settings; None for those of the network.
         preset: settings on top of these, a name in :data:`PRESETS`.
         overrides: single settings, by the names of :class:`TwoFrameConfig`; they win.
 
@@ -109,7 +114,8 @@ def tartan_odometry(
     check_names(TwoFrameConfig, overrides)
     if not isinstance(preset, str) or preset not in PRESETS:
         raise DvoError(f"unknown preset {preset!r}", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
-    settings = replace(config or TwoFrameConfig(), **{**PRESETS[preset], **overrides})
+    config = config or NETWORK_DEFAULTS.get(weights.preset, TwoFrameConfig())
+    settings = replace(config, **{**PRESETS[preset], **overrides})
     return TartanOdometry(weights.model, settings, seed=seed, device=device, name=f"dvo-{weights.name}")
 
 

@@ -87,5 +87,5 @@ def test_sizes_survive_plain_values():
         assert TartanVOConfig.from_dict(plain) == config
     with pytest.raises(DvoError, match="colour"):
         TartanVOConfig.from_dict({"colour": 1})
-    with pytest.raises(DvoError, match="one of small, tiny"):
+    with pytest.raises(DvoError, match="one of small, tiny, full"):
         preset("huge")

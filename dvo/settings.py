@@ -48,14 +48,14 @@ def shown(value: Any, limit: int = 60) -> str:
 
 
 def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
-    """Check type and range of the numbers of a settings dataclass.
+    """Check type and range of the values of a settings dataclass.
 
     Args:
-        settings: instance of a dataclass with fields of type int, float, bool or str.
+        settings: instance of a dataclass; fields of type int, float, bool, str and ``Literal`` of texts are checked.
         ranges: smallest and largest valid value by field, both inclusive; other fields are not bounded.
 
     Raises:
-        DvoError: a value of another type, not finite or out of range, with the name of the field.
+        DvoError: a value of another type, not finite, out of range or unknown, with the name of the field.
     """
     hints = get_type_hints(type(settings))
     for item in fields(settings):
@@ -70,6 +70,9 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
             raise DvoError(
                 f"must be a {kind.__name__}, got {shown(value)}", field=item.name, remedy="see its description"
             )
+        if get_origin(kind) is Literal and not (isinstance(value, str) and value in get_args(kind)):
+            remedy = f"use one of {', '.join(map(str, get_args(kind)))}"
+            raise DvoError(f"unknown: {shown(value)}", field=item.name, remedy=remedy)
         if item.name in ranges:
             low, high = ranges[item.name]
             if not low <= value <= high:

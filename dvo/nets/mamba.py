@@ -11,8 +11,8 @@ and Dao, arXiv 2312.00752) and keeps a history of each point. Here the blocks wo
 
 Differences from MambaVO, as far as a reproduction by others (mohamyt/MambaVO-RRR) shows it: an edge, and not a point,
 has the history; the history is a state-space recurrence too, in place of cross attention and a gated unit; the
-zero-order hold is exact (:mod:`dvo.nets.selective_scan`); nearest-keyframe matching of a new frame is no part of the
-operator.
+zero-order hold is exact (:mod:`dvo.nets.selective_scan`). Matching of a new frame with the nearest keyframe is a
+setting of the tracker (``initial_pose``), since it needs no state of the operator.
 
 Chosen by ``update_operator: mamba`` in :class:`dvo.nets.config.ModelConfig`.
 """

@@ -12,6 +12,9 @@ from dvo.nets.alignment import AlignmentOptions
 from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.settings import check_names, check_settings
 
+InitialPose = Literal["motion", "nearest"]
+"""First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
+
 _RANGES = {
     "pixels": (0, 2**28),
     "patches": (1, 2**14),
@@ -76,6 +79,7 @@ class TrackerConfig:
             below this.
         keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
         motion_damping: factor of the last motion in the prediction of the next pose, in [0, 1].
+        initial_pose: see :data:`InitialPose` (:mod:`dvo.odometry.initial_pose`).
         patience: number of frames with content that are tried after a loss before a new segment begins with them.
         search_updates: recurrent updates of a frame after a lost one or a gap in time, to join it with the window, and
             further ones of a frame that would be lost otherwise.
@@ -116,6 +120,7 @@ class TrackerConfig:
     keyframe_motion: float = 5.0
     keyframe_index: int = 4
     motion_damping: float = 0.5
+    initial_pose: InitialPose = "motion"
     lost_confidence: float = 0.01
     patience: int = 8
     search_updates: int = 8
@@ -160,7 +165,7 @@ class TrackerConfig:
 
 TRACKER_PRESETS: dict[str, TrackerConfig] = {
     "small": TrackerConfig(),
-    "mamba": TrackerConfig(),
+    "mamba": TrackerConfig(initial_pose="nearest"),
     "tiny": TrackerConfig(pixels=160 * 120, patches=16),
     # DPVO's "fast" setting.
     "full": TrackerConfig(

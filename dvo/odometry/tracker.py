@@ -30,6 +30,7 @@ from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
+from dvo.odometry.initial_pose import initial_pose
 from dvo.odometry.initialisation import drop_unrelated, initialise, leave_minimum, median_revision, newest_confidence
 from dvo.odometry.motion import flow_magnitude, predict_pose
 from dvo.odometry.protocol import Estimate, Result, Status
@@ -313,6 +314,8 @@ class PatchOdometry:
         pose = predict_pose(
             window.poses_cw, [f.timestamp for f in window.frames], keyframe.timestamp, config.motion_damping
         )
+        if self._initialised:
+            pose = initial_pose(window, seen, pose, config.initial_pose)
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe
 

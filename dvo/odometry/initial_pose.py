@@ -1,0 +1,116 @@
+"""First pose of a new frame, before its edges have been measured."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from dvo.ba.cold_start import robust_cost
+from dvo.ba.kernels import Kernel
+from dvo.ba.layer import bundle_adjust
+from dvo.ba.options import BAOptions
+from dvo.geometry import se3
+from dvo.geometry.projection import reproject
+from dvo.graph.window import Window
+from dvo.odometry.config import InitialPose
+from dvo.odometry.front_end import Observation
+
+AGREEMENT = 2.0
+"""Distance of a match from its reprojection up to which it agrees with a pose, feature pixels."""
+
+_WIDTHS = (8.0, 4.0, 2.0)  # of the kernels, feature pixels: wide ones first, since the pose may be far off
+_LEAST = 8  # matches that must agree with a pose; six unknowns leave two of them to contradict it
+_SHARE = 1 / 3  # and their share of all
+_ACCURACY = 1.0  # of a match, feature pixels; a prediction that is as close is as good
+
+
+def initial_pose(window: Window, seen: Observation, predicted: Tensor, method: InitialPose) -> Tensor:
+    """First pose of a new frame.
+
+    Args:
+        window: keyframes of an initialised tracker, without the frame.
+        seen: the frame.
+        predicted: ``(7,)`` pose ``T_cw`` of the motion model.
+        method: ``motion``: the prediction; ``nearest``: see :func:`pose_from_nearest`.
+
+    Returns:
+        ``(7,)`` ``T_cw``.
+    """
+    return predicted if method == "motion" else pose_from_nearest(window, seen, predicted)
+
+
+def pose_from_nearest(window: Window, seen: Observation, predicted: Tensor) -> Tensor:
+    """Pose of a frame from matches with the newest keyframe, the nearest one (MambaVO, geometric initialisation).
+
+    Each patch of the keyframe is matched with the place of the frame where its matching features correlate most,
+    anywhere in the image. The pose follows from the matches by bundle adjustment that moves it alone, under robust
+    kernels, from the predicted pose and from that of the keyframe. MambaVO matches detected points and solves
+    perspective-n-point; here the patches have inverse depths.
+
+    Args:
+        window: keyframes, with inverse depths.
+        seen: the frame.
+        predicted: ``(7,)`` pose ``T_cw`` of the motion model.
+
+    Returns:
+        ``(7,)`` ``T_cw`` of the lowest robust cost; the prediction if that is as close to the matches as they are
+        accurate, or if too few matches agree with the other.
+    """
+    nearest, m = len(window) - 1, window.per_frame
+    found = best_matches(window.frames[nearest].matching, seen.maps[0, 0])
+    patches = window.patches[None, nearest * m :]
+    intrinsics = torch.stack([window.frames[nearest].intrinsics, seen.intrinsics])[None]
+    targets, weights = found[None], torch.ones_like(found)[None]
+    kk = torch.arange(m, device=found.device)
+    edges = torch.zeros_like(kk), torch.ones_like(kk), kk
+    starts = [torch.stack([window.poses_cw[nearest], pose])[None] for pose in (predicted, window.poses_cw[nearest])]
+    if float(_distance(starts[0], patches, intrinsics, edges, found).median()) <= _ACCURACY:
+        return predicted
+    poses, costs = [], []
+    for pair in starts:
+        for width in _WIDTHS:
+            options = BAOptions(
+                fixed=1, iterations=4, motion_only=True, bounds=seen.bounds, kernel=Kernel("cauchy", width), check=False
+            )
+            pair = bundle_adjust(pair, patches, intrinsics, targets, weights, *edges, options).poses_cw
+        poses.append(pair)
+        costs.append(float(robust_cost(pair, patches, intrinsics, targets, weights, *edges)))
+    best = poses[costs.index(min(costs))]
+    agree = int((_distance(best, patches, intrinsics, edges, found) < AGREEMENT).sum())
+    return se3.normalise(best[0, 1]) if agree >= max(_LEAST, _SHARE * m) else predicted
+
+
+def best_matches(features: Float[Tensor, "M C p p"], maps: Float[Tensor, "C h w"]) -> Float[Tensor, "M 2"]:
+    """Find the places of a feature map where patches correlate most.
+
+    Args:
+        features: matching features of the patches.
+        maps: matching features of a frame.
+
+    Returns:
+        ``x, y`` of the patch centres, feature pixels; between pixels by a parabola through the neighbours.
+    """
+    products = F.conv2d(maps[None].float(), features.float(), padding=features.shape[-1] // 2)[0]
+    height, width = products.shape[-2:]
+    place = products.flatten(1).argmax(1)
+    x, y = place % width, place // width
+    patch = torch.arange(len(products), device=place.device)
+    found = []
+    for at, size, step in ((x, width, 1), (y, height, width)):
+        before, after = ((place + side * step).clamp(0, height * width - 1) for side in (-1, 1))
+        low, top, high = (products.flatten(1)[patch, index] for index in (before, place, after))
+        offset = 0.5 * (low - high) / (low - 2 * top + high).clamp(max=-1e-6)
+        inside = (at > 0) & (at < size - 1)
+        found.append(at + torch.where(inside, offset, torch.zeros_like(offset)))
+    return torch.stack(found, -1).to(maps.dtype)
+
+
+def _distance(
+    poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, edges: tuple[Tensor, Tensor, Tensor], found: Tensor
+) -> Tensor:
+    """Distance of the reprojections from the matches, ``(M,)`` feature pixels."""
+    coords = reproject(poses_cw, patches, intrinsics, *edges).coords
+    centre = coords.shape[2] // 2
+    return (coords[0, :, centre, centre] - found).norm(dim=-1)

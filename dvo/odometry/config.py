@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -10,7 +11,7 @@ from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 from dvo.nets.alignment import AlignmentOptions
 from dvo.odometry.final_adjustment import AdjustmentOptions
-from dvo.settings import check_names, check_settings
+from dvo.settings import check_names, check_settings, shown
 
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
@@ -189,11 +190,12 @@ PRESETS: dict[str, dict[str, Any]] = {
 """Settings that trade accuracy for speed, on top of those of the weights; ``dvo.load("small", preset="fast")``."""
 
 
-def preset_changes(name: str) -> dict[str, Any]:
+def preset_changes(name: str, presets: Mapping[str, dict[str, Any]] = PRESETS) -> dict[str, Any]:
     """Settings of a preset.
 
     Args:
-        name: in :data:`PRESETS`.
+        name: of the preset.
+        presets: settings of each, those of the tracker unless others are given.
 
     Returns:
         Setting to value.
@@ -201,6 +203,6 @@ def preset_changes(name: str) -> dict[str, Any]:
     Raises:
         DvoError: no such preset.
     """
-    if not isinstance(name, str) or name not in PRESETS:
-        raise DvoError(f"unknown preset {name!r}", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
-    return PRESETS[name]
+    if not isinstance(name, str) or name not in presets:
+        raise DvoError(f"unknown preset {shown(name)}", field="preset", remedy=f"use one of {', '.join(presets)}")
+    return presets[name]

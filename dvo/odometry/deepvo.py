@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
@@ -16,14 +15,15 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.deepvo import DeepVO, RecurrentState, step_pose
 from dvo.models.weights import LoadedWeights
-from dvo.odometry.evidence import missing_content
+from dvo.odometry.config import preset_changes
+from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.segments import result_of_estimates
+from dvo.odometry.segments import result_of_estimates, withdraw
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_names, check_settings
 
-_RANGES = {"pixels": (0, 2**28), "max_gap": (1, math.inf)}
+_RANGES = {"pixels": (0, 2**28), "max_gap": (1, math.inf), "min_matches": (0, 1)}
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,9 @@ class RegressionConfig:
         pixels: largest number of pixels of the image whose content is judged, and from which the network makes its
             own working image (0: full resolution).
         max_gap: time between two images above which a segment ends, in medians of the recent intervals.
+        min_matches: share of the corners of an image that are found in the next one
+            (:func:`dvo.odometry.evidence.matched_share`) below which the two do not show the same scene; 0: every image
+            follows the one before it.
 
     Raises:
         DvoError: a value of another type or out of range.
@@ -41,6 +44,7 @@ class RegressionConfig:
 
     pixels: int = 76_800
     max_gap: float = 4.0
+    min_matches: float = 0.15
 
     def __post_init__(self) -> None:
         check_settings(self, _RANGES)
@@ -49,12 +53,13 @@ class RegressionConfig:
 class DeepVOOdometry:
     """Odometry of one sequence with :class:`dvo.models.deepvo.DeepVO`.
 
-    Every frame whose image has content has a pose; the first one of a segment is its world. A frame without content is
-    lost (:func:`dvo.odometry.evidence.missing_content`). The network has no measurements that could bear out the step
-    across frames without a view, or across a gap in time: the frame after it begins the next segment, with a world and
-    a scale of its own and an empty recurrent state. For the same reason an image of strong noise passes for a view.
-    An image that repeats the one before it has the same pose, and the network does not see it. The intrinsics are not
-    used.
+    A frame has a pose if its image has content (:func:`dvo.odometry.evidence.missing_content`) and shows the scene of
+    the image before it (:func:`dvo.odometry.evidence.matched_share`, since the network has no measurements of its own);
+    the first one of a segment is its world. A frame that does not is lost. For want of measurements no step is taken
+    across lost frames or a gap in time: the next segment begins, with a world and a scale of its own and an empty
+    recurrent state. After a cut its first frame is the lost one, which the result gives a pose once the frame after it
+    shows the same scene; after images of noise there is none. An image that repeats the one before it has the same
+    pose, and the network does not see it. The intrinsics are not used.
 
     Args:
         model: the network; moved to ``device`` and used in evaluation mode.
@@ -88,7 +93,8 @@ class DeepVOOdometry:
         self._reasons: dict[float, str] = {}
         self._segment = -1  # number of the newest segment; -1 before the first one
         self._pose_wc = se3.identity(dtype=torch.float64)  # of the newest frame with a pose
-        self._before: Tensor | None = None  # image (3, H, W) that the next step begins with; None: a segment begins
+        self._before: np.ndarray | None = None  # image that the next step begins with; None: a segment begins
+        self._alone: int | None = None  # position of the frame with that image while no other shows its scene
         self._state: RecurrentState | None = None
         self._last: np.ndarray | None = None  # last image
         self._finished = False
@@ -102,8 +108,9 @@ class DeepVOOdometry:
 
         Returns:
             Pose ``T_wc`` of the frame in the world of the first frame of its segment, in the unit of the network's
-            training; or the status ``lost`` with the reason. The confidence is 1 with a pose, otherwise 0: the network
-            does not tell how sure it is.
+            training; or the status ``lost`` with the reason. The confidence is the share of the corners of the image
+            before that are found, 1 in the first frame of a segment, and 0 without a pose: the network does not tell
+            how sure it is.
 
         Raises:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
@@ -117,18 +124,17 @@ class DeepVOOdometry:
         if self._last is not None and np.array_equal(image, self._last):
             self._sequence.repeat(frame.timestamp)
             last = self._estimates[-1]
-            return self._record(frame.timestamp, last.pose_wc is None, last.reason)
+            return self._record(frame.timestamp, last.confidence, last.reason)
         self._last = image
         gap = self._sequence.tick(frame.timestamp)
         problem = missing_content(image)
         if problem:
-            self._before = self._state = None
-            return self._record(frame.timestamp, True, problem)
+            self._before = self._state = self._alone = None
+            return self._record(frame.timestamp, 0.0, problem)
         reason = ""
         if gap and not gap.frozen and self._before is not None:
-            self._before, reason = None, str(gap)
-        self._advance(torch.from_numpy(image).to(self.device).permute(2, 0, 1))
-        return self._record(frame.timestamp, False, reason)
+            self._before, self._alone, reason = None, None, str(gap)
+        return self._record(frame.timestamp, self._advance(image), reason)
 
     def finish(self) -> Result:
         """End the sequence. Frames are refused afterwards; a second call gives the same result.
@@ -151,31 +157,80 @@ class DeepVOOdometry:
         }  # fmt: skip
         return result_of_estimates(self._estimates, self._reasons, info)
 
-    def _advance(self, image: Tensor) -> None:
-        """Move on to an image, or begin a segment with it."""
-        if self._before is None:
-            self._segment, self._state, self._pose_wc = self._segment + 1, None, se3.identity(dtype=torch.float64)
-        else:
-            steps, self._state = self.model(torch.stack([self._before, image])[None], self._state)
-            self._pose_wc = se3.normalise(se3.compose(self._pose_wc, step_pose(steps[0, 0].cpu().double())))
-        self._before = image
+    def _advance(self, image: np.ndarray) -> float:
+        """Move on to an image, or begin a segment with it.
 
-    def _record(self, time: float, lost: bool, reason: str) -> Estimate:
+        Args:
+            image: with content.
+
+        Returns:
+            Confidence; 0 for an image that does not show the scene of the one before it.
+        """
+        before, self._before = self._before, image
+        if before is None:
+            self._begin()
+            self._alone = len(self._estimates)
+            return 1.0
+        share = matched_share(before, image) if self.config.min_matches > 0 else 1.0
+        if share < self.config.min_matches or share == 0:
+            self._withdraw()
+            self._alone = len(self._estimates)
+            return 0.0
+        self._confirm()
+        pair = torch.from_numpy(np.stack([before, image])).to(self.device).permute(0, 3, 1, 2)
+        steps, self._state = self.model(pair[None], self._state)
+        self._pose_wc = se3.normalise(se3.compose(self._pose_wc, step_pose(steps[0, 0].cpu().double())))
+        return share
+
+    def _begin(self) -> None:
+        self._segment, self._state, self._pose_wc = self._segment + 1, None, se3.identity(dtype=torch.float64)
+
+    def _withdraw(self) -> None:
+        """Take the pose from a frame that began a segment and whose scene no other frame shows."""
+        if self._alone is not None and self._estimates[self._alone].pose_wc is not None:
+            withdraw(self._estimates, self._reasons, self._alone, NO_MATCH)
+            self._segment -= 1
+
+    def _confirm(self) -> None:
+        """Begin a segment with the frame before, if that was lost because its scene was new."""
+        if self._alone is not None and self._estimates[self._alone].pose_wc is None:
+            self._begin()
+            for position in range(self._alone, len(self._estimates)):
+                time = self._estimates[position].timestamp
+                self._estimates[position] = self._estimate(time, 1.0, "")
+                if position > self._alone:  # it repeats the first one, which has the reason of the break
+                    self._reasons.pop(time, None)
+        self._alone = None
+
+    def _record(self, time: float, confidence: float, reason: str) -> Estimate:
         """Note a frame.
 
         Args:
             time: of the frame, seconds.
-            lost: it has no pose.
+            confidence: 0 if it has no pose.
             reason: cause of a loss, or of a new segment.
         """
+        if not (reason or confidence):
+            reason = NO_MATCH
         if reason:
             self._reasons[time] = reason
-        if lost:
-            estimate = Estimate(time, None, Status.LOST, 0.0, max(0, self._segment), reason)
-        else:
-            estimate = Estimate(time, self._pose_wc.numpy().copy(), Status.TRACKING, 1.0, self._segment)
-        self._estimates.append(estimate)
-        return estimate
+        self._estimates.append(self._estimate(time, confidence, reason))
+        return self._estimates[-1]
+
+    def _estimate(self, time: float, confidence: float, reason: str) -> Estimate:
+        """Estimate of the newest pose, or of none; arguments as of :meth:`_record`."""
+        if not confidence:
+            return Estimate(time, None, Status.LOST, 0.0, max(0, self._segment), reason)
+        return Estimate(time, self._pose_wc.numpy().copy(), Status.TRACKING, confidence, self._segment)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "fast": {"pixels": 160 * 120},
+    "accurate": {"pixels": 448 * 336},
+}
+"""Settings that trade accuracy for speed, by the names of those of the other odometries. The network works at the size
+that its weights fix, so that they differ little."""
 
 
 def deepvo_odometry(
@@ -184,6 +239,7 @@ def deepvo_odometry(
     device: torch.device | str = "cpu",
     seed: int = 0,
     config: RegressionConfig | None = None,
+    preset: str = "default",
     **overrides: Any,
 ) -> DeepVOOdometry:
     """Build the odometry of a ``deepvo`` network.
@@ -193,7 +249,8 @@ def deepvo_odometry(
         device: of all computation.
         seed: for the record.
         config: settings; None for the defaults.
-        overrides: single settings, by the names of :class:`RegressionConfig`.
+        preset: settings on top of these, a name in :data:`PRESETS`.
+        overrides: single settings, by the names of :class:`RegressionConfig`; they win.
 
     Returns:
         The odometry.
@@ -203,5 +260,5 @@ def deepvo_odometry(
     """
     assert isinstance(weights.model, DeepVO), "the registry gave the builder of another architecture"
     check_names(RegressionConfig, overrides)
-    config = replace(config or RegressionConfig(), **overrides)
+    config = replace(config or RegressionConfig(), **{**preset_changes(preset, PRESETS), **overrides})
     return DeepVOOdometry(weights.model, config, device=device, name=f"dvo-{weights.name}", seed=seed)

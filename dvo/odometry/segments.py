@@ -11,7 +11,7 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.keyframe_log import KeyframeLog
-from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap
+from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
 
 def segments_of(log: KeyframeLog, poses: Mapping[int, np.ndarray] | None = None) -> tuple[Segment, ...]:
@@ -104,6 +104,21 @@ def result_of_log(
     trajectory = segments[main].trajectory if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
     read, tracked = len(log.frames), sum(len(segment) for segment in segments)
     return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks_of(log)), main
+
+
+def withdraw(estimates: list[Estimate], reasons: dict[float, str], first: int, reason: str) -> None:
+    """Take the poses from the newest frames of an odometry without a graph, in place.
+
+    Args:
+        estimates: of all frames.
+        reasons: causes by timestamp; those that there are stay.
+        first: position of the first of the frames.
+        reason: cause.
+    """
+    for position in range(first, len(estimates)):
+        time, segment = estimates[position].timestamp, estimates[position].segment
+        estimates[position] = Estimate(time, None, Status.LOST, 0.0, segment, reason)
+        reasons.setdefault(time, reason)
 
 
 def result_of_estimates(estimates: Sequence[Estimate], reasons: Mapping[float, str], info: dict[str, Any]) -> Result:

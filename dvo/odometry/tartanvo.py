@@ -22,10 +22,11 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.tartanvo import TartanVO
 from dvo.models.weights import LoadedWeights
-from dvo.odometry.evidence import missing_content
+from dvo.odometry.config import preset_changes
+from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.segments import result_of_estimates
+from dvo.odometry.segments import result_of_estimates, withdraw
 from dvo.odometry.two_view import parallax_of, returning_share
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_names, check_seed, check_settings, shown
@@ -36,7 +37,13 @@ UNRELATED = "new scene"
 ScaleRule = Literal["parallax", "unit"]
 """Length of a step: such that the median depth is one, or one; see :mod:`dvo.odometry.tartanvo`."""
 
-_RANGES = {"pixels": (0, 2**28), "longest": (0, 1e6), "join_share": (0, 1), "max_gap": (1, float("inf"))}
+_RANGES = {
+    "pixels": (0, 2**28),
+    "longest": (0, 1e6),
+    "join_share": (0, 1),
+    "max_gap": (1, float("inf")),
+    "min_matches": (0, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,9 @@ class TwoFrameConfig:
             (frames without content, or a gap in time) to go on in the segment before it; otherwise it begins the next
             one.
         max_gap: time between frames above which they are separated by a gap, in medians of the recent intervals.
+        min_matches: share of the corners of an image that are found in the next one
+            (:func:`dvo.odometry.evidence.matched_share`) below which the two do not show the same scene; 0: every image
+            is taken for a view.
 
     Raises:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
@@ -64,6 +74,7 @@ class TwoFrameConfig:
     longest: float = 2.0
     join_share: float = 0.3
     max_gap: float = 4.5
+    min_matches: float = 0.15
 
     def __post_init__(self) -> None:
         check_settings(self, _RANGES)
@@ -112,10 +123,8 @@ def tartan_odometry(
     """
     assert isinstance(weights.model, TartanVO), "the registry gave the builder of another architecture"
     check_names(TwoFrameConfig, overrides)
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise DvoError(f"unknown preset {preset!r}", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
     config = config or NETWORK_DEFAULTS.get(weights.preset, TwoFrameConfig())
-    settings = replace(config, **{**PRESETS[preset], **overrides})
+    settings = replace(config, **{**preset_changes(preset, PRESETS), **overrides})
     return TartanOdometry(weights.model, settings, seed=seed, device=device, name=f"dvo-{weights.name}")
 
 
@@ -130,9 +139,11 @@ class _View:
 class TartanOdometry:
     """Odometry of one sequence with :class:`dvo.models.tartanvo.TartanVO`.
 
-    Every frame whose image has content gets a pose. After frames without content, or a gap in time, the motion since
-    the last frame with content counts if the flow there and the flow back agree; if they do not, the frame begins a
-    segment with a world and a scale of its own.
+    A frame gets a pose if its image has content and shows the scene of the image before it
+    (:func:`dvo.odometry.evidence.matched_share`); images of noise do not, nor does the first one of another scene,
+    which the result gives a pose once the frame after it agrees with it. After such frames, or a gap in time, the
+    motion since the last frame with a pose counts if the flow there and the flow back agree; if they do not, the frame
+    begins a segment with a world and a scale of its own.
 
     Args:
         model: the network; moved to ``device`` and used in evaluation mode.
@@ -171,7 +182,10 @@ class TartanOdometry:
         self._estimates: list[Estimate] = []
         self._reasons: dict[float, str] = {}  # of losses and breaks, by timestamp
         self._segment = 0
-        self._interrupted = ""  # cause of the interruption since the last frame with content
+        self._interrupted = ""  # cause of the interruption since the last frame with a pose
+        self._shown: np.ndarray | None = None  # image of the last frame, if it had content
+        self._alone: int | None = None  # position of that frame if it began a segment, or waits to be placed
+        self._pending: tuple[float, np.ndarray, np.ndarray] | None = None  # that frame, if it has no pose for it
         self._finished = False
         self._info: dict[str, Any] = {}
 
@@ -201,9 +215,13 @@ class TartanOdometry:
             estimate = replace(self._last[1], timestamp=frame.timestamp)
         else:
             gap = self._sequence.tick(frame.timestamp)
-            problem = missing_content(image)
+            if gap is not None:  # the flow decides if the view is that before it
+                self._shown = self._alone = self._pending = None
+            problem = missing_content(image) or self._stranger(frame.timestamp, image, camera.intrinsics)
             if problem:
                 self._interrupted = self._interrupted or problem
+                if problem != NO_MATCH:
+                    self._shown = self._alone = self._pending = None
                 estimate = Estimate(frame.timestamp, None, Status.LOST, 0.0, self._segment, problem)
             else:
                 if gap is not None and self._view is not None and not self._interrupted:
@@ -211,6 +229,8 @@ class TartanOdometry:
                     if not gap.frozen:
                         self._reasons[frame.timestamp] = str(gap)
                 self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.intrinsics.tolist()}
+                if self._pending is not None:  # its scene is confirmed
+                    self._admit(*self._pending)
                 estimate = self._place(frame.timestamp, image, camera.intrinsics)
         if estimate.status is Status.LOST:
             self._reasons[frame.timestamp] = estimate.reason
@@ -236,12 +256,36 @@ class TartanOdometry:
         info = {**self._info, "seed": self.seed, "config": asdict(self.config)}
         return result_of_estimates(self._estimates, self._reasons, info)
 
+    def _stranger(self, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> str:
+        """Find out if a frame with content does not show the scene of the frame before it, and remember it."""
+        before, self._shown = self._shown, image
+        least = self.config.min_matches
+        if before is None or not least or matched_share(before, image) >= least:
+            return ""
+        if self._alone is not None and self._pending is None:  # the frame before it began a segment
+            withdraw(self._estimates, self._reasons, self._alone, NO_MATCH)
+            self._view = None
+        self._alone, self._pending = len(self._estimates), (timestamp, image, intrinsics)
+        return NO_MATCH
+
+    def _admit(self, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> None:
+        """Give the frame that waits, and those that repeat it, the pose that they lacked."""
+        assert self._alone is not None
+        waiting = range(self._alone, len(self._estimates))
+        for position in waiting:
+            self._reasons.pop(self._estimates[position].timestamp, None)
+        placed = self._place(timestamp, image, intrinsics)
+        for position in waiting:
+            self._estimates[position] = replace(placed, timestamp=self._estimates[position].timestamp)
+        self._alone = self._pending = None
+
     def _place(self, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> Estimate:
         """Estimate the pose of a frame with content."""
         pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(self.device)
         features = self.model.encode(pixels)
         view, interrupted, self._interrupted = self._view, self._interrupted, ""
         start = se3.identity(dtype=torch.float64)
+        self._alone = len(self._estimates)
         if view is None:
             return self._stand(timestamp, features, start, 1.0)
         camera = torch.as_tensor(intrinsics, dtype=torch.float32, device=self.device)[None]
@@ -253,6 +297,7 @@ class TartanOdometry:
                 self._segment += 1
                 self._reasons.setdefault(timestamp, UNRELATED)
                 return self._stand(timestamp, features, start, 1.0)
+        self._alone = None
         pose_ab = se3.normalise(motion.poses_ab()[0].double().cpu())
         parallax = parallax_of(flow, pose_ab.numpy(), intrinsics / self.model.STRIDE)
         if self.config.scale == "parallax":

@@ -128,10 +128,12 @@ def test_the_camera_is_not_known(weights, frames):
 
 
 def test_bad_input_is_named(weights, frames):
-    for settings in ({"patches": 3}, {"preset": "fast"}, {"max_gap": 0.5}, {"pixels": 1.5}):
+    for settings in ({"patches": 3}, {"preset": "faster"}, {"max_gap": 0.5}, {"pixels": 1.5}):
         with pytest.raises(DvoError, match=next(iter(settings))):
             build_odometry(weights, **settings)
     assert build_odometry(weights, config=RegressionConfig(max_gap=9.0), pixels=0).config == RegressionConfig(0, 9.0)
+    fast = build_odometry(weights, config=RegressionConfig(max_gap=9.0), preset="fast", min_matches=0.2).config
+    assert fast == RegressionConfig(160 * 120, 9.0, 0.2)
     odometry = build_odometry(weights)
     odometry.track(frames[1])
     with pytest.raises(DvoError, match="does not come after"):
@@ -139,3 +141,47 @@ def test_bad_input_is_named(weights, frames):
     lens = Camera(50, 50, 31.5, 23.5, 64, 48, "radtan", (0.1, 0, 0, 0))
     with pytest.raises(DvoError, match="distortion"):
         build_odometry(weights).track(Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), lens))
+
+
+def noise(count, shape):
+    return list(np.random.default_rng(3).integers(0, 256, (count, *shape), np.uint8))
+
+
+def strange(frames, images, start):
+    return [replace(f, image=images[k - start]) if 0 <= k - start < len(images) else f for k, f in enumerate(frames)]
+
+
+@pytest.mark.parametrize("start", [0, 5])
+def test_images_of_noise_are_lost(weights, frames, start):
+    changed = strange(frames, noise(4, frames[0].image.shape), start)
+    estimates, result = track(weights, changed)
+    times = np.array([f.timestamp for f in frames])
+    rows = np.concatenate([segment.trajectory.timestamps for segment in result.segments])
+    # The first frame of a sequence has nothing before it; its pose is withdrawn when the next one shows no such scene.
+    assert all(e.status is Status.LOST and e.reason for e in estimates[max(start, 1) : start + 4])
+    np.testing.assert_array_equal(rows, np.delete(times, slice(start, start + 4)))
+    assert [len(segment) for segment in result.segments] == ([5, 5] if start else [10])
+    assert result.frames_lost == 4 and len(result.breaks) == 1 and result.breaks[0].frames == 4
+    assert [e.segment for e in estimates[start + 5 :]] == [int(start > 0)] * (9 - start)
+
+
+def test_another_scene_begins_a_segment(weights, frames):
+    foreign = [f.image for f in make_sequence(23, frames=5, height=96, width=128, fps=10.0, sensor=False)]
+    estimates, result = track(weights, strange(frames, foreign, 4))
+    assert [len(segment) for segment in result.segments] == [4, 5, 5]
+    times = [f.timestamp for f in frames]
+    assert [(b.start, b.end, b.frames, b.new_segment) for b in result.breaks] == [
+        (times[3], times[4], 0, True), (times[8], times[9], 0, True)
+    ]  # fmt: skip
+    assert [k for k, e in enumerate(estimates) if e.status is Status.LOST] == [4, 9]  # until the next one shows it too
+    for segment in result.segments:
+        np.testing.assert_array_equal(segment.trajectory.poses_wc[0], STANDING)
+    whole = track(weights, strange(frames, foreign, 4), min_matches=0.0)[1]
+    assert len(whole.segments) == 1 and whole.frames_lost == 0
+
+
+def test_a_repeated_image_shares_the_fate_of_a_new_scene(weights, frames):
+    foreign = [f.image for f in make_sequence(23, frames=3, height=96, width=128, fps=10.0, sensor=False)]
+    _, result = track(weights, strange(frames, [foreign[0], foreign[0], *foreign[1:]], 6))
+    assert [len(segment) for segment in result.segments] == [6, 4, 4] and len(result.breaks) == 2
+    np.testing.assert_array_equal(result.segments[1].trajectory.poses_wc[:2], [STANDING] * 2)

@@ -16,6 +16,7 @@ from dvo.models.tartanvo import TartanVO, TwoFrameMotion
 from dvo.models.weights import LoadedWeights, save_weights
 from dvo.nets.flow_pyramid import Flows
 from dvo.nets.tartanvo import preset
+from dvo.odometry.evidence import NO_MATCH
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Interim, Odometry, Status
 from dvo.odometry.session import run
@@ -25,12 +26,11 @@ CAMERA = Camera(70.0, 70.0, 31.5, 23.5, 64, 48)
 
 
 def frames(count, seed=0, start=0, still=()):
-    """Images of noise in large blocks, which have content; ``still`` ones repeat the image before."""
-    rng = np.random.default_rng(seed)
+    """Views along a wall of random blocks; ``still`` ones repeat the image before."""
+    wall = np.random.default_rng(seed).integers(0, 255, (6, 8 + count, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     images = []
     for number in range(count):
-        blocks = rng.integers(0, 255, (6, 8, 3), np.uint8).repeat(8, 0).repeat(8, 1)
-        images.append(images[-1] if number in still else blocks)
+        images.append(images[-1] if number in still else wall[:, 2 * number : 2 * number + 64].copy())
     return [Frame(start + i, 0.1 * (start + i), image, CAMERA) for i, image in enumerate(images)]
 
 
@@ -139,6 +139,40 @@ def test_another_scene_after_a_loss_begins_a_segment():
     assert [len(segment) for segment in result.segments] == [3, 2] and len(result.trajectory) == 3
     np.testing.assert_array_equal(result.segments[1].trajectory.poses_wc[0], [0, 0, 0, 0, 0, 0, 1])
     assert [(b.frames, b.reason, b.new_segment) for b in result.breaks] == [(1, "black image", True)]
+
+
+def renumbered(*parts):
+    """Parts of sequences one after the other, at 10 Hz."""
+    return [
+        replace(frame, index=k, timestamp=0.1 * k) for k, frame in enumerate(frame for part in parts for frame in part)
+    ]
+
+
+@pytest.mark.parametrize("start", [0, 5])
+def test_images_of_noise_are_lost(model, start):
+    rng = np.random.default_rng(3)
+    images = [Frame(0, 0.0, rng.integers(0, 256, (48, 64, 3), np.uint8), CAMERA) for _ in range(4)]
+    views = frames(10)
+    odometry_ = odometry(model, join_share=1.0)
+    estimates = [odometry_.track(frame) for frame in renumbered(views[:start], images, views[start:])]
+    result = odometry_.finish()
+    assert all(e.status is Status.LOST and e.reason == NO_MATCH for e in estimates[max(start, 1) : start + 4])
+    rows = np.concatenate([segment.trajectory.timestamps for segment in result.segments])
+    np.testing.assert_array_equal(rows, np.delete(0.1 * np.arange(14), slice(start, start + 4)))
+    assert [len(segment) for segment in result.segments] == ([5, 5] if start else [10])
+    assert len(result.breaks) == 1 and result.breaks[0].frames == 4 and result.breaks[0].reason == NO_MATCH
+
+
+def test_a_cut_to_another_scene_begins_a_segment(model):
+    odometry_ = odometry(model, join_share=1.0)
+    foreign = frames(5, seed=8)
+    estimates = [odometry_.track(frame) for frame in renumbered(frames(5), [foreign[0]], foreign)]
+    result = odometry_.finish()
+    assert [e.status is Status.LOST for e in estimates] == [False] * 5 + [True] * 2 + [False] * 4
+    assert [len(segment) for segment in result.segments] == [5, 6] and result.frames_lost == 0
+    assert len(result.breaks) == 1 and result.breaks[0].new_segment and result.breaks[0].reason == UNRELATED
+    everything = odometry(model, min_matches=0.0)
+    assert all(everything.track(frame).status is Status.TRACKING for frame in renumbered(frames(3), foreign))
 
 
 def test_a_gap_in_time_is_told():

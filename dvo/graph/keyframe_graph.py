@@ -114,6 +114,17 @@ class KeyframeGraph:
         self.segment += int(keep)
         self._first.append((first, self.segment))
 
+    def split_segment(self, first: int) -> None:
+        """Begin a segment with the keyframes of the window.
+
+        Args:
+            first: identifier of its first keyframe; those before it have left the window, and share no edge with it.
+        """
+        for record in self.log.rows(self.segment, first):
+            record.segment += 1
+        self.segment += 1
+        self._first.append((first, self.segment))
+
     def segment_of(self, identifier: int) -> int:
         """Segment of a keyframe.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -92,6 +93,19 @@ class KeyframeLog:
         record = self.frames[frame]
         record.anchor, record.relative = anchor, _compose(T_cw, _inverse(self._poses[anchor]))
         record.lost = False
+
+    def rows(self, segment: int, first: int = 0, last: float = math.inf) -> list[FrameRecord]:
+        """Frames of a segment that are not lost.
+
+        Args:
+            segment: its number.
+            first, last: keyframes, from one number to another, that the frames belong to.
+
+        Returns:
+            Their records, in order of time.
+        """
+        mine = (record for record in self.frames if not record.lost and record.segment == segment)
+        return [record for record in mine if record.anchor is not None and first <= record.anchor <= last]
 
     def lose(self, keyframe: int, reason: str) -> None:
         """Mark the frames of a keyframe that is given up as lost.

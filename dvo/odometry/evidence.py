@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
 from dvo.geometry.projection import reproject
@@ -47,18 +48,19 @@ class Evidence:
     confidence: float
     inliers: float
 
-    def supports(self, config: TrackerConfig, joining: bool = False) -> bool:
+    def supports(self, config: TrackerConfig, joining: bool = False, searched: bool = False) -> bool:
         """Decide if the images bear out the pose.
 
         Args:
             config: thresholds.
             joining: the frame follows frames without a pose, or a gap in time: its pose relative to the window cannot
                 be checked by continuity, so that more agreement is required.
+            searched: the pose was found by further updates, which requires more agreement too.
 
         Returns:
             True if they do.
         """
-        inliers = config.join_inliers if joining else config.min_inliers
+        inliers = config.join_inliers if joining else config.search_inliers if searched else config.min_inliers
         return self.confidence >= config.lost_confidence and self.inliers >= inliers
 
 
@@ -183,7 +185,20 @@ def window_inliers(step: WindowStep) -> float:
     Returns:
         In [0, 1].
     """
-    edges = step.window.ii != step.window.jj
+    return related_share(step, torch.ones_like(step.window.jj, dtype=torch.bool))
+
+
+def related_share(step: WindowStep, among: Tensor) -> float:
+    """Share of the edges between different frames that are inliers.
+
+    Args:
+        step: of the model on a window.
+        among: ``(E,)`` bool, edges that count.
+
+    Returns:
+        In [0, 1]; 0 without such an edge.
+    """
+    edges = among & (step.window.ii != step.window.jj)
     return _inliers(step, edges) if bool(edges.any()) else 0.0
 
 

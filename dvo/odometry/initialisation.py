@@ -11,7 +11,7 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.evidence import NO_MATCH, last_unrelated
+from dvo.odometry.evidence import NO_MATCH, last_unrelated, related_share
 from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
 
@@ -86,15 +86,31 @@ def _solve_again(window: Window, step: WindowStep) -> None:
 
 
 def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> None:
-    """Remove the frames of the first window that do not show the scene of the newest ones; they are lost.
+    """Remove the frames of the first window that do not show the scene of the newest ones.
+
+    They are a segment of their own, with the keyframes that have left the window, if they are as many as an
+    initialisation needs and agree with each other; otherwise they are lost.
 
     Args:
         graph: of the sequence; the window is not initialised yet.
         step: of the model on the window, after some steps.
         config: settings of the tracker.
     """
-    for _ in range(last_unrelated(step, config)):
-        graph.log.lose(graph.discard(0).identifier, NO_MATCH)
+    window, count = graph.window, last_unrelated(step, config)
+    if not count:
+        return
+    first = window.frames[count].identifier
+    earlier = (window.ii < count) & (window.jj < count)
+    rows = len(graph.log.rows(graph.segment, last=first - 1))
+    if rows >= config.initial_frames and related_share(step, earlier) >= config.min_inliers:
+        window.keep(earlier | ((window.ii >= count) & (window.jj >= count)))
+        for _ in range(count):
+            graph.archive_oldest()
+    else:
+        for _ in range(count):
+            graph.log.lose(graph.discard(0).identifier, NO_MATCH)
+    if graph.log.rows(graph.segment, last=first - 1):
+        graph.split_segment(first)
 
 
 def leave_minimum(window: Window, age: int) -> bool:

@@ -200,7 +200,7 @@ class PatchOdometry:
         supported = evidence.supports(config, joining=bool(self._joining))
         if not (supported or self._joining):  # a fast motion may need more updates, but then has to be found for sure
             evidence = self._updated(config.search_updates)
-            supported = evidence.supports(config, joining=True)
+            supported = evidence.supports(config, searched=True)
         if not supported:
             # The frame leaves the graph, so that the next ones are joined with the frames before it.
             window.restore(before)

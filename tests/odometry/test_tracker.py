@@ -22,7 +22,7 @@ from dvo.synth.sequence import make_sequence
 SMALL = TrackerConfig(
     pixels=96 * 72, patches=6, lifetime=4, removal=5, optimisation=4, initial_frames=5, initial_updates=3,
     final_updates=2, initial_motion=0.0, initial_parallax=0.0, keyframe_motion=0.0, lost_confidence=0.0,
-    min_inliers=0.0, join_inliers=0.0, initial_inliers=0.0,
+    min_inliers=0.0, search_inliers=0.0, join_inliers=0.0, initial_inliers=0.0,
 )  # fmt: skip
 
 

@@ -118,6 +118,18 @@ def relative(a: Tensor, b: Tensor) -> Tensor:
     return torch.cat((b[..., :3] - rotate(q, a[..., :3]), q), -1)
 
 
+def steps(poses_cw: Tensor) -> Tensor:
+    """Motions between neighbouring poses: ``T_ab = T_cw[a] T_cw[b]^-1``, of camera ``b = a + 1``.
+
+    Args:
+        poses_cw: ``(..., N, 7)`` world to camera.
+
+    Returns:
+        ``(..., N - 1, 7)`` pose of each camera but the first in the coordinates of the one before it.
+    """
+    return relative(poses_cw[..., 1:, :], poses_cw[..., :-1, :])
+
+
 def act(pose: Tensor, points: Tensor) -> Tensor:
     """Transform points: ``R p + t``.
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dvo.geometry import se3, so3
+from dvo.geometry import se3
 
 UpToScale = Literal["distance", "cosine"]
 """Forms of the translation loss, see :func:`translation_loss`."""
@@ -57,20 +57,6 @@ def rotation_loss(estimate: Float[Tensor, "B 3"], truth: Float[Tensor, "B 3"]) -
         Radians, with a finite gradient at zero.
     """
     return _length(estimate - truth)
-
-
-def relative_motion(poses_cw: Float[Tensor, "B N 7"]) -> tuple[Float[Tensor, "B P 3"], Float[Tensor, "B P 3"]]:
-    """True motions between neighbouring frames.
-
-    Args:
-        poses_cw: world to camera.
-
-    Returns:
-        Translations and rotation vectors (radians) of ``T_ab = T_cw[a] T_cw[b]^-1``, the pose of camera ``b = a + 1``
-        in the coordinates of camera ``a``; ``P = N - 1``.
-    """
-    poses_ab = se3.relative(poses_cw[:, 1:], poses_cw[:, :-1])
-    return poses_ab[..., :3], so3.log(poses_ab[..., 3:])
 
 
 def flow_errors(

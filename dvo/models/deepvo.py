@@ -113,7 +113,7 @@ def true_steps(poses_cw: Float[Tensor, "B N 7"]) -> Float[Tensor, "B N-1 6"]:
     Returns:
         Step from each frame to the next, in the unit of the poses and radians.
     """
-    return pose_step(se3.compose(poses_cw[:, :-1], se3.inverse(poses_cw[:, 1:])))
+    return pose_step(se3.steps(poses_cw))
 
 
 def chain(steps: Float[Tensor, "B N-1 6"]) -> Float[Tensor, "B N 7"]:

@@ -19,7 +19,7 @@ from dvo.odometry.config import preset_changes
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.segments import result_of_estimates, withdraw
+from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_names, check_settings
 
@@ -215,7 +215,7 @@ class DeepVOOdometry:
         if reason:
             self._reasons[time] = reason
         self._estimates.append(self._estimate(time, confidence, reason))
-        return self._estimates[-1]
+        return own_copy(self._estimates[-1])
 
     def _estimate(self, time: float, confidence: float, reason: str) -> Estimate:
         """Estimate of the newest pose, or of none; arguments as of :meth:`_record`."""

@@ -19,9 +19,21 @@ from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.ba.kernels import Kernel
 from dvo.ba.levenberg import LMOptions
 from dvo.ba.restart import RestartOptions, better_start, restart
+from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import GraphProblem, KeyframeGraph
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
+from dvo.settings import check_settings
+
+_RANGES = {
+    "max_residual": (0, 1e6),
+    "iterations": (1, 1000),
+    "tolerance": (0, 1),
+    "block": (3, 10**6),
+    "overlap": (1, 10**6),
+    "shutter_rounds": (0, 100),
+    "restart_frames": (0, 10**6),
+}
 
 
 @dataclass(frozen=True)
@@ -39,6 +51,9 @@ class AdjustmentOptions:
         shutter_rounds: solutions with measurements corrected for a rolling shutter, each from the motion of the last.
             They take the last kernel, and the solution before them the others.
         restart_frames: frames at the beginning that decide whether the solution is started anew.
+
+    Raises:
+        DvoError: a value of another type or out of range, or no kernel.
     """
 
     kernels: tuple[Kernel, ...] = (Kernel("huber", 0.5), Kernel("cauchy", 0.1))
@@ -49,6 +64,11 @@ class AdjustmentOptions:
     overlap: int = 60
     shutter_rounds: int = 2
     restart_frames: int = 60
+
+    def __post_init__(self) -> None:
+        check_settings(self, _RANGES)
+        if not self.kernels:
+            raise DvoError("no kernel", field="kernels", remedy="give one or more; Kernel() has no influence")
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,18 @@ def result_of_log(
     return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks_of(log)), main
 
 
+def own_copy(estimate: Estimate) -> Estimate:
+    """Estimate with a pose array of its own, so that who changes the array of one does not change that of the other.
+
+    Args:
+        estimate: with or without a pose.
+
+    Returns:
+        The same values.
+    """
+    return estimate if estimate.pose_wc is None else replace(estimate, pose_wc=estimate.pose_wc.copy())
+
+
 def withdraw(estimates: list[Estimate], reasons: dict[float, str], first: int, reason: str) -> None:
     """Take the poses from the newest frames of an odometry without a graph, in place.
 

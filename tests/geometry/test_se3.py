@@ -197,3 +197,13 @@ def test_left_jacobians_are_derivatives_of_the_exponential_maps(seed: int, angle
 
         expected = torch.autograd.functional.jacobian(turned, torch.zeros_like(xi)).transpose(0, 1)
         torch.testing.assert_close(group.left_jacobian(xi), expected, atol=1e-9, rtol=0)
+
+
+def test_steps_compose_to_the_trajectory():
+    poses_cw = se3.exp(0.3 * tangents(0.8, 8)).unflatten(0, (2, 4))
+    motions = se3.steps(poses_cw)
+    assert motions.shape == (2, 3, 7)
+    pose_wc = se3.inverse(poses_cw[:, 0])
+    for k in range(3):
+        pose_wc = se3.compose(pose_wc, motions[:, k])
+    torch.testing.assert_close(se3.matrix(pose_wc), se3.matrix(se3.inverse(poses_cw[:, 3])))

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from dvo.geometry import se3, so3
-from dvo.losses.two_frame import flow_errors, relative_motion, rotation_loss, translation_loss, true_flow
+from dvo.geometry import se3
+from dvo.losses.two_frame import flow_errors, rotation_loss, translation_loss, true_flow
 
 
 def random(*shape, seed=0):
@@ -57,16 +57,6 @@ def test_a_camera_at_rest_has_no_direction():
 def test_the_rotation_error_is_an_angle():
     phi = torch.tensor([[0.0, 0.3, 0.0]])
     assert rotation_loss(phi, 1.5 * phi).item() == pytest.approx(0.15)
-
-
-def test_relative_motions_compose_to_the_trajectory():
-    poses_cw = se3.exp(0.3 * random(2, 4, 6))
-    translation, rotation = relative_motion(poses_cw)
-    poses_ab = torch.cat([translation, so3.exp(rotation)], -1)
-    pose_wc = se3.inverse(poses_cw[:, 0])
-    for k in range(3):
-        pose_wc = se3.compose(pose_wc, poses_ab[:, k])
-    torch.testing.assert_close(se3.matrix(pose_wc), se3.matrix(se3.inverse(poses_cw[:, 3])))
 
 
 def test_the_flow_of_known_motions():

@@ -185,3 +185,13 @@ def test_a_repeated_image_shares_the_fate_of_a_new_scene(weights, frames):
     _, result = track(weights, strange(frames, [foreign[0], foreign[0], *foreign[1:]], 6))
     assert [len(segment) for segment in result.segments] == [6, 4, 4] and len(result.breaks) == 2
     np.testing.assert_array_equal(result.segments[1].trajectory.poses_wc[:2], [STANDING] * 2)
+
+
+def test_estimates_are_the_callers_to_change(weights, frames):
+    odometry = build_odometry(weights)
+    expected = []
+    for frame in frames[:4]:
+        pose = odometry.track(frame).pose_wc
+        expected.append(pose.copy())
+        pose[:] = 9
+    np.testing.assert_array_equal(odometry.finish().trajectory.poses_wc, expected)

@@ -6,6 +6,7 @@ import torch
 
 import dvo
 from dvo.ba.restart import restart
+from dvo.errors import DvoError
 from dvo.graph.archive import ArchiveConfig
 from dvo.metrics import evaluate
 from dvo.odometry.final_adjustment import AdjustmentOptions, adjust_segment
@@ -86,3 +87,11 @@ def test_frames_of_a_slow_start_get_poses_of_their_own():
         assert len(rows) == 40
     assert shares[0] > 0.2 and shares[1] == 0
     assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.parametrize(
+    "change", [{"kernels": ()}, {"iterations": 0}, {"block": 1}, {"tolerance": -1.0}, {"overlap": 2.5}]
+)
+def test_options_out_of_range_are_named(change):
+    with pytest.raises(DvoError, match=next(iter(change))):
+        AdjustmentOptions(**change)

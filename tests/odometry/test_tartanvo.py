@@ -222,3 +222,13 @@ def test_weights_files_give_the_odometry(model, tmp_path):
     assert isinstance(tracker, TartanOdometry)
     assert tracker.config == TwoFrameConfig(pixels=256 * 192, scale="unit")
     assert len(run(tracker, frames(3)).result.trajectory) == 3
+
+
+def test_estimates_are_the_callers_to_change(model):
+    tracker = odometry(model)
+    expected = []
+    for frame in frames(4):
+        pose = tracker.track(frame).pose_wc
+        expected.append(pose.copy())
+        pose[:] = 9
+    np.testing.assert_array_equal(tracker.finish().trajectory.poses_wc, expected)

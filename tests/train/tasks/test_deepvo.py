@@ -1,6 +1,7 @@
 """The task of the pose-regression network: its loss, its measures, equal and resumed runs."""
 
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -158,3 +159,17 @@ def test_mixed_precision_stays_near_full_precision(tmp_path, runs):
 def test_an_unknown_preset_is_refused():
     with pytest.raises(DvoError, match="no preset 'huge'.*tiny"):
         DeepVOTask("huge")
+
+
+@pytest.mark.parametrize("change", [{"model": "huge"}, {"seed": -1}, {"both_ways": 1}])
+def test_arguments_out_of_range_are_named(change):
+    field = {"model": "preset"}.get(next(iter(change)), next(iter(change)))
+    with pytest.raises(DvoError, match=field):
+        DeepVOTask(**change)
+
+
+@pytest.mark.parametrize("name", [item.name for item in fields(LossConfig) if item.name != "form"])
+def test_weights_of_the_loss_out_of_range_are_named(name):
+    for value in (-1.0, float("nan"), "1"):
+        with pytest.raises(DvoError, match=name):
+            LossConfig(**{name: value})

@@ -1,6 +1,7 @@
 """The task of the two-frame network: exact estimates, learning, resuming, augmentation, configuration."""
 
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -189,3 +190,17 @@ def test_rotation_vectors_are_those_of_the_second_camera(runs):
     torch.testing.assert_close(
         se3.matrix(se3.compose(poses_wc[:-1], poses_ab)), se3.matrix(poses_wc[1:]), atol=1e-5, rtol=1e-5
     )
+
+
+@pytest.mark.parametrize("change", [{"model": "huge"}, {"seed": -1}, {"true_flow_until": -1}, {"true_flow_until": 1.5}])
+def test_arguments_out_of_range_are_named(change):
+    field = {"model": "preset"}.get(next(iter(change)), next(iter(change)))
+    with pytest.raises(DvoError, match=field):
+        TartanVOTask(**change)
+
+
+@pytest.mark.parametrize("name", [item.name for item in fields(LossConfig) if item.name != "form"])
+def test_weights_of_the_loss_out_of_range_are_named(name):
+    for value in (-1.0, float("nan"), "1"):
+        with pytest.raises(DvoError, match=name):
+            LossConfig(**{name: value})

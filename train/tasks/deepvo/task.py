@@ -11,6 +11,7 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.losses.pose import pose_errors
 from dvo.models.deepvo import DeepVO, chain, true_steps
+from dvo.settings import check_seed, shown
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
 from train.tasks.deepvo.objective import LossConfig, step_errors
@@ -33,7 +34,7 @@ class DeepVOTask(Task):
             camera, which the network does not know.
 
     Raises:
-        DvoError: no such preset.
+        DvoError: no such preset, or another argument out of range.
     """
 
     data_type = Renderings
@@ -46,8 +47,11 @@ class DeepVOTask(Task):
         loss: LossConfig | None = None,
         augmentation: Augmentation | None = None,
     ) -> None:
-        if model not in DeepVO.presets:
-            raise DvoError(f"no preset '{model}'", field="model", remedy=f"use one of {', '.join(DeepVO.presets)}")
+        if not isinstance(model, str) or model not in DeepVO.presets:
+            raise DvoError(f"no preset {shown(model)}", field="model", remedy=f"use one of {', '.join(DeepVO.presets)}")
+        check_seed(seed)
+        if not isinstance(both_ways, bool):
+            raise DvoError(f"must be true or false, got {shown(both_ways)}", field="both_ways", remedy="give a bool")
         self.model, self.seed, self.both_ways = model, seed, both_ways
         self.loss = loss or LossConfig()
         self.augmentation = augmentation

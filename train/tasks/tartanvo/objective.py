@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import get_args
 
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
-from dvo.geometry import so3
+from dvo.geometry import se3, so3
 from dvo.geometry.precision import full_precision
 from dvo.losses.two_frame import (
     UpToScale,
     flow_errors,
-    relative_motion,
     rotation_loss,
     translation_loss,
     true_flow,
 )
 from dvo.models.tartanvo import TwoFrameMotion
-from dvo.settings import check_settings, shown
+from dvo.settings import check_settings
+
+_RANGES = {name: (0, math.inf) for name in ("flow", "translation", "rotation", "still", "margin")}
+_RANGES["level_decay"] = (0, 1)
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class LossConfig:
         margin: a flow counts while it ends within this many feature pixels of the map.
 
     Raises:
-        DvoError: a value of another type, not finite, or an unknown form.
+        DvoError: a value of another type, not finite, negative, or an unknown form.
     """
 
     flow: float = 0.2
@@ -50,10 +50,7 @@ class LossConfig:
     margin: float = 16.0
 
     def __post_init__(self) -> None:
-        check_settings(self, {})
-        if self.form not in get_args(UpToScale):
-            remedy = f"use one of {', '.join(get_args(UpToScale))}"
-            raise DvoError(f"unknown: {shown(self.form)}", field="form", remedy=remedy)
+        check_settings(self, _RANGES)
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,8 @@ def truth_of(batch: dict[str, Tensor], stride: int, margin: float) -> PairTruth:
         ``P = B (N - 1)`` pairs.
     """
     with full_precision(batch["depth"].device):
-        translation, rotation = (value.flatten(0, 1) for value in relative_motion(batch["poses_cw"].float()))
+        motions = se3.steps(batch["poses_cw"].float()).flatten(0, 1)
+        translation, rotation = motions[:, :3], so3.log(motions[:, 3:])
         depth = batch["depth"][:, :-1, ::stride, ::stride].flatten(0, 1).float()
         intrinsics = batch["intrinsics"][:, :-1].flatten(0, 1).float() / stride
         poses_ab = torch.cat([translation, so3.exp(rotation)], -1)

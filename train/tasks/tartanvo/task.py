@@ -7,8 +7,10 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from dvo.errors import DvoError
 from dvo.models.tartanvo import TartanVO, TwoFrameMotion
 from dvo.nets.tartanvo import preset
+from dvo.settings import check_seed, shown
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
 from train.tasks.tartanvo.objective import LossConfig, PairTruth, measures, objective, truth_of
@@ -28,6 +30,9 @@ class TartanVOTask(Task):
         augmentation: random changes of the clips, None for none.
         true_flow_until: step up to which the pose network reads the true flow where it is known, as in the first part
             of TartanVO's training; from then on it reads the estimate, and its loss reaches the matching network.
+
+    Raises:
+        DvoError: no such preset, or another argument out of range.
     """
 
     data_type = Renderings
@@ -40,6 +45,12 @@ class TartanVOTask(Task):
         augmentation: Augmentation | None = None,
         true_flow_until: int = 0,
     ) -> None:
+        preset(model)
+        check_seed(seed)
+        whole = isinstance(true_flow_until, int) and not isinstance(true_flow_until, bool)
+        if not (whole and true_flow_until >= 0):
+            message = f"no number of steps: {shown(true_flow_until)}"
+            raise DvoError(message, field="true_flow_until", remedy="give a whole number, 0 for none")
         self.model, self.seed = model, seed
         self.loss = loss or LossConfig()
         self.augmentation = augmentation

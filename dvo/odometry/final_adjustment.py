@@ -127,10 +127,11 @@ def adjust_segment(
         return 0
     held = min(int(linked.argmax()) + options.overlap, len(identifiers) - 1) if not linked[0] else 1
     start = solved = held
-    change, first, last = _Change(old[held - 1], old[held - 1], 1.0), options, options
+    change = _Change(old[held - 1], old[held - 1], 1.0)
     rolling = shutter if shutter is not None and shutter.readout > 0 else None
-    if rolling is not None:
-        first, last = replace(options, kernels=options.kernels[:-1]), replace(options, kernels=options.kernels[-1:])
+    # The last kernel is for corrected measurements, if they are corrected; there may be no other one.
+    first = options.kernels if rolling is None else options.kernels[:-1]
+    last = replace(options, kernels=options.kernels[-1:])
     while solved < len(identifiers):
         end = min(max(start + options.block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
@@ -140,7 +141,9 @@ def adjust_segment(
         now[solved:end] = change(old[solved:end])
         depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1).clone()
         depths[new] /= change.scale
-        poses, found, _ = solve_part(part, now[rows], depths, fixed, first)
+        poses, found = now[rows], depths
+        if first:
+            poses, found, _ = solve_part(part, poses, found, fixed, replace(options, kernels=first))
         if start == 1:
             poses, found = _leave_minimum(part, poses, found, fixed, options)
         for _ in range(options.shutter_rounds if rolling is not None else 0):

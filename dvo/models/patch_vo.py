@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from dvo.ba.cold_start import damping_at
@@ -92,6 +92,7 @@ class PatchVO(nn.Module):
         generator: torch.Generator | list[torch.Generator] | None = None,
         correlation_gradient: float = 1.0,
         ba_iterations: int = 2,
+        centres: Int[Tensor, "B N M 2"] | None = None,
     ) -> Iterator[UpdateState]:
         """Run the updates of a schedule on a clip; the training pass.
 
@@ -109,6 +110,8 @@ class PatchVO(nn.Module):
                 each clip, the draws of a clip do not depend on the other clips of the batch.
             correlation_gradient: share of the edges whose correlation propagates a gradient to the features.
             ba_iterations: Gauss-Newton iterations an update.
+            centres: integer patch centres ``x, y`` in feature pixels, at least one from the border, as many a frame as
+                in the schedule; None: the selection of the configuration draws them.
 
         Yields:
             The state after each update, with ``coords``. Poses and depths are detached between updates (DPVO 3.3): only
@@ -116,13 +119,11 @@ class PatchVO(nn.Module):
         """
         config = self.config
         b, n = images.shape[:2]
-        m = config.training_patches
         features = self.patchify.encode(normalise_images(images))
         height, width = features.matching.shape[-2:]
-        if isinstance(generator, list):
-            centres = torch.cat([self.select(clip[None], m, one) for clip, one in zip(images, generator, strict=True)])
-        else:
-            centres = self.select(images, m, generator)
+        if centres is None:
+            centres = self.draw_centres(images, generator)
+        m = centres.shape[2]
         matching, context = self.patchify.cut(features, centres)
         volume = CorrelationVolume(matching, features.matching, config.pyramid, config.radius)
         scaled = intrinsics / config.STRIDE
@@ -157,6 +158,23 @@ class PatchVO(nn.Module):
             if state.coords is None:
                 state = state.reprojected()
             yield state
+
+    def draw_centres(
+        self, images: Float[Tensor, "B N 3 H W"], generator: torch.Generator | list[torch.Generator] | None = None
+    ) -> Int[Tensor, "B N M 2"]:
+        """Draw the patch centres of a training clip by the selection of the configuration.
+
+        Args:
+            images: uint8 RGB (or float in the same range).
+            generator: on the CPU; one for each clip, or one for all.
+
+        Returns:
+            Integer ``x, y`` in feature pixels, ``training_patches`` a frame.
+        """
+        m = self.config.training_patches
+        if isinstance(generator, list):
+            return torch.cat([self.select(clip[None], m, one) for clip, one in zip(images, generator, strict=True)])
+        return self.select(images, m, generator)
 
 
 def _draw_edges(

@@ -20,7 +20,7 @@ from train.data.stream import ClipStream, StreamSampler
 from train.engine.provenance import Material, names_of
 
 
-def _start_worker(_: int) -> None:
+def start_worker(_: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the training process's to handle
     torch.set_num_threads(1)
     reuse_freed_memory()
@@ -184,6 +184,6 @@ class Renderings(ClipStream):
             batch_size=self.batch_size,
             sampler=StreamSampler(self.clips_seen, self.batch_size, processes, rank),
             num_workers=self.workers,
-            worker_init_fn=_start_worker,
+            worker_init_fn=start_worker,
             persistent_workers=self.workers > 0,
         )

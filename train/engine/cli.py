@@ -21,7 +21,7 @@ from train.engine.callbacks import RefuseStandstill, StopGently
 from train.engine.config_files import check_files
 from train.engine.parser import OneLineParser, in_one_line
 from train.engine.progress import StepBar
-from train.engine.run import ROOT, describe, find_start, place_outputs, prepare, run_folder, stop_step
+from train.engine.run import ROOT, describe, find_start, place_outputs, prepare, run_folder, start_of_task, stop_step
 from train.tasks.registry import DEFAULT_TASK, task_class
 
 LARGEST_SEED = 2**32 - 1  # of numpy
@@ -87,7 +87,8 @@ class TaskCLI(LightningCLI):
         self.folder = run_folder(settings["name"], trainer["default_root_dir"], settings["task"])
         parts = [*_as_list(trainer["logger"]), *_as_list(trainer["callbacks"])]
         place_outputs([part for part in parts if not isinstance(part, bool)], self.folder)
-        self.start = find_start(self.folder, settings["from"], settings["resume"])
+        start = find_start(self.folder, settings["from"], settings["resume"])
+        self.start = start_of_task(start, settings["task"])
         self.stop = stop_step(self.start, settings["steps"], trainer["max_steps"])
 
     def instantiate_classes(self) -> None:

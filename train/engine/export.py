@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from typing import get_args
 
 import torch
 
 from dvo.errors import DvoError
 from dvo.models.weights import save_weights
 from dvo.yaml_files import read_text
-from train.engine.checkpoint import facts_of, network_of, portable, read_state
+from train.engine.checkpoint import Which, facts_of, network_of, portable, read_state
 
 
 def export(arguments: list[str]) -> None:
-    """``python -m train export CHECKPOINT OUT [--card FILE]``: the moving average, as float16 safetensors with a card.
+    """``python -m train export CHECKPOINT OUT [--card FILE] [--which net]``: the moving average of the weights, or
+    those in training, as float16 safetensors with a card.
 
     Raises:
         DvoError: no such checkpoint or card, or one that cannot be read.
@@ -24,6 +26,7 @@ def export(arguments: list[str]) -> None:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--card", type=Path, help="JSON with further facts for the model card")
+    parser.add_argument("--which", choices=get_args(Which), default="average", help="moving average (default) or net")
     options = parser.parse_args(arguments)
     state = read_state(options.checkpoint)
     facts = facts_of(state)
@@ -38,7 +41,7 @@ def export(arguments: list[str]) -> None:
             facts |= json.loads(read_text(options.card, remedy))
         except (ValueError, TypeError, RecursionError) as error:
             raise DvoError(f"is no model card ({error})", file=options.card, remedy=remedy) from error
-    save_weights(options.out, network_of(state, file=options.checkpoint), facts)
+    save_weights(options.out, network_of(state, options.which, options.checkpoint), facts)
     print(f"{options.out}: {facts}")
 
 

@@ -9,8 +9,10 @@ from typing import Any
 
 from dvo.errors import DvoError
 from dvo.models.weights import LoadedWeights, load_weights
-from train.engine.checkpoint import SUFFIXES, State, read_state
+from train.engine.checkpoint import SUFFIXES, State, network_of, read_state
 from train.engine.program import TrainingProgram, check_tensors
+from train.engine.provenance import Provenance
+from train.tasks.registry import DEFAULT_TASK, task_class
 
 ROOT = "runs/train"
 """Folder of the runs."""
@@ -29,12 +31,14 @@ class Start:
         state: the training state, if it is one.
         weights: the weights, if it is them.
         resumed: the state is that of this run, which goes on.
+        record: what the weights have been trained on, where their training state said it.
     """
 
     file: str | Path | None = None
     state: State | None = None
     weights: LoadedWeights | None = None
     resumed: bool = False
+    record: Provenance | None = None
 
     @property
     def step(self) -> int:
@@ -105,6 +109,30 @@ def find_start(folder: Path, source: str | None, resume: bool) -> Start:
     return Start(source, weights=load_weights(source))
 
 
+def start_of_task(start: Start, task: str) -> Start:
+    """Beginning of a run of a task, which may start from the state of another one.
+
+    Args:
+        start: from :func:`find_start`.
+        task: name of the task.
+
+    Returns:
+        The averaged weights, if the run is new and the start is the state of a task in
+        :attr:`train.tasks.task.Task.starts_from`; else the start itself.
+
+    Raises:
+        DvoError: no such task, or tensors that are not those of the network.
+    """
+    state = start.state
+    if state is None or start.resumed or start.file is None:
+        return start
+    theirs = state.get("task", DEFAULT_TASK)
+    if theirs == task or theirs not in task_class(task).starts_from:
+        return start
+    weights = LoadedWeights.of(network_of(state, file=start.file), Path(start.file).stem)
+    return Start(start.file, weights=weights, record=Provenance.of_state(state))
+
+
 def stop_step(start: Start, steps: int | None, max_steps: int) -> int:
     """Step of the state at which a run ends; -1 for none.
 
@@ -140,6 +168,8 @@ def prepare(program: TrainingProgram, start: Start, stop: int) -> None:
     """
     if start.weights is not None:
         program.start_from(start.weights)
+        if start.record is not None:
+            program.provenance = start.record
     if start.state is not None:
         tensors = {name[4:]: value for name, value in start.state["state_dict"].items() if name.startswith("net.")}
         program.check_task(start.state, start.file)

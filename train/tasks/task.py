@@ -55,6 +55,7 @@ class Task(Protocol):
 
     Attributes:
         data_type: class of the clips; its arguments are the settings under ``data:``.
+        starts_from: names of other tasks whose training states a new run may start from; it takes the averaged weights.
 
     Example:
         >>> class Regression(Task):
@@ -71,6 +72,7 @@ class Task(Protocol):
     """
 
     data_type: ClassVar[type[L.LightningDataModule]]
+    starts_from: ClassVar[tuple[str, ...]] = ()
 
     def network(self) -> nn.Module:
         """New network with random weights, see :class:`dvo.models.registry.Network`."""

@@ -18,6 +18,7 @@ TASKS = Registry(
         "deepvo": "train.tasks.deepvo.task:DeepVOTask",
         "tartanvo": "train.tasks.tartanvo.task:TartanVOTask",
         "droid": "train.tasks.droid.task:DroidTask",
+        "selfsup": "train.tasks.selfsup.task:SelfSupervisedTask",
     },
 )
 """Task name to ``"module:Class"`` of a :class:`train.tasks.task.Task`."""

@@ -25,6 +25,7 @@ ARROWS: dict[str, set[str]] = {
     "ba": {"geometry"},
     "metrics": {"data", "geometry"},
     "segment_metrics": {"metrics", "odometry", "data", "geometry"},
+    "relative_pose": {"segment_metrics", "metrics", "odometry", "data", "geometry"},
     "graph": {"data", "geometry"},
     "nets": {"geometry", "ba", "data", "graph"},
     "models": {"nets", "graph", "ba", "data", "geometry"},

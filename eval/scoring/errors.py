@@ -19,13 +19,13 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, Metrics, evaluate, transform
 from dvo.odometry.protocol import Segment
+from dvo.relative_pose import join_segments
 from dvo.segment_metrics import (
     SegmentMetrics,
     World,
     evaluate_segments,
     fit_world,
     match_worlds,
-    rows_of,
     scored_worlds,
 )
 from eval.scoring.blackout import BlackoutErrors, blackout_errors
@@ -195,12 +195,5 @@ def _some(trajectory: Any, rows: np.ndarray) -> Any:
 
 
 def _pose_auc(segments: Sequence[Segment], reference: Trajectory, gap: int) -> dict[float, float]:
-    if len(segments) == 1:
-        return relative_pose_auc(segments[0].trajectory, reference, gap)
-    worlds = match_worlds(segments, reference)
-    stamps = np.concatenate([np.zeros(0), *(world.estimate.timestamps for world in worlds)])
-    poses = np.concatenate([np.zeros((0, 7)), *(world.estimate.poses_wc for world in worlds)])
-    labels = np.repeat(np.arange(len(worlds)), [len(world) for world in worlds])
-    order = np.argsort(stamps, kind="stable")
-    rows = rows_of(Trajectory(stamps, poses), order)
-    return relative_pose_auc(rows, reference, gap, labels=labels[order])
+    rows, labels = join_segments(segments, reference)
+    return relative_pose_auc(rows, reference, gap, labels=labels)

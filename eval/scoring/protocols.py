@@ -15,11 +15,11 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.metrics import associate
+from dvo.relative_pose import relative_pose_errors
 
 KITTI_LENGTHS = tuple(range(100, 801, 100))  # metres
 KITTI_STEP = 10  # frames between the starts of two segments
 AUC_DEGREES = (1.0, 2.0, 5.0, 10.0)
-STILL_SHARE = 0.1  # of the median step: a pair that moves less has no direction to judge
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,9 @@ def relative_pose_auc(
 ) -> dict[float, float]:
     """Area under the recall curve of relative poses up to 1, 2, 5 and 10 degrees, in [0, 1]; scale plays no part.
 
-    The error of a pair ``i, i + gap`` of reference frames is the larger of its rotation error and the angle between the
-    translations' directions (rotation alone where the reference hardly moves: under a tenth of its median step). The
-    area under a curve of steps is ``mean(max(0, 1 - error / threshold))``. A pair that the estimate lacks fails, and so
-    does one whose frames lie in two segments: this area cannot be raised by cutting a trajectory.
+    The errors are those of :func:`dvo.relative_pose.relative_pose_errors`. The area under a curve of steps is
+    ``mean(max(0, 1 - error / threshold))``. A pair that the estimate lacks fails, and so does one whose frames lie in
+    two segments: this area cannot be raised by cutting a trajectory.
 
     Args:
         estimate, reference: camera to world, seconds.
@@ -99,22 +98,9 @@ def relative_pose_auc(
     Returns:
         Area by threshold, degrees; nan for a reference that is too short.
     """
-    if len(reference) <= gap:
+    errors = relative_pose_errors(estimate, reference, gap, max_dt, labels)
+    if not len(errors):
         return dict.fromkeys(AUC_DEGREES, math.nan)
-    i, j = associate(estimate, reference, max_dt)
-    rows = np.full(len(reference), -1)
-    rows[j] = i
-    starts = np.arange(len(reference) - gap)
-    true_turn, true_step = _steps(reference.poses_wc, starts, starts + gap)
-    errors = np.full(len(starts), np.inf)
-    has = (rows[starts] >= 0) & (rows[starts + gap] >= 0)
-    if labels is not None:
-        has[has] = labels[rows[starts[has]]] == labels[rows[starts[has] + gap]]
-    turn, step = _steps(estimate.poses_wc, rows[starts[has]], rows[starts[has] + gap])
-    errors[has] = _angles(np.swapaxes(true_turn[has], 1, 2) @ turn)
-    lengths = np.linalg.norm(true_step, axis=1)
-    moves = has & (lengths > max(1e-9, STILL_SHARE * float(np.median(lengths))))
-    errors[moves] = np.maximum(errors[moves], _between(step[moves[has]], true_step[moves]))
     return {limit: float(np.maximum(0, 1 - errors / limit).mean()) for limit in AUC_DEGREES}
 
 
@@ -142,22 +128,3 @@ def per_frame_scale(estimate: Trajectory, reference: Trajectory, max_dt: float =
     steps = np.where(have > 1e-12, steps * want / np.maximum(have, 1e-12), 0.0)
     track[1:, :3, 3] = track[0, :3, 3] + np.cumsum(steps, axis=0)
     return Trajectory(reference.timestamps[j], poses_from_matrices(track))
-
-
-def _steps(poses_wc: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    matrices = pose_matrices(poses_wc)
-    step = np.linalg.inv(matrices[first]) @ matrices[last]
-    return step[:, :3, :3], step[:, :3, 3]
-
-
-def _angles(rotations: np.ndarray) -> np.ndarray:
-    """Angle of rotation matrices, degrees; exact for small angles, where the arc cosine is not."""
-    axis = np.stack([rotations[:, a, b] - rotations[:, b, a] for a, b in ((2, 1), (0, 2), (1, 0))], axis=1)
-    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=1), np.trace(rotations, axis1=1, axis2=2) - 1))
-
-
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle between vectors, degrees; 90 where the first has no length, as a guess at random has on average."""
-    lengths = np.linalg.norm(a, axis=1)
-    angles = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1)))
-    return np.where(lengths > 1e-12, angles, 90.0)

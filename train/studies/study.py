@@ -11,75 +11,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
 
 from dvo.errors import DvoError
-from dvo.synth.dataset import ClipDataset
-from train.data.stream import ClipStream, StreamSampler
-from train.engine.build import make_program, task_settings
+from train.engine.build import task_settings
 from train.engine.checkpoint import network_of, read_state
 from train.engine.program import TrainingProgram
+from train.studies.clips import DiskClips, StudyClips
 from train.studies.config import StudyConfig
 from train.studies.report import write_report
+from train.studies.training import StepClock, fit, task_program
 from train.tasks.task import Task
 
 VALIDATION_SEED = 920_001
-
-
-class DiskClips(Dataset[dict[str, Tensor]]):
-    """Rendered clips that are kept on disk, so that the arms pay for rendering once; index modulo ``count``.
-
-    Args:
-        folder: of the clips of a study.
-        seed: of the stream.
-        count: number of clips.
-        config: sizes and options of the clips.
-        arm: whose options are used as well; None for none.
-    """
-
-    def __init__(self, folder: Path, seed: int, count: int, config: StudyConfig, arm: str | None = None) -> None:
-        height, width = config.size
-        options = config.clip_options | (config.arm_clips.get(arm, {}) if arm else {})
-        name = f"{seed}_{config.frames}x{height}x{width}_{config.flow[0]:g}-{config.flow[1]:g}"
-        name += "".join(f"_{key}-{options[key]}" for key in sorted(options))
-        self.folder, self.count = folder / name, count
-        self.rendered = ClipDataset(
-            seed, count, frames=config.frames, height=height, width=width, flow_range=tuple(config.flow), **options
-        )
-
-    def __len__(self) -> int:
-        return 2**62
-
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        index %= self.count
-        file = self.folder / f"{index:06d}.pt"
-        if not file.is_file():
-            clip = self.rendered[index]
-            self.folder.mkdir(parents=True, exist_ok=True)
-            torch.save(clip, file.with_suffix(".part"))
-            file.with_suffix(".part").rename(file)
-        return torch.load(file, weights_only=True)
-
-
-class StudyClips(ClipStream):
-    """The clips of one seed, one a step, from a position on that the checkpoint keeps."""
-
-    def __init__(self, clips: DiskClips) -> None:
-        super().__init__()
-        self.clips = clips
-
-    def train_dataloader(self) -> DataLoader[dict[str, Tensor]]:
-        """Clips from the position on."""
-        return DataLoader(self.clips, batch_size=1, sampler=StreamSampler(self.clips_seen))
 
 
 def validation_error(task: Task, net: nn.Module, clips: DiskClips) -> dict[str, float]:
@@ -101,7 +51,7 @@ def validation_error(task: Task, net: nn.Module, clips: DiskClips) -> dict[str, 
     return found
 
 
-class Curve(L.Callback):
+class Curve(StepClock):
     """Measures the validation error every so many steps, and once before the first; kept with the checkpoint.
 
     Args:
@@ -111,10 +61,9 @@ class Curve(L.Callback):
     """
 
     def __init__(self, clips: DiskClips, every: int, judged: nn.Module) -> None:
+        super().__init__()
         self.clips, self.every, self.judged = clips, every, judged
         self.rows: list[dict[str, float]] = []
-        self.train_seconds = 0.0
-        self._clock = 0.0
 
     def _measure(self, step: int, program: Any) -> None:
         if not self.rows or self.rows[-1]["step"] < step:
@@ -122,45 +71,28 @@ class Curve(L.Callback):
             self.rows.append({"step": float(step)} | validation_error(program.task, self.judged, self.clips))
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Measure before the first step."""
         self._measure(trainer.global_step, pl_module)
 
-    def on_train_batch_start(self, *_: Any) -> None:
-        self._clock = time.process_time()  # of the processor: the machine may do other work
-
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
-        self.train_seconds += time.process_time() - self._clock
+        """Measure if it is time."""
+        super().on_train_batch_end(trainer, pl_module)
         if trainer.global_step % self.every == 0:
             self._measure(trainer.global_step, pl_module)
 
     def state_dict(self) -> dict[str, Any]:
-        return {"rows": self.rows, "train_seconds": self.train_seconds}
+        """Time and measurements so far."""
+        return super().state_dict() | {"rows": self.rows}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.rows, self.train_seconds = state_dict["rows"], state_dict["train_seconds"]
-
-
-def _train(
-    folder: Path, program: TrainingProgram, clips: DiskClips, steps: int, callbacks: list[L.Callback], save_every: int
-) -> None:
-    """Train to so many steps, from the last checkpoint of the folder if there is one."""
-    # The curve comes before the saver, so that a checkpoint holds the row of its own step.
-    saver = ModelCheckpoint(
-        folder, filename="last", every_n_train_steps=save_every, save_top_k=1, enable_version_counter=False
-    )
-    trainer = L.Trainer(
-        accelerator="cpu", max_steps=steps, max_epochs=-1, logger=False, enable_progress_bar=False,
-        enable_model_summary=False, use_distributed_sampler=False, callbacks=[*callbacks, saver],
-    )  # fmt: skip
-    last = folder / "last.ckpt"
-    trainer.fit(program, StudyClips(clips), ckpt_path=last if last.is_file() else None, weights_only=False)
-    trainer.save_checkpoint(last)
+        """Restore :meth:`state_dict`."""
+        super().load_state_dict(state_dict)
+        self.rows = state_dict["rows"]
 
 
 def _program(config: StudyConfig, seed: int, **settings: Any) -> TrainingProgram:
     common = {"model": config.model, "seed": seed, "updates": config.updates}
-    known = task_settings(config.task)
-    common = {name: value for name, value in common.items() if name in known}
-    return make_program(config.task, **(common | config.settings | settings))
+    return task_program(config.task, common, **(config.settings | settings))
 
 
 def _start_of(seed: int, config: StudyConfig, clips: DiskClips) -> dict[str, Tensor]:
@@ -174,7 +106,7 @@ def _start_of(seed: int, config: StudyConfig, clips: DiskClips) -> dict[str, Ten
         torch.manual_seed(seed)
         program = _program(config, seed, learning_rate=config.start_rate, cycle=config.start_steps, **config.start)
         if config.start_steps > 0:
-            _train(folder, program, clips, config.start_steps, [], 100)
+            fit(folder, program, StudyClips(clips), config.start_steps, [], 100)
         folder.mkdir(parents=True, exist_ok=True)
         torch.save(program.net.state_dict(), done)
     return torch.load(done, weights_only=True)
@@ -197,8 +129,9 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
     done = folder / "result.json"
     if done.is_file():
         return json.loads(done.read_text(encoding="utf-8"))
-    clips = DiskClips(Path(config.folder) / "clips", 31 + seed, config.clips, config, arm)
-    held_out = DiskClips(Path(config.folder) / "clips", VALIDATION_SEED, config.validation_clips, config)
+    options, own = config.clip_options, config.arm_clips.get(arm, {})
+    clips = DiskClips(Path(config.folder) / "clips", 31 + seed, config.clips, config, options | own)
+    held_out = DiskClips(Path(config.folder) / "clips", VALIDATION_SEED, config.validation_clips, config, options)
     start = _start_of(seed, config, clips)
     trained = {"warmup_until": 0.0} if "warmup_until" in task_settings(config.task) else {}
     trained |= config.arm_settings.get(arm, {})
@@ -215,7 +148,7 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
         ) from error  # fmt: skip
     program.average.load_state_dict(start)
     curve = Curve(held_out, config.validate_every, _program(config, seed).net)
-    _train(folder, program, clips, config.steps, [curve], config.validate_every)
+    fit(folder, program, StudyClips(clips), config.steps, [curve], config.validate_every)
     result = {
         "arm": arm, "rate": rate, "seed": seed, "curve": curve.rows, "skipped": int(program.skipped),
         "recovered": program.recovered, "seconds_a_step": curve.train_seconds / max(config.steps, 1),

@@ -30,20 +30,20 @@ def test_a_study_runs_resumes_and_reports(tmp_path, monkeypatch):
     assert results[0]["curve"][0] == results[1]["curve"][0] == results[2]["curve"][0]  # the same start
     assert results[0]["curve"][-1] != results[1]["curve"][-1]
     # a run that is done is read; one that stopped half way ends where it would have ended
-    monkeypatch.setattr(study, "_train", None)
+    monkeypatch.setattr(study, "fit", None)
     assert study.run_arm(names[0], 1e-3, 0, config) == results[0]
     monkeypatch.undo()
     run = next(p for p in tmp_path.glob("V2V_weighting_rate*"))
     (run / "result.json").unlink()
     (run / "last.ckpt").unlink()
-    real, stopped = study._train, []
+    real, stopped = study.fit, []
 
     def stops_early(folder, program, clips, steps, callbacks, save_every):
         stopped.append(folder)
         real(folder, program, clips, steps - 1, callbacks, save_every)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(study, "_train", stops_early)
+    monkeypatch.setattr(study, "fit", stops_early)
     with pytest.raises(KeyboardInterrupt):
         study.run_arm(names[1], 1e-3, 0, config)
     monkeypatch.undo()
@@ -64,7 +64,9 @@ def test_arms_start_from_a_state_with_settings_and_clips_of_their_own(tmp_path):
     }  # fmt: skip
     config = small_study(tmp_path / "study", **changes)
     program = study._program(config, 5)
-    study._train(tmp_path, program, study.DiskClips(tmp_path, 0, 1, config), 1, [], 1)
+    study.fit(
+        tmp_path, program, study.StudyClips(study.DiskClips(tmp_path, 0, 1, config, config.clip_options)), 1, [], 1
+    )
     (tmp_path / "last.ckpt").rename(config.state)
     curves = [study.run_arm(arm, 1e-3, 0, config)["curve"] for arm in arms]
     assert curves[0][0] == curves[1][0] == curves[2][0]  # judged with the same settings on the same clips

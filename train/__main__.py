@@ -9,6 +9,8 @@
 - ``snr CHECKPOINT`` measures the signal-to-noise ratio of gradients, for ``patch_vo`` of the plain and the weighted
   (V2V) flow loss.
 - ``study --config configs/train/study.yaml`` compares losses on the same clips, for ``patch_vo`` DPVO's with V2V's.
+- ``family`` trains every member of the learned family for the same processor time on the same clips, and compares them
+  on held-out sequences; ``--report`` prints the comparison again.
 - ``profile`` prints where the seconds of a training step go.
 """
 
@@ -23,6 +25,7 @@ COMMANDS = {
     "validate": "train.validation.validate:main",
     "snr": "train.studies.snr:main",
     "study": "train.studies.study:main",
+    "family": "train.studies.family.study:main",
     "profile": "train.studies.breakdown:main",
 }
 

@@ -45,7 +45,7 @@ def table(results: list[dict[str, Any]], config: StudyConfig) -> str:
     labels = [re.sub(r" \(.*\)", "", label) for label in config.measures.values()]
     head = ["learning rate", "arm", f"{labels[0]} after the last step: median [min-max] over seeds", *labels[1:]]
     head += [f"better than {arms[0]}, paired, %", f"steps to {arms[0]}'s final error", "skipped steps"]
-    lines = [_row(head), _row("---" if name == "arm" else "--:" for name in head)]
+    lines = [row_text(head), row_text("---" if name == "arm" else "--:" for name in head)]
     for rate in rates:
         steps, first = curves(results, arms[0], rate, judged)
         for arm in arms:
@@ -59,11 +59,12 @@ def table(results: list[dict[str, Any]], config: StudyConfig) -> str:
             cells = [f"{rate:g}", arm, f"{np.median(end):.4f} [{end.min():.4f}-{end.max():.4f}]"]
             cells += [f"{np.median(other):.3f}" for other in ends]
             cells += ["" if arm == arms[0] else _spread(gain), reached, f"{skipped}"]
-            lines.append(_row(cells))
+            lines.append(row_text(cells))
     return "\n".join(lines)
 
 
-def _row(cells: Iterable[str]) -> str:
+def row_text(cells: Iterable[str]) -> str:
+    """Row of a table in Markdown."""
     return f"| {' | '.join(cells)} |"
 
 

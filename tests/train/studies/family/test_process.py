@@ -1,0 +1,18 @@
+"""A process of its own."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from dvo.yaml_files import read_yaml
+from train.studies.family.process import apart
+
+
+def test_errors_of_a_process_are_printed_by_it(tmp_path, capfd):
+    apart(os.mkdir, tmp_path / "made")
+    assert (tmp_path / "made").is_dir()
+    with pytest.raises(SystemExit) as ended:
+        apart(read_yaml, Path("absent.yaml"), "give a file")
+    assert ended.value.code == 2
+    assert capfd.readouterr().err.startswith("error: absent.yaml: ")

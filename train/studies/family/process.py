@@ -1,0 +1,63 @@
+"""A process of its own for a part of the study, so that its peak memory and processor time are its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from dvo.errors import DvoError
+
+
+def apart(function: Callable[..., None], *arguments: Any) -> None:
+    """Call a function in a new process with one thread, which ends with this one.
+
+    Args:
+        function: of a module.
+        arguments: for it.
+
+    Raises:
+        SystemExit: the process failed; its code, after it has printed the reason.
+    """
+    process = multiprocessing.get_context("spawn").Process(target=_run, args=(function, arguments), daemon=True)
+    process.start()
+    try:
+        process.join()
+    finally:
+        if process.is_alive():
+            process.terminate()
+            process.join()
+    if process.exitcode:
+        raise SystemExit(max(process.exitcode, 1))
+
+
+def _run(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    use_one_thread()
+    try:
+        function(*arguments)
+    except DvoError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)  # a thread cannot end the process in another way; states are written as a whole
+
+
+def use_one_thread() -> None:
+    """Restrict torch and OpenCV to one thread, and let the allocator reuse freed memory."""
+    import cv2
+    import torch
+
+    from dvo.allocator import reuse_freed_memory
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    reuse_freed_memory()

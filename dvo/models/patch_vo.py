@@ -8,7 +8,8 @@ adjustment of the revised flow.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -21,8 +22,9 @@ from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import PRESETS, ModelConfig
 from dvo.nets.correlation import Correlation, CorrelationVolume
-from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates
-from dvo.nets.selection import SELECTIONS, PatchSelection
+from dvo.nets.patchifier import Features, Patchifier, normalise_images, patch_coordinates
+from dvo.nets.score import ScoreHead
+from dvo.nets.selection import SELECTIONS, PatchSelection, needs_score, no_score
 from dvo.nets.update import UPDATE_OPERATORS
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
@@ -33,6 +35,9 @@ class PatchVO(nn.Module):
 
     Args:
         config: sizes, see :class:`dvo.nets.config.ModelConfig`.
+
+    Raises:
+        DvoError: the selection ``learned`` without the head.
 
     Example:
         >>> model = PatchVO(preset("tiny"))
@@ -51,8 +56,42 @@ class PatchVO(nn.Module):
         super().__init__()
         self.config = config
         self.patchify = Patchifier(config)
-        self.select: PatchSelection = SELECTIONS.resolve(config.selection)
+        self.score = ScoreHead(config.feature_channels) if config.score_head else None
+        self.select = self.selection()
         self.update = UPDATE_OPERATORS.resolve(config.update_operator)(config)
+
+    def selection(self, name: str = "") -> PatchSelection:
+        """Patch selection by name.
+
+        Args:
+            name: in :data:`dvo.nets.selection.SELECTIONS`; empty for that of the configuration.
+
+        Raises:
+            DvoError: no such selection, or one by a score that this network does not have.
+        """
+        select: PatchSelection = SELECTIONS.resolve(name or self.config.selection)
+        if needs_score(select) and self.score is None:
+            raise no_score()
+        return select
+
+    def centres(
+        self, images: Float[Tensor, "B N 3 H W"], features: Features | None, select: Callable[..., Tensor]
+    ) -> Float[Tensor, "B N M 2"]:
+        """Choose the centres of the patches.
+
+        Args:
+            images: RGB, uint8 or float in [0, 255].
+            features: of these images; only a selection by score needs them.
+            select: a :class:`dvo.nets.selection.PatchSelection` with the number of patches and the generator given.
+
+        Returns:
+            Feature pixels ``x, y``.
+        """
+        if not needs_score(select):
+            return select(images)
+        if self.score is None or features is None:
+            raise no_score()
+        return select(images, score=partial(self.score, features.matching))
 
     def forward(
         self,
@@ -93,6 +132,7 @@ class PatchVO(nn.Module):
         correlation_gradient: float = 1.0,
         ba_iterations: int = 2,
         centres: Int[Tensor, "B N M 2"] | None = None,
+        select: PatchSelection | None = None,
     ) -> Iterator[UpdateState]:
         """Run the updates of a schedule on a clip; the training pass.
 
@@ -112,6 +152,7 @@ class PatchVO(nn.Module):
             ba_iterations: Gauss-Newton iterations an update.
             centres: integer patch centres ``x, y`` in feature pixels, at least one from the border, as many a frame as
                 in the schedule; None: the selection of the configuration draws them.
+            select: selection of the patches, None for that of the configuration; without effect if ``centres`` are given.
 
         Yields:
             The state after each update, with ``coords``. Poses and depths are detached between updates (DPVO 3.3): only
@@ -122,8 +163,9 @@ class PatchVO(nn.Module):
         features = self.patchify.encode(normalise_images(images))
         height, width = features.matching.shape[-2:]
         if centres is None:
-            centres = self.draw_centres(images, generator)
+            centres = self.draw_centres(images, generator, features, select)
         m = centres.shape[2]
+        scores = None if self.score is None else self.score(features.matching, centres).flatten(1)
         matching, context = self.patchify.cut(features, centres)
         volume = CorrelationVolume(matching, features.matching, config.pyramid, config.radius)
         scaled = intrinsics / config.STRIDE
@@ -133,7 +175,7 @@ class PatchVO(nn.Module):
         frames, graph = stages[0].frames, stages[0].graph
         hidden = context.new_zeros(b, len(graph), config.hidden_channels)
         start = poses_cw[:, :frames], all_patches[:, : frames * m], scaled[:, :frames]
-        state = UpdateState(graph, *start, context, hidden)
+        state = UpdateState(graph, *start, context, hidden, scores=scores)
 
         def lookup(coords: Tensor, graph: PatchGraph) -> Correlation:
             learn = None
@@ -152,7 +194,8 @@ class PatchVO(nn.Module):
                 patches = torch.cat([patches, joined], 1)
                 hidden = hidden.index_select(1, stage.carry.clamp(min=0)) * (stage.carry >= 0)[:, None]
                 frames, coords = stage.frames, None
-            state = UpdateState(stage.graph, poses, patches, scaled[:, :frames], context, hidden, coords)
+            present = scaled[:, :frames]
+            state = UpdateState(stage.graph, poses, patches, present, context, hidden, coords, scores=scores)
             options = StepOptions(mode, 1, ba_iterations, damping_at(update), (width, height))
             state = step(self, state, lookup, options)
             if state.coords is None:
@@ -160,21 +203,34 @@ class PatchVO(nn.Module):
             yield state
 
     def draw_centres(
-        self, images: Float[Tensor, "B N 3 H W"], generator: torch.Generator | list[torch.Generator] | None = None
+        self,
+        images: Float[Tensor, "B N 3 H W"],
+        generator: torch.Generator | list[torch.Generator] | None = None,
+        features: Features | None = None,
+        select: PatchSelection | None = None,
     ) -> Int[Tensor, "B N M 2"]:
-        """Draw the patch centres of a training clip by the selection of the configuration.
+        """Draw the patch centres of training clips.
 
         Args:
             images: uint8 RGB (or float in the same range).
             generator: on the CPU; one for each clip, or one for all.
+            features: of the images; None: they are computed if the selection needs them.
+            select: selection of the patches, None for that of the configuration.
 
         Returns:
             Integer ``x, y`` in feature pixels, ``training_patches`` a frame.
         """
-        m = self.config.training_patches
-        if isinstance(generator, list):
-            return torch.cat([self.select(clip[None], m, one) for clip, one in zip(images, generator, strict=True)])
-        return self.select(images, m, generator)
+        select = select or self.select
+        if features is None and needs_score(select):
+            features = self.patchify.encode(normalise_images(images))
+        draw = partial(select, patches=self.config.training_patches)
+        if not isinstance(generator, list):
+            return self.centres(images, features, partial(draw, generator=generator))
+        parts = []
+        for i, one in enumerate(generator):
+            own = None if features is None else features.clip(i)
+            parts.append(self.centres(images[i : i + 1], own, partial(draw, generator=one)))
+        return torch.cat(parts)
 
 
 def _draw_edges(

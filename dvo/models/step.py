@@ -43,6 +43,7 @@ class UpdateState:
         weights: ``(B, E, 2)`` of the targets in bundle adjustment: the confidence, unless a :class:`Refinement` has
             changed it; None before the first step.
         confidence: ``(B, E, 2)`` of the network, in (0, 1); None before the first step.
+        scores: ``(B, K)`` of the patches by :class:`dvo.nets.score.ScoreHead`, for training; None without one.
     """
 
     graph: PatchGraph
@@ -55,6 +56,7 @@ class UpdateState:
     targets: Tensor | None = None
     weights: Tensor | None = None
     confidence: Tensor | None = None
+    scores: Tensor | None = None
 
     @property
     def frames(self) -> int:

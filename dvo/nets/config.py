@@ -37,6 +37,7 @@ class ModelConfig:
         self_edges: join patches with their own frame too, as DPVO does.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`.
+        score_head: whether there is a :class:`dvo.nets.score.ScoreHead`, which the selection ``learned`` needs.
 
     Raises:
         DvoError: a size of another type or out of :data:`RANGES`, or an even patch.
@@ -54,6 +55,7 @@ class ModelConfig:
     self_edges: bool = True
     selection: str = field(default="random", compare=False)  # no size: a preset stays one
     update_operator: str = "gated"
+    score_head: bool = field(default=False, compare=False)  # beside the network: a preset stays one
 
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
 

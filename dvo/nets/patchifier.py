@@ -25,6 +25,10 @@ class Features:
     matching: Tensor
     trunk: Tensor
 
+    def clip(self, index: int) -> Features:
+        """Features of one clip, as a batch of one."""
+        return Features(self.matching[index : index + 1], self.trunk[index : index + 1])
+
 
 def normalise_images(images: Tensor) -> Tensor:
     """Scale images to the input range of the encoders, [-0.5, 1.5], as DPVO does.

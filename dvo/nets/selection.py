@@ -6,14 +6,17 @@ A selection gives the centres of the patches from the images; a network names th
 
 from __future__ import annotations
 
+import inspect
 import math
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.errors import DvoError
 from dvo.registry import Registry
 
 SELECTIONS = Registry(
@@ -23,18 +26,24 @@ SELECTIONS = Registry(
         "random": "dvo.nets.selection:random_selection",
         "grid": "dvo.nets.selection:grid_selection",
         "structure": "dvo.nets.selection:structure_selection",
+        "learned": "dvo.nets.selection:learned_selection",
     },
 )
 """Names to ``"module:function"`` of a :class:`PatchSelection`."""
 
 CANDIDATES = 4
-"""Random positions in a cell of the grid, of which ``structure`` takes the best."""
+"""Random positions in a cell of the grid, of which ``structure`` and ``learned`` take the best."""
+PointScore = Callable[[Tensor], Tensor]
+"""Score of positions ``(B, N, P, 2)`` in feature pixels as ``(B, N, P)``, larger for better ones."""
 _STRIDE = 4  # image pixels to a feature pixel
 _BOX = 7  # side of the window of the structure tensor, image pixels
 
 
 class PatchSelection(Protocol):
-    """Interface of a patch selection."""
+    """Interface of a patch selection.
+
+    One with a further keyword ``score``, a :data:`PointScore`, is given that of the network (:func:`needs_score`).
+    """
 
     def __call__(self, images: Tensor, patches: int, generator: torch.Generator | None) -> Tensor:
         """Choose the centres of the patches.
@@ -104,9 +113,43 @@ def structure_selection(
     b, n, height, width = _feature_size(images)
     points = _positions(b, n, patches, CANDIDATES, height, width, generator).to(images.device)
     index = (points[..., 1] * width + points[..., 0]).flatten(2)
-    scores = structure_score(images).flatten(2).gather(2, index).unflatten(2, (patches, CANDIDATES))
-    best = scores.argmax(-1)[..., None, None].expand(-1, -1, -1, 1, 2)
-    return points.gather(3, best)[..., 0, :]
+    return _best(points, structure_score(images).flatten(2).gather(2, index))
+
+
+def learned_selection(
+    images: Float[Tensor, "B N 3 H W"],
+    patches: int,
+    generator: torch.Generator | None = None,
+    *,
+    score: PointScore | None = None,
+) -> Float[Tensor, "B N M 2"]:
+    """Best of four uniform positions in each cell of a grid, by the score that the network has learned.
+
+    The positions are those of ``structure`` for the same random numbers. For arguments and result see
+    :class:`PatchSelection`.
+
+    Args:
+        score: of the network, see :class:`dvo.nets.score.ScoreHead`.
+
+    Raises:
+        DvoError: no score.
+    """
+    if score is None:
+        raise no_score()
+    b, n, height, width = _feature_size(images)
+    points = _positions(b, n, patches, CANDIDATES, height, width, generator).to(images.device)
+    return _best(points, score(points.flatten(2, 3)))
+
+
+def needs_score(select: Callable[..., Any]) -> bool:
+    """Whether a selection takes the score of the network."""
+    return "score" in inspect.signature(select).parameters
+
+
+def no_score() -> DvoError:
+    """Error of a network without the head that a selection needs."""
+    remedy = "choose another selection, or train a head (python -m train fit --model.train_only score)"
+    return DvoError("the network has no head that scores patches", field="selection", remedy=remedy)
 
 
 def structure_score(images: Float[Tensor, "B N 3 H W"]) -> Float[Tensor, "B N h w"]:
@@ -133,6 +176,20 @@ def structure_score(images: Float[Tensor, "B N 3 H W"]) -> Float[Tensor, "B N h 
 def _feature_size(images: Tensor) -> tuple[int, int, int, int]:
     b, n, _, height, width = images.shape
     return b, n, math.ceil(height / _STRIDE), math.ceil(width / _STRIDE)
+
+
+def _best(points: Tensor, scores: Tensor) -> Tensor:
+    """The position with the highest score of each cell.
+
+    Args:
+        points: ``(B, N, M, candidates, 2)``.
+        scores: ``(B, N, M * candidates)``.
+
+    Returns:
+        ``(B, N, M, 2)``.
+    """
+    best = scores.unflatten(2, points.shape[2:4]).argmax(-1)[..., None, None].expand(-1, -1, -1, 1, 2)
+    return points.gather(3, best)[..., 0, :]
 
 
 def _positions(

@@ -74,7 +74,7 @@ def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Ten
 
 
 def observe(
-    model: PatchVO, image: np.ndarray, camera: Camera, select: Callable[[Tensor], Tensor], device: torch.device
+    model: PatchVO, image: np.ndarray, camera: Camera, select: Callable[..., Tensor], device: torch.device
 ) -> Observation:
     """Encode a working image and select its patches.
 
@@ -90,7 +90,7 @@ def observe(
     """
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
     features = model.patchify.encode(normalise_images(rgb)[None, None])
-    centres = select(rgb[None, None])
+    centres = model.centres(rgb[None, None], features, select)
     matching, context = model.patchify.cut(features, centres)
     stride = model.config.STRIDE
     x, y = (centres[0, 0] * stride).unbind(-1)

@@ -25,7 +25,6 @@ from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions, recent_depth
 from dvo.nets.patchifier import patch_coordinates
-from dvo.nets.selection import SELECTIONS
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
 from dvo.odometry.frame_sequence import FrameSequence
@@ -81,7 +80,7 @@ class PatchOdometry:
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
         c = model.config
-        select = SELECTIONS.resolve(config.selection or c.selection)
+        select = self.model.selection(config.selection)
         self._select = partial(select, patches=config.patches, generator=torch.Generator().manual_seed(seed))
         sizes = config.patches, c.patch_size, c.hidden_channels
         self.graph = KeyframeGraph(*sizes, self.device, archive, lambda edges: self._step.finalise(edges))

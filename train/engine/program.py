@@ -276,7 +276,7 @@ class TrainingProgram(L.LightningModule):
                 group |= {"lr": now, "initial_lr": base, "weight_decay": decay}
 
     def start_from(self, weights: LoadedWeights) -> None:
-        """Take over trained weights, before the first step.
+        """Take over trained weights, before the first step; they may lack what the task says is new.
 
         Raises:
             DvoError: weights of another network.
@@ -289,7 +289,9 @@ class TrainingProgram(L.LightningModule):
                 file=file,
                 remedy="give weights of that network, or name another task",
             )
-        tensors = weights.model.state_dict()
+        new = self.task.new_tensors()
+        own = {name: value for name, value in self.net.state_dict().items() if name.startswith(new)}
+        tensors = own | weights.model.state_dict()
         check_tensors(self.net, tensors, file)
         for module in (self.net, self.average):
             module.load_state_dict(tensors)

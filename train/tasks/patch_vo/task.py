@@ -18,12 +18,16 @@ from dvo.losses.trend import TrendPenalty
 from dvo.models.patch_vo import Mode, PatchVO
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.nets.config import preset
+from dvo.nets.selection import random_selection
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
 from train.engine.ranks import mean_over_ranks, rank
 from train.tasks.patch_vo.objective import LossConfig, Terms, Truth, clip_terms, truth_of
 from train.tasks.patch_vo.variants import HEADS, flow_loss_variants
 from train.tasks.task import Batch, StepContext, StepLoss, Task
+
+SCORE = "score"
+"""Name of the head that :class:`dvo.nets.score.ScoreHead` is, for ``train_only``."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,9 @@ class PatchVOTask(Task):
         patches: patches a frame; None: those of the preset.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; None: that of the preset.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`; None: that of the preset.
+        train_only: beginning of the names of the parameters that learn, the others are held; None: all. ``score`` adds
+            the head for the selection ``learned`` and trains it alone, on random patches; ``selection`` is then only
+            the one that the network keeps.
 
     Attributes:
         beta, rotation: weights of the flow and of the rotation, which V2V's balance moves.
@@ -79,9 +86,13 @@ class PatchVOTask(Task):
         patches: int | None = None,
         selection: str | None = None,
         update_operator: str | None = None,
+        train_only: str | None = None,
     ) -> None:
-        self.model, self.seed = model, seed
-        self.changes = {"training_patches": patches, "selection": selection, "update_operator": update_operator}
+        self.model, self.seed, self.train_only = model, seed, train_only
+        self.changes = {
+            "training_patches": patches, "selection": selection, "update_operator": update_operator,
+            "score_head": True if selection == "learned" or train_only == SCORE else None,
+        }  # fmt: skip
         self.updates, self.initial, self.settle = updates, initial, settle
         self.warmup_mode, self.warmup_until, self.warmup_steps = warmup_mode, warmup_until, warmup_steps
         self.correlation_gradient = correlation_gradient
@@ -107,7 +118,20 @@ class PatchVOTask(Task):
         if self.loss.follows_gradients and wanted not in dict(net.named_parameters()):
             remedy = "name one of this update operator, such as update.history.enter.weight of 'mamba'"
             raise DvoError(f"no parameter '{wanted}'", field="balance_parameter", remedy=remedy)
+        if self.train_only is not None:
+            self._hold_others(net, self.train_only)
         return net
+
+    def _hold_others(self, net: nn.Module, beginning: str) -> None:
+        """Hold the parameters whose names begin otherwise."""
+        for name, parameter in net.named_parameters():
+            parameter.requires_grad_(name.startswith(beginning))
+        if not any(parameter.requires_grad for parameter in net.parameters()):
+            known = ", ".join(dict.fromkeys(name.split(".")[0] for name, _ in net.named_parameters()))
+            raise DvoError(f"no parameter begins with '{beginning}'", field="train_only", remedy=f"name one of {known}")
+        if self.loss.follows_gradients and not net.get_parameter(self.loss.balance_parameter).requires_grad:
+            remedy = "choose the balance none or fixed"
+            raise DvoError("holds the parameter that the balance compares on", field="train_only", remedy=remedy)
 
     def parts(self, net: nn.Module) -> dict[str, nn.Module]:
         """Encoder and update operator."""
@@ -121,6 +145,10 @@ class PatchVOTask(Task):
     def trained_weights_loaded(self, buffers: Mapping[str, Tensor]) -> None:
         """End the warm-up, which is for a network that does not see flow yet."""
         buffers["warming"].fill_(False)
+
+    def new_tensors(self) -> tuple[str, ...]:
+        """The score head, if there is one."""
+        return ("score.",) if self.changes["score_head"] else ()
 
     def state_dict(self) -> dict[str, Any]:
         """State of the balance."""
@@ -170,6 +198,7 @@ class PatchVOTask(Task):
             mode=mode,
             generator=self.generators(context.step, b),
             correlation_gradient=self.correlation_gradient,
+            select=random_selection if self.train_only == SCORE else None,
         )
         terms, measures = clip_terms(states, truth, self.loss, mode)
         return terms, measures, truth

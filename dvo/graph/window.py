@@ -34,6 +34,7 @@ class Keyframe:
         colors: ``(M, 3)`` uint8 RGB at the patch centres.
         intrinsics: ``(4,)`` fx fy cx cy of the feature map.
         image: ``(H, W, 3)`` uint8 RGB working image, None if it is not kept.
+        fine: ``(M, c, p, p)`` features of its patches at the fine level of the correlation, None without one.
     """
 
     identifier: int
@@ -44,6 +45,7 @@ class Keyframe:
     colors: Tensor
     intrinsics: Tensor
     image: np.ndarray | None = None
+    fine: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,11 @@ class Window:
     def matching(self) -> Tensor:
         """``(n * M, C, p, p)`` matching features of the patches."""
         return torch.cat([frame.matching for frame in self.frames])
+
+    @property
+    def fine(self) -> Tensor:
+        """``(n * M, c, p, p)`` features of its patches at the fine level, for a network that has one."""
+        return torch.cat([frame.fine for frame in self.frames if frame.fine is not None])
 
     @property
     def map_slots(self) -> Tensor:

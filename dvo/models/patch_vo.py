@@ -22,7 +22,7 @@ from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import PRESETS, ModelConfig
 from dvo.nets.correlation import Correlation, CorrelationVolume
-from dvo.nets.patchifier import Features, Patchifier, normalise_images, patch_coordinates
+from dvo.nets.patchifier import Features, Patchifier, cut_fine, normalise_images, patch_coordinates
 from dvo.nets.score import ScoreHead
 from dvo.nets.selection import SELECTIONS, PatchSelection, needs_score, no_score
 from dvo.nets.update import UPDATE_OPERATORS
@@ -152,7 +152,7 @@ class PatchVO(nn.Module):
             ba_iterations: Gauss-Newton iterations an update.
             centres: integer patch centres ``x, y`` in feature pixels, at least one from the border, as many a frame as
                 in the schedule; None: the selection of the configuration draws them.
-            select: selection of the patches, None for that of the configuration; without effect if ``centres`` are given.
+            select: selection of the patches if no ``centres`` are given, None for that of the configuration.
 
         Yields:
             The state after each update, with ``coords``. Poses and depths are detached between updates (DPVO 3.3): only
@@ -168,6 +168,9 @@ class PatchVO(nn.Module):
         scores = None if self.score is None else self.score(features.matching, centres).flatten(1)
         matching, context = self.patchify.cut(features, centres)
         volume = CorrelationVolume(matching, features.matching, config.pyramid, config.radius)
+        cut, fine = cut_fine(features, centres, config.patch_size), None
+        if cut is not None and features.fine is not None:
+            fine = CorrelationVolume(cut, features.fine, (1,), config.fine_radius)
         scaled = intrinsics / config.STRIDE
         if inverse_depth is None:
             inverse_depth = torch.ones(b, n * m, device=images.device)
@@ -181,7 +184,9 @@ class PatchVO(nn.Module):
             learn = None
             if correlation_gradient < 1 and torch.is_grad_enabled():
                 learn = _draw_edges(b, len(graph), correlation_gradient, generator).to(images.device)
-            return Correlation(volume.lookup(coords, graph.kk, graph.jj, learn))
+            where = (graph.kk, graph.jj, learn)
+            closer = None if fine is None else fine.lookup(config.FINE * coords, *where)[0]
+            return Correlation(volume.lookup(coords, *where), fine=closer)
 
         for update, stage in enumerate(stages):
             poses, patches, hidden = state.poses_cw.detach(), state.patches.detach(), state.hidden

@@ -17,6 +17,8 @@ RANGES = {
     "patch_size": (1, 9),
     "radius": (1, 16),
     "training_patches": (1, 100_000),
+    "fine_channels": (0, 256),
+    "fine_radius": (1, 8),
 }
 LEVELS, COARSEST, CORRELATIONS = 8, 64, 16_384  # of the pyramid: levels and largest factor; channels of an edge
 
@@ -37,6 +39,9 @@ class ModelConfig:
         self_edges: join patches with their own frame too, as DPVO does.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`.
+        fine_channels: features of a further, fine level of the correlation, at half the image resolution
+            (:class:`dvo.nets.update.FineLayer`); 0 for none.
+        fine_radius: correlation radius of that level in its pixels.
         score_head: whether there is a :class:`dvo.nets.score.ScoreHead`, which the selection ``learned`` needs.
 
     Raises:
@@ -55,9 +60,12 @@ class ModelConfig:
     self_edges: bool = True
     selection: str = field(default="random", compare=False)  # no size: a preset stays one
     update_operator: str = "gated"
+    fine_channels: int = 0
+    fine_radius: int = 1
     score_head: bool = field(default=False, compare=False)  # beside the network: a preset stays one
 
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
+    FINE = 2  # pixels of the fine level to a feature pixel; its pixel (u, v) is centred on image pixel (2u, 2v)
 
     def __post_init__(self) -> None:
         check_settings(self, RANGES)
@@ -79,6 +87,11 @@ class ModelConfig:
     def correlation_channels(self) -> int:
         """Number of correlation channels of an edge: levels x offsets x patch pixels."""
         return len(self.pyramid) * (2 * self.radius + 1) ** 2 * self.patch_size**2
+
+    @property
+    def fine_correlation_channels(self) -> int:
+        """Number of correlation channels of an edge at the fine level: offsets x patch pixels."""
+        return (2 * self.fine_radius + 1) ** 2 * self.patch_size**2
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for the metadata of weights.

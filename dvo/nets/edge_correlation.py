@@ -27,7 +27,7 @@ class EdgeCorrelation:
     (:class:`dvo.odometry.window_correlation.WindowCorrelation`).
 
     Args:
-        scale: down-sampling of the level relative to the features.
+        scale: down-sampling of the level relative to the features; below 1 for the fine level.
         pixels: patch pixels ``p * p``.
         radius: correlation radius in pixels of the level.
         side: side of the cached window, pixels of the level; at least ``2 * radius + 2``.
@@ -44,7 +44,7 @@ class EdgeCorrelation:
         torch.Size([2, 441])
     """
 
-    def __init__(self, scale: int, pixels: int, radius: int, side: int, device: torch.device | str) -> None:
+    def __init__(self, scale: float, pixels: int, radius: int, side: int, device: torch.device | str) -> None:
         self.scale, self.pixels, self.radius, self.side = scale, pixels, radius, side
         self._maps = torch.zeros(0, 0, 0, 0, device=device)
         self._products = torch.zeros(0, pixels, side, side, device=device)

@@ -67,6 +67,17 @@ class Encoder(nn.Module):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
+    def stem(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n s H2 W2"]:
+        """Layers at half of the image resolution.
+
+        Args:
+            images: normalised images.
+
+        Returns:
+            Stem features, centred on image pixels ``(2u, 2v)``.
+        """
+        return self.layer1(F.relu(self.norm1(self.conv1(images))))
+
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
         """All layers but the last one, a 1x1 convolution that :meth:`head` allows to evaluate at single pixels.
 
@@ -76,7 +87,7 @@ class Encoder(nn.Module):
         Returns:
             Trunk features at a quarter of the image resolution.
         """
-        return self.layer2(self.layer1(F.relu(self.norm1(self.conv1(images)))))
+        return self.layer2(self.stem(images))
 
     def head(self, outputs: slice) -> tuple[Tensor, Tensor]:
         """Parameters of some output channels of the last layer.

@@ -12,7 +12,7 @@ from torch import Tensor
 from dvo.geometry.camera import Camera
 from dvo.graph.keyframe_log import FrameRecord
 from dvo.models.patch_vo import PatchVO
-from dvo.nets.patchifier import normalise_images
+from dvo.nets.patchifier import cut_fine, normalise_images
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class Observation:
         matching: ``(M, C, p, p)`` matching features of the patches.
         context: ``(M, D)`` context features of the patches.
         colors: ``(M, 3)`` uint8 RGB at the patch centres.
+        fine_maps: ``(1, 1, c, H / 2, W / 2)`` features of the fine level of the correlation, None without one.
+        fine: ``(M, c, p, p)`` those of the patches, None without one.
     """
 
     image: np.ndarray
@@ -38,6 +40,8 @@ class Observation:
     matching: Tensor
     context: Tensor
     colors: Tensor
+    fine_maps: Tensor | None = None
+    fine: Tensor | None = None
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -92,6 +96,7 @@ def observe(
     features = model.patchify.encode(normalise_images(rgb)[None, None])
     centres = model.centres(rgb[None, None], features, select)
     matching, context = model.patchify.cut(features, centres)
+    fine = cut_fine(features, centres, model.config.patch_size)
     stride = model.config.STRIDE
     x, y = (centres[0, 0] * stride).unbind(-1)
     return Observation(
@@ -103,4 +108,6 @@ def observe(
         matching=matching[0],
         context=context[0],
         colors=rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu(),
+        fine_maps=features.fine,
+        fine=None if fine is None else fine[0],
     )

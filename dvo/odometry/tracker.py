@@ -305,7 +305,7 @@ class PatchOdometry:
         slot = window.free_map_slot()
         self._step.keep_frame(slot, seen)
         keyframe = Keyframe(self._count, view.records[0].timestamp, slot, seen.matching, seen.context, seen.colors,
-                            seen.intrinsics, seen.image)  # fmt: skip
+                            seen.intrinsics, seen.image, seen.fine)  # fmt: skip
         self._count += 1
         depth = torch.ones(1, config.patches, device=self.device)
         if self._initialised:

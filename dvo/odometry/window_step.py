@@ -50,7 +50,7 @@ class WindowStep:
             seen: the frame.
         """
         self.bounds = seen.bounds
-        self.lookup.keep_maps(map_slot, seen.maps)
+        self.lookup.keep_maps(map_slot, seen.maps, seen.fine_maps)
         if self.align is not None:
             self.align.keep_image(map_slot, seen.image)
 

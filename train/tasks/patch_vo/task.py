@@ -59,6 +59,8 @@ class PatchVOTask(Task):
         patches: patches a frame; None: those of the preset.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; None: that of the preset.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`; None: that of the preset.
+        fine_channels: of the fine level of the correlation, see :class:`dvo.nets.config.ModelConfig`; None: those of
+            the preset. Weights to start from need not have one.
         train_only: beginning of the names of the parameters that learn, the others are held; None: all. ``score`` adds
             the head for the selection ``learned`` and trains it alone, on random patches; ``selection`` is then only
             the one that the network keeps.
@@ -86,11 +88,13 @@ class PatchVOTask(Task):
         patches: int | None = None,
         selection: str | None = None,
         update_operator: str | None = None,
+        fine_channels: int | None = None,
         train_only: str | None = None,
     ) -> None:
         self.model, self.seed, self.train_only = model, seed, train_only
         self.changes = {
             "training_patches": patches, "selection": selection, "update_operator": update_operator,
+            "fine_channels": fine_channels,
             "score_head": True if selection == "learned" or train_only == SCORE else None,
         }  # fmt: skip
         self.updates, self.initial, self.settle = updates, initial, settle
@@ -147,8 +151,9 @@ class PatchVOTask(Task):
         buffers["warming"].fill_(False)
 
     def new_tensors(self) -> tuple[str, ...]:
-        """The score head, if there is one."""
-        return ("score.",) if self.changes["score_head"] else ()
+        """The score head and the fine level of the correlation, if they are wanted."""
+        parts = {"score_head": ("score.",), "fine_channels": ("patchify.fine.", "update.fine.")}
+        return tuple(name for part, names in parts.items() if self.changes[part] for name in names)
 
     def state_dict(self) -> dict[str, Any]:
         """State of the balance."""

@@ -18,19 +18,25 @@ from dvo.geometry.precision import full_precision
 
 @torch.no_grad()
 def pose_covariance(
-    problem: Problem, frames: Sequence[int], damping: BADamping = BADamping(), block: str = POSES  # noqa: B008
-) -> Tensor:  # fmt: skip
+    problem: Problem,
+    frames: Sequence[int],
+    damping: BADamping = BADamping(),  # noqa: B008
+    block: str = POSES,
+    sigma: float = 1.0,
+) -> Tensor:
     """Joint marginal covariance of chosen poses: their part of the inverse Hessian of all unknowns.
 
-    It is a covariance if the weights of all factors are inverse variances. Absolute damping stays in the Hessian, where
-    it acts as a weak prior on directions that nothing measures, for example the scale of a monocular problem with one
-    fixed pose; relative damping is left out.
+    It is a covariance if the weights of all factors are inverse variances, in units of ``sigma^-2``. Absolute damping
+    stays in the Hessian, where it acts as a weak prior on directions that nothing measures, for example the scale of a
+    monocular problem with one fixed pose; relative damping is left out.
 
     Args:
         problem: at its solution.
         frames: ``m`` elements of the block of poses.
         damping: absolute damping of poses and inverse depths.
         block: name of the block.
+        sigma: standard deviation of a measurement of weight 1, by which the result is scaled. For the confidence of a
+            network see :attr:`dvo.odometry.config.TrackerConfig.sigma`.
 
     Returns:
         ``(B, d m, d m)`` covariance of the left tangents (``d = 6``: ``[tau, phi]``), zero for fixed poses; infinite on
@@ -52,7 +58,7 @@ def pose_covariance(
     # One unit column for each tangent; the column of a fixed pose, past the last row, is zero.
     columns = torch.nn.functional.one_hot(rows, state.size + 1)[:, : state.size].T.to(solver.factor)
     inverse = torch.cholesky_solve(columns.expand(len(solver.factor), -1, -1), solver.factor)
-    covariance = columns.T @ inverse
+    covariance = sigma**2 * (columns.T @ inverse)
     good = (solver.ok & torch.isfinite(covariance).all(-1).all(-1))[:, None, None]
     infinite = torch.diag_embed(torch.full_like(covariance[..., 0], torch.inf))
     return torch.where(good, covariance, infinite)

@@ -100,7 +100,7 @@ def bundle_adjust(
         intrinsics = state[INTRINSICS].value if INTRINSICS in state.blocks else intrinsics.to(poses_cw.dtype)
         cost = inliers = covariance = None
         if options.covariance is not None:
-            covariance = pose_covariance(problem, options.covariance, options.damping)
+            covariance = pose_covariance(problem, options.covariance, options.damping, sigma=options.sigma)
         if options.report:
             arguments = (intrinsics, *arguments[1:])
             more = {name: state[name] for name in blocks or {}}

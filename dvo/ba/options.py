@@ -69,9 +69,10 @@ class BAOptions:
             an accelerator would have to be waited for.
         report: fill ``cost`` and ``inliers`` of the result.
         covariance: frames whose joint covariance is wanted.
+        sigma: standard deviation of a measurement of weight 1, for the covariance alone.
 
     Raises:
-        DvoError: unknown ``refine_intrinsics``, or a negative number of iterations.
+        DvoError: unknown ``refine_intrinsics``, a negative number of iterations, or a ``sigma`` that is not positive.
     """
 
     fixed: int | Tensor | Sequence[bool] = 1
@@ -88,6 +89,7 @@ class BAOptions:
     check: bool | None = None
     report: bool = False
     covariance: Sequence[int] | None = None
+    sigma: float = 1.0
 
     def __post_init__(self) -> None:
         if self.refine_intrinsics not in _REFINE:
@@ -97,6 +99,8 @@ class BAOptions:
             )
         if self.iterations < 0:
             raise DvoError(f"is {self.iterations}, negative", field="iterations", remedy="give 0 or more")
+        if not self.sigma > 0:
+            raise DvoError(f"is {self.sigma}, not positive", field="sigma", remedy="give a positive number of pixels")
 
 
 @dataclass(frozen=True)

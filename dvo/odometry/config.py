@@ -24,6 +24,7 @@ _RANGES = {
     "lifetime": (1, 1000),
     "removal": (1, 1000),
     "robust": (0, 1e4),
+    "sigma": (1e-6, 1e3),
     "optimisation": (1, 1000),
     "initial_frames": (2, 1000),
     "initial_updates": (1, 1000),
@@ -67,6 +68,9 @@ class TrackerConfig:
         estimate_readout: look for a rolling shutter in the final adjustment if the camera states no readout time
             (:mod:`dvo.odometry.self_calibration`).
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
+        sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
+            are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). It scales covariances
+            (:attr:`dvo.ba.options.BAOptions.sigma`) and changes no trajectory.
         restart: start the window anew, some frames after the initialisation, and the final adjustment, if that leads to
             a better solution (:mod:`dvo.ba.restart`).
         initial_frames: keyframes before the first joint optimisation.
@@ -116,6 +120,7 @@ class TrackerConfig:
     final_adjustment: bool = True
     estimate_readout: bool = True
     robust: float = 0.3
+    sigma: float = 0.064
     restart: bool = True
     updates: int = 1
     initial_motion: float = 0.5

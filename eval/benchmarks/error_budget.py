@@ -15,8 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.geometry import se3
-from dvo.geometry.projection import reproject
 from dvo.graph.window import Window
 from dvo.metrics import Metrics, evaluate
 from dvo.models.step import Measurement, Revision, UpdateState
@@ -24,9 +22,9 @@ from dvo.odometry.load import load
 from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.threads import settle_threads
+from eval.benchmarks.true_positions import TruePositions
 from eval.suites.suite import read_suites
 
-_OCCLUDED = 0.95  # a point this much farther away than what is seen there is hidden
 CASES = {
     "network": {"align": "none", "final_adjustment": False},
     "network, adjusted": {"align": "none"},
@@ -46,9 +44,7 @@ class TrueMeasurements:
     """
 
     def __init__(self, window: Window, sequence: SyntheticSequence, depth: Tensor) -> None:
-        self.window, self.depth = window, depth
-        self.times = torch.from_numpy(sequence.groundtruth.timestamps)
-        self.poses_cw = se3.inverse(torch.from_numpy(sequence.groundtruth.poses_wc)).float()
+        self.window, self.truth = window, TruePositions(sequence, depth)
 
     def keep_image(self, map_slot: int, image: np.ndarray) -> None:
         """Nothing: images are not needed."""
@@ -63,25 +59,7 @@ class TrueMeasurements:
             state: of the window.
             revision: output of the network, whose weights stay.
         """
-        graph, centre = state.graph, state.patches.shape[-1] // 2
-        stamps = torch.tensor([frame.timestamp for frame in self.window.frames], dtype=torch.float64)
-        frames = (stamps[:, None] - self.times).abs().argmin(1)
-        x, y = (4 * state.patches[0, :, axis, centre, centre].round().long() for axis in (0, 1))
-        exact = state.patches.clone()
-        depth = self.depth[frames.repeat_interleave(self.window.per_frame), y, x]
-        exact[0, :, 2] = (1 / depth.clamp(min=1e-6))[:, None, None]
-        true = reproject(self.poses_cw[frames][None], exact, state.intrinsics, graph.ii, graph.jj, graph.kk)
-        targets = true.coords[0, :, centre, centre]
-        h, w = self.depth.shape[1:]
-        column, row = (4 * targets).round().long().unbind(-1)
-        inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
-        there = self.depth[frames[graph.jj], row.clamp(0, h - 1), column.clamp(0, w - 1)]
-        points = torch.cat([exact[0, :, :2, centre, centre], torch.ones(len(depth), 1)], 1)
-        focal, principal = state.intrinsics[0, graph.ii].split(2, -1)
-        rays = torch.cat([(points[graph.kk, :2] - principal) / focal, points[graph.kk, 2:]], 1)
-        relative = se3.relative(self.poses_cw[frames[graph.ii]], self.poses_cw[frames[graph.jj]])
-        distance = se3.act(relative, rays * depth[graph.kk, None])[:, 2]
-        seen = true.valid[0, :, centre, centre] & inside & (depth[graph.kk] > 0) & (there > _OCCLUDED * distance)
+        targets, seen = self.truth.find(self.window)
         return Measurement(targets[None], revision.weights * seen[None, :, None])
 
 

@@ -21,6 +21,7 @@ from dvo.ba.step import solve
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
+from dvo.odometry.config import TrackerConfig
 
 F64 = torch.float64
 Maker = Callable[..., Any]
@@ -176,6 +177,11 @@ def test_covariance_is_the_inverse_of_the_dense_hessian(problem: Maker) -> None:
     assert (found[:, 6:12] == 0).all() and (found[:, :, 6:12] == 0).all()
     with pytest.raises(DvoError, match="frame 4 outside"):
         p.adjust(covariance=(4,))
+    again = p.adjust(covariance=(3, 0, 1), damping=damping, sigma=0.05)
+    torch.testing.assert_close(again.covariance, 0.05**2 * found)
+    assert torch.equal(again.poses_cw, result.poses_cw)
+    with pytest.raises(DvoError, match="sigma: is 0, not positive"):
+        p.adjust(covariance=(3,), sigma=0)
     nothing = replace(p, weights=torch.zeros_like(p.weights))
     found = pose_covariance(make_problem(*nothing.arguments()), (1,), BADamping(pose=0.0))
     assert torch.isinf(found.diagonal(dim1=1, dim2=2)).all() and not torch.isnan(found).any()
@@ -191,6 +197,22 @@ def test_covariance_predicts_the_spread_of_the_estimate(problem: Maker) -> None:
     noise = sigma * torch.randn(p.targets.shape, dtype=F64, generator=torch.Generator().manual_seed(0))
     p = replace(p, targets=p.targets + noise, weights=torch.full_like(p.weights, sigma**-2))
     result = p.adjust(fixed=2, iterations=6, covariance=(3,), damping=BADamping(0.1, 0.0, 1e-4))
+    errors = se3.log(se3.relative(p.true_poses[:, 3], result.poses_cw[:, 3]))
+    whitened = torch.linalg.solve_triangular(torch.linalg.cholesky(result.covariance), errors[..., None], upper=False)
+    assert 0.8 < whitened.square().mean().item() < 1.25
+
+
+def test_confidence_and_sigma_predict_the_spread_of_the_estimate(problem: Maker) -> None:
+    """Weights that are inverse variances in units of ``sigma^-2``, as the confidence of a network is."""
+    p = problem(batch=400, frames=4, per_frame=12, disturbance=0.0, depth_error=0.0).element(0)
+    rows = ("poses", "patches", "intrinsics", "targets", "weights", "true_poses", "true_patches")
+    p = replace(p, **{name: getattr(p, name).expand(400, *getattr(p, name).shape[1:]) for name in rows})
+    generator, sigma = torch.Generator().manual_seed(0), TrackerConfig().sigma
+    weights = 0.2 + 0.8 * torch.rand(p.weights.shape[1:], dtype=F64, generator=generator).expand_as(p.weights)
+    noise = sigma / weights.sqrt() * torch.randn(p.targets.shape, dtype=F64, generator=generator)
+    p = replace(p, targets=p.targets + noise, weights=weights)
+    damping = BADamping(1e-4, 0.0, 1e-6)
+    result = p.adjust(fixed=2, iterations=6, covariance=(3,), sigma=sigma, damping=damping)
     errors = se3.log(se3.relative(p.true_poses[:, 3], result.poses_cw[:, 3]))
     whitened = torch.linalg.solve_triangular(torch.linalg.cholesky(result.covariance), errors[..., None], upper=False)
     assert 0.8 < whitened.square().mean().item() < 1.25

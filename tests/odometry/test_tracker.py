@@ -44,6 +44,14 @@ def run(odometry, images):
     return estimates, odometry.finish()
 
 
+def test_sigma_changes_no_trajectory():
+    """It is for covariances alone."""
+    poses = [run(tracker(replace(SMALL, sigma=sigma)), frames(10))[1].trajectory.poses_wc for sigma in (0.06, 1.0)]
+    assert np.array_equal(*poses)
+    with pytest.raises(DvoError, match="sigma"):
+        TrackerConfig(sigma=0.0)
+
+
 def test_is_an_odometry_with_a_pose_for_every_frame():
     odometry = tracker()
     assert isinstance(odometry, Odometry)

@@ -58,7 +58,7 @@ def least_squares(given: list[Tensor]) -> float:
 @pytest.mark.parametrize("explicit", [True, False])
 def test_the_minimum_is_that_of_scipy(problem: Callable, monkeypatch: pytest.MonkeyPatch, solver: str, explicit: bool):
     given = arguments(problem(batch=1, frames=6, per_frame=5, noise=0.3))
-    monkeypatch.setattr(sparse, "EXPLICIT_WORK", 1e9 if explicit else 0)
+    monkeypatch.setattr(schur_pattern, "EXPLICIT_WORK", 1e9 if explicit else 0)
     options = replace(PLAIN, solver=replace(EXACT, solver=solver))
     result = global_bundle_adjust(*given, options=options)
     assert result.converged and result.cost < 0.1 * result.initial_cost

@@ -72,12 +72,15 @@ def _spread(values: np.ndarray) -> str:
     return f"{np.median(values):+.1f} [{values.min():+.1f}, {values.max():+.1f}]"
 
 
-def write_report(results: list[dict[str, Any]], config: StudyConfig) -> list[Path]:
+def write_report(
+    results: list[dict[str, Any]], config: StudyConfig, file: Path = Path("configs/train/study.yaml")
+) -> list[Path]:
     """Write ``OUT.md`` and ``OUT.png``.
 
     Args:
         results: of :func:`train.studies.study.run_arm`.
         config: the study.
+        file: that the study was read from.
 
     Returns:
         the files written.
@@ -86,16 +89,17 @@ def write_report(results: list[dict[str, Any]], config: StudyConfig) -> list[Pat
     out.parent.mkdir(parents=True, exist_ok=True)
     picture = out.with_suffix(".png")
     _plot(picture, results, config)
+    start = f"{config.start_steps} steps that are shared" if not config.state else f"the state `{config.state}`"
     seconds = np.mean([r["seconds_a_step"] for r in results])
     text = f"""# {config.title}
 
 {config.about}
 Preset `{config.model}`, clips of {config.frames} frames of {config.size[1]}x{config.size[0]} pixels,
-{config.updates} updates, {config.steps} steps of one OneCycle after {config.start_steps} steps that are shared. For a
+{config.updates} updates, {config.steps} steps of one OneCycle after {start}. For a
 seed all arms see the same clips and draw the same random numbers. Errors are taken on {config.validation_clips}
 held-out clips. Reproduced by
 
-    python -m train study --config configs/train/study.yaml
+    python -m train study --config {file.as_posix()}
 
 {table(results, config)}
 

@@ -186,5 +186,5 @@ def main(arguments: list[str]) -> None:
                 last = result["curve"][-1]
                 errors = ", ".join(f"{label} {last[name]:.4f}" for name, label in config.measures.items())
                 print(f"seed {seed} rate {rate:g} {arm}: {errors}, {result['seconds_a_step']:.2f} s a step", flush=True)
-    for file in write_report(results, config):
+    for file in write_report(results, config, options.config):
         print(file)

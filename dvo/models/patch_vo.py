@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from dvo.ba.cold_start import damping_at
 from dvo.geometry import se3
 from dvo.graph.edges import PatchGraph
+from dvo.models.clip_alignment import ClipAlignment
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import PRESETS, ModelConfig
@@ -133,6 +134,7 @@ class PatchVO(nn.Module):
         ba_iterations: int = 2,
         centres: Int[Tensor, "B N M 2"] | None = None,
         select: PatchSelection | None = None,
+        align_last: int = 0,
     ) -> Iterator[UpdateState]:
         """Run the updates of a schedule on a clip; the training pass.
 
@@ -153,6 +155,8 @@ class PatchVO(nn.Module):
             centres: integer patch centres ``x, y`` in feature pixels, at least one from the border, as many a frame as
                 in the schedule; None: the selection of the configuration draws them.
             select: selection of the patches if no ``centres`` are given, None for that of the configuration.
+            align_last: number of updates at the end whose measurements are aligned to a fraction of a pixel
+                (:class:`dvo.models.clip_alignment.ClipAlignment`) before bundle adjustment.
 
         Yields:
             The state after each update, with ``coords``. Poses and depths are detached between updates (DPVO 3.3): only
@@ -188,6 +192,7 @@ class PatchVO(nn.Module):
             closer = None if fine is None else fine.lookup(config.FINE * coords, *where)[0]
             return Correlation(volume.lookup(coords, *where), fine=closer)
 
+        refine = ClipAlignment(images) if align_last > 0 else None
         for update, stage in enumerate(stages):
             poses, patches, hidden = state.poses_cw.detach(), state.patches.detach(), state.hidden
             coords = state.coords
@@ -202,7 +207,7 @@ class PatchVO(nn.Module):
             present = scaled[:, :frames]
             state = UpdateState(stage.graph, poses, patches, present, context, hidden, coords, scores=scores)
             options = StepOptions(mode, 1, ba_iterations, damping_at(update), (width, height))
-            state = step(self, state, lookup, options)
+            state = step(self, state, lookup, options, refine if update >= len(stages) - align_last else None)
             if state.coords is None:
                 state = state.reprojected()
             yield state

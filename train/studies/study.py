@@ -57,18 +57,19 @@ class Curve(StepClock):
     Args:
         clips: held out.
         every: steps between measurements.
-        judged: network with the settings that all arms are judged with; it gets the weights of the arm.
+        judge: program with the settings that all arms are judged with; its network gets the weights of the arm.
     """
 
-    def __init__(self, clips: DiskClips, every: int, judged: nn.Module) -> None:
+    def __init__(self, clips: DiskClips, every: int, judge: TrainingProgram) -> None:
         super().__init__()
-        self.clips, self.every, self.judged = clips, every, judged
+        self.clips, self.every, self.judge = clips, every, judge
         self.rows: list[dict[str, float]] = []
 
     def _measure(self, step: int, program: Any) -> None:
         if not self.rows or self.rows[-1]["step"] < step:
-            self.judged.load_state_dict(program.net.state_dict())
-            self.rows.append({"step": float(step)} | validation_error(program.task, self.judged, self.clips))
+            self.judge.net.load_state_dict(program.net.state_dict())
+            found = validation_error(self.judge.task, self.judge.net, self.clips)
+            self.rows.append({"step": float(step)} | found)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Measure before the first step."""
@@ -147,7 +148,7 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
             remedy=f"give a state of the size '{config.model}'",
         ) from error  # fmt: skip
     program.average.load_state_dict(start)
-    curve = Curve(held_out, config.validate_every, _program(config, seed).net)
+    curve = Curve(held_out, config.validate_every, _program(config, seed))
     fit(folder, program, StudyClips(clips), config.steps, [curve], config.validate_every)
     result = {
         "arm": arm, "rate": rate, "seed": seed, "curve": curve.rows, "skipped": int(program.skipped),

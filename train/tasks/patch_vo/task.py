@@ -58,6 +58,8 @@ class PatchVOTask(Task):
         augmentation: random changes of the clips, None for none.
         patches: patches a frame; None: those of the preset.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; None: that of the preset.
+        align_last: updates at the end of a clip whose measurements are aligned to a fraction of a pixel, see
+            :meth:`dvo.models.patch_vo.PatchVO.unroll`.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`; None: that of the preset.
         fine_channels: of the fine level of the correlation, see :class:`dvo.nets.config.ModelConfig`; None: those of
             the preset. Weights to start from need not have one.
@@ -87,6 +89,7 @@ class PatchVOTask(Task):
         augmentation: Augmentation | None = None,
         patches: int | None = None,
         selection: str | None = None,
+        align_last: int = 0,
         update_operator: str | None = None,
         fine_channels: int | None = None,
         train_only: str | None = None,
@@ -99,7 +102,7 @@ class PatchVOTask(Task):
         }  # fmt: skip
         self.updates, self.initial, self.settle = updates, initial, settle
         self.warmup_mode, self.warmup_until, self.warmup_steps = warmup_mode, warmup_until, warmup_steps
-        self.correlation_gradient = correlation_gradient
+        self.correlation_gradient, self.align_last = correlation_gradient, align_last
         self.loss = loss or LossConfig()
         self.augmentation = augmentation
         fixed = self.loss.balance != "none"
@@ -203,6 +206,7 @@ class PatchVOTask(Task):
             mode=mode,
             generator=self.generators(context.step, b),
             correlation_gradient=self.correlation_gradient,
+            align_last=self.align_last,
             select=random_selection if self.train_only == SCORE else None,
         )
         terms, measures = clip_terms(states, truth, self.loss, mode)
@@ -284,7 +288,7 @@ class PatchVOTask(Task):
         states = list(
             net.unroll(
                 batch["images"], batch["intrinsics"], self.stages(net, n, "joint"), poses_cw=se3.identity(b, n),
-                generator=torch.Generator().manual_seed(seed),
+                generator=torch.Generator().manual_seed(seed), align_last=self.align_last,
             )
         )  # fmt: skip
         _, measures = clip_terms(states[-1:], truth, LossConfig())

@@ -57,7 +57,8 @@ class Curve(StepClock):
     Args:
         clips: held out.
         every: steps between measurements.
-        judge: program with the settings that all arms are judged with; its network gets the weights of the arm.
+        judge: program with the settings of the task that all arms are judged with; its network gets the weights of the
+            arm.
     """
 
     def __init__(self, clips: DiskClips, every: int, judge: TrainingProgram) -> None:
@@ -136,9 +137,8 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
     start = _start_of(seed, config, clips)
     trained = {"warmup_until": 0.0} if "warmup_until" in task_settings(config.task) else {}
     trained |= config.arm_settings.get(arm, {})
-    program = _program(
-        config, seed, learning_rate=rate, cycle=config.steps, loss=config.base | config.arms[arm], **trained
-    )
+    loss = config.base | config.arms[arm]
+    program = _program(config, seed, learning_rate=rate, cycle=config.steps, loss=loss, **trained)
     try:
         program.net.load_state_dict(start)
     except RuntimeError as error:
@@ -148,7 +148,7 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
             remedy=f"give a state of the size '{config.model}'",
         ) from error  # fmt: skip
     program.average.load_state_dict(start)
-    curve = Curve(held_out, config.validate_every, _program(config, seed))
+    curve = Curve(held_out, config.validate_every, _program(config, seed, loss=loss))
     fit(folder, program, StudyClips(clips), config.steps, [curve], config.validate_every)
     result = {
         "arm": arm, "rate": rate, "seed": seed, "curve": curve.rows, "skipped": int(program.skipped),

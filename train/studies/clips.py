@@ -62,7 +62,7 @@ class DiskClips(Dataset[dict[str, Tensor]]):
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         index %= self.count
-        file = self.folder / f"{index:06d}.pt"
+        file = self._file(index)
         if not file.is_file():
             clip = self.rendered[index]
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -70,6 +70,13 @@ class DiskClips(Dataset[dict[str, Tensor]]):
             torch.save(clip, part)
             part.replace(file)
         return torch.load(file, weights_only=True)
+
+    def _file(self, index: int) -> Path:
+        return self.folder / f"{index:06d}.pt"
+
+    def missing(self) -> list[int]:
+        """Indices of the clips that do not lie on disk."""
+        return [index for index in range(self.count) if not self._file(index).is_file()]
 
 
 class StudyClips(ClipStream):

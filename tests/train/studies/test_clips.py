@@ -17,7 +17,7 @@ def test_clips_are_rendered_once_and_used_in_turn(tmp_path, monkeypatch):
     monkeypatch.setattr(clips, "rendered", None)
     again = clips[2]
     assert all(torch.equal(first[name], again[name]) for name in ("images", "poses_cw"))
-    assert [file.name for file in clips.folder.iterdir()] == ["000000.pt"]
+    assert [file.name for file in clips.folder.iterdir()] == ["000000.pt"] and clips.missing() == [1]
     assert DiskClips(tmp_path, 5, 2, CONFIG, {"movers": 1.0}).folder != clips.folder
 
 

@@ -20,7 +20,7 @@ def apart(function: Callable[..., None], *arguments: Any) -> None:
         arguments: for it.
 
     Raises:
-        SystemExit: the process failed; its code, after it has printed the reason.
+        SystemExit: the process failed, and has printed the reason; with its code, or 1 if a signal ended it.
     """
     process = multiprocessing.get_context("spawn").Process(target=_run, args=(function, arguments), daemon=True)
     process.start()
@@ -30,6 +30,8 @@ def apart(function: Callable[..., None], *arguments: Any) -> None:
         if process.is_alive():
             process.terminate()
             process.join()
+    if process.exitcode and process.exitcode < 0:
+        print(f"error: signal {-process.exitcode} ended {function.__name__}; run it again to go on", file=sys.stderr)
     if process.exitcode:
         raise SystemExit(max(process.exitcode, 1))
 

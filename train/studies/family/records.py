@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from dvo.errors import DvoError
 from train.studies.family.config import NULL, FamilyConfig
@@ -39,13 +44,12 @@ class Table:
         names = (*self.key, *self.columns)
         texts = [f"{v:.6g}" if isinstance(v, float) else str(v) for v in (values[name] for name in names)]
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with self.file.open("x", encoding="utf-8", newline="") as file:
-                csv.writer(file, lineterminator="\n").writerow(names)
-        except FileExistsError:
-            pass
-        with self.file.open("a", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerow(texts)
+        with self.file.open("a+b") as file, _alone(file):
+            end = file.seek(0, os.SEEK_END)
+            before = "" if end else _line(names)
+            if end and file.seek(end - 1) and file.read(1) != b"\n":  # of a process that was killed
+                before = "," * len(names) + "\n"  # too many fields: the row does not count
+            file.write((before + _line(texts)).encode())
 
     def rows(self) -> list[Row]:
         """Rows in the order of their first appearance; none if there is no file.
@@ -55,16 +59,38 @@ class Table:
         """
         if not self.file.is_file():
             return []
-        with self.file.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in (*self.key, *self.columns) if name not in (reader.fieldnames or ())]
-            if missing:
-                remedy = "remove it, or take the version that this program wrote"
-                raise DvoError(f"has no column '{missing[0]}'", file=self.file, remedy=remedy)
-            # A row that was cut off when the process was killed has too few fields, or too many with the next one's.
-            whole = (row for row in reader if None not in row and None not in row.values())
-            found = {tuple(row[name] for name in self.key): row for row in whole}
+        text = self.file.read_bytes().decode()
+        reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+        missing = [name for name in (*self.key, *self.columns) if name not in (reader.fieldnames or ())]
+        if missing and text:
+            remedy = "remove it, or take the version that this program wrote"
+            raise DvoError(f"has no column '{missing[0]}'", file=self.file, remedy=remedy)
+        # A row that was cut off has no end of line, or too many fields since append() went on behind it.
+        whole = (row for row in reader if None not in row and None not in row.values())
+        found = {tuple(row[name] for name in self.key): row for row in whole}
         return list(found.values())
+
+
+@contextmanager
+def _alone(file: IO[bytes]) -> Iterator[None]:
+    """Lock a file against other processes that append to it, where the system can."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    fcntl.flock(file, fcntl.LOCK_EX)
+    try:
+        yield
+        file.flush()
+    finally:
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
+def _line(texts: Iterable[str]) -> str:
+    line = io.StringIO()
+    csv.writer(line, lineterminator="\n").writerow(texts)
+    return line.getvalue()
 
 
 class Records:
@@ -127,11 +153,19 @@ class Records:
         wanted = [member, str(seed)]
         return {row["sequence"] for row in self.sequences.rows() if [row["member"], row["seed"]] == wanted}
 
-    def complete(self, member: str, seed: int) -> bool:
-        """Whether there is nothing left to do for a run.
+    def trained(self, member: str, seed: int) -> bool:
+        """Answer whether a run is trained; :data:`train.studies.family.config.NULL` needs no training.
 
         Args:
             member, seed: of the run.
         """
-        trained = member == NULL or any([r["member"], r["seed"]] == [member, str(seed)] for r in self.runs.rows())
-        return trained and self.measured(member, seed) >= set(self.config.held_out.sequences())
+        wanted = [member, str(seed)]
+        return member == NULL or any([row["member"], row["seed"]] == wanted for row in self.runs.rows())
+
+    def complete(self, member: str, seed: int) -> bool:
+        """Answer whether there is nothing left to do for a run.
+
+        Args:
+            member, seed: of the run.
+        """
+        return self.trained(member, seed) and self.measured(member, seed) >= set(self.config.held_out.sequences())

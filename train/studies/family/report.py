@@ -117,8 +117,8 @@ def method(config: FamilyConfig) -> list[str]:
         the sequences. Rotation: sum of the rotation errors over two frames, over the sum of the true rotations,
         median over the sequences. Frames without a pose count in neither, so the share of frames with one stands
         beside. Speed: frames a second of processor time, one thread, final optimisation included. Memory: peak of
-        the process that tracks, and of the one that trains (a resumed training: of its last process); Python and
-        libraries alone are the row `{NULL}`.""",
+        the process that tracks, and of the one that trains and measures the learning curve (a resumed training: of its
+        last process); Python and libraries alone are the row `{NULL}`.""",
         """Tables of all measurements: `runs.csv` (training runs), `curves.csv` (learning curves), `sequences.csv`,
         `pairs.csv` (errors of all pairs, degrees).""",
     ]

@@ -17,7 +17,7 @@ from train.studies.family.config import NULL, FamilyConfig
 from train.studies.family.evaluation import Measured, errors_of, held_out_sequence, measure, straight_line
 from train.studies.family.process import apart
 from train.studies.family.records import Records
-from train.studies.family.training import build_member, sequence_folder, train_member
+from train.studies.family.training import build_member, sequence_folder, train_member, training_clips
 
 CONFIG = Path("configs/train/family.yaml")
 
@@ -26,6 +26,13 @@ def render_sequences(config: FamilyConfig) -> None:
     """Render the held-out sequences that do not lie on disk."""
     for sequence, options in config.held_out.sequences().items():
         held_out_sequence(sequence_folder(config, sequence), options)
+
+
+def render_clips(config: FamilyConfig) -> None:
+    """Render the training clips that do not lie on disk."""
+    clips = training_clips(config)
+    for index in clips.missing():
+        clips[index]
 
 
 def train_run(config: FamilyConfig, name: str, seed: int) -> None:
@@ -73,11 +80,14 @@ def run_member(config: FamilyConfig, name: str, seed: int) -> None:
         name: of the member, or :data:`train.studies.family.config.NULL`.
         seed: of the run.
     """
-    if Records(config).complete(name, seed):
+    records = Records(config)
+    if records.complete(name, seed):
         return
     if not all(sequence_folder(config, sequence).is_dir() for sequence in config.held_out.sequences()):
-        apart(render_sequences, config)  # so that its memory is not that of tracking
+        apart(render_sequences, config)  # so that its memory is not that of training or tracking
     if name != NULL:
+        if not records.trained(name, seed) and training_clips(config).missing():
+            apart(render_clips, config)
         apart(train_run, config, name, seed)
     apart(evaluate_run, config, name, seed)
 

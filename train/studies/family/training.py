@@ -54,6 +54,11 @@ def sequence_folder(config: FamilyConfig, name: str) -> Path:
     return Path(config.folder) / "sequences" / f"{name}_{form.seed}_{size}"
 
 
+def training_clips(config: FamilyConfig) -> DiskClips:
+    """Training clips of all members and seeds."""
+    return DiskClips(Path(config.folder) / "clips", CLIP_SEED, config.clips, config)
+
+
 def member_program(member: Member, phase: Phase, seed: int) -> TrainingProgram:
     """Training program of a phase; its learning rate is constant until :class:`Pace` sets it.
 
@@ -148,7 +153,7 @@ def train_member(config: FamilyConfig, name: str, seed: int) -> TrainingProgram:
     """
     member, folder, records = config.members[name], run_folder(config, name, seed), Records(config)
     progress, offset, state = Progress(), 0.0, None
-    trained = not any([row["member"], row["seed"]] == [name, str(seed)] for row in records.runs.rows())
+    trained = not records.trained(name, seed)  # in this call
     program = member_program(member, member.phases[0], seed)
     for number, phase in enumerate(member.phases):
         done = folder / f"phase{number}.pt"
@@ -186,13 +191,13 @@ def _train_phase(
     folder = run_folder(config, name, seed) / f"phase{number}"
     curve = LearningCurve(config, name, seed, offset, phase.share, before, (folder / "last.ckpt").is_file())
     pace = Pace(Budget(60 * config.minutes * phase.share, steps), phase.rate, config.rise, curve)
-    clips = DiskClips(Path(config.folder) / "clips", CLIP_SEED, config.clips, config)
-    stream = StudyClips(clips, member.batch, before.clips)
+    stream = StudyClips(training_clips(config), member.batch, before.clips)
     fit(folder, program, stream, steps or -1, [pace], timedelta(minutes=config.save_minutes))
-    if pace.share < 1:  # ended from outside
+    taken = int(program.trainer.global_step)  # the pace counts none if the state had taken them all
+    if pace.budget.share(taken, pace.train_seconds) < 1:  # ended from outside
         raise KeyboardInterrupt
     return Progress(
-        before.steps + int(program.trainer.global_step), stream.clips_seen, before.skipped + int(program.skipped),
+        before.steps + taken, stream.clips_seen, before.skipped + int(program.skipped),
         before.seconds + pace.train_seconds,
     )  # fmt: skip
 

@@ -1,5 +1,6 @@
 """Tables of measurements."""
 
+import threading
 from dataclasses import replace
 
 import pytest
@@ -25,14 +26,38 @@ def test_rows_are_appended_and_the_last_of_equal_ones_counts(tmp_path):
 def test_rows_that_were_cut_off_do_not_count(tmp_path):
     table = Table(tmp_path / "t.csv", ("a",), ("b", "c"))
     table.append(a=1, b=2, c=3)
-    with table.file.open("a") as file:
-        file.write("2,3")  # the process was killed; the next one appends
-    table.append(a=3, b=4, c=5)
-    table.append(a=4, b=4, c=5)
-    assert [row["a"] for row in table.rows()] == ["1", "4"]
+    for part in ("", "2", "2,3", "2,3,4"):  # the process was killed; the next one appends
+        with table.file.open("a") as file:
+            file.write(part)
+        assert [row["a"] for row in table.rows()][:1] == ["1"] and not any(row["a"] == "2" for row in table.rows())
+        table.append(a=f"after {part}", b=4, c=5)
+    assert [row["a"] for row in table.rows()] == ["1", "after ", "after 2", "after 2,3", "after 2,3,4"]
+    assert {(row["b"], row["c"]) for row in table.rows()} == {("2", "3"), ("4", "5")}
     table.file.write_text("a,b\n1,2\n")
     with pytest.raises(DvoError, match=r"t.csv: has no column 'c'"):
         table.rows()
+
+
+def test_a_table_that_was_begun_without_its_names_gets_them(tmp_path):
+    table = Table(tmp_path / "t.csv", ("a",), ("b",))
+    table.file.touch()
+    assert table.rows() == []
+    table.append(a=1, b=2)
+    assert table.rows() == [{"a": "1", "b": "2"}] and table.file.read_text() == "a,b\n1,2\n"
+
+
+def test_rows_of_several_writers_are_all_there(tmp_path):
+    def write(number):
+        for k in range(20):
+            Table(tmp_path / "t.csv", ("a", "b"), ("c",)).append(a=number, b=k, c="x" * 500)
+
+    writers = [threading.Thread(target=write, args=(number,)) for number in range(6)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    head, *rows = (tmp_path / "t.csv").read_text().splitlines()
+    assert head == "a,b,c" and sorted(rows) == sorted(f"{a},{b},{'x' * 500}" for a in range(6) for b in range(20))
 
 
 def test_measurements_with_other_settings_are_refused(family):

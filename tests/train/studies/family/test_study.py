@@ -9,7 +9,8 @@ from dvo.errors import DvoError
 from train.studies.family import study, training
 from train.studies.family.config import FamilyConfig
 from train.studies.family.records import Records
-from train.studies.family.study import main, rehearsal
+from train.studies.family.study import main, rehearsal, render_clips
+from train.studies.family.training import training_clips
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def test_a_study_runs_once_and_reports_again(file, monkeypatch, capsys):
     rows = [(row["member"], row["sequence"]) for row in records.sequences.rows()]
     names = list(records.config.held_out.sequences())
     assert rows == [(member, name) for member in ("null", "first") for name in names]
-    assert len(records.pairs.rows()) == 8
+    assert len(records.pairs.rows()) == 8 and training_clips(records.config).missing() == []
     with open(page, encoding="utf-8") as stream:
         text = stream.read()
     assert "| first | " in text and "| null | " in text
@@ -73,3 +74,10 @@ def test_a_rehearsal_is_short_and_elsewhere(family):
     assert short.minutes == pytest.approx(1 / 3) and short.seeds == (3,) and len(short.held_out.sequences()) == 1
     assert short.folder != config.folder and short.out.startswith(short.folder) and short.clips < config.clips
     assert short.members == config.members and replace(short, minutes=config.minutes) != config
+
+
+def test_clips_are_rendered_before_training(family, tmp_path):
+    config = family(folder=str(tmp_path / "empty"), clips=2)
+    assert training_clips(config).missing() == [0, 1]
+    render_clips(config)
+    assert training_clips(config).missing() == []

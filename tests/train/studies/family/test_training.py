@@ -79,3 +79,17 @@ def test_the_budget_is_processor_time(family, monkeypatch):
     train_member(config, "deepvo", 0)
     (run,) = Records(config).runs.rows()
     assert (run["steps"], run["seconds"]) == ("6", "6")  # two phases of three seconds
+
+
+@pytest.mark.parametrize("steps", [4, 0])
+def test_a_phase_that_was_stopped_after_its_last_step_is_not_trained_again(steps, family, monkeypatch):
+    config = family(curve_sequences=0, minutes=1e-3)
+    config = replace(config, members={"deepvo": replace(config.members["deepvo"], steps=steps)})
+    whole = train_member(config, "deepvo", 0)
+    (before,) = Records(config).runs.rows()
+    (run_folder(config, "deepvo", 0) / "phase1.pt").unlink()
+    again = train_member(config, "deepvo", 0)
+    assert same(again.average, whole.average)
+    (after,) = Records(config).runs.rows()
+    for name in ("steps", "clips", "seconds"):
+        assert after[name] == before[name], name

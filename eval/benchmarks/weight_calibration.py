@@ -13,17 +13,19 @@ for those that the sub-pixel alignment replaced.
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from dvo.errors import DvoError
 from dvo.odometry.load import load
 from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.threads import settle_threads
 from eval.benchmarks.true_positions import TruePositions
-from eval.suites.suite import read_suites
+from eval.suites.suite import Sequence, read_suites
 
 MEDIAN = 0.45494
 """Median of chi-square with one degree of freedom."""
@@ -138,11 +140,15 @@ def measure(sequence: SyntheticSequence, weights: str, seed: int) -> dict[str, E
 
     Returns:
         Errors by kind.
+
+    Raises:
+        DvoError: no such weights, or those of a network without patches.
     """
     frames = list(sequence)
     depth = torch.stack([torch.as_tensor(sequence.rendering(i).depth[0]) for i in range(len(sequence))])
     odometry = load(weights, seed=seed, final_adjustment=False)
-    assert isinstance(odometry, PatchOdometry)
+    if not isinstance(odometry, PatchOdometry):
+        raise DvoError("measures no patches", file=weights, field="--weights", remedy="give weights of a patch network")
     recorder = Recorder(odometry, TruePositions(sequence, depth))
     for frame in frames:
         odometry.track(frame)
@@ -174,8 +180,29 @@ def table(kind: str, fitted: Errors, held_out: Errors) -> list[str]:
     return lines
 
 
-def main() -> None:
-    """Track the sequences and print the tables."""
+def rendered_sequences(suites: str) -> list[Sequence]:
+    """Entries of rendered suites.
+
+    Args:
+        suites: names, with commas.
+
+    Raises:
+        DvoError: no such suite, or a recording in it, whose true positions are not known.
+    """
+    entries = [entry for name in suites.split(",") for suite in read_suites(name) for entry in suite.sequences]
+    for entry in entries:
+        if entry.rendered is None:
+            remedy = "name suites of rendered sequences, such as plain"
+            raise DvoError(f"{entry.name} is a recording", field="--suites", remedy=remedy)
+    return entries
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Track the sequences and print the tables; bad input ends with code 2 and one line.
+
+    Args:
+        arguments: of the command line; None: those of the process.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m eval.benchmarks.weight_calibration", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -183,15 +210,21 @@ def main() -> None:
     parser.add_argument("--suites", default="plain,scale,textureless,fast,blur", help="with commas (%(default)s)")
     parser.add_argument("--weights", default="small", help="name or file (%(default)s)")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
     settle_threads()
+    try:
+        _print_tables(rendered_sequences(given.suites), given.weights, given.seed)
+    except DvoError as error:
+        print(f"weight_calibration: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _print_tables(entries: list[Sequence], weights: str, seed: int) -> None:
     halves: tuple[list[dict[str, Errors]], list[dict[str, Errors]]] = ([], [])
-    entries = [
-        entry for name in given.suites.split(",") for suite in read_suites(name) for entry in suite.sequences
-    ]  # fmt: skip
     for number, entry in enumerate(entries):
         options = {name: value for name, value in entry.rendered or () if name != "version"}
-        errors = measure(make_sequence(**options), given.weights, given.seed)
+        errors = measure(make_sequence(**options), weights, seed)
         halves[number % 2].append(errors)
         chis = (f"{kind} {chi_of(errors[kind]).mean:.4f} / {chi_of(errors[kind]).robust:.4f}" for kind in KINDS)
         print(f"{entry.name:28} {('fitted', 'held out')[number % 2]:9} mean / robust: {', '.join(chis)}", flush=True)
@@ -201,4 +234,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

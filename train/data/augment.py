@@ -45,6 +45,15 @@ class Augmentation:
         check_settings(self, {})
 
 
+def random_source(number: int) -> torch.Generator:
+    """Source of random numbers on the CPU.
+
+    Args:
+        number: that it starts from; of one beyond 64 bits, the lower bits count.
+    """
+    return torch.Generator().manual_seed(number % 2**64)
+
+
 def augment(batch: dict[str, Tensor], settings: Augmentation, seed: int, step: int) -> dict[str, Tensor]:
     """Change a batch at random, the same for the same seed, step and process.
 
@@ -59,7 +68,7 @@ def augment(batch: dict[str, Tensor], settings: Augmentation, seed: int, step: i
     clips = []
     count = len(batch["images"])
     for index in range(count):
-        draw = torch.Generator().manual_seed((seed * 1_000_003 + step) * 8191 + rank() * count + index)
+        draw = random_source((seed * 1_000_003 + step) * 8191 + rank() * count + index)
         clip = {name: value[index] for name, value in batch.items()}
         if torch.rand((), generator=draw) < settings.zoom:
             clip |= _zoom(clip, settings, draw)

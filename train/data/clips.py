@@ -87,7 +87,7 @@ class MixedClips(Dataset[dict[str, torch.Tensor]]):
 
 
 def is_recorded(seed: int, batch: int, real: RealData | None) -> bool:
-    """Whether a batch is cut from recordings and not rendered.
+    """Answer whether a batch is cut from recordings and not rendered.
 
     Args:
         seed: of the stream of clips.

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from dvo.errors import DvoError
 from dvo.settings import check_settings
+from train.data.augment import random_source
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ def degrade(images: Tensor, settings: Degradation, seed: int, step: int) -> Tens
     clips = []
     for index, clip in enumerate(images):
         number = (seed * 1_000_003 + step) * 8191 + rank() * count + index
-        draw = torch.Generator().manual_seed(number ^ 0x5E1F)
+        draw = random_source(number ^ 0x5E1F)
         clips.append(_degraded(clip, settings, draw))
     return torch.stack(clips)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+import textwrap
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from dvo.viz.plot import ACCENT, INK, PAPER, START, TRUTH
 from train.studies.config import StudyConfig
 
 COLOURS = (TRUTH, ACCENT, START, INK)
+WIDTH = 128  # characters of a line of the page
 
 
 def curves(results: list[dict[str, Any]], arm: str, rate: float, measure: str) -> tuple[np.ndarray, np.ndarray]:
@@ -68,6 +70,10 @@ def row_text(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _options(options: Mapping[str, Any]) -> str:
+    return ", ".join(f"`{name}: {value}`" for name, value in options.items())
+
+
 def _spread(values: np.ndarray) -> str:
     return f"{np.median(values):+.1f} [{values.min():+.1f}, {values.max():+.1f}]"
 
@@ -90,13 +96,15 @@ def write_report(
     picture = out.with_suffix(".png")
     _plot(picture, results, config)
     start = f"{config.start_steps} steps that are shared" if not config.state else f"the state `{config.state}`"
+    about = "\n".join(textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in config.about.splitlines())
+    own = "".join(f"; the clips of `{arm}` have {_options(found)}" for arm, found in config.arm_clips.items())
     seconds = np.mean([r["seconds_a_step"] for r in results])
     text = f"""# {config.title}
 
-{config.about}
+{about}
 Preset `{config.model}`, clips of {config.frames} frames of {config.size[1]}x{config.size[0]} pixels,
 {config.updates} updates, {config.steps} steps of one OneCycle after {start}. For a
-seed all arms see the same clips and draw the same random numbers. Errors are taken on {config.validation_clips}
+seed all arms see the same clips and draw the same random numbers{own}. Errors are taken on {config.validation_clips}
 held-out clips. Reproduced by
 
     python -m train study --config {file.as_posix()}

@@ -110,7 +110,9 @@ def _start_of(seed: int, config: StudyConfig, clips: DiskClips) -> dict[str, Ten
         if config.start_steps > 0:
             fit(folder, program, StudyClips(clips), config.start_steps, [], 100)
         folder.mkdir(parents=True, exist_ok=True)
-        torch.save(program.net.state_dict(), done)
+        part = done.with_suffix(".part")
+        torch.save(program.net.state_dict(), part)
+        part.replace(done)  # whole, or not there
     return torch.load(done, weights_only=True)
 
 
@@ -144,8 +146,8 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise DvoError(
-            f"does not fit the network ({reason})", file=config.state, field="state",
-            remedy=f"give a state of the size '{config.model}'",
+            f"does not fit the network of '{arm}' ({reason})", file=config.state or None, field="state",
+            remedy=f"give a state of the size '{config.model}', and arms of the same network",
         ) from error  # fmt: skip
     program.average.load_state_dict(start)
     curve = Curve(held_out, config.validate_every, _program(config, seed, loss=loss))
@@ -154,7 +156,9 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
         "arm": arm, "rate": rate, "seed": seed, "curve": curve.rows, "skipped": int(program.skipped),
         "recovered": program.recovered, "seconds_a_step": curve.train_seconds / max(config.steps, 1),
     }  # fmt: skip
-    done.write_text(json.dumps(result, indent=1), encoding="utf-8")
+    part = done.with_suffix(".part")
+    part.write_text(json.dumps(result, indent=1), encoding="utf-8")
+    part.replace(done)  # whole, or not there
     return result
 
 

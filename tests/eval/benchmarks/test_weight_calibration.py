@@ -7,7 +7,7 @@ from dvo.odometry.load import load
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.error_budget import TrueMeasurements
 from eval.benchmarks.true_positions import TruePositions
-from eval.benchmarks.weight_calibration import Errors, Recorder, chi_of, table
+from eval.benchmarks.weight_calibration import Errors, Recorder, chi_of, main, table
 
 
 def gaussian(sigma, count=20_000, wrong=0, seed=0):
@@ -62,3 +62,10 @@ def test_measurements_are_compared_with_the_truth():
     true = found["always"]
     late = true["network"].squared[len(network.weights) // 2 :]  # the initialisation is the network's
     assert len(true["aligned"].weights) == 0 and late.max() < 1e-4 < network.squared.max()
+
+
+def test_recordings_and_unknown_suites_are_refused(capsys):
+    assert main(["--suites", "validation"]) == 2
+    assert "--suites: kitti00_120 is a recording. Name suites of rendered sequences" in capsys.readouterr().err
+    assert main(["--suites", "plain,absent"]) == 2
+    assert "absent" in capsys.readouterr().err

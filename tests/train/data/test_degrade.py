@@ -54,3 +54,9 @@ def test_a_point_is_smeared_along_the_line(angle):
 def test_values_out_of_range_are_refused(change):
     with pytest.raises(DvoError, match=next(iter(change))):
         Degradation(**change)
+
+
+def test_seeds_may_have_64_bits():
+    images = torch.full((2, 2, 3, 16, 16), 100, dtype=torch.uint8)
+    found = [degrade(images, Degradation(noise=1.0), seed, 7) for seed in (2**63 - 1, 2**63 - 1, 2**63 - 2)]
+    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])

@@ -12,9 +12,8 @@ from train.studies.family.config import NULL, FamilyConfig
 from train.studies.family.figure import draw
 from train.studies.family.records import Records
 from train.studies.family.summary import LIMITS, MemberSummary, summarise
-from train.studies.report import row_text
+from train.studies.report import WIDTH, row_text
 
-WIDTH = 128  # characters of a line of the page
 FAR = "tartanvo"
 """Member that the published comparison has far behind on the ATE."""
 

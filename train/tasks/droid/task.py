@@ -13,7 +13,7 @@ from dvo.losses.pose import pose_errors
 from dvo.models.dense_step import DenseMode
 from dvo.models.droid import DroidVO, neighbour_edges
 from dvo.nets.droid import preset
-from train.data.augment import Augmentation, augment
+from train.data.augment import Augmentation, augment, random_source
 from train.data.clips import Renderings
 from train.tasks.droid.objective import LossConfig, measures, objective, true_positions, truth_of
 from train.tasks.task import Batch, StepContext, StepLoss, Task
@@ -82,7 +82,7 @@ class DroidTask(Task):
         """
         ii, jj = neighbour_edges(frames, self.reach)
         if self.further:
-            draw = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
+            draw = random_source(self.seed * 1_000_003 + step)
             i, j = neighbour_edges(frames, frames)
             far = ((i - j).abs() > self.reach).nonzero()[:, 0]
             chosen = far[torch.randperm(len(far), generator=draw)[: self.further]]

@@ -69,7 +69,7 @@ class LossConfig:
 
     @property
     def follows_gradients(self) -> bool:
-        """Whether the balance compares gradients."""
+        """True if the balance compares gradients."""
         return self.balance in ("v2v", "trend")
 
 

@@ -19,7 +19,7 @@ from dvo.models.patch_vo import Mode, PatchVO
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.nets.config import preset
 from dvo.nets.selection import random_selection
-from train.data.augment import Augmentation, augment
+from train.data.augment import Augmentation, augment, random_source
 from train.data.clips import Renderings
 from train.engine.ranks import mean_over_ranks, rank
 from train.tasks.patch_vo.objective import LossConfig, Terms, Truth, clip_terms, truth_of
@@ -190,7 +190,7 @@ class PatchVOTask(Task):
         """A source of random numbers for each clip of a step, the same however the clips are spread over processes."""
         first = self.seed * 1_000_003 + step
         numbers = range(rank() * clips, (rank() + 1) * clips)
-        return [torch.Generator().manual_seed(first + number * 2**40) for number in numbers]
+        return [random_source(first + number * 2**40) for number in numbers]
 
     def terms(self, context: StepContext, batch: Batch, mode: Mode) -> tuple[Terms, dict[str, Tensor], Truth]:
         """Run the updates on a batch; see :func:`train.tasks.patch_vo.objective.clip_terms`."""

@@ -97,7 +97,7 @@ def write_report(
     _plot(picture, results, config)
     start = f"{config.start_steps} steps that are shared" if not config.state else f"the state `{config.state}`"
     about = "\n".join(textwrap.fill(line, WIDTH, break_on_hyphens=False) for line in config.about.splitlines())
-    own = "".join(f"; the clips of `{arm}` have {_options(found)}" for arm, found in config.arm_clips.items())
+    own = "".join(f";\nthe clips of `{arm}` have {_options(found)}" for arm, found in config.arm_clips.items())
     seconds = np.mean([r["seconds_a_step"] for r in results])
     text = f"""# {config.title}
 

@@ -137,3 +137,18 @@ def test_settings_of_a_wrong_type(text, message, tmp_path):
 def test_the_study_of_the_checkout_can_be_read():
     config = StudyConfig.read(Path(__file__).resolve().parents[3] / "configs" / "train" / "study.yaml")
     assert config.rates == (4e-4, 2e-3) and list(config.arms) == ["DPVO", "V2V weighting", "V2V weighting + balance"]
+
+
+def test_the_report_tells_clips_of_an_arm_and_has_short_lines(tmp_path):
+    config = small_study(
+        tmp_path, arms={"A": {}, "B": {}}, arm_clips={"B": {"movers": 0.0}}, about="word " * 60,
+        measures={"turn": "turn"}, out=str(tmp_path / "report"),
+    )  # fmt: skip
+    curve = [{"step": 0, "turn": 2.0}, {"step": 1, "turn": 1.0}]
+    results = [
+        {"arm": arm, "rate": 1e-3, "seed": 0, "skipped": 0, "curve": curve, "seconds_a_step": 1.0} for arm in "AB"
+    ]
+    page, _ = write_report(results, config)
+    text = page.read_text(encoding="utf-8")
+    assert "random numbers;\nthe clips of `B` have `movers: 0.0`. Errors" in text
+    assert max(len(line) for line in text.splitlines() if not line.startswith("|")) <= 128

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from dvo.data.frame import Frame
     from dvo.data.source import open_source as open
     from dvo.data.trajectory import Trajectory
+    from dvo.export.formats import export_map, export_trajectory
     from dvo.geometry import se3
     from dvo.geometry.camera import Camera
     from dvo.metrics import Metrics, evaluate
@@ -55,6 +56,8 @@ _LAZY = {
     "Trajectory": ("dvo.data.trajectory", "Trajectory"),
     "bundle_adjust": ("dvo.ba.layer", "bundle_adjust"),
     "evaluate": ("dvo.metrics", "evaluate"),
+    "export_map": ("dvo.export.formats", "export_map"),
+    "export_trajectory": ("dvo.export.formats", "export_trajectory"),
     "load": ("dvo.odometry.load", "load"),
     "load_model": ("dvo.models.weights", "load_model"),
     "losses": ("dvo.losses", ""),
@@ -66,7 +69,8 @@ _LAZY = {
 __all__ = [
     "BADamping", "BAOptions", "BAResult", "Break", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "Metrics",
     "ModelConfig", "Odometry", "Result", "Segment", "SparseMap", "Status", "TrackerConfig", "Trajectory", "__version__",
-    "bundle_adjust", "evaluate", "load", "load_model", "losses", "open", "run", "se3",
+    "bundle_adjust", "evaluate", "export_map", "export_trajectory", "load", "load_model", "losses", "open", "run",
+    "se3",
 ]  # fmt: skip
 
 

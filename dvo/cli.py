@@ -61,7 +61,21 @@ def build_parser() -> argparse.ArgumentParser:
         "--fps", type=_positive_float, metavar="F", help="frames per second, if the source does not define it"
     )
     run.add_argument("--groundtruth", metavar="FILE", help="TUM trajectory (camera to world) to compare with")
+    run.add_argument(
+        "--export",
+        type=_names,
+        default=[],
+        metavar="NAMES",
+        help="write the results for other programs too: colmap, colmap-text, nerfstudio, tum, kitti, euroc; by commas",
+    )
     run.set_defaults(run="dvo.commands.run:run")
+
+    export = commands.add_parser("export", help="write the trajectory of a results folder for another program")
+    export.add_argument("source", metavar="RESULTS", help="results folder of dvo run or dvo demo")
+    export.add_argument("out", metavar="OUT", help="new folder")
+    export.add_argument("--to", metavar="NAME", required=True, help="format: tum, kitti or euroc")
+    export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
+    export.set_defaults(run="dvo.commands.export:export")
 
     weights = commands.add_parser("weights", help="list, import or describe weights")
     verbs = weights.add_subparsers(dest="verb", required=True, metavar="VERB")
@@ -151,6 +165,20 @@ def _positive_int(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be 1 or more, got {text}")
     return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"must be 0 or more, got {text[:60]}")
+    return value
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"expected names separated by commas, got {text[:60]!r}")
+    return list(dict.fromkeys(names))
 
 
 def _size(text: str) -> tuple[int, int]:

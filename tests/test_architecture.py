@@ -32,6 +32,7 @@ ARROWS: dict[str, set[str]] = {
     "synth": {"geometry", "ba", "data"},
     "losses": {"geometry"},
     "odometry": {"models", "graph", "nets", "ba", "data", "geometry", "threads"},
+    "export": {"odometry", "graph", "nets", "data", "geometry"},
     "viz": {"data", "geometry", "odometry"},
 }
 TOP = {"cli", "commands", "demo", "__main__", "__init__"}  # these know everything, nobody below knows them

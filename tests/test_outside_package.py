@@ -1,6 +1,6 @@
 """A package outside ``dvo``, ``train`` and ``eval`` (``tests/outside``) brings a network, an odometry, a training task,
-an update operator, a factor, a reader, a system and a scene family. It is announced by entry points, as an installed
-package is, and each part is run by the ordinary commands without editing a file."""
+an update operator, a factor, a reader, a system, a scene family and a trajectory format. It is announced by entry
+points, as an installed package is, and each part is run by the ordinary commands without editing a file."""
 
 import json
 import os
@@ -46,6 +46,15 @@ def recording(tmp_path_factory):
     times = np.arange(6) / 10
     write_tum(folder / "groundtruth.txt", Trajectory(times, np.column_stack([times, np.zeros((6, 5)), np.ones(6)])))
     return folder
+
+
+def test_export_in_a_format_of_the_package(tmp_path):
+    times, out = np.arange(4) / 10, tmp_path / "out"
+    poses = np.column_stack([times, 2 * times, np.zeros((4, 4)), np.ones(4)])
+    (tmp_path / "results").mkdir()
+    write_tum(tmp_path / "results" / "trajectory.txt", Trajectory(times, poses))
+    assert "4 poses" in command("-m", "dvo", "export", tmp_path / "results", out, "--to", "positions")
+    np.testing.assert_allclose(np.loadtxt(out / "positions.csv", delimiter=","), poses[:, :3])
 
 
 def test_parts_are_announced_without_a_call():

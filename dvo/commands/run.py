@@ -14,17 +14,19 @@ import torch
 
 import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
-from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, seed_everything, warn
+from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.commands.picture import draw
 from dvo.commands.report import Scores, headline, print_report, score
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
+from dvo.export.formats import check_formats, export_run, remove_exports
 from dvo.odometry import results, session
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.odometry.recorder import Recorder
 from dvo.settings import parse_settings, read_settings
 
+EXPORT = "export"  # folder of the exports in the results folder
 _ABORTED = "aborted by a second Ctrl-C or SIGTERM"
 
 
@@ -62,8 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
         Exit code, see :func:`track`.
 
     Raises:
-        DvoError: invalid source, weights, device or settings, or a folder that cannot be written.
+        DvoError: invalid source, weights, device, settings or export, or a folder that cannot be written.
     """
+    check_formats(arguments.export)
     device = device_of(arguments.device)
     source = dvo.open(
         arguments.source,
@@ -88,7 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
     seed_everything(arguments.seed)
     with results.results_folder(arguments.out, source.name) as folder:  # checked before the weights load
         odometry = load_odometry(arguments, device)
-        return track(odometry, source, folder, stride=arguments.stride, facts=facts)
+        check_formats(arguments.export, odometry)
+        return track(odometry, source, folder, stride=arguments.stride, facts=facts, export=arguments.export)
 
 
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
@@ -114,7 +118,15 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     return dvo.load(arguments.weights, device=device, seed=arguments.seed, **settings)
 
 
-def track(odometry: Odometry, clip: Clip, out: Path | str | None, *, stride: int = 1, facts: dict[str, Any]) -> int:
+def track(
+    odometry: Odometry,
+    clip: Clip,
+    out: Path | str | None,
+    *,
+    stride: int = 1,
+    facts: dict[str, Any],
+    export: Sequence[str] = (),
+) -> int:
     """Track a clip, write the results folder and print a summary.
 
     Results are written from the first frame on (:class:`dvo.odometry.recorder.Recorder`) and replaced at the end. The
@@ -127,6 +139,7 @@ def track(odometry: Odometry, clip: Clip, out: Path | str | None, *, stride: int
         out: results folder; None for ``runs/NAME-TIME``.
         stride: distance of tracked frames, in frames of the clip.
         facts: metadata to write into run.json.
+        export: formats to write the results in too, into ``export/NAME`` of the results folder.
 
     Returns:
         Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C, 143 after SIGTERM.
@@ -135,15 +148,19 @@ def track(odometry: Odometry, clip: Clip, out: Path | str | None, *, stride: int
         DvoError: no frame could be read, or a result cannot be written.
     """
     with results.results_folder(out, clip.name) as folder:
-        return _track(odometry, clip, folder, stride, facts)
+        return _track(odometry, clip, folder, stride, facts, export)
 
 
-def _track(odometry: Odometry, clip: Clip, folder: Path, stride: int, facts: dict[str, Any]) -> int:
+def _track(
+    odometry: Odometry, clip: Clip, folder: Path, stride: int, facts: dict[str, Any], export: Sequence[str]
+) -> int:
     printed = set(clip.warnings)
     facts = {"odometry": odometry.name, **facts}
     recorder = Recorder(folder, odometry, facts, warn=warn)
 
     def on_frame(frame: Frame, estimate: Estimate | None) -> None:
+        if not recorder.started:
+            remove_exports(folder / EXPORT)
         recorder.update(frame, estimate)
         progress.update(frame, estimate)
 
@@ -165,9 +182,20 @@ def _track(odometry: Odometry, clip: Clip, folder: Path, stride: int, facts: dic
     for warning in new_warnings:
         warn(warning)
     print_report(folder, done, scores)
+    if export:
+        _export(odometry, done, folder / EXPORT, export)
     if done.interrupted:
         return TERMINATED if switch.pressed is signal.SIGTERM else INTERRUPTED
     return OK if done.result.frames_tracked else NOTHING_TRACKED
+
+
+def _export(odometry: Odometry, done: session.Run, folder: Path, formats: Sequence[str]) -> None:
+    """Write the exports, and print a line for each."""
+    if not done.result.frames_tracked:
+        warn("nothing to export")
+        return
+    for sentence in export_run(odometry, done.result, formats, folder):
+        say(f"exported to {folder}/{sentence}")
 
 
 def _write(folder: Path, done: session.Run, scores: Scores, clip: Clip, facts: dict[str, Any]) -> None:

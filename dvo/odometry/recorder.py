@@ -77,6 +77,11 @@ class Recorder:
         self._started = self._written = clock()
         self._clean = False
 
+    @property
+    def started(self) -> bool:
+        """True after the first frame."""
+        return self._read > 0
+
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
         """Record a frame; callback of :func:`dvo.odometry.session.run`.
 

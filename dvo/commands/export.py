@@ -1,0 +1,60 @@
+"""``dvo export``: write the trajectory of a results folder for another program."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from dvo.commands.console import say
+from dvo.data.trajectory import read_tum
+from dvo.errors import DvoError
+from dvo.export.formats import MAP_FORMATS, TRAJECTORY_FORMATS, describe_rows, export_trajectory
+from dvo.odometry import results
+
+
+def export(arguments: argparse.Namespace) -> int:
+    """Entry point of ``dvo export``.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
+
+    Raises:
+        DvoError: no results folder, a format of maps or none at all, no such segment, or a folder that is not empty.
+    """
+    folder, name = Path(arguments.source), arguments.to
+    if not folder.is_dir():
+        raise DvoError("not a results folder", file=folder, remedy="give a folder that dvo run has written")
+    if name in MAP_FORMATS and name not in TRAJECTORY_FORMATS:
+        raise DvoError(
+            f"a results folder holds no keyframes, which '{name}' needs",
+            field="--to",
+            remedy=f"track again with dvo run --export {name}, or use one of {', '.join(TRAJECTORY_FORMATS)}",
+        )
+    TRAJECTORY_FORMATS.target(name)  # before any file is read
+    trajectory = read_tum(_trajectory_file(folder, arguments.segment))
+    export_trajectory(trajectory, arguments.out, name)
+    say(f"exported to {arguments.out}: {describe_rows(name, len(trajectory), _frames_read(folder))}")
+    return 0
+
+
+def _trajectory_file(folder: Path, segment: int | None) -> Path:
+    if segment is None:
+        return folder / results.TRAJECTORY
+    if segment == 0 and not (folder / results.segment_file(0)).exists():  # the only one
+        return folder / results.TRAJECTORY
+    if not (folder / results.segment_file(segment)).is_file():
+        raise DvoError(f"no segment {segment}", file=folder, field="--segment", remedy="see segments in run.json")
+    return folder / results.segment_file(segment)
+
+
+def _frames_read(folder: Path) -> int | None:
+    """Number of frames of the source, if run.json tells."""
+    try:
+        count = json.loads((folder / results.SUMMARY).read_text(encoding="utf-8"))["frames"]["read"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return count if isinstance(count, int) else None

@@ -1,0 +1,263 @@
+"""Reconstruction of a segment: images, points and observations of a keyframe graph, which the map formats write.
+
+A feature-map pixel ``(u, v)`` is centred on the image pixel ``(4u, 4v)`` (:class:`dvo.nets.encoder.Encoder`), so
+positions and intrinsics of the feature map times 4 are those of the working image, without a half pixel. Pixel centres
+lie at integers here; a format that counts from the corner of the first pixel adds 0.5 (:data:`CORNER`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvo.data.image_header import image_size
+from dvo.errors import DvoError
+from dvo.geometry.camera import Camera
+from dvo.geometry.poses import pose_matrices
+from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
+from dvo.graph.keyframe_graph import NEAR, KeyframeGraph
+from dvo.nets.config import ModelConfig
+from dvo.settings import check_settings
+
+CORNER = 0.5
+"""Pixel coordinates counted from the corner of the first pixel, less those counted from its centre."""
+
+_RANGES = {"max_error": (0, 1e6), "min_weight": (0, 1e6), "min_images": (1, 1000)}
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """Choice of the observations and points of a reconstruction.
+
+    Attributes:
+        max_error: largest reprojection error of an observation, pixels of the working image.
+        min_weight: smallest weight of a measurement in bundle adjustment, mean of both axes.
+        min_images: smallest number of images in which a point is observed.
+
+    Raises:
+        DvoError: a value of another type or out of range.
+    """
+
+    max_error: float = 4.0
+    min_weight: float = 0.1
+    min_images: int = 2
+
+    def __post_init__(self) -> None:
+        check_settings(self, _RANGES)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Images, points and observations of a segment, in its world and scale.
+
+    Attributes:
+        cameras: distinct pinhole cameras of the images; pixel centres at integers.
+        camera_of: ``(N,)`` position in ``cameras`` of the camera of each image.
+        identifiers: ``(N,)`` identifier of the keyframe of each image, increasing.
+        timestamps: ``(N,)`` float64 seconds.
+        T_cw: ``(N, 4, 4)`` float64 world to camera (x right, y down, z forward).
+        jpegs: content of the N files.
+        points: ``(P, 3)`` float64 in the world.
+        colors: ``(P, 3)`` uint8 RGB.
+        errors: ``(P,)`` mean reprojection error of the observations of each point, pixels.
+        image_of, point_of: ``(O,)`` image and point of each observation, ordered by image, then by point; at most one
+            observation of a point in an image.
+        positions: ``(O, 2)`` observed positions, pixels with centres at integers.
+        residuals: ``(O,)`` reprojection errors, pixels; 0 in the image that the patch of the point was taken from.
+        without_image: number of keyframes left out because their image is not kept.
+    """
+
+    cameras: tuple[Camera, ...]
+    camera_of: np.ndarray
+    identifiers: np.ndarray
+    timestamps: np.ndarray
+    T_cw: np.ndarray
+    jpegs: tuple[bytes, ...]
+    points: np.ndarray
+    colors: np.ndarray
+    errors: np.ndarray
+    image_of: np.ndarray
+    point_of: np.ndarray
+    positions: np.ndarray
+    residuals: np.ndarray
+    without_image: int = 0
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the image files, by the identifiers of the keyframes."""
+        return [f"{identifier:06d}.jpg" for identifier in self.identifiers.tolist()]
+
+    @property
+    def mean_error(self) -> float:
+        """Mean reprojection error of all observations, pixels; 0 without observations."""
+        return float(self.residuals.mean()) if len(self.residuals) else 0.0
+
+    def __str__(self) -> str:
+        left = f", {self.without_image} keyframes without an image left out" if self.without_image else ""
+        counts = f"{len(self.jpegs)} images, {len(self.points)} points, {len(self.residuals)} observations"
+        return f"{counts}, mean reprojection error {self.mean_error:.2f} px{left}"
+
+
+@dataclass(frozen=True)
+class _Patches:
+    """Patches of all keyframes of a segment, one row a patch.
+
+    Attributes:
+        start: ``(F + 1,)`` first row of each keyframe.
+        points: ``(K, 3)`` in the world.
+        centres: ``(K, 2)`` pixels of the working image.
+        colors: ``(K, 3)`` uint8 RGB.
+        usable: ``(K,)`` bool, not too far for its depth to be known.
+    """
+
+    start: np.ndarray
+    points: np.ndarray
+    centres: np.ndarray
+    colors: np.ndarray
+    usable: np.ndarray
+
+
+def longest_segment(graph: KeyframeGraph) -> int:
+    """Segment with the most frames.
+
+    Args:
+        graph: of a sequence.
+
+    Returns:
+        Its number; the first of several equally long ones, 0 without frames.
+    """
+    counts = np.bincount([r.segment for r in graph.log.frames if not r.lost and r.anchor is not None], minlength=1)
+    return int(counts.argmax())
+
+
+def reconstruct(
+    graph: KeyframeGraph,
+    segment: int,
+    options: PointOptions = PointOptions(),  # noqa: B008 (frozen)
+) -> Reconstruction:
+    """Collect images, points and observations of a segment from the archive of a keyframe graph.
+
+    Images are those of the keyframes that were kept. A point is a patch, also one of a dropped keyframe; it is observed
+    in the image of its keyframe, if there is one, and in every image in which it was measured with a sufficient weight
+    and a small reprojection error. Measurements of a rolling shutter are given as they are in the image.
+
+    Args:
+        graph: keyframes in the window are not part of the archive: finish the odometry first.
+        segment: its number.
+        options: thresholds.
+
+    Returns:
+        The reconstruction.
+
+    Raises:
+        DvoError: no archived keyframes in the segment, or none with an image.
+    """
+    frames = graph.members(segment)
+    kept = np.array([frame.anchor is None for frame in frames], dtype=bool)
+    if not kept.any():
+        remedy = f"finish the odometry first, and give one of the segments 0 to {graph.segment}"
+        raise DvoError("no archived keyframes in it", field=f"segment {segment}", remedy=remedy)
+    sizes = [image_size(frame.jpeg) if here and frame.jpeg else None for frame, here in zip(frames, kept, strict=True)]
+    shown = np.array([size is not None for size in sizes], dtype=bool)
+    if not shown.any():
+        remedy = "track with ArchiveConfig(images=True) and a larger max_bytes"
+        raise DvoError("no keyframe has its image", field=f"segment {segment}", remedy=remedy)
+    T_cw = pose_matrices(graph.poses_cw(np.array([frame.identifier for frame in frames])).numpy())
+    intrinsics = ModelConfig.STRIDE * np.array([frame.intrinsics for frame in frames], dtype=np.float64)
+    patches = _patches(frames, T_cw, intrinsics)
+    frame_of, point_of, positions, residuals = _observations(
+        graph.archive.edges(), frames, T_cw, intrinsics, patches, sizes, options
+    )
+    views = np.bincount(point_of, minlength=len(patches.points))
+    seen = views >= options.min_images
+    chosen = seen[point_of]
+    frame_of, point_of, positions, residuals = (x[chosen] for x in (frame_of, point_of, positions, residuals))
+    point_of = (np.cumsum(seen) - 1)[point_of]
+    sums = np.bincount(point_of, residuals, minlength=int(seen.sum()))
+    images = np.flatnonzero(shown)
+    found = [_camera(intrinsics[image], sizes[image]) for image in images]
+    cameras = tuple(dict.fromkeys(found))
+    return Reconstruction(
+        cameras=cameras,
+        camera_of=np.array([cameras.index(camera) for camera in found]),
+        identifiers=np.array([frames[image].identifier for image in images]),
+        timestamps=np.array([frames[image].timestamp for image in images], dtype=np.float64),
+        T_cw=T_cw[images],
+        jpegs=tuple(frames[image].jpeg or b"" for image in images),
+        points=patches.points[seen],
+        colors=patches.colors[seen],
+        errors=sums / views[seen],
+        image_of=(np.cumsum(shown) - 1)[frame_of],
+        point_of=point_of,
+        positions=positions,
+        residuals=residuals,
+        without_image=int((kept & ~shown).sum()),
+    )
+
+
+def _camera(intrinsics: np.ndarray, size: tuple[int, int] | None) -> Camera:
+    assert size is not None
+    fx, fy, cx, cy = intrinsics.tolist()
+    return Camera(fx, fy, cx, cy, *size)
+
+
+def _patches(frames: list[ArchivedKeyframe], T_cw: np.ndarray, intrinsics: np.ndarray) -> _Patches:
+    """Patches of keyframes with poses ``(F, 4, 4)`` and intrinsics of the working images ``(F, 4)``."""
+    counts = np.array([len(frame.inverse_depth) for frame in frames])
+    owner = np.repeat(np.arange(len(frames)), counts)
+    centres = ModelConfig.STRIDE * np.concatenate([frame.centres for frame in frames]).astype(np.float64)
+    depth = np.concatenate([frame.inverse_depth for frame in frames]).astype(np.float64)
+    usable = np.concatenate([_usable(frame.inverse_depth) for frame in frames])
+    rays = np.column_stack([(centres - intrinsics[owner, 2:]) / intrinsics[owner, :2], np.ones(len(owner))])
+    in_camera = rays / np.where(usable, depth, 1.0)[:, None]
+    rotation, translation = T_cw[owner, :3, :3], T_cw[owner, :3, 3]
+    points = np.einsum("kji,kj->ki", rotation, in_camera - translation)
+    colors = np.concatenate([frame.colors for frame in frames]).astype(np.uint8)
+    return _Patches(np.concatenate([[0], np.cumsum(counts)]), points, centres, colors, usable)
+
+
+def _usable(inverse_depth: np.ndarray) -> np.ndarray:
+    """``(M,)`` bool, patches of a keyframe with a depth, and not so far that it is uncertain."""
+    known = np.isfinite(inverse_depth) & (inverse_depth > 0)
+    return known & (inverse_depth > NEAR * np.median(inverse_depth[known])) if known.any() else known
+
+
+def _observations(
+    edges: ArchivedEdges,
+    frames: list[ArchivedKeyframe],
+    T_cw: np.ndarray,
+    intrinsics: np.ndarray,
+    patches: _Patches,
+    sizes: list[tuple[int, int] | None],
+    options: PointOptions,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Frame ``(O,)``, patch ``(O,)``, position ``(O, 2)`` and reprojection error ``(O,)`` of each observation in an
+    image, ordered by frame, then by patch."""
+    identifiers = np.array([frame.identifier for frame in frames])
+    shown = np.array([size is not None for size in sizes], dtype=bool)
+    owner = np.repeat(np.arange(len(frames)), np.diff(patches.start))
+    own = np.flatnonzero(patches.usable & shown[owner])
+    edges = edges.select(np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers))
+    ii, jj = np.searchsorted(identifiers, edges.source), np.searchsorted(identifiers, edges.target)
+    kk = patches.start[ii] + edges.patch
+    positions = ModelConfig.STRIDE * edges.position.astype(np.float64)
+    in_camera = np.einsum("eij,ej->ei", T_cw[jj, :3, :3], patches.points[kk]) + T_cw[jj, :3, 3]
+    in_front = in_camera[:, 2] > 0
+    z = np.where(in_front, in_camera[:, 2], 1.0)[:, None]
+    projected = in_camera[:, :2] / z * intrinsics[jj, :2] + intrinsics[jj, 2:]
+    errors = np.linalg.norm(projected - positions, axis=1)
+    size = np.array([size or (0, 0) for size in sizes], dtype=np.float64)[jj]
+    inside = ((positions >= -CORNER) & (positions <= size - CORNER)).all(axis=1)
+    weights = edges.weight.astype(np.float64).mean(axis=1)
+    good = (ii != jj) & shown[jj] & patches.usable[kk] & in_front & inside
+    good &= (errors <= options.max_error) & (weights >= options.min_weight)  # NaN fails too
+    frame_of, point_of = np.concatenate([owner[own], jj[good]]), np.concatenate([own, kk[good]])
+    positions = np.concatenate([patches.centres[own], positions[good]])
+    residuals = np.concatenate([np.zeros(len(own)), errors[good]])
+    order = np.lexsort([residuals, point_of, frame_of])  # of several measurements of a patch in an image the best
+    pairs = np.column_stack([frame_of, point_of])[order]
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (pairs[1:] != pairs[:-1]).any(axis=1)
+    order = order[first]
+    return frame_of[order], point_of[order], positions[order], residuals[order]

@@ -1,0 +1,107 @@
+"""``dvo run --export`` and ``dvo export``."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dvo.cli import main
+from dvo.data.euroc import read_state_groundtruth
+from dvo.data.trajectory import read_kitti_poses, read_tum
+from dvo.geometry.poses import pose_matrices
+from tests.command_line import arguments, errors, names, summary
+
+
+def same(found, expected):
+    np.testing.assert_allclose(pose_matrices(found), pose_matrices(expected), atol=1e-6)
+
+
+def test_run_exports_beside_the_results(given, image_folder, tmp_path, capsys):
+    given(lost=(4, 5))
+    out = tmp_path / "out"
+    assert main(arguments(image_folder, out, "--export", "kitti,euroc,kitti")) == 0
+    assert names(out / "export") == ["euroc", "kitti"]
+    trajectory = read_tum(out / "trajectory.txt")
+    same(read_kitti_poses(out / "export" / "kitti" / "poses.txt"), trajectory.poses_wc)
+    same(read_state_groundtruth(out / "export" / "euroc" / "trajectory.csv").poses_wc, trajectory.poses_wc)
+    printed = capsys.readouterr().out
+    assert f"exported to {out}/export/kitti: 18 poses; 2 of 20 frames have no pose in it and no row" in printed
+    assert summary(out)["finished"] is True
+
+
+def test_the_next_run_removes_exports(given, image_folder, tmp_path):
+    given()
+    out = tmp_path / "out"
+    assert main(arguments(image_folder, out, "--export", "kitti")) == 0
+    given()
+    assert main(arguments(image_folder, out)) == 0
+    assert "export" not in names(out)
+
+
+def test_a_map_of_an_odometry_without_one_is_refused_before_tracking(given, image_folder, tmp_path, capsys):
+    odometry = given()
+    assert main(arguments(image_folder, tmp_path / "out", "--export", "kitti,colmap")) == 2
+    (line,) = errors(capsys.readouterr().err)
+    assert "keeps no keyframe graph" in line and "tum, kitti, euroc" in line
+    assert odometry.frames == [] and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("value", ["obj", "kitti,,tum", ""])
+def test_wrong_names(value, given, image_folder, tmp_path, capsys):
+    odometry = given()
+    assert main(arguments(image_folder, tmp_path / "out", "--export", value)) == 2
+    assert "export" in capsys.readouterr().err
+    assert odometry.asked == {} and not (tmp_path / "out").exists()
+
+
+def test_nothing_tracked_exports_nothing(given, image_folder, tmp_path, capsys):
+    given(lost=tuple(range(20)))
+    assert main(arguments(image_folder, tmp_path / "out", "--export", "tum")) == 1
+    assert "nothing to export" in capsys.readouterr().err
+
+
+@pytest.fixture
+def results(given, image_folder, tmp_path, capsys):
+    """Results folder of a run with two segments, of 7 and 12 frames, and one lost frame."""
+    given(new_segment=(8,), lost=(7,))
+    assert main(arguments(image_folder, tmp_path / "out")) == 0
+    capsys.readouterr()
+    return tmp_path / "out"
+
+
+def test_export_of_a_results_folder(results, tmp_path, capsys):
+    assert main(["export", str(results), "--to", "kitti", str(tmp_path / "kitti")]) == 0
+    same(read_kitti_poses(tmp_path / "kitti" / "poses.txt"), read_tum(results / "trajectory.txt").poses_wc)
+    assert "12 poses; 8 of 20 frames have no pose in it" in capsys.readouterr().out
+    assert main(["export", str(results), str(tmp_path / "first"), "--to", "euroc", "--segment", "0"]) == 0
+    first = read_state_groundtruth(tmp_path / "first" / "trajectory.csv")
+    same(first.poses_wc, read_tum(results / "trajectory-0.txt").poses_wc)
+    assert len(first) == 7
+
+
+def test_the_only_segment_has_the_number_0(given, image_folder, tmp_path):
+    given()
+    assert main(arguments(image_folder, tmp_path / "out")) == 0
+    (tmp_path / "out" / "run.json").unlink()  # only says how many frames there were
+    assert main(["export", str(tmp_path / "out"), str(tmp_path / "tum"), "--to", "tum", "--segment", "0"]) == 0
+    assert (tmp_path / "tum" / "trajectory.txt").read_bytes() == (tmp_path / "out" / "trajectory.txt").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(["--to", "colmap"], "a results folder holds no keyframes, which 'colmap' needs. Track again with dvo run"),
+     (["--to", "obj"], "no trajectory format 'obj'. Use one of tum, kitti, euroc"),
+     (["--to", "tum", "--segment", "2"], "no segment 2"), (["--to", "tum", "--segment", "-1"], "must be 0 or more"),
+     ([], "--to")],
+)  # fmt: skip
+def test_bad_input(options, message, results, tmp_path, capsys):
+    assert main(["export", str(results), str(tmp_path / "new"), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_no_results_folder_and_no_new_folder(results, tmp_path, capsys):
+    assert main(["export", str(tmp_path / "none"), str(tmp_path / "new"), "--to", "tum"]) == 2
+    assert main(["export", str(results), str(results), "--to", "tum"]) == 2
+    first, second = errors(capsys.readouterr().err)
+    assert "not a results folder" in first and "is not an empty folder" in second

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 from dvo.errors import DvoError
-from dvo.settings import check_names, check_settings, shown
+from dvo.nets.sizes import Sizes, check_sizes, named_preset
+from dvo.settings import check_settings
 
 # Smallest and largest sizes; the largest are far beyond networks of use, and keep a file from claiming the memory.
 RANGES = {
@@ -24,7 +24,7 @@ LEVELS, COARSEST, CORRELATIONS = 8, 64, 16_384  # of the pyramid: levels and lar
 
 
 @dataclass(frozen=True)
-class ModelConfig:
+class ModelConfig(Sizes):
     """Sizes of :class:`dvo.models.patch_vo.PatchVO`.
 
     Attributes:
@@ -69,14 +69,7 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, RANGES)
-        sizes = self.pyramid
-        if not isinstance(sizes, tuple) or not 1 <= len(sizes) <= LEVELS:
-            raise DvoError(
-                f"not a list of levels: {shown(sizes)}", field="pyramid", remedy=f"give 1 to {LEVELS} numbers"
-            )
-        if not all(isinstance(size, int) and not isinstance(size, bool) and 1 <= size <= COARSEST for size in sizes):
-            remedy = f"give whole numbers from 1 to {COARSEST}"
-            raise DvoError(f"out of range: {shown(sizes)}", field="pyramid", remedy=remedy)
+        check_sizes(self.pyramid, "pyramid", (1, LEVELS), COARSEST)
         if self.correlation_channels > CORRELATIONS:
             message = f"too many correlation channels: {self.correlation_channels:,}, {CORRELATIONS:,} at most"
             raise DvoError(message, field="radius", remedy="give a smaller radius, patch or pyramid")
@@ -92,33 +85,6 @@ class ModelConfig:
     def fine_correlation_channels(self) -> int:
         """Number of correlation channels of an edge at the fine level: offsets x patch pixels."""
         return (2 * self.fine_radius + 1) ** 2 * self.patch_size**2
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the metadata of weights.
-
-        Returns:
-            Attribute name to value.
-        """
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> ModelConfig:
-        """Build from plain values, for instance of a YAML file or of weights metadata.
-
-        Args:
-            values: attribute name to value; attributes that are missing take their defaults.
-
-        Returns:
-            The configuration.
-
-        Raises:
-            DvoError: an unknown attribute, or an invalid size.
-        """
-        check_names(cls, values)
-        values = dict(values)
-        if isinstance(values.get("pyramid"), list):
-            values["pyramid"] = tuple(values["pyramid"])
-        return cls(**values)
 
 
 PRESETS: dict[str, ModelConfig] = {
@@ -151,17 +117,5 @@ PRESETS["mamba"] = replace(PRESETS["small"], update_operator="mamba")
 
 
 def preset(name: str) -> ModelConfig:
-    """Configuration of a preset.
-
-    Args:
-        name: key of :data:`PRESETS`.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        DvoError: no such preset.
-    """
-    if name not in PRESETS:
-        raise DvoError(f"no preset '{name}'", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
-    return PRESETS[name]
+    """Configuration of a preset, a key of :data:`PRESETS`; see :func:`dvo.nets.sizes.named_preset`."""
+    return named_preset(PRESETS, name)

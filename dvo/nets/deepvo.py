@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from dvo.errors import DvoError
-from dvo.settings import check_names, check_settings, shown
+from dvo.nets.sizes import Sizes, check_sizes
+from dvo.settings import check_settings
 
 # Kernel and stride of the nine convolutions (DeepVO, table I; those of FlowNetSimple).
 LAYERS = ((7, 2), (5, 2), (5, 2), (3, 1), (3, 2), (3, 1), (3, 2), (3, 1), (3, 2))
@@ -23,7 +23,7 @@ INPUTS = 65_536  # features of an image pair that the recurrent layers take
 
 
 @dataclass(frozen=True)
-class DeepVOConfig:
+class DeepVOConfig(Sizes):
     """Sizes of :class:`dvo.models.deepvo.DeepVO`.
 
     Attributes:
@@ -45,13 +45,7 @@ class DeepVOConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, RANGES)
-        sizes, count = self.channels, len(LAYERS)
-        if not isinstance(sizes, tuple) or len(sizes) != count:
-            remedy = f"give the channels of the {count} convolutions"
-            raise DvoError(f"not a list of {count} numbers: {shown(sizes)}", field="channels", remedy=remedy)
-        if not all(isinstance(size, int) and not isinstance(size, bool) and 1 <= size <= WIDEST for size in sizes):
-            remedy = f"give whole numbers from 1 to {WIDEST}"
-            raise DvoError(f"out of range: {shown(sizes)}", field="channels", remedy=remedy)
+        check_sizes(self.channels, "channels", (len(LAYERS), len(LAYERS)), WIDEST)
         if self.pair_features > INPUTS:
             message = f"too many features of an image pair: {self.pair_features:,}, {INPUTS:,} at most"
             raise DvoError(message, field="channels", remedy="give a smaller working image, or fewer channels")
@@ -60,33 +54,6 @@ class DeepVOConfig:
     def pair_features(self) -> int:
         """Number of features of an image pair: channels x rows x columns of the last feature map."""
         return self.channels[-1] * -(-self.height // STRIDE) * -(-self.width // STRIDE)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the metadata of weights.
-
-        Returns:
-            Attribute name to value.
-        """
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> DeepVOConfig:
-        """Build from plain values, for instance of weights metadata.
-
-        Args:
-            values: attribute name to value; attributes that are missing take their defaults.
-
-        Returns:
-            The configuration.
-
-        Raises:
-            DvoError: an unknown attribute, or an invalid size.
-        """
-        check_names(cls, values)
-        values = dict(values)
-        if isinstance(values.get("channels"), list):
-            values["channels"] = tuple(values["channels"])
-        return cls(**values)
 
 
 PRESETS: dict[str, DeepVOConfig] = {

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -12,7 +11,8 @@ from torch.nn import functional as F
 
 from dvo.errors import DvoError
 from dvo.nets.encoder import ResidualBlock
-from dvo.settings import check_names, check_settings
+from dvo.nets.sizes import Sizes, named_preset
+from dvo.settings import check_settings
 
 RANGES = {
     "stem_channels": (1, 256),
@@ -30,7 +30,7 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet,
 
 
 @dataclass(frozen=True)
-class DroidConfig:
+class DroidConfig(Sizes):
     """Sizes of :class:`dvo.models.droid.DroidVO`.
 
     Attributes:
@@ -72,30 +72,6 @@ class DroidConfig:
         """Smallest height and width of an image, pixels: one pixel of the coarsest level."""
         return STRIDE * 2 ** (self.levels - 1)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the metadata of weights.
-
-        Returns:
-            Attribute name to value.
-        """
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> DroidConfig:
-        """Build from plain values, for instance of weights metadata.
-
-        Args:
-            values: attribute name to value; attributes that are missing take their defaults.
-
-        Returns:
-            The configuration.
-
-        Raises:
-            DvoError: an unknown attribute, or an invalid size.
-        """
-        check_names(cls, values)
-        return cls(**values)
-
 
 PRESETS: dict[str, DroidConfig] = {
     # DROID-SLAM, tensor for tensor.
@@ -110,20 +86,8 @@ PRESETS: dict[str, DroidConfig] = {
 
 
 def preset(name: str) -> DroidConfig:
-    """Configuration of a preset.
-
-    Args:
-        name: key of :data:`PRESETS`.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        DvoError: no such preset.
-    """
-    if name not in PRESETS:
-        raise DvoError(f"no preset '{name}'", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
-    return PRESETS[name]
+    """Configuration of a preset, a key of :data:`PRESETS`; see :func:`dvo.nets.sizes.named_preset`."""
+    return named_preset(PRESETS, name)
 
 
 def standardise_images(images: Float[Tensor, "*n 3 H W"]) -> Float[Tensor, "*n 3 H W"]:

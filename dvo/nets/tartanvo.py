@@ -6,8 +6,8 @@ one network serves all cameras.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -17,7 +17,8 @@ from torch.nn import functional as F
 from dvo.errors import DvoError
 from dvo.nets.encoder import ResidualBlock
 from dvo.nets.flow_pyramid import STRIDE, initialise
-from dvo.settings import check_names, check_settings, shown
+from dvo.nets.sizes import Sizes, check_sizes, named_preset
+from dvo.settings import check_settings
 
 FlowUnits = Literal["pixels", "rays"]
 """Units of the flow that the pose network reads: feature pixels (TartanVO), or pixels over the focal length."""
@@ -33,7 +34,7 @@ _ROTATION = 0.05  # radians to a unit of the output, as TartanVO's scale of its 
 
 
 @dataclass(frozen=True)
-class TartanVOConfig:
+class TartanVOConfig(Sizes):
     """Sizes of :class:`dvo.models.tartanvo.TartanVO`.
 
     Attributes:
@@ -63,9 +64,9 @@ class TartanVOConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, RANGES)
-        _check_sizes(self.feature_channels, "feature_channels", (1, LEVELS), CHANNELS)
-        _check_sizes(self.pose_channels, "pose_channels", (1, LEVELS), CHANNELS)
-        _check_sizes(self.grid, "grid", (2, 2), GRID)
+        check_sizes(self.feature_channels, "feature_channels", (1, LEVELS), CHANNELS)
+        check_sizes(self.pose_channels, "pose_channels", (1, LEVELS), CHANNELS)
+        check_sizes(self.grid, "grid", (2, 2), GRID)
         if self.design == "published" and replace(self, design="compact") != TartanVOConfig():
             remedy = "leave the other sizes at their defaults, or use compact"
             raise DvoError("the sizes of the published network are fixed", field="design", remedy=remedy)
@@ -75,41 +76,6 @@ class TartanVOConfig:
         """Smallest height and width of an image, pixels: two pixels of the coarsest level."""
         levels = 5 if self.design == "published" else len(self.feature_channels)
         return 2 ** (levels + 2)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for the metadata of weights.
-
-        Returns:
-            Attribute name to value.
-        """
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> TartanVOConfig:
-        """Build from plain values, for instance of weights metadata.
-
-        Args:
-            values: attribute name to value; attributes that are missing take their defaults.
-
-        Returns:
-            The configuration.
-
-        Raises:
-            DvoError: an unknown attribute, or an invalid size.
-        """
-        check_names(cls, values)
-        plain: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
-        return cls(**plain)
-
-
-def _check_sizes(sizes: Any, field: str, count: tuple[int, int], largest: int) -> None:
-    low, high = count
-    if not isinstance(sizes, tuple) or not low <= len(sizes) <= high:
-        wanted = f"{low}" if low == high else f"{low} to {high}"
-        raise DvoError(f"not a list of {wanted} sizes: {shown(sizes)}", field=field, remedy=f"give {wanted} numbers")
-    if not all(isinstance(size, int) and not isinstance(size, bool) and 1 <= size <= largest for size in sizes):
-        remedy = f"give whole numbers from 1 to {largest}"
-        raise DvoError(f"out of range: {shown(sizes)}", field=field, remedy=remedy)
 
 
 PRESETS: dict[str, TartanVOConfig] = {
@@ -131,20 +97,8 @@ PRESETS: dict[str, TartanVOConfig] = {
 
 
 def preset(name: str) -> TartanVOConfig:
-    """Configuration of a preset.
-
-    Args:
-        name: key of :data:`PRESETS`.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        DvoError: no such preset.
-    """
-    if not isinstance(name, str) or name not in PRESETS:
-        raise DvoError(f"no preset {shown(name)}", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
-    return PRESETS[name]
+    """Configuration of a preset, a key of :data:`PRESETS`; see :func:`dvo.nets.sizes.named_preset`."""
+    return named_preset(PRESETS, name)
 
 
 def intrinsics_layer(intrinsics: Float[Tensor, "B 4"], height: int, width: int) -> Float[Tensor, "B 2 h w"]:

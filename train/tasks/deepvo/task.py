@@ -11,6 +11,7 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.losses.pose import pose_errors
 from dvo.models.deepvo import DeepVO, chain, true_steps
+from dvo.nets.sizes import named_preset
 from dvo.settings import check_seed, shown
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
@@ -47,8 +48,7 @@ class DeepVOTask(Task):
         loss: LossConfig | None = None,
         augmentation: Augmentation | None = None,
     ) -> None:
-        if not isinstance(model, str) or model not in DeepVO.presets:
-            raise DvoError(f"no preset {shown(model)}", field="model", remedy=f"use one of {', '.join(DeepVO.presets)}")
+        named_preset(DeepVO.presets, model, "model")
         check_seed(seed)
         if not isinstance(both_ways, bool):
             raise DvoError(f"must be true or false, got {shown(both_ways)}", field="both_ways", remedy="give a bool")

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 from dvo.nets.alignment import AlignmentOptions
 from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.settings import check_names, check_settings, shown
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+C = TypeVar("C", bound="DataclassInstance")
 
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
@@ -69,8 +74,8 @@ class TrackerConfig:
             (:mod:`dvo.odometry.self_calibration`).
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
         sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
-            are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). It scales covariances
-            (:attr:`dvo.ba.options.BAOptions.sigma`) and changes no trajectory.
+            are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). The tracker does not read it;
+            it is there for callers that give it to :attr:`dvo.ba.options.BAOptions.sigma`, which scales covariances.
         restart: start the window anew, some frames after the initialisation, and the final adjustment, if that leads to
             a better solution (:mod:`dvo.ba.restart`).
         initial_frames: keyframes before the first joint optimisation.
@@ -215,3 +220,22 @@ def preset_changes(name: str, presets: Mapping[str, dict[str, Any]] = PRESETS) -
     if not isinstance(name, str) or name not in presets:
         raise DvoError(f"unknown preset {shown(name)}", field="preset", remedy=f"use one of {', '.join(presets)}")
     return presets[name]
+
+
+def with_changes(config: C, preset: str, presets: Mapping[str, dict[str, Any]], overrides: Mapping[str, Any]) -> C:
+    """Settings of an odometry, changed by a preset and by single settings on top of it.
+
+    Args:
+        config: settings to begin with, a dataclass.
+        preset: name of the preset.
+        presets: settings of each.
+        overrides: single settings; they win.
+
+    Returns:
+        The settings.
+
+    Raises:
+        DvoError: no such preset; an unknown or invalid setting.
+    """
+    check_names(type(config), overrides)
+    return replace(config, **{**preset_changes(preset, presets), **overrides})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,13 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.deepvo import DeepVO, RecurrentState, step_pose
 from dvo.models.weights import LoadedWeights
-from dvo.odometry.config import preset_changes
+from dvo.odometry.config import with_changes
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.working_image import working_image
-from dvo.settings import check_names, check_settings
+from dvo.settings import check_settings
 
 _RANGES = {"pixels": (0, 2**28), "max_gap": (1, math.inf), "min_matches": (0, 1)}
 
@@ -259,6 +259,5 @@ def deepvo_odometry(
         DvoError: an unknown or invalid setting.
     """
     assert isinstance(weights.model, DeepVO), "the registry gave the builder of another architecture"
-    check_names(RegressionConfig, overrides)
-    config = replace(config or RegressionConfig(), **{**preset_changes(preset, PRESETS), **overrides})
-    return DeepVOOdometry(weights.model, config, device=device, name=f"dvo-{weights.name}", seed=seed)
+    settings = with_changes(config or RegressionConfig(), preset, PRESETS, overrides)
+    return DeepVOOdometry(weights.model, settings, device=device, name=f"dvo-{weights.name}", seed=seed)

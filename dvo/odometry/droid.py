@@ -21,6 +21,7 @@ from dvo.geometry import se3
 from dvo.graph.keyframe_log import KeyframeLog
 from dvo.models.droid import DroidVO
 from dvo.models.weights import LoadedWeights
+from dvo.odometry.config import with_changes
 from dvo.odometry.dense_frame import place_frame, predicted_pose
 from dvo.odometry.dense_mapper import DenseMapper, View
 from dvo.odometry.depth_maps import depth_maps, fused
@@ -30,7 +31,7 @@ from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of_log
 from dvo.odometry.working_image import working_image
-from dvo.settings import check_names, check_seed
+from dvo.settings import check_seed
 
 _WITH_FEATURES = 32  # frames without a pose whose features are kept until the initialisation
 NOT_INITIALISED = "not initialised"
@@ -63,10 +64,7 @@ def droid_odometry(
         DvoError: an unknown or invalid setting.
     """
     assert isinstance(weights.model, DroidVO), "the registry gave the builder of another architecture"
-    check_names(DenseConfig, overrides)
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise DvoError(f"unknown preset {preset!r}", field="preset", remedy=f"use one of {', '.join(PRESETS)}")
-    settings = replace(config or DenseConfig(), **{**PRESETS[preset], **overrides})
+    settings = with_changes(config or DenseConfig(), preset, PRESETS, overrides)
     return DroidOdometry(weights.model, settings, seed=seed, device=device, name=f"dvo-{weights.name}")
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from dvo.models.weights import LoadedWeights, load_weights
-from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig, preset_changes
+from dvo.odometry.config import PRESETS, TRACKER_PRESETS, TrackerConfig, with_changes
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.registry import odometry_builder
 from dvo.settings import check_seed
@@ -115,9 +114,5 @@ def patch_odometry(
 
     assert isinstance(weights.model, PatchVO), "the registry gave the builder of another architecture"
     config = config or TRACKER_PRESETS.get(weights.preset, TrackerConfig())
-    if overrides:
-        TrackerConfig.from_dict(dict(overrides))
-    changes = {**preset_changes(preset), **overrides}
-    if changes:
-        config = replace(config, **changes)
-    return PatchOdometry(weights.model, config, seed=seed, device=device, name=f"dvo-{weights.name}")
+    settings = with_changes(config, preset, PRESETS, overrides)
+    return PatchOdometry(weights.model, settings, seed=seed, device=device, name=f"dvo-{weights.name}")

@@ -22,14 +22,14 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.tartanvo import TartanVO
 from dvo.models.weights import LoadedWeights
-from dvo.odometry.config import preset_changes
+from dvo.odometry.config import with_changes
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.two_view import parallax_of, returning_share
 from dvo.odometry.working_image import working_image
-from dvo.settings import check_names, check_settings
+from dvo.settings import check_settings
 
 UNRELATED = "new scene"
 """Reason of a break before a frame that does not show what was seen before an interruption."""
@@ -119,9 +119,8 @@ def tartan_odometry(
         DvoError: an unknown or invalid setting.
     """
     assert isinstance(weights.model, TartanVO), "the registry gave the builder of another architecture"
-    check_names(TwoFrameConfig, overrides)
     config = config or NETWORK_DEFAULTS.get(weights.preset, TwoFrameConfig())
-    settings = replace(config, **{**preset_changes(preset, PRESETS), **overrides})
+    settings = with_changes(config, preset, PRESETS, overrides)
     return TartanOdometry(weights.model, settings, seed=seed, device=device, name=f"dvo-{weights.name}")
 
 

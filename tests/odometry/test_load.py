@@ -1,11 +1,13 @@
 """``dvo.load``: the odometry of an architecture, its settings and its name."""
 
+from dataclasses import replace
+
 import pytest
 
 import dvo
 from dvo.errors import DvoError
 from dvo.models.patch_vo import PatchVO
-from dvo.models.registry import ARCHITECTURES
+from dvo.models.registry import ARCHITECTURES, network_class
 from dvo.models.weights import LoadedWeights
 from dvo.nets.config import ModelConfig, preset
 from dvo.odometry.config import PRESETS, TRACKER_PRESETS, TrackerConfig
@@ -57,3 +59,19 @@ def test_unknown_settings_and_architectures_are_named():
     with pytest.raises(DvoError, match="no odometry.*'none'.*patch_vo"):
         odometry_builder("none")
     assert set(ODOMETRIES) == set(ARCHITECTURES)
+
+
+@pytest.mark.parametrize("architecture", ["patch_vo", "deepvo", "tartanvo", "droid"])
+def test_presets_and_single_settings_of_every_odometry(architecture):
+    network = network_class(architecture)
+    weights = LoadedWeights.of(network(network.presets["tiny"]), "tiny")
+    given = replace(build_odometry(weights).config, max_gap=9.0)
+    changed = build_odometry(weights, config=given, preset="accurate", max_gap=8.0).config
+    assert changed.max_gap == 8.0 and given.max_gap == 9.0 and changed.pixels == 448 * 336
+    assert build_odometry(weights, config=given).config == given
+    with pytest.raises(DvoError, match="^preset: unknown preset 'slow'.*default, fast, accurate"):
+        build_odometry(weights, preset="slow")
+    with pytest.raises(DvoError, match="^colour: unknown setting"):
+        build_odometry(weights, colour=1)
+    with pytest.raises(DvoError, match="^max_gap: "):
+        build_odometry(weights, max_gap=0.5)

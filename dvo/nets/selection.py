@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any, Protocol
 
 import torch
@@ -43,6 +44,7 @@ class PatchSelection(Protocol):
     """Interface of a patch selection.
 
     One with a further keyword ``score``, a :data:`PointScore`, is given that of the network (:func:`needs_score`).
+    It is hashable, as functions are.
     """
 
     def __call__(self, images: Tensor, patches: int, generator: torch.Generator | None) -> Tensor:
@@ -142,7 +144,19 @@ def learned_selection(
 
 
 def needs_score(select: Callable[..., Any]) -> bool:
-    """Whether a selection takes the score of the network."""
+    """Return True if a selection takes the score of the network.
+
+    Args:
+        select: a :class:`PatchSelection`, or a ``functools.partial`` of one by keywords.
+    """
+    while isinstance(select, partial):  # new ones may be made for every frame, of the same selection
+        select = select.func
+    return _takes_score(select)
+
+
+@lru_cache(maxsize=64)
+def _takes_score(select: Callable[..., Any]) -> bool:
+    """Return True if a function has the keyword; the look-up takes longer than some selections."""
     return "score" in inspect.signature(select).parameters
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.dense import pixel_grid
 from dvo.ba.options import BADamping
 from dvo.models.dense_step import DAMPING, DenseOptions, DenseState, HeldEdges, VolumeLookup, dense_step, frame_graph
 from dvo.models.droid import DroidVO
@@ -103,10 +104,9 @@ def agreement(state: DenseState) -> Agreement:
     count = float(seen.sum().clamp(min=1))
     confidence = state.confidence.mean(-1)
     found = seen & (confidence > CONFIDENT) & ((state.targets - coords).norm(dim=-1) < AGREEMENT)
-    grid = coords.new_tensor([w, h])
-    flow = coords - torch.stack(torch.meshgrid(*(torch.arange(int(n)) for n in grid), indexing="xy"), -1).to(coords)
     first = seen[0, 0]
-    length = float(flow[0, 0].norm(dim=-1)[first].mean()) if float(first.float().mean()) > 0.4 else float("inf")
+    flow = coords[0, 0] - pixel_grid(h, w, coords.device).permute(1, 2, 0)
+    length = float(flow.norm(dim=-1)[first].mean()) if float(first.float().mean()) > 0.4 else float("inf")
     share = float((confidence * seen).sum()) / count
     return Agreement(share, float(found.sum()) / count if count > 0.1 * seen.numel() else 0.0, length)
 

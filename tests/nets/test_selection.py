@@ -1,5 +1,6 @@
 """Patch selections: where they place the patches, and that the seed decides."""
 
+import inspect
 from dataclasses import replace
 from functools import partial
 
@@ -20,7 +21,7 @@ from dvo.models.schedule import training_schedule
 from dvo.models.weights import LoadedWeights, load_weights, save_weights
 from dvo.nets.config import ModelConfig, preset
 from dvo.nets.patchifier import normalise_images
-from dvo.nets.selection import SELECTIONS, random_centres, structure_score
+from dvo.nets.selection import SELECTIONS, needs_score, random_centres, structure_score
 from dvo.odometry.config import TRACKER_PRESETS
 from dvo.odometry.front_end import observe
 from dvo.odometry.load import build_odometry
@@ -173,6 +174,22 @@ def test_a_head_changes_neither_preset_nor_trajectory(tmp_path):
 
     mine, theirs, learned = poses(loaded), poses(shipped), poses(loaded, selection="learned")
     assert len(mine) and np.array_equal(mine, theirs) and not np.array_equal(mine, learned)
+
+
+def test_the_signature_of_a_selection_is_read_once(monkeypatch):
+    read, signature = [], inspect.signature
+    monkeypatch.setattr(inspect, "signature", lambda select: read.append(select) or signature(select))
+
+    def scored(images, patches, generator, *, score=None):
+        return None
+
+    def plain(images, patches, generator):
+        return None
+
+    for patches in (1, 2):
+        assert needs_score(scored) and needs_score(partial(partial(scored, patches=patches), generator=None))
+        assert not needs_score(plain) and not needs_score(partial(plain, patches=patches))
+    assert read == [scored, plain]
 
 
 def test_an_unknown_selection_is_named():

@@ -1,16 +1,21 @@
 """Tiny training runs."""
 
 import functools
+import sys
+from pathlib import Path
 
 import lightning as L
 import pytest
 import torch
+import yaml
 
 import dvo.synth.dataset
 from dvo.synth.clip import make_clip
+from train.__main__ import main
 from train.data.clips import Renderings
 from train.engine.build import make_program
 
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "train"
 CLIP = {"frames": 4, "sizes": [(48, 64), (64, 48)], "workers": 0, "seed": 5}
 
 
@@ -70,7 +75,49 @@ class Runs:
         trainer.save_checkpoint(folder / "last.ckpt")
         return program, record.losses
 
+    @classmethod
+    def check_resuming(cls, folder, steps, make, data=lambda: None):
+        """Equal runs have equal bytes, and so has one that is stopped after two steps and resumed; returns the program.
+
+        ``make`` and ``data`` give a new program and new clips; the state of the stopped run stays in ``stopped``.
+        """
+        for name in ("whole", "again", "stopped", "resumed"):
+            (folder / name).mkdir()
+        whole, losses = cls.fit(folder / "whole", steps, make(), data=data())
+        _, same = cls.fit(folder / "again", steps, make(), data=data())
+        assert losses == same
+        _, first = cls.fit(folder / "stopped", 2, make(), data=data())
+        resumed, then = cls.fit(folder / "resumed", steps, make(), folder / "stopped" / "last.ckpt", data=data())
+        assert first + then == losses
+        for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
+            assert torch.equal(a, b), name
+        return whole
+
+    @staticmethod
+    def shipped(task, folder):
+        """Settings of the shipped configuration of a task, for a short run whose files go to a folder."""
+        settings = yaml.safe_load((CONFIGS / f"{task}.yaml").read_text())
+        assert settings["task"] == task and settings["model"]["model"] == "small"
+        saver = settings["trainer"]["callbacks"][0]
+        saver["init_args"]["every_n_train_steps"] = 1
+        settings["trainer"] |= {
+            "accelerator": "cpu", "log_every_n_steps": 1, "default_root_dir": str(folder), "callbacks": [saver],
+            "enable_progress_bar": False, "enable_model_summary": False,
+        }  # fmt: skip
+        return settings
+
 
 @pytest.fixture
 def runs():
     return Runs
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """``command("fit", ...)`` runs ``python -m train fit ...``."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
+        main()
+
+    return run

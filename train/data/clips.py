@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
-from dvo.allocator import reuse_freed_memory
 from dvo.errors import DvoError
 from dvo.synth.dataset import ClipDataset
 from dvo.synth.specs import check_share
 from train.data.real import RealClips, RealData
-from train.data.stream import ClipStream, StreamSampler
+from train.data.stream import BatchStream
 from train.engine.provenance import Material, names_of
-
-
-def start_worker(_: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the training process's to handle
-    torch.set_num_threads(1)
-    reuse_freed_memory()
 
 
 @dataclass
@@ -97,7 +89,7 @@ def is_recorded(seed: int, batch: int, real: RealData | None) -> bool:
     return real is not None and bool(np.random.default_rng([seed, 9109, batch]).random() < real.share)
 
 
-class Renderings(ClipStream):
+class Renderings(BatchStream):
     """An endless stream of rendered clips, the same for the same seed whatever the number of workers and processes.
 
     Args:
@@ -175,15 +167,3 @@ class Renderings(ClipStream):
         if self.real is not None and is_recorded(self.seed, clip // (self.batch_size * processes), self.real):
             return Material(recordings=names_of(self.real.folders))
         return Material(photographs=names_of([self.textures])[0] if self.textures else "")
-
-    def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
-        """Batches of this process, from the position on."""
-        processes, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
-        return DataLoader(
-            self.clips(processes),
-            batch_size=self.batch_size,
-            sampler=StreamSampler(self.clips_seen, self.batch_size, processes, rank),
-            num_workers=self.workers,
-            worker_init_fn=start_worker,
-            persistent_workers=self.workers > 0,
-        )

@@ -8,13 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import Dataset
 
 from dvo.errors import DvoError
 from dvo.synth.dataset import ClipDataset
 from dvo.synth.specs import check_share
-from train.data.clips import start_worker
-from train.data.stream import ClipStream, StreamSampler
+from train.data.stream import BatchStream
 from train.data.unlabelled import UnlabelledClips, UnlabelledData
 from train.engine.provenance import Material, names_of
 
@@ -45,7 +44,7 @@ class LabelledRenderings:
             check_share(f"data.labelled.{name}", getattr(self, name))
 
 
-class Mixture(ClipStream):
+class Mixture(BatchStream):
     """Endless stream of clips, most of them without labels: their depths and poses are nan.
 
     Args:
@@ -140,18 +139,6 @@ class Mixture(ClipStream):
         if self.kind(clip // (self.batch_size * processes)) == "recorded" and self.real is not None:
             return Material(recordings=names_of(self.real.folders))
         return Material(photographs=names_of([self.textures])[0] if self.textures else "")
-
-    def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
-        """Batches of this process, from the position on."""
-        processes, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
-        return DataLoader(
-            self.clips(processes),
-            batch_size=self.batch_size,
-            sampler=StreamSampler(self.clips_seen, self.batch_size, processes, rank),
-            num_workers=self.workers,
-            worker_init_fn=start_worker,
-            persistent_workers=self.workers > 0,
-        )
 
 
 class MixtureClips(Dataset[dict[str, torch.Tensor]]):

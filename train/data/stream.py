@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from typing import Any
 
 import lightning as L
-from torch.utils.data import Sampler
+import torch
+from torch.utils.data import DataLoader, Dataset, Sampler
 
+from dvo.allocator import reuse_freed_memory
 from train.engine.provenance import Material
 
 
@@ -65,3 +68,37 @@ class ClipStream(L.LightningDataModule):
             processes: number of training processes.
         """
         return Material(other=type(self).__name__)
+
+
+class BatchStream(ClipStream):
+    """Base of data modules whose clips are made by index, by worker processes if there are any.
+
+    Attributes:
+        batch_size: clips a step, in each process.
+        workers: processes that make clips; 0: the training process does.
+    """
+
+    batch_size: int
+    workers: int
+
+    def clips(self, processes: int = 1) -> Dataset[dict[str, torch.Tensor]]:
+        """The clips, in batches that span so many processes."""
+        raise NotImplementedError
+
+    def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
+        """Batches of this process, from the position on."""
+        processes, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
+        return DataLoader(
+            self.clips(processes),
+            batch_size=self.batch_size,
+            sampler=StreamSampler(self.clips_seen, self.batch_size, processes, rank),
+            num_workers=self.workers,
+            worker_init_fn=start_worker,
+            persistent_workers=self.workers > 0,
+        )
+
+
+def start_worker(_: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the training process's to handle
+    torch.set_num_threads(1)
+    reuse_freed_memory()

@@ -1,6 +1,5 @@
 """The task of the pose-regression network: its loss, its measures, equal and resumed runs."""
 
-import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import dvo
 from dvo.errors import DvoError
 from dvo.models.deepvo import TRANSLATION_UNIT, chain, true_steps
 from dvo.synth.sequence import make_sequence
-from train.__main__ import main
 from train.data.augment import Augmentation
 from train.engine.build import make_program
 from train.engine.checkpoint import read_state
@@ -76,7 +74,7 @@ def test_the_same_seed_gives_the_same_bytes_and_resuming_those_of_not_having_sto
         assert torch.equal(a, b) and torch.equal(a, c), name
 
 
-def test_the_shipped_configuration_trains_resumes_and_gives_weights_that_track(tmp_path, monkeypatch):
+def test_the_shipped_configuration_trains_resumes_and_gives_weights_that_track(tmp_path, command):
     """By the ordinary commands, with smaller sizes on top."""
     watch = {"every": 2, "rendered": 1, "frames": 4, "size": [48, 64]}
     smaller = {
@@ -94,10 +92,6 @@ def test_the_shipped_configuration_trains_resumes_and_gives_weights_that_track(t
     }  # fmt: skip
     file = tmp_path / "smaller.yaml"
     file.write_text(yaml.safe_dump(smaller))
-
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
-        main()
 
     fit = ("fit", "--config", ROOT / "configs" / "train" / "deepvo.yaml", "--config", file)
     command(*fit, "--name", "whole", "--trainer.max_steps=4")

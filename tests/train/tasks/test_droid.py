@@ -1,8 +1,6 @@
 """The task of the dense network: exact estimates, gradients, learning, resuming, configuration."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +15,6 @@ from dvo.models.dense_step import DenseState, frame_graph
 from dvo.models.droid import DroidVO, neighbour_edges
 from dvo.nets.dense_update import MASK
 from dvo.synth.clip import flow_field, make_clip
-from train.__main__ import main
 from train.engine.build import make_program
 from train.engine.checkpoint import read_state
 from train.tasks.droid.objective import LossConfig, mean_error, objective, true_positions, truth_of, upsampled_error
@@ -150,16 +147,7 @@ def test_the_loss_falls_within_some_steps(runs):
 
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs):
     options = {"flow_steps": 1, "further": 2, "reach": 1}
-    for name in ("whole", "again", "parts"):
-        (tmp_path / name).mkdir()
-    whole, losses = runs.fit(tmp_path / "whole", 3, program(**options))
-    _, same = runs.fit(tmp_path / "again", 3, program(**options))
-    assert losses == same  # the same seed, the same bytes
-    _, first = runs.fit(tmp_path / "parts", 2, program(**options))
-    resumed, then = runs.fit(tmp_path / "parts", 3, program(**options), tmp_path / "parts" / "last.ckpt")
-    assert first + then == losses
-    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
-        assert torch.equal(a, b), name
+    runs.check_resuming(tmp_path, 3, lambda: program(**options))
 
 
 def test_further_edges_are_drawn_anew_and_the_same_again():
@@ -217,30 +205,19 @@ def test_bad_weights_of_the_loss_are_refused(change):
         LossConfig(**change)
 
 
-def test_the_shipped_configuration_trains_and_resumes(tmp_path, monkeypatch, repository):
+def test_the_shipped_configuration_trains_and_resumes(tmp_path, runs, command):
     """With sizes for a test; the network is exported and loaded."""
     pytest.importorskip("kornia")
-    settings = yaml.safe_load((Path(repository) / "configs/train/droid.yaml").read_text())
-    assert settings["task"] == "droid" and settings["model"]["model"] == "small"
-    settings["trainer"] |= {
-        "max_steps": 2, "accelerator": "cpu", "log_every_n_steps": 1, "default_root_dir": str(tmp_path),
-        "enable_progress_bar": False, "enable_model_summary": False,
-    }  # fmt: skip
-    saver = settings["trainer"]["callbacks"][0]
-    saver["init_args"]["every_n_train_steps"] = 1
-    settings["trainer"]["callbacks"] = [saver]
+    settings = runs.shipped("droid", tmp_path)
     settings["model"] |= {"model": "tiny", "updates": 2}
     settings["data"] |= {"frames": 3, "sizes": [[48, 64]], "workers": 0}
     file = tmp_path / "settings.yaml"
     for steps in (1, 2):
         settings["trainer"]["max_steps"] = steps
         file.write_text(yaml.safe_dump(settings))
-        resume = ["--resume"] if steps > 1 else []
-        monkeypatch.setattr(sys, "argv", ["train", "fit", "--config", str(file), *resume])
-        main()
+        command("fit", "--config", file, *(["--resume"] if steps > 1 else []))
     state = read_state(tmp_path / "droid" / "last.ckpt")
     assert state["global_step"] == 2 and state["task"] == "droid" and state["Renderings"] == {"clips_seen": 2}
     weights = tmp_path / "dense.safetensors"
-    monkeypatch.setattr(sys, "argv", ["train", "export", str(tmp_path / "droid" / "last.ckpt"), str(weights)])
-    main()
+    command("export", tmp_path / "droid" / "last.ckpt", weights)
     assert isinstance(dvo.load_model(weights), DroidVO)

@@ -1,8 +1,6 @@
 """The self-supervised task: learning without labels, the teacher's state, resuming, starts, configuration."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +12,6 @@ import dvo
 from dvo.errors import DvoError
 from dvo.losses.consistency import Limits
 from dvo.models.weights import save_weights
-from train.__main__ import main
 from train.data.augment import Augmentation
 from train.data.degrade import Degradation
 from train.data.mixture import LabelledRenderings, Mixture
@@ -104,21 +101,10 @@ def test_resumed_training_equals_uninterrupted_training(tmp_path, runs):
         "teacher": replace(SHORT, decay=0.9), "learning_rate": 1e-3,
     }  # fmt: skip
     data = {"seed": 1, "labelled": LabelledRenderings(share=0.5)}
-    for name in ("whole", "again", "parts"):
-        (tmp_path / name).mkdir()
-    whole, losses = runs.fit(tmp_path / "whole", 4, program(**options), data=mixture(**data))
-    _, same = runs.fit(tmp_path / "again", 4, program(**options), data=mixture(**data))
-    assert losses == same  # the same seed, the same bytes
     assert {mixture(**data).kind(batch) for batch in range(4)} == {"labelled", "rendered"}
-    _, first = runs.fit(tmp_path / "parts", 2, program(**options), data=mixture(**data))
-    saved = read_state(tmp_path / "parts" / "last.ckpt")["state_dict"]
+    whole = runs.check_resuming(tmp_path, 4, lambda: program(**options), lambda: mixture(**data))
+    saved = read_state(tmp_path / "stopped" / "last.ckpt")["state_dict"]
     assert saved["teaching"] and not torch.equal(saved["teacher"], torch.zeros_like(saved["teacher"]))
-    resumed, then = runs.fit(
-        tmp_path / "parts", 4, program(**options), tmp_path / "parts" / "last.ckpt", data=mixture(**data)
-    )
-    assert first + then == losses
-    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
-        assert torch.equal(a, b), name
     assert not torch.equal(whole.teacher, flat_weights(whole.net))
 
 
@@ -178,18 +164,11 @@ def recording(tmp_path):
     return folder
 
 
-def test_the_shipped_configuration_trains_resumes_and_exports(tmp_path, monkeypatch, repository, runs, recording):
+def test_the_shipped_configuration_trains_resumes_and_exports(tmp_path, runs, recording, command):
     """With sizes for a test, from a state of ``patch_vo``, on a folder of images without poses."""
     pytest.importorskip("kornia")
-    settings = yaml.safe_load((Path(repository) / "configs/train/selfsup.yaml").read_text())
-    assert settings["task"] == "selfsup" and settings["model"]["model"] == "small"
-    settings["trainer"] |= {
-        "max_steps": -1, "accelerator": "cpu", "log_every_n_steps": 1, "default_root_dir": str(tmp_path),
-        "enable_progress_bar": False, "enable_model_summary": False, "logger": False,
-    }  # fmt: skip
-    saver = settings["trainer"]["callbacks"][0]
-    saver["init_args"]["every_n_train_steps"] = 1
-    settings["trainer"]["callbacks"] = [saver]
+    settings = runs.shipped("selfsup", tmp_path)
+    settings["trainer"] |= {"max_steps": -1, "logger": False}
     settings["model"] |= {"model": "tiny", "updates": 3, "initial": 3, "settle": 1, "teacher": {"updates": 4}}
     settings["model"]["limits"] = {"confidence": 0.0, "residual": 1e9, "disagreement": 1e9, "share": 0.0}
     settings["data"] |= {"frames": 4, "sizes": [[48, 64]], "workers": 0, "labelled": {"share": 0.0}}
@@ -197,10 +176,6 @@ def test_the_shipped_configuration_trains_resumes_and_exports(tmp_path, monkeypa
     file.write_text(yaml.safe_dump(settings))
     (tmp_path / "start").mkdir()
     runs.fit(tmp_path / "start", 1)
-
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
-        main()
 
     def refused(*arguments):
         with pytest.raises(SystemExit) as stopped:

@@ -1,8 +1,6 @@
 """The task of the two-frame network: exact estimates, learning, resuming, augmentation, configuration."""
 
-import sys
 from dataclasses import fields
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +12,6 @@ from dvo.geometry import se3, so3
 from dvo.models.tartanvo import TwoFrameMotion
 from dvo.nets.flow_pyramid import Flows
 from dvo.synth.clip import flow_field, make_clip
-from train.__main__ import main
 from train.data.augment import Augmentation, crop_and_resize
 from train.engine.build import make_program
 from train.engine.checkpoint import read_state
@@ -90,16 +87,7 @@ def test_the_loss_falls_within_some_steps(runs):
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs):
     pytest.importorskip("kornia")
     options = {"augmentation": Augmentation(zoom=1.0, zoom_range=1.3), "true_flow_until": 2}
-    for name in ("whole", "again", "parts"):
-        (tmp_path / name).mkdir()
-    whole, losses = runs.fit(tmp_path / "whole", 4, program(**options))
-    _, same = runs.fit(tmp_path / "again", 4, program(**options))
-    assert losses == same  # the same seed, the same bytes
-    _, first = runs.fit(tmp_path / "parts", 2, program(**options))
-    resumed, then = runs.fit(tmp_path / "parts", 4, program(**options), tmp_path / "parts" / "last.ckpt")
-    assert first + then == losses
-    for (name, a), b in zip(whole.state_dict().items(), resumed.state_dict().values(), strict=True):
-        assert torch.equal(a, b), name
+    runs.check_resuming(tmp_path, 4, lambda: program(**options))
 
 
 def test_the_true_flow_is_read_at_first_only(runs):
@@ -151,33 +139,21 @@ def test_bad_weights_of_the_loss_are_refused(change):
         LossConfig(**change)
 
 
-def test_the_shipped_configuration_trains_and_resumes(tmp_path, monkeypatch, repository):
+def test_the_shipped_configuration_trains_and_resumes(tmp_path, runs, command):
     """With sizes for a test; the network is exported, loaded and gives a flow."""
     pytest.importorskip("kornia")
-    settings = yaml.safe_load((Path(repository) / "configs/train/tartanvo.yaml").read_text())
-    assert settings["task"] == "tartanvo" and settings["model"]["model"] == "small"
-    settings["trainer"] |= {
-        "max_steps": 2, "accelerator": "cpu", "log_every_n_steps": 1, "default_root_dir": str(tmp_path),
-        "enable_progress_bar": False, "enable_model_summary": False,
-    }  # fmt: skip
-    saver = settings["trainer"]["callbacks"][0]
-    saver["init_args"]["every_n_train_steps"] = 1
-    settings["trainer"]["callbacks"] = [saver]
+    settings = runs.shipped("tartanvo", tmp_path)
     settings["model"]["model"] = "tiny"
     settings["data"] |= {"batch_size": 1, "frames": 3, "sizes": [[48, 64]], "workers": 0}
     file = tmp_path / "settings.yaml"
-    file.write_text(yaml.safe_dump(settings))
     for steps in (2, 4):
         settings["trainer"]["max_steps"] = steps
         file.write_text(yaml.safe_dump(settings))
-        resume = ["--resume"] if steps > 2 else []
-        monkeypatch.setattr(sys, "argv", ["train", "fit", "--config", str(file), *resume])
-        main()
+        command("fit", "--config", file, *(["--resume"] if steps > 2 else []))
     state = read_state(tmp_path / "tartanvo" / "last.ckpt")
     assert state["global_step"] == 4 and state["task"] == "tartanvo" and state["Renderings"] == {"clips_seen": 4}
     weights = tmp_path / "two.safetensors"
-    monkeypatch.setattr(sys, "argv", ["train", "export", str(tmp_path / "tartanvo" / "last.ckpt"), str(weights)])
-    main()
+    command("export", tmp_path / "tartanvo" / "last.ckpt", weights)
     flow = dvo.load_model(weights).flow(torch.zeros(1, 3, 48, 64), torch.zeros(1, 3, 48, 64))
     assert flow.shape == (1, 2, 12, 16)
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from dvo.odometry.config import TrackerConfig
     from dvo.odometry.load import load
     from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
+    from dvo.odometry.saving import load_map
     from dvo.odometry.session import run
     from dvo.synth.dataset import ClipDataset
 
@@ -59,6 +60,7 @@ _LAZY = {
     "export_map": ("dvo.export.formats", "export_map"),
     "export_trajectory": ("dvo.export.formats", "export_trajectory"),
     "load": ("dvo.odometry.load", "load"),
+    "load_map": ("dvo.odometry.saving", "load_map"),
     "load_model": ("dvo.models.weights", "load_model"),
     "losses": ("dvo.losses", ""),
     "open": ("dvo.data.source", "open_source"),
@@ -69,8 +71,8 @@ _LAZY = {
 __all__ = [
     "BADamping", "BAOptions", "BAResult", "Break", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "Metrics",
     "ModelConfig", "Odometry", "Result", "Segment", "SparseMap", "Status", "TrackerConfig", "Trajectory", "__version__",
-    "bundle_adjust", "evaluate", "export_map", "export_trajectory", "load", "load_model", "losses", "open", "run",
-    "se3",
+    "bundle_adjust", "evaluate", "export_map", "export_trajectory", "load", "load_map", "load_model", "losses", "open",
+    "run", "se3",
 ]  # fmt: skip
 
 

@@ -68,6 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="NAMES",
         help="write the results for other programs too: colmap, colmap-text, nerfstudio, tum, kitti, euroc; by commas",
     )
+    run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for dvo.load_map")
     run.set_defaults(run="dvo.commands.run:run")
 
     export = commands.add_parser("export", help="write the trajectory of a results folder for another program")

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,7 +23,8 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.export.formats import check_formats, export_run, remove_exports
 from dvo.odometry import results, session
-from dvo.odometry.protocol import Estimate, Odometry
+from dvo.odometry.files import check_writable
+from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.recorder import Recorder
 from dvo.settings import parse_settings, read_settings
 
@@ -92,7 +94,33 @@ def run(arguments: argparse.Namespace) -> int:
     with results.results_folder(arguments.out, source.name) as folder:  # checked before the weights load
         odometry = load_odometry(arguments, device)
         check_formats(arguments.export, odometry)
-        return track(odometry, source, folder, stride=arguments.stride, facts=facts, export=arguments.export)
+        save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
+        return track(
+            odometry,
+            source,
+            folder,
+            stride=arguments.stride,
+            facts=facts,
+            export=arguments.export,
+            save_map=save_map,
+        )
+
+
+def _map_file(text: str, odometry: Odometry) -> Path:
+    """File of ``--save-map``, if the odometry can be saved and its folder written."""
+    if not isinstance(odometry, Saveable):
+        message = f"the odometry {odometry.name} has no map that can be saved"
+        raise DvoError(message, field="--save-map", remedy="use weights of patch_vo, such as small")
+    file = Path(text)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(file.parent)
+        reason = "is a folder" if file.is_dir() else ""
+    except OSError as error:
+        reason = error.strerror or str(error)
+    if reason:
+        raise DvoError(reason, file=file, field="--save-map", remedy="give a file in a folder that can be written")
+    return file
 
 
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
@@ -126,6 +154,7 @@ def track(
     stride: int = 1,
     facts: dict[str, Any],
     export: Sequence[str] = (),
+    save_map: Path | None = None,
 ) -> int:
     """Track a clip, write the results folder and print a summary.
 
@@ -140,6 +169,7 @@ def track(
         stride: distance of tracked frames, in frames of the clip.
         facts: metadata to write into run.json.
         export: formats to write the results in too, into ``export/NAME`` of the results folder.
+        save_map: map file to write at the end; the odometry is :class:`dvo.odometry.protocol.Saveable`.
 
     Returns:
         Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C, 143 after SIGTERM.
@@ -148,11 +178,17 @@ def track(
         DvoError: no frame could be read, or a result cannot be written.
     """
     with results.results_folder(out, clip.name) as folder:
-        return _track(odometry, clip, folder, stride, facts, export)
+        return _track(odometry, clip, folder, stride, facts, export, save_map)
 
 
 def _track(
-    odometry: Odometry, clip: Clip, folder: Path, stride: int, facts: dict[str, Any], export: Sequence[str]
+    odometry: Odometry,
+    clip: Clip,
+    folder: Path,
+    stride: int,
+    facts: dict[str, Any],
+    export: Sequence[str],
+    save_map: Path | None,
 ) -> int:
     printed = set(clip.warnings)
     facts = {"odometry": odometry.name, **facts}
@@ -178,10 +214,13 @@ def _track(
         new_warnings = [warning for warning in done.warnings if warning not in printed]
         done = replace(done, warnings=(*done.warnings, *recorder.warnings))
         scores = score(done, clip.groundtruth)
-        _write(folder, done, scores, clip, facts)
+        writer = None if save_map is None else partial(_save, odometry, save_map)
+        _write(folder, done, scores, clip, facts, writer)
     for warning in new_warnings:
         warn(warning)
     print_report(folder, done, scores)
+    if save_map is not None:
+        say(f"map in {save_map}")
     if export:
         _export(odometry, done, folder / EXPORT, export)
     if done.interrupted:
@@ -198,9 +237,23 @@ def _export(odometry: Odometry, done: session.Run, folder: Path, formats: Sequen
         say(f"exported to {folder}/{sentence}")
 
 
-def _write(folder: Path, done: session.Run, scores: Scores, clip: Clip, facts: dict[str, Any]) -> None:
-    """Replace the files of the recorder with the final ones."""
-    facts = {**facts, "metrics": None if scores.longest is None else asdict(scores.longest)}
+def _save(odometry: Odometry, file: Path) -> dict[str, Any]:
+    """Write the map file; gives the entry of run.json that names it."""
+    assert isinstance(odometry, Saveable)
+    odometry.save(file)
+    return {"map_file": str(file.resolve())}
+
+
+def _write(
+    folder: Path,
+    done: session.Run,
+    scores: Scores,
+    clip: Clip,
+    facts: dict[str, Any],
+    save_map: Callable[[], dict[str, Any]] | None,
+) -> None:
+    """Replace the files of the recorder with the final ones, and write the map file, which run.json names."""
+    facts = {**facts, "map_file": None, "metrics": None if scores.longest is None else asdict(scores.longest)}
 
     def picture(path: Path) -> None:
         draw(
@@ -213,7 +266,7 @@ def _write(folder: Path, done: session.Run, scores: Scores, clip: Clip, facts: d
         )
 
     try:
-        results.write_results(folder, done, facts, draw=picture, segment_facts=scores.segment_facts)
+        results.write_results(folder, done, facts, draw=picture, segment_facts=scores.segment_facts, also=save_map)
     except KeyboardInterrupt:
         aborted = replace(done, interrupted=True, warnings=(*done.warnings, _ABORTED))
         with contextlib.suppress(OSError):

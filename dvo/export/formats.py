@@ -13,9 +13,10 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dvo.data.output import PART
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from dvo.odometry.files import PART, write_error
+from dvo.odometry.files import write_error
 from dvo.registry import Registry
 
 if TYPE_CHECKING:

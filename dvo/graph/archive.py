@@ -183,6 +183,16 @@ class Archive:
         return self._keyframes[identifier]
 
     @property
+    def keyframes(self) -> list[ArchivedKeyframe]:
+        """Keyframes in the order in which they were archived and will be released."""
+        return list(self._keyframes.values())
+
+    @property
+    def parts(self) -> list[ArchivedEdges]:
+        """Measurements as they were added, each released as a whole, oldest first."""
+        return list(self._edges)
+
+    @property
     def nbytes(self) -> int:
         """Memory of features, images, edges and patches; at most ``config.max_bytes`` after every call."""
         return self._bytes

@@ -68,6 +68,7 @@ class KeyframeGraph:
         archive: keyframes and edges that have left the window.
         log: every frame that was read, relative to a keyframe.
         segment: number of the current segment, from 0; keyframes of two segments share no edge, world or scale.
+        starts: first keyframe and number of each segment, by increasing keyframe; -1 for a rejected segment.
 
     Example:
         Global bundle adjustment of everything that a tracker has archived:
@@ -95,8 +96,7 @@ class KeyframeGraph:
         self.archive, self._finalise = Archive(archive), finalise
         self.log = KeyframeLog()
         self.segment = 0
-        # First keyframe and number of each segment; -1 for a rejected one.
-        self._first: list[tuple[int, int]] = [(0, 0)]
+        self.starts: list[tuple[int, int]] = [(0, 0)]
 
     def begin_segment(self, first: int, keep: bool = True, reason: str = "") -> None:
         """Begin a segment. The window must be empty.
@@ -110,9 +110,9 @@ class KeyframeGraph:
             for record in self.log.frames:
                 if record.segment == self.segment and not record.lost:
                     record.lost, record.reason = True, record.reason or reason
-            self._first[-1] = (self._first[-1][0], -1)
+            self.starts[-1] = (self.starts[-1][0], -1)
         self.segment += int(keep)
-        self._first.append((first, self.segment))
+        self.starts.append((first, self.segment))
 
     def split_segment(self, first: int) -> None:
         """Begin a segment with the keyframes of the window.
@@ -123,7 +123,7 @@ class KeyframeGraph:
         for record in self.log.rows(self.segment, first):
             record.segment += 1
         self.segment += 1
-        self._first.append((first, self.segment))
+        self.starts.append((first, self.segment))
 
     def segment_of(self, identifier: int) -> int:
         """Segment of a keyframe.
@@ -134,7 +134,7 @@ class KeyframeGraph:
         Returns:
             Its number; -1 for a keyframe of a rejected segment.
         """
-        return self._first[bisect_right(self._first, identifier, key=lambda entry: entry[0]) - 1][1]
+        return self.starts[bisect_right(self.starts, identifier, key=lambda entry: entry[0]) - 1][1]
 
     def keep_edges(self, mask: Tensor) -> None:
         """Move edges from the window to the archive.

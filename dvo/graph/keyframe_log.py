@@ -167,6 +167,16 @@ class KeyframeLog:
         self._colors.append(colors)
 
     @property
+    def poses(self) -> Mapping[int, np.ndarray]:
+        """``T_cw`` of the keyframes that have a pose."""
+        return self._poses
+
+    @property
+    def removed(self) -> Mapping[int, tuple[int, np.ndarray]]:
+        """Anchor of each removed keyframe, and its pose relative to the anchor."""
+        return self._removed
+
+    @property
     def keyframes(self) -> int:
         """Number of keyframes that have a pose."""
         return len(self._poses)

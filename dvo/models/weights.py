@@ -87,6 +87,23 @@ class LoadedWeights:
         return cls(model, name, network.architecture, preset_name(network, network.config), info)
 
 
+def tensor_digest(model: nn.Module) -> str:
+    """Digest of the tensors of a network, which tells networks apart whatever file they come from.
+
+    Args:
+        model: on any device.
+
+    Returns:
+        SHA-256 of names, types, shapes and values, in hexadecimal digits.
+    """
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        values = tensor.detach().cpu().contiguous()
+        digest.update(f"{name} {values.dtype} {tuple(values.shape)}\n".encode())
+        digest.update(values.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
 def find_weights(name_or_file: str | Path) -> Path:
     """The file of shipped weights by name, or a file by path.
 

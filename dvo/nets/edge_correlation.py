@@ -12,7 +12,7 @@ contiguous range at every position, and products are stored with x fastest, so t
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 _NOWHERE = -(10**6)
@@ -87,6 +87,49 @@ class EdgeCorrelation:
             self._products = torch.cat([self._products, self._products.new_zeros(extra, *self._products.shape[1:])])
             self._origin = torch.cat([self._origin, self._origin.new_full((extra, 2), _NOWHERE)])
 
+    def origins(self, slots: Int[Tensor, " n"]) -> Int[Tensor, "n 2"]:
+        """Upper left corners of the cached windows, from which :meth:`restore` computes the same products again.
+
+        Args:
+            slots: edge slots.
+
+        Returns:
+            ``x, y`` in pixels of the level; far outside of the map for a window that has not been computed.
+        """
+        return self._origin[slots]
+
+    def are_origins(self, origins: Int[Tensor, "n 2"]) -> Bool[Tensor, " n"]:
+        """Check corners of windows against the size of the maps.
+
+        Args:
+            origins: of :meth:`origins`, or numbers of a file.
+
+        Returns:
+            True for a window that meets the map, or that has not been computed.
+        """
+        limit = torch.tensor([self._maps.shape[2], self._maps.shape[1]], device=origins.device) - 2 * self.side
+        return ((origins >= -self.side) & (origins <= limit)).all(-1) | (origins == _NOWHERE).all(-1)
+
+    def restore(
+        self,
+        origins: Int[Tensor, "n 2"],
+        slots: Int[Tensor, " n"],
+        features: Float[Tensor, "K C q"],
+        kk: Int[Tensor, " n"],
+        frames: Int[Tensor, " n"],
+    ) -> None:
+        """Compute the cached windows of edges at given positions.
+
+        Args:
+            origins: see :meth:`origins`; those of :meth:`are_origins`.
+            slots: edge slots; storage is reserved for new ones.
+            features, kk, frames: see :meth:`lookup`.
+        """
+        self.forget(slots)
+        known = (origins != _NOWHERE).any(-1).nonzero()[:, 0]
+        if len(known):
+            self._fill(origins[known], slots[known], features, kk[known], frames[known])
+
     def lookup(
         self,
         coords: Float[Tensor, "E p p 2"],
@@ -130,7 +173,7 @@ class EdgeCorrelation:
     def _refresh(self, at: Tensor, slots: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> None:
         """Compute the products again for edges that have moved out of their cached window."""
         s, r = self.side, self.radius
-        _, height, width, c = self._maps.shape
+        _, height, width, _ = self._maps.shape
         # A window beyond the border contains only zeros, at any position.
         limit = torch.tensor([width - 2 * s, height - 2 * s], device=at.device)
         at = at.clamp(-1e5, 1e5)  # far-away projections would overflow the integers
@@ -140,12 +183,19 @@ class EdgeCorrelation:
         # A patch whose projection is larger than a window stays clamped; its centre alone decides on a refresh then.
         outside = ((low - r < origin) | (high + r + 1 >= origin + s)).any(-1)
         stale = (outside & (origin != wanted).any(-1)).nonzero()[:, 0]
-        runs = self._maps.as_strided((self._maps.numel() // c - s + 1, s * c), (c, 1)) if len(stale) else self._maps
-        x, y = (wanted + s).unbind(-1)
+        if len(stale):
+            self._fill(wanted[stale], slots[stale], features, kk[stale], frames[stale])
+
+    def _fill(self, origins: Tensor, slots: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> None:
+        """Compute the windows of edges at positions ``(n, 2)``."""
+        s = self.side
+        _, height, width, c = self._maps.shape
+        runs = self._maps.as_strided((self._maps.numel() // c - s + 1, s * c), (c, 1))
+        x, y = (origins + s).unbind(-1)
         first = (frames * height + y) * width + x
-        steps = torch.arange(s, device=at.device) * width
-        for edges in stale.split(PIECE // 4):
+        steps = torch.arange(s, device=origins.device) * width
+        for edges in torch.arange(len(slots), device=origins.device).split(PIECE // 4):
             window = runs.index_select(0, (first[edges, None] + steps).flatten()).view(len(edges), s * s, c)
             products = torch.bmm(features[kk[edges]].mT, window.mT)
             self._products[slots[edges]] = products.view(len(edges), self.pixels, s, s)
-        self._origin[slots[stale]] = wanted[stale]
+        self._origin[slots] = origins

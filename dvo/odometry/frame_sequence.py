@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import median
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 
-_RECENT = 30  # number of intervals that the usual one is the median of
+RECENT = 30
+"""Number of intervals that the usual one is the median of."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,37 @@ class FrameSequence:
 
     def __init__(self, max_gap: float) -> None:
         self.max_gap = max_gap
-        self._intervals: deque[float] = deque(maxlen=_RECENT)
+        self._intervals: deque[float] = deque(maxlen=RECENT)
         self._size: tuple[int, int] | None = None
         self._last: float | None = None  # time of the last frame
         self._new = 0.0  # time of the first frame with the image of the last one
+
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height of the images; None before the first."""
+        return self._size
+
+    @property
+    def intervals(self) -> list[float]:
+        """Recent times between two frames, seconds, oldest first."""
+        return list(self._intervals)
+
+    @property
+    def new(self) -> float:
+        """Time of the first frame with the image of the last one, seconds."""
+        return self._new
+
+    def restore(self, size: tuple[int, int] | None, intervals: Iterable[float], last: float, new: float) -> None:
+        """Take the state of another sequence, which has frames.
+
+        Args:
+            size: see :attr:`size`.
+            intervals: see :attr:`intervals`.
+            last: time of the last frame, seconds.
+            new: see :attr:`new`.
+        """
+        self._size, self._last, self._new = size, last, new
+        self._intervals.extend(intervals)
 
     def check(self, frame: Frame) -> None:
         """Check that a frame continues the sequence.

@@ -12,7 +12,7 @@ from torch import Tensor
 from dvo.geometry.camera import Camera
 from dvo.graph.keyframe_log import FrameRecord
 from dvo.models.patch_vo import PatchVO
-from dvo.nets.patchifier import cut_fine, normalise_images
+from dvo.nets.patchifier import Features, cut_fine, normalise_images
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class View:
     seen: Observation
 
 
-def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Tensor:
-    """Matching features of an image.
+def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Features:
+    """Features of an image.
 
     Args:
         model: the network.
@@ -71,14 +71,19 @@ def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Ten
         device: of the network.
 
     Returns:
-        ``(1, 1, C, h, w)``, at a quarter of the image resolution.
+        Features of a batch of one frame; the same image gives the same ones, bit for bit on the CPU.
     """
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
-    return model.patchify.encode(normalise_images(rgb)[None, None]).matching
+    return model.patchify.encode(normalise_images(rgb)[None, None])
 
 
 def observe(
-    model: PatchVO, image: np.ndarray, camera: Camera, select: Callable[..., Tensor], device: torch.device
+    model: PatchVO,
+    image: np.ndarray,
+    camera: Camera,
+    select: Callable[..., Tensor],
+    device: torch.device,
+    centres: Tensor | None = None,
 ) -> Observation:
     """Encode a working image and select its patches.
 
@@ -88,13 +93,15 @@ def observe(
         camera: of the image.
         select: selection of the patches, with their number and the generator given (:mod:`dvo.nets.selection`).
         device: of the network.
+        centres: ``(1, 1, M, 2)`` of the patches, if they are known already; nothing is selected then.
 
     Returns:
         Features and patches.
     """
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
-    features = model.patchify.encode(normalise_images(rgb)[None, None])
-    centres = model.centres(rgb[None, None], features, select)
+    features = encode_image(model, image, device)
+    if centres is None:
+        centres = model.centres(rgb[None, None], features, select)
     matching, context = model.patchify.cut(features, centres)
     fine = cut_fine(features, centres, model.config.patch_size)
     stride = model.config.STRIDE

@@ -14,8 +14,9 @@ from dvo.ba.options import BAOptions
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.graph.window import Window
-from dvo.odometry.config import InitialPose
+from dvo.odometry.config import InitialPose, TrackerConfig
 from dvo.odometry.front_end import Observation
+from dvo.odometry.motion import predict_pose
 
 AGREEMENT = 2.0
 """Distance of a match from its reprojection up to which it agrees with a pose, feature pixels."""
@@ -24,6 +25,23 @@ _WIDTHS = (8.0, 4.0, 2.0)  # of the kernels, feature pixels: wide ones first, si
 _LEAST = 8  # matches that must agree with a pose; six unknowns leave two of them to contradict it
 _SHARE = 1 / 3  # and their share of all
 _ACCURACY = 1.0  # of a match, feature pixels; a prediction that is as close is as good
+
+
+def first_pose(window: Window, seen: Observation, time: float, config: TrackerConfig, initialised: bool) -> Tensor:
+    """First pose of a new frame: that of the motion model or, once the tracker is initialised, of the method chosen.
+
+    Args:
+        window: keyframes without the frame, possibly none.
+        seen: the frame.
+        time: of the frame, seconds.
+        config: settings of the tracker.
+        initialised: the tracker is.
+
+    Returns:
+        ``(7,)`` ``T_cw``.
+    """
+    predicted = predict_pose(window.poses_cw, [f.timestamp for f in window.frames], time, config.motion_damping)
+    return initial_pose(window, seen, predicted, config.initial_pose) if initialised else predicted
 
 
 def initial_pose(window: Window, seen: Observation, predicted: Tensor, method: InitialPose) -> Tensor:

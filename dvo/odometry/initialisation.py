@@ -11,7 +11,7 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.evidence import NO_MATCH, last_unrelated, related_share
+from dvo.odometry.evidence import NO_MATCH, last_unrelated, related_share, window_inliers
 from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
 
@@ -47,6 +47,21 @@ def newest_confidence(revision: Revision, window: Window) -> float:
     n = len(window)
     edges = (window.ii == n - 2) & (window.jj == n - 1)
     return float(revision.weights[0][edges].mean())
+
+
+def first_motion(revision: Revision, window: Window, config: TrackerConfig) -> tuple[float, bool]:
+    """Confidence of the newest frame of a window that is not initialised yet, and whether it has moved.
+
+    Args:
+        revision: output of the network for the edges of the window.
+        window: keyframes, the newest frame last.
+        config: settings of the tracker.
+
+    Returns:
+        Mean confidence in [0, 1]; and False for a confident frame with too little motion to initialise.
+    """
+    confidence = newest_confidence(revision, window)
+    return confidence, confidence < config.lost_confidence or median_revision(revision, window) >= config.initial_motion
 
 
 def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
@@ -111,6 +126,25 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
             graph.log.lose(graph.discard(0).identifier, NO_MATCH)
     if graph.log.rows(graph.segment, last=first - 1):
         graph.split_segment(first)
+
+
+def worth_keeping(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, last: bool) -> bool:
+    """Whether the frames of a segment that was never initialised are kept.
+
+    Args:
+        graph: of the sequence, its window not empty.
+        step: of the model on the window, after some steps.
+        config: settings of the tracker.
+        last: no frame will follow.
+
+    Returns:
+        True if they agree with each other, and are as many as an initialisation needs or the only ones of the sequence.
+    """
+    records = graph.log.frames
+    rows = sum(not record.lost and record.segment == graph.segment for record in records)
+    only = last and graph.segment == 0 and not any(record.reason == NO_MATCH for record in records)
+    agree = len(graph.window) == 1 or window_inliers(step) >= config.min_inliers
+    return agree and (only or rows >= config.initial_frames)
 
 
 def leave_minimum(window: Window, age: int) -> bool:

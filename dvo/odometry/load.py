@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from dvo.models.weights import LoadedWeights, load_weights
+from dvo.models.weights import FOLDER, LoadedWeights, load_weights
 from dvo.odometry.config import PRESETS, TRACKER_PRESETS, TrackerConfig, with_changes
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.registry import odometry_builder
@@ -115,4 +115,21 @@ def patch_odometry(
     assert isinstance(weights.model, PatchVO), "the registry gave the builder of another architecture"
     config = config or TRACKER_PRESETS.get(weights.preset, TrackerConfig())
     settings = with_changes(config, preset, PRESETS, overrides)
-    return PatchOdometry(weights.model, settings, seed=seed, device=device, name=f"dvo-{weights.name}")
+    name, origin = f"dvo-{weights.name}", source_of(weights)
+    return PatchOdometry(weights.model, settings, seed=seed, device=device, name=name, weights=origin)
+
+
+def source_of(weights: LoadedWeights) -> str:
+    """Name or file by which weights can be loaded again.
+
+    Args:
+        weights: the network with its origin.
+
+    Returns:
+        The name of weights that ship with dvo, the absolute path of another file, or nothing for a network from
+        elsewhere.
+    """
+    if weights.info is None:
+        return ""
+    path = weights.info.path.resolve()
+    return weights.name if path.parent == FOLDER else str(path)

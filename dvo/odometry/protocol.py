@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -222,5 +223,21 @@ class Interim(Protocol):
 
         Returns:
             Trajectory and map so far.
+        """
+        ...
+
+
+@runtime_checkable
+class Saveable(Protocol):
+    """Interface of an odometry that can be written to a map file."""
+
+    def save(self, file: str | Path) -> None:
+        """Write everything that is needed to go on, or to use the map.
+
+        Args:
+            file: to write; replaced as a whole.
+
+        Raises:
+            DvoError: the file cannot be written.
         """
         ...

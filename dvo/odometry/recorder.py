@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.data.output import replaced
 from dvo.data.trajectory import TUM_HEADER, Trajectory, tum_row
-from dvo.odometry.files import replaced, write_ply
+from dvo.odometry.files import write_ply
 from dvo.odometry.protocol import Estimate, Interim, Odometry, Result, Segment, SparseMap, Status
 from dvo.odometry.results import MAP, TRAJECTORY, remove_files, segment_file, summary, write_summary
 from dvo.odometry.session import Run

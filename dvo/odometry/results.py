@@ -22,9 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from dvo.data.output import PART, replaced
 from dvo.data.trajectory import write_tum
 from dvo.errors import DvoError
-from dvo.odometry.files import PART, check_writable, replaced, write_error, write_ply
+from dvo.odometry.files import check_writable, write_error, write_ply
 from dvo.odometry.session import Run
 
 FILES = TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
@@ -135,6 +136,7 @@ def write_results(
     *,
     draw: Callable[[Path], None] | None = None,
     segment_facts: Sequence[dict[str, Any]] = (),
+    also: Callable[[], dict[str, Any]] | None = None,
 ) -> None:
     """Write trajectory.txt, a trajectory file for each segment if there are several, map.ply, the plot and run.json.
 
@@ -147,6 +149,7 @@ def write_results(
         facts: metadata of the caller (source, seed, device, config, metrics), the first entries of run.json.
         draw: writes the plot to the file that it is given.
         segment_facts: further entries for each segment in run.json.
+        also: writes a further file after these, anywhere, and returns entries for run.json about it.
 
     Raises:
         DvoError: a file cannot be written.
@@ -166,6 +169,11 @@ def write_results(
                 write(part)
         except OSError as error:
             failures.append(write_error(folder / name, error))
+    if also is not None:
+        try:
+            facts = {**facts, **also()}
+        except DvoError as error:
+            failures.append(error)
     try:
         remove_files(folder, keep={*FILES, *writers})
         warned = replace(run, warnings=(*run.warnings, *map(str, failures)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,16 +27,18 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions, recent_depth
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence, window_inliers
+from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
-from dvo.odometry.initial_pose import initial_pose
-from dvo.odometry.initialisation import drop_unrelated, initialise, leave_minimum, median_revision, newest_confidence
-from dvo.odometry.motion import flow_magnitude, predict_pose
+from dvo.odometry.initial_pose import first_pose
+from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise, leave_minimum, worth_keeping
+from dvo.odometry.motion import flow_magnitude
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.rolling_shutter import Shutter
+from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
 from dvo.odometry.self_calibration import adjust_segments
+from dvo.odometry.tracker_state import TrackerState
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
@@ -55,9 +58,12 @@ class PatchOdometry:
         device: of all computation.
         name: of the system, in reports.
         archive: bound and content of the archive of keyframes.
+        weights: name or file of the network, by which :func:`dvo.load_map` finds it again.
 
     Attributes:
         graph: window, archive and log of frames.
+        state: all else that a frame changes.
+        correlation, step: of the network on the window; what they cache is computed from the other two.
 
     Example:
         >>> odometry = PatchOdometry(dvo.load_model("small"), TrackerConfig())
@@ -75,29 +81,20 @@ class PatchOdometry:
         device: torch.device | str = "cpu",
         name: str = "dvo",
         archive: ArchiveConfig | None = None,
+        weights: str = "",
     ) -> None:
-        self.name, self.config, self.seed = name, config, seed
+        self.name, self.config, self.seed, self.weights = name, config, seed, weights
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
         c = model.config
         select = self.model.selection(config.selection)
-        self._select = partial(select, patches=config.patches, generator=torch.Generator().manual_seed(seed))
+        self.state = TrackerState(torch.Generator().manual_seed(seed), FrameSequence(config.max_gap))
+        self.select = partial(select, patches=config.patches, generator=self.state.generator)
         sizes = config.patches, c.patch_size, c.hidden_channels
-        self.graph = KeyframeGraph(*sizes, self.device, archive, lambda edges: self._step.finalise(edges))
+        self.graph = KeyframeGraph(*sizes, self.device, archive, lambda edges: self.step.finalise(edges))
         self.correlation = WindowCorrelation(self.window, c, self.device)
         align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
-        self._step = WindowStep(
-            self.model, self.window, self.correlation, align, config.align == "final", config.kernel
-        )
-        self._count = self._tracked = 0  # keyframes, and frames of the segment since its initialisation
-        self._initialised = self._finished = False
-        self._adjustable: list[int] = []  # segments that were initialised
-        self._sequence = FrameSequence(config.max_gap)
-        self._waiting: list[View] = []  # frames with content since tracking was lost
-        self._joining = ""  # cause of the interruption that the next frame has to be joined across
-        self._skipped = False  # the interruption is a gap in time
-        self._last: tuple[np.ndarray, Estimate] | None = None  # last image and its estimate
-        self._info: dict[str, object] = {}
+        self.step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final", config.kernel)
 
     @property
     def window(self) -> Window:
@@ -124,29 +121,30 @@ class PatchOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        if self._finished:
+        if self.state.finished:
             raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
-        frame = checked_frame(frame)
+        frame, state = checked_frame(frame), self.state
         image, camera = working_image(frame, self.config.pixels)
-        self._shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
-        self._sequence.check(frame)
+        state.shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
+        state.sequence.check(frame)
         record = self.graph.log.add(frame.timestamp)
-        if self._last is not None and np.array_equal(image, self._last[0]):
-            self._sequence.repeat(frame.timestamp)
+        if state.last is not None and np.array_equal(image, state.last[0]):
+            state.sequence.repeat(frame.timestamp)
             return self._repeat(record)
-        gap = self._sequence.tick(frame.timestamp)
+        gap = state.sequence.tick(frame.timestamp)
         problem = missing_content(image)
         if problem:
             estimate = self._lose(record, problem)
         else:
-            if gap and self._initialised and not self._joining:
-                self._joining, self._skipped = str(gap), not gap.frozen
-            seen = observe(self.model, image, camera, self._select, self.device)
-            self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
+            if gap and state.initialised and not state.joining:
+                state.joining, state.skipped = str(gap), not gap.frozen
+            seen = observe(self.model, image, camera, self.select, self.device)
+            intrinsics = seen.image_intrinsics.tolist()
+            state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": intrinsics}
             estimate = self._take(View([record], seen))
-            if len(self._waiting) >= self.config.patience:
+            if len(state.waiting) >= self.config.patience:
                 estimate = self._begin_segment()
-        self._last = image, estimate
+        state.last = image, estimate
         return estimate
 
     @torch.inference_mode()
@@ -157,15 +155,15 @@ class PatchOdometry:
             Trajectories ``T_wc`` of all segments and the sparse map of the longest, each in the world of its first
             keyframe, up to scale.
         """
-        if not self._finished:
-            self._finished = True
-            if len(self._waiting) >= self.config.initial_frames:
+        config, state = self.config, self.state
+        if not state.finished:
+            state.finished = True
+            if len(state.waiting) >= config.initial_frames:
                 self._begin_segment()
             self._close_segment(last=True)
-            if self.config.final_adjustment and self._adjustable:
-                c = self.config
-                self._info |= adjust_segments(
-                    self.graph, self._adjustable, self._shutter, c.estimate_readout, c.adjustment
+            if config.final_adjustment and state.adjustable:
+                state.info |= adjust_segments(
+                    self.graph, state.adjustable, state.shutter, config.estimate_readout, config.adjustment
                 )
         return self._result({})
 
@@ -178,79 +176,90 @@ class PatchOdometry:
         """
         poses = self.window.poses_cw.double().cpu().numpy()
         known = {frame.identifier: pose for frame, pose in zip(self.window.frames, poses, strict=True)}
-        return self._result(known if self._initialised else {})
+        return self._result(known if self.state.initialised else {})
+
+    def save(self, file: str | Path) -> None:
+        """Write everything to a map file: to go on later (:func:`dvo.load_map`), or as a map. Tracking may go on.
+
+        Args:
+            file: to write, by convention ``*.dvo``; replaced as a whole.
+
+        Raises:
+            DvoError: the file cannot be written.
+        """
+        save_map(file, self)
 
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
         info = {
-            **self._info, "keyframes": self.graph.log.keyframes, "seed": self.seed,
-            "initialised": bool(self._adjustable), "config": asdict(self.config),
+            **self.state.info, "keyframes": self.graph.log.keyframes, "seed": self.seed,
+            "initialised": bool(self.state.adjustable), "config": asdict(self.config),
         }  # fmt: skip
         return result_of(self.graph, info, poses)
 
     def _take(self, view: View) -> Estimate:
         """Add a frame with content to the window, and estimate its pose."""
-        window, config, record = self.window, self.config, view.records[0]
+        window, config, state, record = self.window, self.config, self.state, view.records[0]
         keyframe = self._append(view)
-        self._step.forget(window.connect_newest(config.lifetime, self.model.config.self_edges))
-        if not self._initialised:
+        self.step.forget(window.connect_newest(config.lifetime, self.model.config.self_edges))
+        if not state.initialised:
             return self._initialise(view, keyframe)
         before = window.snapshot()
-        evidence = self._updated(config.search_updates if self._joining else config.updates)
-        supported = evidence.supports(config, joining=bool(self._joining))
-        if not (supported or self._joining):  # a fast motion may need more updates, but then has to be found for sure
+        evidence = self._updated(config.search_updates if state.joining else config.updates)
+        supported = evidence.supports(config, joining=bool(state.joining))
+        if not (supported or state.joining):  # a fast motion may need more updates, but then has to be found for sure
             evidence = self._updated(config.search_updates)
             supported = evidence.supports(config, searched=True)
         if not supported:
             # The frame leaves the graph, so that the next ones are joined with the frames before it.
             window.restore(before)
             self.graph.discard(len(window) - 1)
-            self._waiting.append(view)
+            state.waiting.append(view)
             return self._lose(record, NO_MATCH)
-        self._place(record, keyframe.identifier, self._joining if self._skipped else "")
-        self._joining, self._skipped = "", False
-        self._waiting.clear()
-        self._tracked += 1
+        self._place(record, keyframe.identifier, state.joining if state.skipped else "")
+        state.joining, state.skipped = "", False
+        state.waiting.clear()
+        state.tracked += 1
         if config.restart:
-            leave_minimum(window, self._tracked)
+            leave_minimum(window, state.tracked)
         pose_wc = self._pose_wc(len(window) - 1)
         self._reduce()
         return self._estimate(record, pose_wc, Status.TRACKING, evidence.confidence)
 
     def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
-        window, config, record = self.window, self.config, view.records[0]
-        self._joining, confidence = "", 0.0
+        window, config, state, record = self.window, self.config, self.state, view.records[0]
+        state.joining, confidence = "", 0.0
         if len(window) > 1:
-            revision = self._step.revise()
-            confidence = newest_confidence(revision, window)
-            if confidence >= config.lost_confidence and median_revision(revision, window) < config.initial_motion:
+            revision = self.step.revise()
+            confidence, moved = first_motion(revision, window, config)
+            if not moved:
                 # Too little motion to initialise: until the final adjustment it shares the pose of the last keyframe.
-                self._step.store(revision)
+                self.step.store(revision)
                 self.graph.drop(len(window) - 1, still=True)
                 self._place(record, keyframe.identifier)
                 return self._estimate(record, None, Status.INITIALISING, confidence)
         self._place(record, keyframe.identifier)
         if len(window) >= config.initial_frames:
-            enough = initialise(window, self._step, config)
-            drop_unrelated(self.graph, self._step, config)
-            evidence = newest_evidence(self._step)
+            enough = initialise(window, self.step, config)
+            drop_unrelated(self.graph, self.step, config)
+            evidence = newest_evidence(self.step)
             supported = len(window) >= config.initial_frames and evidence.supports(config)
-            self._initialised = enough and supported
-            self._adjustable += [self.graph.segment] * self._initialised
+            state.initialised = enough and supported
+            state.adjustable += [self.graph.segment] * state.initialised
             confidence = evidence.confidence
-        pose_wc = self._pose_wc(len(window) - 1) if self._initialised else None
+        pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         self._reduce()
         return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING, confidence)
 
     def _repeat(self, record: FrameRecord) -> Estimate:
         """Give a frame with the image of the frame before it the same pose and state."""
-        assert self._last is not None
-        past = self.graph.log.frames[-2]
+        state, past = self.state, self.graph.log.frames[-2]
+        assert state.last is not None
         record.follow(past)
-        if self._waiting and self._waiting[-1].records[-1] is past:
-            self._waiting[-1].records.append(record)
-        self._last = self._last[0], replace(self._last[1], timestamp=record.timestamp)
-        return self._last[1]
+        if state.waiting and state.waiting[-1].records[-1] is past:
+            state.waiting[-1].records.append(record)
+        state.last = state.last[0], replace(state.last[1], timestamp=record.timestamp)
+        return state.last[1]
 
     def _place(self, record: FrameRecord, anchor: int, reason: str = "") -> None:
         record.anchor, record.lost, record.segment, record.reason = anchor, False, self.graph.segment, reason
@@ -258,14 +267,14 @@ class PatchOdometry:
     def _lose(self, record: FrameRecord, reason: str) -> Estimate:
         """Mark a frame as lost; the next frame of an initialised segment has to be joined across it."""
         record.anchor, record.lost = None, True
-        if self._initialised and not self._joining:
-            self._joining = reason
-        record.reason = self._joining or reason
+        if self.state.initialised and not self.state.joining:
+            self.state.joining = reason
+        record.reason = self.state.joining or reason
         return self._estimate(record, None, Status.LOST, 0.0)
 
     def _begin_segment(self) -> Estimate:
         """Close the segment, and begin the next one with the frames that could not be joined with it."""
-        waiting, self._waiting, reason = self._waiting, [], self._joining
+        waiting, self.state.waiting, reason = self.state.waiting, [], self.state.joining
         self._close_segment()
         for view in waiting:
             estimate = self._take(view)
@@ -276,68 +285,55 @@ class PatchOdometry:
         return estimate
 
     def _close_segment(self, last: bool = False) -> None:
-        """Refine the window and archive it, and decide if the rows of the segment are kept.
-
-        A segment that was never initialised is kept if its frames agree with each other, and are as many as an
-        initialisation needs or the only ones of the sequence.
-        """
-        window, config = self.window, self.config
-        supported = self._initialised
+        """Refine the window and archive it, and decide if the rows of the segment are kept."""
+        window, config, supported = self.window, self.config, self.state.initialised
         if len(window) > 1:
-            for age in range(config.final_updates if self._initialised else config.initial_updates):
-                self._update(COLD_UPDATES if self._initialised else age)
-            if not self._initialised:
-                drop_unrelated(self.graph, self._step, config)
+            for age in range(config.final_updates if supported else config.initial_updates):
+                self._update(COLD_UPDATES if supported else age)
+            if not supported:
+                drop_unrelated(self.graph, self.step, config)
         if not supported and len(window):
-            records = self.graph.log.frames
-            rows = sum(not r.lost and r.segment == self.graph.segment for r in records)
-            only = last and self.graph.segment == 0 and not any(r.reason == NO_MATCH for r in records)
-            agree = len(window) == 1 or window_inliers(self._step) >= config.min_inliers
-            supported = agree and (only or rows >= config.initial_frames)
+            supported = worth_keeping(self.graph, self.step, config, last)
         while len(window):
             self.graph.archive_oldest()
-        self.graph.begin_segment(self._count, supported, "too few frames with content")
-        self._initialised, self._joining, self._skipped, self._tracked = False, "", False, 0
+        self.graph.begin_segment(self.state.keyframes, supported, "too few frames with content")
+        self.state.begin_segment()
 
     def _append(self, view: View) -> Keyframe:
         """Add a frame to the window, with predicted pose and the median depth of the frames before it."""
         config, window, seen = self.config, self.window, view.seen
         slot = window.free_map_slot()
-        self._step.keep_frame(slot, seen)
-        keyframe = Keyframe(self._count, view.records[0].timestamp, slot, seen.matching, seen.context, seen.colors,
-                            seen.intrinsics, seen.image, seen.fine)  # fmt: skip
-        self._count += 1
+        self.step.keep_frame(slot, seen.image, seen.maps, seen.fine_maps)
+        keyframe = Keyframe(self.state.keyframes, view.records[0].timestamp, slot, seen.matching, seen.context,
+                            seen.colors, seen.intrinsics, seen.image, seen.fine)  # fmt: skip
+        self.state.keyframes += 1
         depth = torch.ones(1, config.patches, device=self.device)
-        if self._initialised:
+        if self.state.initialised:
             depth *= recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES)
-        pose = predict_pose(
-            window.poses_cw, [f.timestamp for f in window.frames], keyframe.timestamp, config.motion_damping
-        )
-        if self._initialised:
-            pose = initial_pose(window, seen, pose, config.initial_pose)
+        pose = first_pose(window, seen, keyframe.timestamp, config, self.state.initialised)
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe
 
     def _update(self, age: int = COLD_UPDATES) -> None:
         """Take a step on the window; ``age``, the number of earlier steps, sets the damping of bundle adjustment."""
-        fixed = max(1, len(self.window) - self.config.optimisation) if self._initialised else 1
-        self._step(StepOptions(fixed=fixed, damping=damping_at(age)), align=self._initialised)
+        fixed = max(1, len(self.window) - self.config.optimisation) if self.state.initialised else 1
+        self.step(StepOptions(fixed=fixed, damping=damping_at(age)), align=self.state.initialised)
 
     def _updated(self, count: int) -> Evidence:
         for _ in range(count):
             self._update()
-        return newest_evidence(self._step)
+        return newest_evidence(self.step)
 
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
         window, config = self.window, self.config
         n, back = len(window), config.keyframe_index
-        if self._initialised and n > back + 1:
+        if self.state.initialised and n > back + 1:
             i, j = n - back - 1, n - back + 1
             if (flow_magnitude(window, i, j) + flow_magnitude(window, j, i)) / 2 < config.keyframe_motion:
                 self.graph.drop(n - back)
         self.graph.keep_edges(window.ii >= len(window) - config.removal)
-        limit = config.removal + config.lifetime if self._initialised else config.initial_frames + 4
+        limit = config.removal + config.lifetime if self.state.initialised else config.initial_frames + 4
         while len(window) > limit:
             self.graph.archive_oldest()
 

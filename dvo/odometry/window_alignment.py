@@ -64,6 +64,42 @@ class WindowAlignment:
         self._measured[edge_slots] = torch.inf
         self._accepted[edge_slots] = False
 
+    @property
+    def images(self) -> np.ndarray:
+        """``(N, H, W)`` uint8 grey working images by map slot, those of frames that have left the window included."""
+        return self._images.cpu().numpy().astype(np.uint8)
+
+    def restore_images(self, images: np.ndarray) -> None:
+        """Set the images of all map slots.
+
+        Their number, and what is in the slots that no frame has, takes part in the rounding of a sampled grey level
+        (:func:`dvo.nets.alignment.sample_images`).
+
+        Args:
+            images: see :attr:`images`.
+        """
+        self._images = torch.from_numpy(images).to(self._images)
+
+    def results(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Alignments of the edges of the window, for :meth:`restore`.
+
+        Returns:
+            ``(E, 2)`` measurements that were aligned, infinite for none; ``(E, 2)`` their alignments; and ``(E,)`` bool
+            for those that were accepted.
+        """
+        slots = self.window.edge_slots
+        return self._measured[slots], self._aligned[slots], self._accepted[slots]
+
+    def restore(self, measured: Tensor, aligned: Tensor, accepted: Tensor) -> None:
+        """Set the alignments of the edges of the window.
+
+        Args:
+            measured, aligned, accepted: of :meth:`results`.
+        """
+        slots = self.window.edge_slots
+        self.forget(slots)
+        self._measured[slots], self._aligned[slots], self._accepted[slots] = measured, aligned, accepted
+
     def __call__(self, state: UpdateState, revision: Revision) -> Measurement:
         """Replace the measurements of the network by the alignments that are accepted.
 

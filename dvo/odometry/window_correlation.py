@@ -63,8 +63,46 @@ class WindowCorrelation:
         Args:
             edge_slots: ``(e,)``.
         """
-        for level in (*self.levels, *([self.fine] if self.fine is not None else [])):
+        for level in self._all:
             level.forget(edge_slots)
+
+    def origins(self) -> Tensor:
+        """Positions of the cached windows of the edges, for :meth:`restore`.
+
+        Returns:
+            ``(L, E, 2)`` for each level, the fine one last.
+        """
+        return torch.stack([level.origins(self.window.edge_slots) for level in self._all])
+
+    def are_origins(self, origins: Tensor) -> bool:
+        """Check positions of a file against the maps, which are stored already.
+
+        Args:
+            origins: ``(L, E, 2)``.
+
+        Returns:
+            True if :meth:`restore` takes them.
+        """
+        return all(bool(level.are_origins(part).all()) for level, part in zip(self._all, origins, strict=True))
+
+    def restore(self, origins: Tensor) -> None:
+        """Compute the cached windows of all edges at given positions; the maps of the frames are stored already.
+
+        An interpolated value depends in its last bit on the position of its window, so that positions are kept; the
+        products are the same whenever they are computed.
+
+        Args:
+            origins: of :meth:`origins`.
+        """
+        window = self.window
+        maps = window.map_slots[window.jj]
+        for level, part in zip(self._all, origins, strict=True):
+            features = window.fine if level is self.fine else window.matching
+            level.restore(part, window.edge_slots, features.flatten(2), window.kk, maps)
+
+    @property
+    def _all(self) -> list[EdgeCorrelation]:
+        return [*self.levels, *([self.fine] if self.fine is not None else [])]
 
     def __call__(self, coords: Tensor, graph: PatchGraph) -> Correlation:
         """Look up the edges of the window, see :class:`dvo.nets.correlation.CorrelationLookup`.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepModel, StepOptions, UpdateState, revise, step
-from dvo.odometry.front_end import Observation
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 
@@ -42,17 +42,18 @@ class WindowStep:
         self.kernel = kernel
         self.bounds = (0, 0)
 
-    def keep_frame(self, map_slot: int, seen: Observation) -> None:
+    def keep_frame(self, map_slot: int, image: np.ndarray, maps: Tensor, fine_maps: Tensor | None) -> None:
         """Store feature maps and image of a frame.
 
         Args:
             map_slot: slot of the frame; its content is overwritten.
-            seen: the frame.
+            image: ``(H, W, 3)`` uint8 RGB working image.
+            maps, fine_maps: see :class:`dvo.odometry.front_end.Observation`.
         """
-        self.bounds = seen.bounds
-        self.lookup.keep_maps(map_slot, seen.maps, seen.fine_maps)
+        self.bounds = maps.shape[-1], maps.shape[-2]
+        self.lookup.keep_maps(map_slot, maps, fine_maps)
         if self.align is not None:
-            self.align.keep_image(map_slot, seen.image)
+            self.align.keep_image(map_slot, image)
 
     def forget(self, edge_slots: Tensor) -> None:
         """Invalidate the cached results of new edges.

@@ -20,7 +20,7 @@ from dvo.errors import DvoError
 from eval.benchmarks.malformed.target import Target
 from eval.benchmarks.malformed.worker import Outcome, run_cases, warm
 
-ROOMS = ("data", "files", "settings", "models", "scenes", "frames")
+ROOMS = ("data", "files", "settings", "models", "maps", "scenes", "frames")
 
 
 def all_targets() -> list[Target]:

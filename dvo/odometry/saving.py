@@ -1,0 +1,176 @@
+"""Trackers in files: ``odometry.save`` and ``dvo.load_map``.
+
+A map file holds the graph (:mod:`dvo.graph.serialisation`), the settings and the state of the tracker
+(:class:`dvo.odometry.tracker_state.TrackerState`), and which network it used: by name and by a digest of its tensors,
+not the network itself. What can be computed again bit for bit is left out: feature maps of the window from its images,
+and correlations from the maps and the positions of the cached windows (an interpolated value depends on these in its
+last bit, so that they are written).
+
+A sequence that is saved between two frames, loaded and continued has the results of one that is not interrupted, bit
+for bit on the CPU with the same number of threads. A finished sequence can be saved too; it takes no further frames.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from dvo.errors import DvoError
+from dvo.graph.map_file import MapReader, open_map_file, write_map_file
+from dvo.graph.serialisation import GraphTable, graph_arrays, read_graph
+from dvo.models.patch_vo import PatchVO
+from dvo.models.weights import LoadedWeights, load_weights, tensor_digest
+from dvo.odometry.front_end import View
+from dvo.odometry.load import source_of
+from dvo.odometry.restoring import EstimateTable, TrackerTable, WeightsTable, restore_tracker
+from dvo.threads import settle_threads
+
+if TYPE_CHECKING:
+    from dvo.odometry.tracker import PatchOdometry
+
+
+def save_map(file: str | Path, odometry: PatchOdometry) -> None:
+    """Write a tracker with its graph to a map file, between two frames or after the last one.
+
+    Args:
+        file: to write; replaced as a whole.
+        odometry: the tracker, which is not changed.
+
+    Raises:
+        DvoError: the file cannot be written.
+    """
+    graph, arrays = graph_arrays(odometry.graph)
+    description = {
+        "weights": asdict(WeightsTable(odometry.weights, tensor_digest(odometry.model))),
+        "tracker": asdict(_tracker_table(odometry)),
+        "graph": graph,
+    }
+    write_map_file(file, description, arrays | _tracker_arrays(odometry))
+
+
+def load_map(
+    file: str | Path, *, device: torch.device | str = "cpu", weights: str | Path | LoadedWeights | None = None
+) -> PatchOdometry:
+    """Load a tracker from a map file, to go on with its sequence or to use its map.
+
+    Args:
+        file: written by ``odometry.save`` or ``dvo run --save-map``.
+        device: of all computation.
+        weights: of the network, if they are not found by the name in the file: a name, a file, or a network in memory.
+
+    Returns:
+        The tracker as it was saved. A finished one takes no frames; ``finish`` gives its result again, and ``graph`` is
+        its map.
+
+    Raises:
+        DvoError: no such file; not a map of a tracker, one of a newer version, or an invalid content, with the name of
+            the field; weights that are not found, or are others than those that the map was made with.
+
+    Example:
+        >>> odometry = dvo.load("small")
+        >>> for frame in first_half:
+        ...     odometry.track(frame)
+        >>> odometry.save("office.dvo")
+        >>> odometry = dvo.load_map("office.dvo")  # in another process, on another day
+        >>> for frame in second_half:
+        ...     odometry.track(frame)
+        >>> result = odometry.finish()
+    """
+    settle_threads()
+    with open_map_file(file) as source:
+        if "tracker" not in source.description:
+            remedy = "dvo.graph.serialisation.load_graph reads it"
+            raise source.refused("holds a graph without a tracker", "tracker", remedy)
+        table, graph = source.table(TrackerTable, "tracker"), source.table(GraphTable, "graph")
+        network = _network(source, source.table(WeightsTable, "weights"), weights, device)
+        odometry = _empty(source, table, graph, network, device)
+        read_graph(source, odometry.graph, graph)
+        with torch.inference_mode():
+            restore_tracker(source, odometry, table)
+        return odometry
+
+
+def _tracker_table(odometry: PatchOdometry) -> TrackerTable:
+    state, estimate = odometry.state, None
+    if state.last is not None:
+        last = state.last[1]
+        pose = None if last.pose_wc is None else tuple(last.pose_wc.tolist())
+        confidence = last.confidence if math.isfinite(last.confidence) else 0.0
+        estimate = EstimateTable(pose, last.status.value, confidence, last.segment, last.reason)
+    number = {id(record): index for index, record in enumerate(odometry.graph.log.frames)}
+    return TrackerTable(
+        odometry.name, odometry.seed, odometry.config, state.keyframes, state.tracked, state.initialised,
+        state.finished, tuple(state.adjustable), state.joining, state.skipped, state.info, state.shutter.readout,
+        state.shutter.rows, state.sequence.size, tuple(state.sequence.intervals), state.sequence.new, estimate,
+        tuple(tuple(number[id(record)] for record in view.records) for view in _views(odometry)),
+    )  # fmt: skip
+
+
+def _views(odometry: PatchOdometry) -> list[View]:
+    """Waiting views; none of a finished sequence, which does not take them up any more."""
+    return [] if odometry.state.finished else odometry.state.waiting
+
+
+def _tracker_arrays(odometry: PatchOdometry) -> dict[str, np.ndarray]:
+    state, views = odometry.state, [view.seen for view in _views(odometry)]
+    last = np.zeros((0, 0, 3), np.uint8) if state.last is None else state.last[0]
+    arrays = {
+        "tracker/generator": state.generator.get_state().numpy(),
+        "tracker/last_image": last,
+        "tracker/origins": odometry.correlation.origins().cpu().numpy(),
+    }
+    if views:
+        arrays["waiting/images"] = np.stack([seen.image for seen in views])
+        arrays["waiting/intrinsics"] = np.stack([seen.image_intrinsics for seen in views]).astype(np.float64)
+        arrays["waiting/centres"] = np.stack([seen.centres[0, 0].cpu().numpy() for seen in views])
+    align = odometry.step.align
+    if align is not None and len(odometry.window):
+        arrays["alignment/images"] = align.images
+    if align is not None and odometry.config.align == "always":
+        measured, aligned, accepted = (part.cpu().numpy() for part in align.results())
+        known = np.isfinite(measured).all(1)
+        arrays["alignment/known"] = known.astype(np.uint8)
+        arrays["alignment/measured"] = np.where(known[:, None], measured, 0).astype(np.float32)
+        arrays["alignment/aligned"] = aligned
+        arrays["alignment/accepted"] = accepted.astype(np.uint8)
+    return arrays
+
+
+def _network(
+    source: MapReader, table: WeightsTable, weights: str | Path | LoadedWeights | None, device: torch.device | str
+) -> LoadedWeights:
+    """Network with the digest of the file."""
+    remedy = "give the file of the weights that the map was made with: weights=FILE"
+    if weights is None and not table.name:
+        raise source.refused("was made with a network that has no name", "weights", remedy)
+    try:
+        found = weights if isinstance(weights, LoadedWeights) else load_weights(weights or table.name, device)
+    except DvoError as error:
+        if weights is not None:
+            raise
+        raise source.refused(f"its weights are not found ({error})", "weights", remedy) from error
+    if not isinstance(found.model, PatchVO) or tensor_digest(found.model) != table.digest:
+        raise source.refused(f"'{found.name}' are other weights than those it was made with", "weights", remedy)
+    return found
+
+
+def _empty(
+    source: MapReader, table: TrackerTable, graph: GraphTable, network: LoadedWeights, device: torch.device | str
+) -> PatchOdometry:
+    """New tracker of the sizes and settings in the file."""
+    from dvo.odometry.tracker import PatchOdometry
+
+    assert isinstance(network.model, PatchVO)
+    sizes = (table.config.patches, network.model.config.patch_size, network.model.config.hidden_channels)
+    same = sizes == (graph.per_frame, graph.patch_size, graph.hidden)
+    source.require(same, "sizes that are not those of the network and its settings", "graph")
+    options: dict[str, Any] = {"seed": table.seed, "device": device, "name": table.name, "archive": graph.archive}
+    try:
+        return PatchOdometry(network.model, table.config, weights=source_of(network), **options)
+    except DvoError as error:
+        raise source.refused(error.message, f"tracker: {error.field}") from error

@@ -1,0 +1,52 @@
+"""State of a tracker between two frames, beside its graph and what is cached for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from dvo.odometry.frame_sequence import FrameSequence
+from dvo.odometry.front_end import View
+from dvo.odometry.protocol import Estimate
+from dvo.odometry.rolling_shutter import Shutter
+
+
+@dataclass
+class TrackerState:
+    """State of :class:`dvo.odometry.tracker.PatchOdometry`; :mod:`dvo.odometry.saving` writes and reads all of it.
+
+    Attributes:
+        generator: of the patch centres.
+        sequence: order, size and intervals of the frames.
+        keyframes: number of identifiers of keyframes given so far.
+        tracked: frames of the segment since its initialisation.
+        initialised: the segment is.
+        finished: no frame is taken any more.
+        adjustable: segments that were initialised.
+        waiting: frames with content since tracking was lost.
+        joining: cause of the interruption that the next frame has to be joined across; empty for none.
+        skipped: the interruption is a gap in time.
+        last: last working image and its estimate; None before the first frame.
+        shutter: timing of the rows of the last frame.
+        info: metadata for run.json.
+    """
+
+    generator: torch.Generator
+    sequence: FrameSequence
+    keyframes: int = 0
+    tracked: int = 0
+    initialised: bool = False
+    finished: bool = False
+    adjustable: list[int] = field(default_factory=list)
+    waiting: list[View] = field(default_factory=list)
+    joining: str = ""
+    skipped: bool = False
+    last: tuple[np.ndarray, Estimate] | None = None
+    shutter: Shutter = Shutter(0.0, 1.0)
+    info: dict[str, object] = field(default_factory=dict)
+
+    def begin_segment(self) -> None:
+        """Forget the segment that has been closed."""
+        self.initialised, self.joining, self.skipped, self.tracked = False, "", False, 0

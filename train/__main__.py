@@ -11,6 +11,7 @@
 - ``study --config configs/train/study.yaml`` compares losses on the same clips, for ``patch_vo`` DPVO's with V2V's.
 - ``family`` trains every member of the learned family for the same processor time on the same clips, and compares them
   on held-out sequences; ``--report`` prints the comparison again.
+- ``places`` fits the descriptor of places, by which keyframes are found again, to a network.
 - ``profile`` prints where the seconds of a training step go.
 """
 
@@ -26,6 +27,7 @@ COMMANDS = {
     "snr": "train.studies.snr:main",
     "study": "train.studies.study:main",
     "family": "train.studies.family.study:main",
+    "places": "train.places:main",
     "profile": "train.studies.breakdown:main",
 }
 

@@ -168,6 +168,31 @@ def write_vocabulary(path: Path | str, vocabulary: Vocabulary) -> None:
         raise DvoError(str(error.strerror), file=path, field="--out", remedy="give another file") from error
 
 
+def read_vocabulary(path: Path | str) -> Vocabulary:
+    """Read DBoW2's text format.
+
+    Args:
+        path: text file, see :func:`write_vocabulary`.
+
+    Returns:
+        The tree; its depth is the one that the file states.
+
+    Raises:
+        DvoError: no such file, or another content.
+    """
+    try:
+        with Path(path).open(encoding="ascii") as file:
+            branching, depth = (int(word) for word in file.readline().split()[:2])
+            rows = np.loadtxt(file, ndmin=2)
+        if rows.shape[1:] != (35,) or not (rows[:, 0] < np.arange(1, len(rows) + 1)).all() or (rows[:, 0] < 0).any():
+            raise ValueError("rows of a tree have 35 numbers, and parents before their children")
+    except (OSError, ValueError) as error:
+        raise DvoError(str(error), file=path, remedy="give a vocabulary in the text format of DBoW2") from error
+    root = np.zeros((1, 35))
+    rows = np.concatenate([root, rows])
+    return Vocabulary(branching, depth, rows[:, 0].astype(int), rows[:, 2:34].astype(np.uint8), rows[:, 34])
+
+
 def rendered_descriptors(sequences: int, frames: int, features: int, seed: int) -> Iterator[np.ndarray]:
     """ORB descriptors ``(N, 32)`` of pictures 640x480, a few seconds apart, of rendered sequences of all families.
 

@@ -159,6 +159,7 @@ def _tracking_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", metavar="NAME=VALUE", action="append", default=[], help="one setting, such as patches=48; repeatable"
     )
+    parser.add_argument("--no-loops", action="store_true", help="pure odometry: do not close loops (--set loops=false)")
 
 
 def _positive_int(text: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def _panels_with_truth(result: Result, chosen: list[int], groundtruth: Trajector
         return []
     span = slice(min(spans), max(spans) + 1)  # ground truth may be longer than the clip
     truth = Trajectory(groundtruth.timestamps[span], groundtruth.poses_wc[span])
-    return [Panel(tuple(tracks), points, truth)]
+    return [Panel(tuple(tracks), points, truth, _loops(result, tracks))]
 
 
 def _panels(result: Result, chosen: list[int], label: str) -> list[Panel]:
@@ -78,8 +79,21 @@ def _panels(result: Result, chosen: list[int], label: str) -> list[Panel]:
         worlds.setdefault(_root(result, number), []).append(track)
     longest = None if result.longest is None else _root(result, result.longest)
     none = np.zeros((0, 3))
-    panels = [Panel(tuple(tracks), result.map.points if world == longest else none) for world, tracks in worlds.items()]
+    panels = [
+        Panel(tuple(tracks), result.map.points if world == longest else none, loops=_loops(result, tracks))
+        for world, tracks in worlds.items()
+    ]
     return panels or [Panel((), result.map.points)]
+
+
+def _loops(result: Result, tracks: Sequence[Track]) -> np.ndarray:
+    """Positions ``(L, 3)`` on the tracks at which loops were found (``loops`` of the metadata)."""
+    found = []
+    for loop in result.info.get("loops", ()):
+        for track in tracks:
+            row = np.flatnonzero(np.isclose(track.trajectory.timestamps, loop["from"], rtol=0, atol=1e-6))
+            found += [track.trajectory.positions[k] for k in row[:1]]
+    return np.array(found).reshape(-1, 3)
 
 
 def _root(result: Result, number: int) -> int:

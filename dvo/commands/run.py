@@ -124,7 +124,9 @@ def _map_file(text: str, odometry: Odometry) -> Path:
 
 
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
-    """Load the odometry of ``--weights`` with the settings of ``--preset``, ``--config`` and ``--set``; the later win.
+    """Load the odometry of ``--weights`` with the settings of ``--preset``, ``--config``, ``--set`` and ``--no-loops``.
+
+    The later ones win.
 
     Args:
         arguments: of the command line.
@@ -140,6 +142,8 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     settings |= parse_settings(arguments.set)
     if arguments.preset is not None:
         settings["preset"] = arguments.preset
+    if arguments.no_loops:
+        settings["loops"] = False
     reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
     if reserved:
         raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")

@@ -182,6 +182,24 @@ class Archive:
     def __getitem__(self, identifier: int) -> ArchivedKeyframe:
         return self._keyframes[identifier]
 
+    def kept_after(self, identifier: int) -> list[ArchivedKeyframe]:
+        """Keyframes that were not dropped, later than another one.
+
+        Args:
+            identifier: of a keyframe, or -1.
+
+        Returns:
+            By increasing identifier.
+        """
+        found: list[ArchivedKeyframe] = []
+        for key in reversed(self._keyframes):  # those that were kept are archived in their order
+            keyframe = self._keyframes[key]
+            if keyframe.anchor is None:
+                if key <= identifier:
+                    break
+                found.append(keyframe)
+        return found[::-1]
+
     @property
     def keyframes(self) -> list[ArchivedKeyframe]:
         """Keyframes in the order in which they were archived and will be released."""

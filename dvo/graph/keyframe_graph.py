@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,37 +17,12 @@ from torch import Tensor
 from dvo.geometry import se3
 from dvo.graph.archive import Archive, ArchiveConfig, ArchivedEdges, ArchivedKeyframe, encode_jpeg
 from dvo.graph.keyframe_log import KeyframeLog
+from dvo.graph.problem import GraphProblem, graph_problem
 from dvo.graph.window import Keyframe, Window
 
 NEAR = 0.05
 """Points whose inverse depth is below this fraction of their keyframe's median are left out of the map, because their
 depth is uncertain."""
-
-
-@dataclass(frozen=True)
-class GraphProblem:
-    """Bundle adjustment problem of archived keyframes: arguments of
-    :func:`dvo.ba.global_adjust.global_bundle_adjust`.
-
-    Attributes:
-        identifiers: ``(N,)`` identifier of the keyframe of each pose.
-        poses_cw: ``(N, 7)`` float64 world to camera.
-        patches: ``(K, 3, 1, 1)`` float64 x, y (feature-map pixels), inverse depth.
-        intrinsics: ``(N, 4)`` float64 of the feature maps.
-        targets, weights: ``(E, 2)`` float64 measured positions of the patch centres (feature-map pixels), and their
-            confidence.
-        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge.
-    """
-
-    identifiers: np.ndarray
-    poses_cw: Tensor
-    patches: Tensor
-    intrinsics: Tensor
-    targets: Tensor
-    weights: Tensor
-    ii: Tensor
-    jj: Tensor
-    kk: Tensor
 
 
 class KeyframeGraph:
@@ -67,8 +41,11 @@ class KeyframeGraph:
         window: active keyframes and edges.
         archive: keyframes and edges that have left the window.
         log: every frame that was read, relative to a keyframe.
-        segment: number of the current segment, from 0; keyframes of two segments share no edge, world or scale.
+        segment: number of the current segment, from 0; keyframes of two segments share no edge, world or scale, unless
+            the segments have been joined.
         starts: first keyframe and number of each segment, by increasing keyframe; -1 for a rejected segment.
+        worlds: number of the earliest segment with the same world, of segments that have been joined.
+        loops: number of loops whose measurements are archived.
 
     Example:
         Global bundle adjustment of everything that a tracker has archived:
@@ -97,6 +74,8 @@ class KeyframeGraph:
         self.log = KeyframeLog()
         self.segment = 0
         self.starts: list[tuple[int, int]] = [(0, 0)]
+        self.worlds: dict[int, int] = {}
+        self.loops = 0
 
     def begin_segment(self, first: int, keep: bool = True, reason: str = "") -> None:
         """Begin a segment. The window must be empty.
@@ -135,6 +114,37 @@ class KeyframeGraph:
             Its number; -1 for a keyframe of a rejected segment.
         """
         return self.starts[bisect_right(self.starts, identifier, key=lambda entry: entry[0]) - 1][1]
+
+    def world_of(self, segment: int) -> int:
+        """World of a segment.
+
+        Args:
+            segment: its number.
+
+        Returns:
+            Number of the earliest segment whose world and scale it shares.
+        """
+        return self.worlds.get(segment, segment)
+
+    def join(self, segment: int, other: int) -> None:
+        """Record that the worlds of two segments have become one; their poses are in it already.
+
+        Args:
+            segment, other: numbers of the segments.
+        """
+        worlds = {self.world_of(segment), self.world_of(other)}
+        for number in range(self.segment + 1):
+            if self.world_of(number) in worlds:
+                self.worlds[number] = min(worlds)
+
+    def add_loop(self, edges: ArchivedEdges) -> None:
+        """Archive the measurements of a loop.
+
+        Args:
+            edges: between archived keyframes.
+        """
+        self.loops += 1
+        self.archive.add_edges(edges)
 
     def keep_edges(self, mask: Tensor) -> None:
         """Move edges from the window to the archive.
@@ -210,7 +220,7 @@ class KeyframeGraph:
         for keyframe in self.archive:
             if keyframe.anchor is not None or not len(keyframe.inverse_depth):
                 continue
-            if self.segment_of(keyframe.identifier) != segment:
+            if not self._shares_world(keyframe.identifier, segment):
                 continue
             depth = torch.from_numpy(keyframe.inverse_depth)
             x, y = torch.from_numpy(keyframe.centres).unbind(-1)
@@ -236,10 +246,14 @@ class KeyframeGraph:
         return [
             frame
             for frame in self.archive
-            if self.segment_of(frame.identifier) == segment
+            if self._shares_world(frame.identifier, segment)
             and len(frame.inverse_depth)
             and (frame.anchor is None or frame.anchor in self.archive)
         ]
+
+    def _shares_world(self, identifier: int, segment: int) -> bool:
+        own = self.segment_of(identifier)
+        return own >= 0 and self.world_of(own) == self.world_of(segment)
 
     def poses_cw(self, identifiers: np.ndarray) -> Tensor:
         """Poses of archived keyframes, dropped or not.
@@ -273,31 +287,7 @@ class KeyframeGraph:
         Returns:
             The problem of the :meth:`members`, on the CPU.
         """
-        edges = self.archive.edges(first, last)
-        linked = set(np.unique(np.concatenate([edges.source, edges.target])).tolist()) if first > 0 else set()
-        frames = [
-            frame
-            for frame in self.members(segment)
-            if (frame.identifier >= first or frame.identifier in linked)
-            and (last is None or frame.identifier <= last)
-            and (dropped or frame.anchor is None)
-        ]
-        m = self.window.per_frame
-        identifiers = np.array([frame.identifier for frame in frames], dtype=np.int64)
-        edges = edges.select(np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers))
-        ii, jj = np.searchsorted(identifiers, edges.source), np.searchsorted(identifiers, edges.target)
-        patches = [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
-        return GraphProblem(
-            identifiers=identifiers,
-            poses_cw=self.poses_cw(identifiers),
-            patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(len(frames) * m, 3, 1, 1),
-            intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(-1, 4)),
-            targets=torch.from_numpy(edges.position.astype(np.float64)),
-            weights=torch.from_numpy(edges.weight.astype(np.float64)),
-            ii=torch.from_numpy(ii),
-            jj=torch.from_numpy(jj),
-            kk=torch.from_numpy(ii * m + edges.patch),
-        )
+        return graph_problem(self, dropped, segment, first, last)
 
     def _archive_edges(self, mask: Tensor) -> None:
         """Archive the edges where ``mask (E,)`` is True, without those that have not been updated yet."""

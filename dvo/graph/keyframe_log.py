@@ -142,6 +142,21 @@ class KeyframeLog:
         """
         self._poses[keyframe] = T_cw
 
+    def rescale(self, scales: Mapping[int, float]) -> None:
+        """Divide the lengths of frames relative to keyframes whose scale has changed.
+
+        Args:
+            scales: by keyframe; those that are not named keep theirs.
+        """
+        for record in self.frames:
+            scale = scales.get(record.anchor, 1.0) if record.anchor is not None else 1.0
+            if record.relative is not None and scale != 1.0:
+                record.relative = record.relative.copy()
+                if _is_matrix(record.relative):
+                    record.relative[:3, 3] /= scale
+                else:
+                    record.relative[:3] /= scale
+
     def keyframe_pose(self, keyframe: int) -> np.ndarray:
         """Pose of a keyframe that has one.
 

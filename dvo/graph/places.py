@@ -107,6 +107,19 @@ class PlaceIndex:
         if at < self._count and self._identifiers[at] == identifier:
             self._delete(at)
 
+    def descriptor(self, identifier: int) -> np.ndarray | None:
+        """Descriptor of a keyframe.
+
+        Args:
+            identifier: of the keyframe.
+
+        Returns:
+            ``(dimensions,)`` float32, as it is kept; None if the keyframe is not there.
+        """
+        at = int(np.searchsorted(self.identifiers, identifier))
+        here = at < self._count and self._identifiers[at] == identifier
+        return self._descriptors[at].astype(np.float32) if here else None
+
     def query(self, descriptor: np.ndarray, count: int = 5, *, before: int | None = None, apart: int = 0) -> Candidates:
         """Find the keyframes whose descriptors are most like that of an image.
 

@@ -39,6 +39,8 @@ class GraphTable:
         segment: number of the current segment.
         archive: bound and content of the archive.
         reasons: causes of losses and breaks that the log refers to.
+        loops: number of loops whose measurements are archived.
+        worlds: by segment, the earliest segment with the same world; none where no segments have been joined.
     """
 
     per_frame: int
@@ -47,12 +49,15 @@ class GraphTable:
     segment: int
     archive: ArchiveConfig
     reasons: tuple[str, ...]
+    loops: int = 0
+    worlds: tuple[int, ...] = ()
 
     RANGES: ClassVar[dict[str, tuple[float, float]]] = {
         "per_frame": (1, 2**14),
         "patch_size": (1, 9),
         "hidden": (1, 4096),
         "segment": (0, _LAST),
+        "loops": (0, _LAST),
     }
 
 
@@ -109,7 +114,7 @@ def graph_arrays(graph: KeyframeGraph) -> tuple[dict[str, Any], Arrays]:
     reasons = sorted({record.reason for record in graph.log.frames})
     table = GraphTable(
         window.per_frame, window.patches.shape[-1], window.hidden.shape[1], graph.segment, graph.archive.config,
-        tuple(reasons),
+        tuple(reasons), graph.loops, tuple(map(graph.world_of, range(graph.segment + 1))) if graph.worlds else (),
     )  # fmt: skip
     starts = {"segments": np.array(graph.starts, np.int64)}
     return asdict(table), starts | _log_arrays(graph.log, reasons) | _archive_arrays(graph) | window_arrays(window)
@@ -126,7 +131,11 @@ def read_graph(source: MapReader, graph: KeyframeGraph, table: GraphTable) -> No
     Raises:
         DvoError: a missing or invalid array.
     """
-    graph.segment = table.segment
+    graph.segment, graph.loops = table.segment, table.loops
+    worlds = np.array(table.worlds, np.int64)
+    fits = len(worlds) in (0, table.segment + 1) and (worlds >= 0).all() and (worlds <= np.arange(len(worlds))).all()
+    source.require(fits and (worlds[worlds] == worlds).all(), "not a world for each segment", "graph: worlds")
+    graph.worlds = dict(enumerate(worlds.tolist()))
     starts = source.array("segments", np.int64, (None, 2), low=-1, high=_LAST)
     first = starts[:, 0]
     ordered = len(first) > 0 and first[0] == 0 and (np.diff(first) >= 0).all()

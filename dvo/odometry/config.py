@@ -72,6 +72,7 @@ class TrackerConfig:
             (:mod:`dvo.odometry.final_adjustment`).
         estimate_readout: look for a rolling shutter in the final adjustment if the camera states no readout time
             (:mod:`dvo.odometry.self_calibration`).
+        loops: close loops, and join segments that show the same place (:mod:`dvo.odometry.loop_closure`).
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
         sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
             are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). The tracker does not read it;
@@ -124,6 +125,7 @@ class TrackerConfig:
     final_updates: int = 8
     final_adjustment: bool = True
     estimate_readout: bool = True
+    loops: bool = True
     robust: float = 0.3
     sigma: float = 0.064
     restart: bool = True

@@ -30,6 +30,7 @@ _RANGES = {
     "iterations": (1, 1000),
     "tolerance": (0, 1),
     "block": (3, 10**6),
+    "loop_block": (3, 10**6),
     "overlap": (1, 10**6),
     "shutter_rounds": (0, 100),
     "restart_frames": (0, 10**6),
@@ -47,6 +48,7 @@ class AdjustmentOptions:
         iterations: Levenberg-Marquardt steps of a block with each kernel, at most.
         tolerance: relative decrease of the cost by a step below which a solution has converged.
         block: largest number of frames that are solved for at once.
+        loop_block: the same for a graph with loops, which one solution has to close.
         overlap: frames at the end of a block that the next block solves for again.
         shutter_rounds: solutions with measurements corrected for a rolling shutter, each from the motion of the last.
             They take the last kernel, and the solution before them the others.
@@ -61,6 +63,7 @@ class AdjustmentOptions:
     iterations: int = 10
     tolerance: float = 1e-3
     block: int = 600
+    loop_block: int = 3000
     overlap: int = 60
     shutter_rounds: int = 2
     restart_frames: int = 60
@@ -127,13 +130,14 @@ def adjust_segment(
         return 0
     held = min(int(linked.argmax()) + options.overlap, len(identifiers) - 1) if not linked[0] else 1
     start = solved = held
+    block = options.loop_block if graph.loops else options.block
     change = _Change(old[held - 1], old[held - 1], 1.0)
     rolling = shutter if shutter is not None and shutter.readout > 0 else None
     # The last kernel is for corrected measurements, if they are corrected; there may be no other one.
     first = options.kernels if rolling is None else options.kernels[:-1]
     last = replace(options, kernels=options.kernels[-1:])
     while solved < len(identifiers):
-        end = min(max(start + options.block, solved + 1), len(identifiers))
+        end = min(max(start + block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
         part = graph.problem(True, segment, 0 if start == held else int(identifiers[start]), int(identifiers[end - 1]))
         rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))

@@ -213,6 +213,19 @@ def save_descriptor(file: Path | str, fitted: GridDescriptor, facts: dict[str, A
         raise DvoError(f"cannot be written ({error})", file=file, remedy="give a file in another folder") from error
 
 
+def shipped_descriptor(channels: int) -> GridDescriptor | None:
+    """Descriptor that ships with dvo.
+
+    Args:
+        channels: of the matching features of the network.
+
+    Returns:
+        The descriptor; None for a network with another number of channels.
+    """
+    found = load_descriptor()
+    return found if found.mean.shape[2] == channels else None
+
+
 def load_descriptor(file: Path | str = SHIPPED) -> GridDescriptor:
     """Read a fitted descriptor.
 

@@ -177,6 +177,7 @@ def _restore_window(source: MapReader, odometry: PatchOdometry, size: tuple[int,
         assert frame.image is not None
         features = encode_image(odometry.model, frame.image, odometry.device)
         odometry.step.keep_frame(frame.map_slot, frame.image, features.matching, features.fine)
+        odometry.loops.see(frame.identifier, frame.image, features.matching)
     levels = len(c.pyramid) + bool(c.fine_channels)
     found = source.array("tracker/origins", np.int64, (levels, len(window.kk), 2))
     origins = torch.from_numpy(found).to(odometry.device)

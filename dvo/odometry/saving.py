@@ -27,6 +27,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights, load_weights, tensor_digest
 from dvo.odometry.front_end import View
 from dvo.odometry.load import source_of
+from dvo.odometry.loop_saving import loops_arrays, loops_table, restore_loops
 from dvo.odometry.restoring import EstimateTable, TrackerTable, WeightsTable, restore_tracker
 from dvo.threads import settle_threads
 
@@ -49,8 +50,9 @@ def save_map(file: str | Path, odometry: PatchOdometry) -> None:
         "weights": asdict(WeightsTable(odometry.weights, tensor_digest(odometry.model))),
         "tracker": asdict(_tracker_table(odometry)),
         "graph": graph,
+        "loops": loops_table(odometry.loops),
     }
-    write_map_file(file, description, arrays | _tracker_arrays(odometry))
+    write_map_file(file, description, arrays | _tracker_arrays(odometry) | loops_arrays(odometry.loops))
 
 
 def load_map(
@@ -92,6 +94,7 @@ def load_map(
         read_graph(source, odometry.graph, graph)
         with torch.inference_mode():
             restore_tracker(source, odometry, table)
+            restore_loops(source, odometry.loops)
         return odometry
 
 

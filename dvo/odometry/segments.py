@@ -14,21 +14,30 @@ from dvo.graph.keyframe_log import KeyframeLog
 from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
 
-def segments_of(log: KeyframeLog, poses: Mapping[int, np.ndarray] | None = None) -> tuple[Segment, ...]:
+def segments_of(
+    log: KeyframeLog, poses: Mapping[int, np.ndarray] | None = None, worlds: Mapping[int, int] | None = None
+) -> tuple[Segment, ...]:
     """Segments of a log that have rows, in order of time.
 
     Args:
         log: of every frame, with its segment.
         poses: ``T_cw`` of keyframes that are still being optimised.
+        worlds: number of the segment whose world a segment has joined, by its own number; None if none has.
 
     Returns:
         The segments; their positions are the numbers of the records.
     """
-    found = []
+    found: list[Segment] = []
+    place: dict[int, int] = {}
     for number in sorted({record.segment for record in log.frames if not record.lost}):
         rows = log.trajectory(number, poses)
         if len(rows):
-            found.append(Segment(rows, float(rows.timestamps[0]), float(rows.timestamps[-1])))
+            place[number] = len(found)
+            joined_to = place.get(worlds.get(number, number)) if worlds else None
+            own = joined_to is None or joined_to == place[number]
+            found.append(
+                Segment(rows, float(rows.timestamps[0]), float(rows.timestamps[-1]), None if own else joined_to)
+            )
     return tuple(found)
 
 
@@ -80,14 +89,17 @@ def result_of(graph: KeyframeGraph, info: dict[str, Any], poses: Mapping[int, np
         poses: ``T_cw`` of keyframes that are still being optimised.
 
     Returns:
-        All segments, with the trajectory and the map of the one with the most rows.
+        All segments, with the trajectory and the map of the world with the most rows.
     """
-    result, main = result_of_log(graph.log, info, poses)
+    result, main = result_of_log(graph.log, info, poses, graph.worlds)
     return replace(result, map=SparseMap(*graph.points(main)))
 
 
 def result_of_log(
-    log: KeyframeLog, info: dict[str, Any], poses: Mapping[int, np.ndarray] | None = None
+    log: KeyframeLog,
+    info: dict[str, Any],
+    poses: Mapping[int, np.ndarray] | None = None,
+    worlds: Mapping[int, int] | None = None,
 ) -> tuple[Result, int]:
     """Result of an odometry that keeps a log, without a map.
 
@@ -95,15 +107,27 @@ def result_of_log(
         log: of every frame, with its segment.
         info: metadata for run.json.
         poses: ``T_cw`` of keyframes that are still being optimised.
+        worlds: number of the segment whose world a segment has joined, by its own number; None if none has.
 
     Returns:
-        All segments, with the trajectory of the first of the longest, and the number of that one.
+        All segments, with the trajectory of the world with the most rows (of several, the first), and the number of the
+        first segment in it.
     """
-    segments = segments_of(log, poses)
-    main = max(range(len(segments)), key=lambda number: (len(segments[number]), -number), default=0)
-    trajectory = segments[main].trajectory if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
+    segments = segments_of(log, poses, worlds)
+    rows: dict[int, list[Trajectory]] = {}
+    for number, segment in enumerate(segments):
+        rows.setdefault(number if segment.joined_to is None else segment.joined_to, []).append(segment.trajectory)
+    main = max(rows, key=lambda number: (sum(map(len, rows[number])), -number), default=0)
+    trajectory = _concatenated(rows[main]) if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
     read, tracked = len(log.frames), sum(len(segment) for segment in segments)
     return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks_of(log)), main
+
+
+def _concatenated(parts: Sequence[Trajectory]) -> Trajectory:
+    """One trajectory of several that follow each other in time."""
+    if len(parts) == 1:
+        return parts[0]
+    return Trajectory(np.concatenate([p.timestamps for p in parts]), np.concatenate([p.poses_wc for p in parts]))
 
 
 def own_copy(estimate: Estimate) -> Estimate:

@@ -140,6 +140,7 @@ def adjust_segments(
     Returns:
         ``readout`` in seconds, and ``readout_from``: ``camera``, ``images``, or ``none`` for a global shutter.
     """
+    segments = sorted({graph.world_of(segment) for segment in segments})  # joined ones are solved as one
     source = "camera" if shutter.readout > 0 else "none"
     sizes = {segment: adjust_segment(graph, segment, options, shutter) for segment in segments}
     if estimate and source == "none" and sizes:

@@ -32,6 +32,7 @@ from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
 from dvo.odometry.initial_pose import first_pose
 from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise, leave_minimum, worth_keeping
+from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.rolling_shutter import Shutter
@@ -95,6 +96,7 @@ class PatchOdometry:
         self.correlation = WindowCorrelation(self.window, c, self.device)
         align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
         self.step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final", config.kernel)
+        self.loops = loop_closer(self.model, config, self.graph, self.device)
 
     @property
     def window(self) -> Window:
@@ -108,7 +110,7 @@ class PatchOdometry:
         A frame whose image has no content, or whose pose its measurements do not bear out
         (:mod:`dvo.odometry.evidence`), is lost and leaves the graph. The frames after it are joined with the window if
         there is evidence for it; after ``config.patience`` frames with content that could not be joined, these begin
-        the next segment.
+        the next segment. A loop (:mod:`dvo.odometry.loop_closure`) moves earlier frames too, and may change the scale.
 
         Args:
             frame: of the same size as the first, later than the one before, without lens distortion.
@@ -161,6 +163,7 @@ class PatchOdometry:
             if len(state.waiting) >= config.initial_frames:
                 self._begin_segment()
             self._close_segment(last=True)
+            self.loops.complete()
             if config.final_adjustment and state.adjustable:
                 state.info |= adjust_segments(
                     self.graph, state.adjustable, state.shutter, config.estimate_readout, config.adjustment
@@ -191,7 +194,7 @@ class PatchOdometry:
 
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
         info = {
-            **self.state.info, "keyframes": self.graph.log.keyframes, "seed": self.seed,
+            **self.state.info, **self.loops.information(), "keyframes": self.graph.log.keyframes, "seed": self.seed,
             "initialised": bool(self.state.adjustable), "config": asdict(self.config),
         }  # fmt: skip
         return result_of(self.graph, info, poses)
@@ -307,6 +310,7 @@ class PatchOdometry:
         keyframe = Keyframe(self.state.keyframes, view.records[0].timestamp, slot, seen.matching, seen.context,
                             seen.colors, seen.intrinsics, seen.image, seen.fine)  # fmt: skip
         self.state.keyframes += 1
+        self.loops.see(keyframe.identifier, seen.image, seen.maps)
         depth = torch.ones(1, config.patches, device=self.device)
         if self.state.initialised:
             depth *= recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES)
@@ -336,6 +340,7 @@ class PatchOdometry:
         limit = config.removal + config.lifetime if self.state.initialised else config.initial_frames + 4
         while len(window) > limit:
             self.graph.archive_oldest()
+        self.loops.advance()
 
     def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status, confidence: float) -> Estimate:
         reason = record.reason if status is Status.LOST else ""

@@ -76,11 +76,13 @@ class Panel:
         tracks: lines in one world; aligned with the reference if there is one.
         points: ``(M, 3)`` map points in that world, drawn faintly behind the lines.
         reference: ground truth, camera to world, metres.
+        loops: ``(L, 3)`` positions at which a loop was found, in that world.
     """
 
     tracks: tuple[Track, ...]
     points: np.ndarray | None = None
     reference: Trajectory | None = None
+    loops: np.ndarray | None = None
 
 
 def plot_trajectory(
@@ -143,7 +145,7 @@ def _draw_side_by_side(figure: Figure, panels: Sequence[Panel], title: str, subt
         plot = figure.add_subplot(rows, columns, place)
         _draw_panel(plot, panel, SIZE_INCHES[0] / columns / (SIZE_INCHES[1] / rows))
         names = [track.label for track in panel.tracks]
-        handles = [line for line in plot.get_lines() if line.get_label() in names]
+        handles = [line for line in plot.get_lines() if line.get_label() in names or line.get_marker() == "D"]
         plot.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
     figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
     note = "every panel has a world and a scale of its own; a dot marks a start"
@@ -168,6 +170,9 @@ def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:
             x, y = track.trajectory.positions[0, axes]
             label = "start" if track is panel.tracks[-1] else None
             plot.plot(x, y, "o", ms=7, color=START, mec=PAPER, mew=1.2, ls="none", label=label, zorder=4)
+    if panel.loops is not None and len(panel.loops):
+        name = f"{len(panel.loops)} loop{'s' * (len(panel.loops) > 1)}"
+        plot.plot(*panel.loops[:, axes].T, "D", ms=5, mfc="none", mec=INK, mew=1.2, ls="none", label=name, zorder=5)
     _decorate(plot, axes, "m" if truth is not None else "unit free")
 
 

@@ -1,0 +1,82 @@
+"""Corrections of a keyframe graph that change poses and scale: of a loop, or of a segment that joins another."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.geometry import se3, sim3
+from dvo.graph.keyframe_graph import KeyframeGraph
+
+
+def apply_similarities(graph: KeyframeGraph, identifiers: np.ndarray, similarities: Tensor) -> None:
+    """Set poses and scales of archived keyframes; the dropped keyframes and the frames relative to them follow.
+
+    A similarity ``S`` maps points of the world to the frame of the camera, in the unit that the keyframe had so far.
+    With its scale ``s`` the pose becomes that of ``S / s``, and the inverse depths are multiplied by ``s``.
+
+    Args:
+        graph: keyframes, corrected in place.
+        identifiers: ``(N,)`` of keyframes that were kept (not dropped).
+        similarities: ``(N, 8)`` float64 world to camera.
+
+    Example:
+        >>> keyframes = np.array([keyframe.identifier for keyframe in graph.archive if keyframe.anchor is None])
+        >>> twice = sim3.from_se3(graph.poses_cw(keyframes), 0.5)  # camera to world lengths double
+        >>> apply_similarities(graph, keyframes, twice)
+    """
+    scales = dict(zip(identifiers.tolist(), similarities[:, 7].tolist(), strict=True))
+    poses_cw = torch.cat([similarities[:, :3] / similarities[:, 7:], similarities[:, 3:7]], 1).numpy()
+    for identifier, pose_cw in zip(identifiers.tolist(), poses_cw, strict=True):
+        inverse_depth = graph.archive[identifier].inverse_depth * scales[identifier]
+        graph.correct(identifier, pose_cw, inverse_depth.astype(np.float32))
+    for frame in list(graph.archive):  # by increasing identifier: the keyframe that it is relative to comes first
+        if frame.anchor is None or frame.anchor not in scales:
+            continue
+        scale = scales[frame.anchor]
+        scales[frame.identifier] = scale
+        relative = frame.pose_cw.copy()
+        relative[:3] /= scale
+        graph.archive.set_pose(frame.identifier, relative, frame.inverse_depth * np.float32(scale), frame.anchor)
+        graph.log.reanchor(frame.identifier, frame.anchor, relative)
+    graph.log.rescale(scales)
+
+
+def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> None:
+    """Move the window along with a keyframe outside of it.
+
+    Args:
+        graph: its window is changed.
+        before_cw: ``(7,)`` float64 pose of that keyframe before.
+        similarity: ``(8,)`` float64 world to camera of the keyframe now, see :func:`apply_similarities`.
+    """
+    window, scale = graph.window, float(similarity[7])
+    if not len(window):
+        return
+    now = torch.cat([similarity[:3] / scale, similarity[3:7]])
+    poses = window.poses_cw.double().cpu()
+    relative = se3.relative(before_cw.expand_as(poses), poses)
+    relative = torch.cat([relative[:, :3] / scale, relative[:, 3:]], 1)
+    window.poses_cw = se3.normalise(se3.compose(relative, now.expand_as(poses))).to(window.poses_cw)
+    patches = window.patches.clone()
+    patches[:, 2] *= scale
+    window.patches = patches
+
+
+def similarity_between(poses_cw: Tensor, found_cw: Tensor, scale: float) -> Tensor:
+    """Similarity from the world of poses to another world in which they were found.
+
+    Args:
+        poses_cw: ``(7,)`` float64 ``T_cw`` of a keyframe in its world.
+        found_cw: ``(7,)`` ``T_cw`` of the same keyframe in the other world.
+        scale: of lengths, in the other world over its own.
+
+    Returns:
+        ``(8,)`` similarity of points.
+    """
+    return sim3.compose(sim3.inverse(sim3.from_se3(found_cw)), sim3.from_se3(_scaled(poses_cw, scale), scale))
+
+
+def _scaled(pose_cw: Tensor, scale: float) -> Tensor:
+    return torch.cat([pose_cw[:3] * scale, pose_cw[3:]])

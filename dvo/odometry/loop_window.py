@@ -1,0 +1,142 @@
+"""Matching of two groups of archived keyframes by the network.
+
+A loop edge is measured as any other edge of the tracker: patches are reprojected into the other frame, correlated
+there and revised by the update operator, and poses and inverse depths are fitted to the revised positions by bundle
+adjustment. Poses of the older group are held; those of the newer group move, and its inverse depths with the scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.ba.cold_start import COLD_UPDATES, damping_at
+from dvo.geometry import se3
+from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
+from dvo.graph.features import FeatureCache
+from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.window import Keyframe, Window
+from dvo.models.patch_vo import PatchVO
+from dvo.models.step import StepOptions
+from dvo.nets.patchifier import patch_coordinates
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.evidence import related_share
+from dvo.odometry.front_end import encode_image
+from dvo.odometry.window_alignment import WindowAlignment
+from dvo.odometry.window_correlation import WindowCorrelation
+from dvo.odometry.window_step import WindowStep
+
+_MAPS = 16  # keyframes whose feature maps are kept for the next match
+
+
+@dataclass(frozen=True)
+class Match:
+    """Outcome of a match of two groups.
+
+    Attributes:
+        inliers: share of the edges between the groups whose measurement is confident and agrees with bundle adjustment.
+        poses_cw: ``(n, 7)`` float64 ``T_cw`` of the older and the newer group, in the world and the scale of the older.
+        scale: of the lengths of the newer group, after over before.
+        edges: measurements between the groups, aligned to a fraction of a pixel where that is possible.
+    """
+
+    inliers: float
+    poses_cw: Tensor
+    scale: float
+    edges: ArchivedEdges
+
+
+class GroupMatcher:
+    """Matcher of groups of archived keyframes.
+
+    Args:
+        model: the network.
+        config: of the tracker: sub-pixel alignment and kernel.
+        graph: holds the keyframes.
+        device: of the computation.
+    """
+
+    def __init__(self, model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device) -> None:
+        self.model, self.config, self.graph, self.device = model, config, graph, device
+        self.maps = FeatureCache(graph.archive, lambda image: encode_image(model, image, device).matching, _MAPS)
+
+    def can_match(self, identifier: int) -> bool:
+        """Return True if a keyframe still has what a match needs: image, features and patches."""
+        frame = self.graph.archive[identifier]
+        return frame.jpeg is not None and frame.matching is not None and frame.context is not None
+
+    def match(
+        self, old: Sequence[int], new: Sequence[int], poses_cw: Tensor, updates: tuple[int, int], inliers: float
+    ) -> Match | None:
+        """Match two groups.
+
+        Args:
+            old, new: identifiers of the keyframes; each :meth:`can_match`.
+            poses_cw: ``(n, 7)`` poses ``T_cw`` of the older and the newer group to start from, in the world of the
+                older.
+            updates: steps before the first decision, and further steps of a pair that passes it.
+            inliers: smallest share of inliers of a match.
+
+        Returns:
+            The match; None if the groups do not show the same.
+        """
+        step = self._joint(old, new, poses_cw)
+        window, count = step.window, len(old)
+        across = (window.ii < count) != (window.jj < count)
+        before = window.patches[count * window.per_frame :, 2, 0, 0].clone()
+        share = 0.0
+        for number in updates:
+            for _ in range(number):
+                step(StepOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
+            share = related_share(step, across)
+            if not share >= inliers:  # NaN fails too
+                return None
+        step.finalise(across.nonzero()[:, 0])
+        after = window.patches[count * window.per_frame :, 2, 0, 0]
+        scale = float((before / after).median())
+        poses = se3.normalise(window.poses_cw.double().cpu())
+        if not (np.isfinite(scale) and scale > 0 and bool(torch.isfinite(poses).all())):
+            return None
+        return Match(share, poses, scale, self._edges((*old, *new), window, across))
+
+    def _joint(self, old: Sequence[int], new: Sequence[int], poses_cw: Tensor) -> WindowStep:
+        """Window of both groups with all edges but those within the older one."""
+        c, config, device = self.model.config, self.config, self.device
+        window = Window.empty(self.graph.window.per_frame, c.patch_size, c.hidden_channels, device)
+        align = None if config.align == "none" else WindowAlignment(window, config.alignment, device)
+        step = WindowStep(self.model, window, WindowCorrelation(window, c, device), align, True, config.kernel)
+        for slot, identifier in enumerate((*old, *new)):
+            self._append(step, slot, self.graph.archive[identifier], poses_cw[slot])
+        m, n = window.per_frame, len(window)
+        pairs = [(i, j) for i, j in product(range(n), range(n)) if max(i, j) >= len(old)]
+        kk = torch.cat([torch.arange(i * m, (i + 1) * m, device=device) for i, _ in pairs])
+        jj = torch.tensor([j for _, j in pairs], device=device).repeat_interleave(m)
+        step.forget(window.connect(kk, jj))
+        return step
+
+    def _append(self, step: WindowStep, slot: int, frame: ArchivedKeyframe, pose_cw: Tensor) -> None:
+        device, image, maps = self.device, frame.image(), self.maps.maps(frame.identifier)
+        assert image is not None and maps is not None and frame.matching is not None and frame.context is not None
+        centres = torch.from_numpy(frame.centres)[None, None].to(device)
+        matching, context = (torch.from_numpy(x).float().to(device) for x in (frame.matching, frame.context))
+        intrinsics, colors = torch.from_numpy(frame.intrinsics).to(device), torch.from_numpy(frame.colors)
+        step.keep_frame(slot, image, maps, None)
+        keyframe = Keyframe(frame.identifier, frame.timestamp, slot, matching, context, colors, intrinsics)
+        depth = torch.from_numpy(frame.inverse_depth)[None].to(device)
+        patches = patch_coordinates(centres, depth, self.model.config.patch_size)[0]
+        step.window.append(keyframe, pose_cw.to(patches), patches)
+
+    @staticmethod
+    def _edges(identifiers: Sequence[int], window: Window, across: Tensor) -> ArchivedEdges:
+        known = across & (window.weights > 0).any(-1)
+        frames, m = np.array(identifiers, dtype=np.int32), window.per_frame
+        kk, jj = window.kk[known].cpu().numpy(), window.jj[known].cpu().numpy()
+        position, weight = (x[known].float().cpu().numpy() for x in (window.targets, window.weights))
+        return ArchivedEdges(
+            frames[kk // m], (kk % m).astype(np.int16), frames[jj], position, weight.astype(np.float16)
+        )

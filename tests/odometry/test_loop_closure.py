@@ -1,0 +1,169 @@
+"""Loops of a walk there and back, with the shipped weights."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import dvo
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+from dvo.metrics import evaluate
+from dvo.odometry.loop_closure import LoopCloser
+from dvo.odometry.loops import LoopOptions
+from dvo.synth.sequence import make_sequence
+
+THERE = 40
+SHORT = {"keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5}  # keyframes leave the window soon
+OPTIONS = LoopOptions(seconds=1.0, every=2, neighbours=1)
+
+
+@pytest.fixture(scope="module")
+def film():
+    """Frames of a walk and the same in reverse, with times that go on; and the true trajectory."""
+    walk = make_sequence(
+        63, frames=THERE, family="room", kind="handheld", speed=5.0, height=120, width=160, fps=15.0, sensor=False
+    )
+    order = [*range(THERE), *range(THERE - 2, -1, -1)]
+    clip, times = list(walk), np.arange(len(order)) / 15.0
+    frames = [replace(clip[k], timestamp=float(t)) for k, t in zip(order, times, strict=True)]
+    return frames, Trajectory(times, walk.groundtruth.poses_wc[order])
+
+
+def track(frames, options=OPTIONS, **settings):
+    odometry = dvo.load("small", device="cpu", **SHORT, **settings)
+    odometry.loops.finder.options = options
+    estimates = [odometry.track(frame) for frame in frames]
+    return odometry, estimates, odometry.finish()
+
+
+@pytest.fixture(scope="module")
+def closed(film):
+    return track(film[0])
+
+
+def test_loops_are_found_where_the_way_is_repeated(film, closed):
+    odometry, _, result = closed
+    loops = result.info["loops"]
+    assert len(loops) >= 2 and result.info["loop_corrections"] == odometry.loops.corrections
+    assert loops == sorted(loops, key=lambda loop: loop["from"])
+    turn, rows = (THERE - 1) / 15.0, film[1]
+    assert sum(loop["to"] < turn < loop["from"] for loop in loops) >= 2
+    for loop in loops:
+        new, old = (rows.poses_wc[int(np.abs(rows.timestamps - loop[k]).argmin())] for k in ("from", "to"))
+        near = np.linalg.norm(new[:3] - old[:3]) < 1.0 and abs(new[3:] @ old[3:]) > np.cos(np.deg2rad(5))
+        assert near and loop["from"] - loop["to"] >= OPTIONS.seconds
+        assert loop["inliers"] >= OPTIONS.inliers and loop["edges"] > 0 and not loop["joins_segments"]
+    assert evaluate(result.trajectory, film[1]).ate_percent < 0.5
+
+
+@pytest.fixture(scope="module")
+def saved(film, tmp_path_factory):
+    """Map files of the walk with a loop that waits for its confirmation, and with loops; and frames tracked by then."""
+    odometry, found = dvo.load("small", device="cpu", **SHORT), {}
+    odometry.loops.finder.options = OPTIONS
+    for count, frame in enumerate(film[0], 1):
+        odometry.track(frame)
+        state = "pending" if odometry.loops.pending is not None else "closed" if odometry.loops.loops else ""
+        if state and state not in found:
+            found[state] = tmp_path_factory.mktemp("maps") / f"{state}.dvo", count
+            odometry.save(found[state][0])
+        if len(found) == 2:
+            return found
+    raise AssertionError(found)
+
+
+@pytest.mark.parametrize("state", ["pending", "closed"])
+def test_a_sequence_goes_on_from_a_file_with_the_same_bytes(film, closed, saved, state, tmp_path):
+    file, count = saved[state]
+    loaded = dvo.load_map(file)
+    loaded.loops.finder.options = OPTIONS
+    assert (loaded.loops.pending is not None) == (state == "pending") and loaded.loops.finder.kept
+    for frame in film[0][count:]:
+        loaded.track(frame)
+    result = loaded.finish()
+    assert np.array_equal(result.trajectory.poses_wc, closed[2].trajectory.poses_wc)
+    assert np.array_equal(result.map.points, closed[2].map.points)
+    assert result.info["loops"] == closed[2].info["loops"]
+    loaded.save(tmp_path / "done.dvo")
+    assert dvo.load_map(tmp_path / "done.dvo").finish().info["loops"] == closed[2].info["loops"]
+
+
+def test_without_loops_nothing_is_searched_or_kept(film, closed):
+    odometry, estimates, result = track(film[0], loops=False)
+    assert "loops" not in result.info and not odometry.loops.finder.kept
+    # Up to the first correction the estimates are the same.
+    first = min(loop["from"] for loop in closed[2].info["loops"])
+    for mine, other in zip(estimates, closed[1], strict=True):
+        if mine.timestamp > first:
+            break
+        assert (mine.pose_wc is None) == (other.pose_wc is None)
+        assert mine.pose_wc is None or np.array_equal(mine.pose_wc, other.pose_wc)
+
+
+@pytest.mark.slow
+def test_a_loop_that_is_far_too_recent_is_none(film):
+    _, _, result = track(film[0], replace(OPTIONS, seconds=60.0))
+    assert result.info["loops"] == []
+
+
+def test_segments_that_show_the_same_place_are_joined(film):
+    """Darkness in the middle; afterwards the camera looks back at what it saw before."""
+    frames, truth = film
+    order = [*range(34), *[34] * 10, *range(20, -1, -1), *range(1, 20)]
+    times = np.arange(len(order)) / 15.0
+    views = [replace(frames[k], timestamp=float(t)) for k, t in zip(order, times, strict=True)]
+    dark = [replace(f, image=np.zeros_like(f.image)) if k == 34 else f for k, f in zip(order, views, strict=True)]
+    truth = Trajectory(times, truth.poses_wc[order])
+    alone = {"join_inliers": 1.0}  # no frame is joined with the window across the darkness
+    _, estimates, result = track(dark, **alone)
+    assert [segment.joined_to for segment in result.segments] == [None, 0]
+    assert any(loop["joins_segments"] for loop in result.info["loops"])
+    assert len(result.trajectory) == sum(map(len, result.segments)) >= 70
+    assert evaluate(result.trajectory, truth).ate_percent < 0.5
+    assert {estimate.segment for estimate in estimates} == {0, 1}
+    _, _, apart = track(dark, loops=False, **alone)
+    assert [segment.joined_to for segment in apart.segments] == [None, None]
+
+
+@pytest.mark.slow
+def test_a_scene_never_seen_before_is_no_loop(film):
+    other = make_sequence(
+        64, frames=30, family="street", kind="handheld", speed=5.0, height=120, width=160, fps=15.0, sensor=False
+    )
+    frames = film[0][:30] + [replace(f, timestamp=2.0 + f.timestamp) for f in other]
+    _, _, result = track(frames, replace(OPTIONS, seconds=0.5))
+    assert not any(loop["from"] > 2.0 > loop["to"] for loop in result.info["loops"])
+
+
+@pytest.mark.slow
+def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
+    """A single false match, by whatever likeness, does not change the map."""
+    odometry = dvo.load("small", device="cpu", **SHORT)
+    odometry.loops.finder.options = OPTIONS
+    real, calls = odometry.loops.finder.find, []
+
+    def once(new):
+        found = real(new)
+        if found is not None:
+            calls.append(found)
+            shift = torch.tensor([len(calls) * 1.0, 0, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
+            return replace(found, measurement=found.measurement + shift)  # no two agree
+        return None
+
+    monkeypatch.setattr(odometry.loops.finder, "find", once)
+    for frame in film[0]:
+        odometry.track(frame)
+    assert calls and not odometry.loops.loops and odometry.loops.corrections == 0
+
+
+@pytest.mark.parametrize("wrong", [{"inliers": 2.0}, {"every": 0}, {"seconds": "x"}, {"patience": 0}])
+def test_options_are_checked(wrong):
+    with pytest.raises(DvoError, match=next(iter(wrong))):
+        LoopOptions(**wrong)
+
+
+def test_a_network_with_a_fine_level_closes_no_loops():
+    closer = LoopCloser(None, None, enabled=False)
+    assert closer.information() == {} and not closer.advance() and not closer.complete()

@@ -58,7 +58,7 @@ def encoded(model: PatchVO, images: Iterator[np.ndarray]) -> Iterator[Tensor]:
     """
     for image in images:
         with torch.inference_mode():
-            yield encode_image(model, image, torch.device("cpu"))
+            yield encode_image(model, image, torch.device("cpu")).matching
 
 
 def main(arguments: list[str]) -> None:

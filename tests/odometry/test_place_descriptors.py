@@ -104,7 +104,7 @@ def test_the_shipped_descriptor_recognises_a_view_in_another_light_among_other_s
 
     def describe(image):
         with torch.inference_mode():
-            return descriptor(image, encode_image(model, image, torch.device("cpu")))
+            return descriptor(image, encode_image(model, image, torch.device("cpu")).matching)
 
     index = PlaceIndex(descriptor.dimensions)
     images = []

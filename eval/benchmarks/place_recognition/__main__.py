@@ -123,7 +123,7 @@ def measure(
     device = torch.device("cpu")
     relit = [relight(image, rng) for image in places.images]
     with torch.inference_mode():
-        maps = {kind: [encode_image(model, image, device).half() for image in images]
+        maps = {kind: [encode_image(model, image, device).matching.half() for image in images]
                 for kind, images in (("as it is", places.images), ("relit", relit))}  # fmt: skip
     found: dict[str, dict[str, tuple[Recall, float, float]]] = {}
     count = len(places.images)

@@ -79,7 +79,7 @@ def measure(sequence: SyntheticSequence, depth: Tensor, case: str, weights: str,
     odometry = load(weights, seed=seed, **CASES[case])
     assert isinstance(odometry, PatchOdometry)
     if case.startswith("true"):
-        odometry._step.align = TrueMeasurements(odometry.window, sequence, depth)  # type: ignore[assignment]
+        odometry.step.align = TrueMeasurements(odometry.window, sequence, depth)  # type: ignore[assignment]
     for frame in sequence:
         odometry.track(frame)
     return evaluate(odometry.finish().trajectory, sequence.groundtruth)

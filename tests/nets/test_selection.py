@@ -109,8 +109,8 @@ def test_a_network_carries_its_selection_to_the_tracker(tmp_path):
     save_weights(tmp_path / "mine.safetensors", PatchVO(config), {})
     loaded = load_weights(tmp_path / "mine.safetensors")
     assert loaded.preset == "tiny" and build_odometry(loaded).config == TRACKER_PRESETS["tiny"]
-    assert build_odometry(loaded)._select.func is SELECTIONS.resolve("grid")
-    assert build_odometry(loaded, selection="structure")._select.func is SELECTIONS.resolve("structure")
+    assert build_odometry(loaded).select.func is SELECTIONS.resolve("grid")
+    assert build_odometry(loaded, selection="structure").select.func is SELECTIONS.resolve("structure")
 
 
 def test_learned_spreads_patches_as_structure_does():
@@ -131,9 +131,9 @@ def test_learned_is_the_same_in_training_and_tracking():
     start = {"poses_cw": se3.identity(1, 2), "generator": generator.manual_seed(4)}
     unrolled = next(model.unroll(images, torch.ones(1, 2, 4), training_schedule(2, 16, 1, self_edges=False), **start))
     tracker = build_odometry(LoadedWeights.of(model, "mine"), seed=4, selection="learned", patches=16)
-    assert tracker._select.func is SELECTIONS.resolve("learned")
+    assert tracker.select.func is SELECTIONS.resolve("learned")
     camera = Camera(90.0, 90.0, 64.0, 48.0, 128, 96)
-    seen = observe(model, images[0, 0].permute(1, 2, 0).numpy(), camera, tracker._select, torch.device("cpu"))
+    seen = observe(model, images[0, 0].permute(1, 2, 0).numpy(), camera, tracker.select, torch.device("cpu"))
     generator.manual_seed(4)
     with torch.no_grad():
         features = model.patchify.encode(normalise_images(images[:, :1]))

@@ -12,7 +12,7 @@ from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.graph.window import Keyframe, Window
 from dvo.nets.patchifier import patch_coordinates
-from dvo.odometry import tracker as tracker_module
+from dvo.odometry import initial_pose as pose_module
 from dvo.odometry.config import TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.front_end import Observation
 from dvo.odometry.initial_pose import best_matches, initial_pose, pose_from_nearest
@@ -109,7 +109,7 @@ def test_a_fast_rotation_begins_closer_to_its_pose(monkeypatch):
             first.append(initial_pose(*arguments))
             return first[-1]
 
-        monkeypatch.setattr(tracker_module, "initial_pose", record)
+        monkeypatch.setattr(pose_module, "initial_pose", record)
         odometry = dvo.load("small", initial_pose=method, final_adjustment=False)
         found = []
         for frame in frames:

@@ -130,9 +130,12 @@ def print_report(folder: Path, run: Run, scores: Scores) -> None:
     if result.breaks:
         say(describe_breaks(result.breaks))
     if several:
+        joined = sum(segment.joined_to is not None for segment in result.segments)
+        worlds = f"{joined} of them joined to an earlier one" if joined else "each with a world and a scale of its own"
+        whole = ", and those that share its world" if joined else ""
         say(
-            f"{len(result.segments)} segments, each with a world and a scale of its own; {results.TRAJECTORY} and "
-            f"{results.MAP} hold the longest, segment {result.longest}"
+            f"{len(result.segments)} segments, {worlds}; {results.TRAJECTORY} and {results.MAP} hold the longest, segment "
+            f"{result.longest}{whole}"
         )
     if result.info.get("readout_from") == "images":
         say(f"rolling shutter with a readout of {1000 * result.info['readout']:.1f} ms, estimated from the images")

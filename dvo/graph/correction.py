@@ -31,6 +31,11 @@ def apply_similarities(graph: KeyframeGraph, identifiers: np.ndarray, similariti
     for identifier, pose_cw in zip(identifiers.tolist(), poses_cw, strict=True):
         inverse_depth = graph.archive[identifier].inverse_depth * scales[identifier]
         graph.correct(identifier, pose_cw, inverse_depth.astype(np.float32))
+    _rescale_relative(graph, scales)
+
+
+def _rescale_relative(graph: KeyframeGraph, scales: dict[int, float]) -> None:
+    """Divide the lengths of dropped keyframes and frames that are relative to keyframes with a new scale."""
     for frame in list(graph.archive):  # by increasing identifier: the keyframe that it is relative to comes first
         if frame.anchor is None or frame.anchor not in scales:
             continue
@@ -44,7 +49,7 @@ def apply_similarities(graph: KeyframeGraph, identifiers: np.ndarray, similariti
 
 
 def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> None:
-    """Move the window along with a keyframe outside of it.
+    """Move the window along with a keyframe outside of it, and the keyframes that were dropped from it.
 
     Args:
         graph: its window is changed.
@@ -62,6 +67,7 @@ def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> 
     patches = window.patches.clone()
     patches[:, 2] *= scale
     window.patches = patches
+    _rescale_relative(graph, {frame.identifier: scale for frame in window.frames})
 
 
 def similarity_between(poses_cw: Tensor, found_cw: Tensor, scale: float) -> Tensor:

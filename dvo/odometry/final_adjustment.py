@@ -21,7 +21,8 @@ from dvo.ba.levenberg import LMOptions
 from dvo.ba.restart import RestartOptions, better_start, restart
 from dvo.errors import DvoError
 from dvo.geometry import se3
-from dvo.graph.keyframe_graph import GraphProblem, KeyframeGraph
+from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.problem import GraphProblem
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.settings import check_settings
 

@@ -8,6 +8,7 @@ frames give the same result, bit for bit on the CPU.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.kernels import Kernel
-from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
+from dvo.ba.pose_graph import optimise_pose_graph
 from dvo.geometry import sim3, so3
 from dvo.graph.archive import ArchivedKeyframe
 from dvo.graph.correction import apply_similarities, move_window, similarity_between
@@ -81,8 +81,11 @@ class LoopCloser:
         if self.enabled:
             self.finder.see(identifier, image, maps)
 
-    def advance(self) -> bool:
+    def advance(self, segments: Collection[int]) -> bool:
         """Look at the keyframes that have been archived since the last call.
+
+        Args:
+            segments: those that are initialised. Keyframes of others wait until theirs is.
 
         Returns:
             True if poses were corrected.
@@ -90,19 +93,21 @@ class LoopCloser:
         corrected = False
         seen = self.finder.kept[-1] if self.enabled and self.finder.kept else -1
         for frame in self.graph.archive.kept_after(seen) if self.enabled else []:
-            corrected |= self._visit(frame)
+            if self.graph.segment_of(frame.identifier) in segments:
+                corrected |= self._visit(frame)
         return corrected
 
-    def complete(self, searches: int = 60) -> bool:
+    def complete(self, segments: Collection[int], searches: int = 60) -> bool:
         """Search once more with the corrected poses, where no loop has been found so far; for the end of a sequence.
 
         Args:
+            segments: those that were initialised.
             searches: number of keyframes that are looked at, at most.
 
         Returns:
             True if poses were corrected.
         """
-        corrected = self.advance()
+        corrected = self.advance(segments)
         if not self.loops:
             return corrected
         options, kept = self.finder.options, self.finder.kept
@@ -222,7 +227,7 @@ class LoopCloser:
         shape[:, :3] *= depth[ends, None]
         result = optimise_pose_graph(
             start, torch.cat([ii, old]), ends, torch.cat([measured, *(loop.measurement[None] for loop in loops)]),
-            shape.square().reciprocal(), PoseGraphOptions(kernel=Kernel()),
+            shape.square().reciprocal(),
         )  # fmt: skip
         return sim3.normalise(result.poses_cw)
 

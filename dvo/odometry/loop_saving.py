@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -81,12 +82,13 @@ def loops_arrays(closer: LoopCloser) -> dict[str, np.ndarray]:
     return arrays
 
 
-def restore_loops(source: MapReader, closer: LoopCloser) -> None:
+def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[int]) -> None:
     """Restore the loop closure of a tracker whose graph has been read.
 
     Args:
         source: the file.
         closer: newly built.
+        segments: those that are initialised.
 
     Raises:
         DvoError: a missing or invalid value or array.
@@ -111,7 +113,8 @@ def restore_loops(source: MapReader, closer: LoopCloser) -> None:
     closer.loops[:] = loops
     if not closer.enabled:
         return
-    closer.finder.kept[:] = [frame.identifier for frame in archive if frame.anchor is None]
+    kept = (frame.identifier for frame in archive if frame.anchor is None)
+    closer.finder.kept[:] = [k for k in kept if closer.graph.segment_of(k) in segments]
     _restore_places(source, closer)
 
 

@@ -66,9 +66,11 @@ class GroupMatcher:
         self.maps = FeatureCache(graph.archive, lambda image: encode_image(model, image, device).matching, _MAPS)
 
     def can_match(self, identifier: int) -> bool:
-        """Return True if a keyframe still has what a match needs: image, features and patches."""
-        frame = self.graph.archive[identifier]
-        return frame.jpeg is not None and frame.matching is not None and frame.context is not None
+        """Return True if a keyframe still has what a match needs: image, patches, and features of this network."""
+        frame, c = self.graph.archive[identifier], self.model.config
+        if frame.jpeg is None or frame.matching is None or frame.context is None:
+            return False
+        return frame.matching.shape[1] == c.feature_channels and frame.context.shape[1] == c.hidden_channels
 
     def match(
         self, old: Sequence[int], new: Sequence[int], poses_cw: Tensor, updates: tuple[int, int], inliers: float
@@ -85,6 +87,9 @@ class GroupMatcher:
         Returns:
             The match; None if the groups do not show the same.
         """
+        sizes = {None if maps is None else maps.shape for maps in map(self.maps.maps, (*old, *new))}
+        if len(sizes) != 1 or None in sizes:  # an image that cannot be read, or images of two sizes
+            return None
         step = self._joint(old, new, poses_cw)
         window, count = step.window, len(old)
         across = (window.ii < count) != (window.jj < count)

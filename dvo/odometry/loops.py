@@ -25,6 +25,8 @@ from dvo.odometry.loop_window import GroupMatcher, Match
 from dvo.odometry.place_descriptors import PlaceDescriptor
 from dvo.settings import Range, check_settings
 
+_RECENT = 256  # descriptors beside the index above which those without a keyframe are dropped
+
 
 @dataclass(frozen=True)
 class LoopOptions:
@@ -142,6 +144,11 @@ class LoopFinder:
         """
         if self.descriptor is not None:
             self._recent[identifier] = self.descriptor(image, maps)
+            if len(self._recent) > _RECENT:  # most belong to keyframes that were dropped
+                archive, window = self.graph.archive, {frame.identifier for frame in self.graph.window.frames}
+                waiting = {frame.identifier for frame in archive.kept_after(self.kept[-1] if self.kept else -1)}
+                wanted = {identifier, *window, *waiting}
+                self._recent = {k: row for k, row in self._recent.items() if k in wanted}
 
     def keep(self, identifier: int) -> None:
         """Take a keyframe that was archived and not dropped into the list and the index.

@@ -127,8 +127,8 @@ class Result:
     """Result for a sequence, available after the last frame.
 
     Attributes:
-        trajectory: camera-to-world pose of every tracked frame of the longest segment, those before initialisation
-            included; lost frames have no row.
+        trajectory: camera-to-world pose of every tracked frame of the longest segment, with those that share its world,
+            frames before the initialisation included; lost frames have no row.
         map: sparse coloured map in the world of ``trajectory``, empty for systems without one.
         frames_read: number of input frames.
         frames_lost: number of input frames without a row in any segment.
@@ -160,12 +160,12 @@ class Result:
 
     @property
     def longest(self) -> int | None:
-        """Number of the segment that ``trajectory`` is; None without segments."""
+        """Number of the segment that ``trajectory`` is, of joined ones the longest; None without segments."""
         if not self.segments:
             return None
         times = self.trajectory.timestamps
-        same = (k for k, s in enumerate(self.segments) if np.array_equal(s.trajectory.timestamps, times))
-        return next(same, max(range(len(self.segments)), key=lambda k: len(self.segments[k])))
+        inside = [k for k, s in enumerate(self.segments) if np.isin(s.trajectory.timestamps, times).all()]
+        return max(inside or range(len(self.segments)), key=lambda k: len(self.segments[k]))
 
 
 @runtime_checkable

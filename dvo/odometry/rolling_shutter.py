@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3
-from dvo.graph.keyframe_graph import GraphProblem
+from dvo.graph.problem import GraphProblem
 
 _STENCIL = 5  # poses that a polynomial goes through
 _NEAREST = 0.05  # least depth of a point in front of a camera, in the unit of the poses

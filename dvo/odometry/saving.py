@@ -94,7 +94,7 @@ def load_map(
         read_graph(source, odometry.graph, graph)
         with torch.inference_mode():
             restore_tracker(source, odometry, table)
-            restore_loops(source, odometry.loops)
+            restore_loops(source, odometry.loops, odometry.state.adjustable)
         return odometry
 
 

@@ -163,7 +163,7 @@ class PatchOdometry:
             if len(state.waiting) >= config.initial_frames:
                 self._begin_segment()
             self._close_segment(last=True)
-            self.loops.complete()
+            self.loops.complete(state.adjustable)
             if config.final_adjustment and state.adjustable:
                 state.info |= adjust_segments(
                     self.graph, state.adjustable, state.shutter, config.estimate_readout, config.adjustment
@@ -340,7 +340,7 @@ class PatchOdometry:
         limit = config.removal + config.lifetime if self.state.initialised else config.initial_frames + 4
         while len(window) > limit:
             self.graph.archive_oldest()
-        self.loops.advance()
+        self.loops.advance(self.state.adjustable)
 
     def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status, confidence: float) -> Estimate:
         reason = record.reason if status is Status.LOST else ""

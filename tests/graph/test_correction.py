@@ -91,6 +91,23 @@ def test_the_window_moves_with_a_keyframe(xi):
     assert torch.allclose(se3.inverse(window.poses_cw)[:, :3], sim3.act(change, centres), atol=1e-6)
 
 
+def test_keyframes_dropped_from_the_window_keep_their_place_in_it():
+    """Their unit is that of the window: a scale of it leaves the shape of the trajectory as it is."""
+    graph, _ = archived_walk(frames=8, dropped=(3, 4), archived=False)
+    window = graph.window
+    for frame, pose in zip(window.frames, window.poses_cw.double().numpy(), strict=True):
+        graph.log.set_pose(frame.identifier, pose)
+    before, depth = graph.log.trajectory().positions, graph.archive[4].inverse_depth.copy()
+    reference = window.poses_cw[0].double()
+    move_window(graph, reference, sim3.compose(sim3.from_se3(reference), sim3.exp(torch.tensor([0.0] * 6 + [0.7]))))
+    for frame, pose in zip(window.frames, window.poses_cw.double().numpy(), strict=True):
+        graph.log.set_pose(frame.identifier, pose)
+    after = graph.log.trajectory().positions
+    ratio = np.linalg.norm(np.diff(after, axis=0), axis=1) / np.linalg.norm(np.diff(before, axis=0), axis=1)
+    assert np.allclose(ratio, np.exp(-0.7), atol=1e-4)
+    assert np.allclose(graph.archive[4].inverse_depth, depth * np.exp(0.7))
+
+
 @settings(max_examples=10, deadline=None)
 @given(TANGENT, TANGENT)
 def test_similarity_between_two_worlds(xi, change):

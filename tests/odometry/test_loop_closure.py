@@ -158,6 +158,12 @@ def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
     assert calls and not odometry.loops.loops and odometry.loops.corrections == 0
 
 
+def test_keyframes_of_a_segment_that_is_not_initialised_are_left_alone(closed):
+    loops = closed[0].loops
+    fresh = LoopCloser(loops.graph, replace(loops.finder, kept=[]))
+    assert not fresh.advance([]) and not fresh.advance([1]) and not fresh.finder.kept
+
+
 @pytest.mark.parametrize("wrong", [{"inliers": 2.0}, {"every": 0}, {"seconds": "x"}, {"patience": 0}])
 def test_options_are_checked(wrong):
     with pytest.raises(DvoError, match=next(iter(wrong))):
@@ -166,4 +172,4 @@ def test_options_are_checked(wrong):
 
 def test_a_network_with_a_fine_level_closes_no_loops():
     closer = LoopCloser(None, None, enabled=False)
-    assert closer.information() == {} and not closer.advance() and not closer.complete()
+    assert closer.information() == {} and not closer.advance([0]) and not closer.complete([0])

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from dvo.data.trajectory import Trajectory
 from dvo.graph.keyframe_log import KeyframeLog
 from dvo.odometry.protocol import Break, Result, SparseMap
-from dvo.odometry.segments import breaks_of, segments_of
+from dvo.odometry.segments import breaks_of, result_of_log, segments_of
 
 
 def log_of(text):
@@ -58,3 +59,21 @@ def test_frames_of_a_keyframe_that_is_given_up_are_lost():
     log.lose(1, "no match")
     assert [record.lost for record in log.frames] == [False, True, True, False]
     assert log.frames[2].reason == "no match"
+
+
+def test_the_trajectory_of_joined_segments_is_not_that_of_a_longer_one_apart():
+    """Two segments of one world have more rows together than the longest; ``longest`` names one of theirs."""
+
+    def rows(start, count):
+        return Trajectory(start + np.arange(count, dtype=float), np.tile([0.0, 0, 0, 0, 0, 0, 1], (count, 1)))
+
+    log = KeyframeLog()
+    for number, (start, count) in enumerate([(0, 3), (10, 4), (20, 3)]):
+        for time in rows(start, count).timestamps:
+            log.set_pose(number, np.array([0.0, 0, 0, 0, 0, 0, 1]))
+            log.add(float(time), number).segment = number
+    result, main = result_of_log(log, {}, worlds={0: 0, 1: 1, 2: 0})
+    assert main == 0 and len(result.trajectory) == 6 and result.longest in (0, 2)
+    assert [segment.joined_to for segment in result.segments] == [None, None, 0]
+    apart, main = result_of_log(log, {})
+    assert main == 1 and len(apart.trajectory) == 4 and apart.longest == 1

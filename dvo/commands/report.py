@@ -134,8 +134,8 @@ def print_report(folder: Path, run: Run, scores: Scores) -> None:
         worlds = f"{joined} of them joined to an earlier one" if joined else "each with a world and a scale of its own"
         whole = ", and those that share its world" if joined else ""
         say(
-            f"{len(result.segments)} segments, {worlds}; {results.TRAJECTORY} and {results.MAP} hold the longest, segment "
-            f"{result.longest}{whole}"
+            f"{len(result.segments)} segments, {worlds}; {results.TRAJECTORY} and "
+            f"{results.MAP} hold the longest, segment {result.longest}{whole}"
         )
     if result.info.get("readout_from") == "images":
         say(f"rolling shutter with a readout of {1000 * result.info['readout']:.1f} ms, estimated from the images")

@@ -253,6 +253,13 @@ class Window:
         self.patches = torch.cat([self.patches[: position * m], self.patches[(position + 1) * m :]])
         return self.frames.pop(position)
 
+    def reset(self) -> None:
+        """Give all frames the pose of the first and inverse depths of 1, and edges the state of new ones."""
+        self.poses_cw = self.poses_cw[:1].expand_as(self.poses_cw).clone()
+        self.patches = torch.cat([self.patches[:, :2], torch.ones_like(self.patches[:, 2:])], dim=1)
+        edges = self.hidden, self.targets, self.weights, self.confidence
+        self.hidden, self.targets, self.weights, self.confidence = (torch.zeros_like(x) for x in edges)
+
     def snapshot(self) -> WindowSnapshot:
         """Record poses, patches and edge states.
 

@@ -100,7 +100,28 @@ def _solve_again(window: Window, step: WindowStep) -> None:
         window.patches = patches[0]
 
 
-def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> None:
+def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> bool:
+    """Optimise the first window without the frames that do not show the scene of the newest ones.
+
+    Where frames are removed, the others begin anew: poses and depths that were fitted to another scene, or to noise,
+    may be a minimum that they do not leave, and the test for motion needs equal poses.
+
+    Args:
+        graph: of the sequence; its window is changed in place.
+        step: step of the model on the window.
+        config: settings of the tracker.
+
+    Returns:
+        True if the frames are as many as an initialisation needs, and the parallax is sufficient for tracking.
+    """
+    enough = initialise(graph.window, step, config)
+    if drop_unrelated(graph, step, config):
+        graph.window.reset()
+        enough = len(graph.window) >= config.initial_frames and initialise(graph.window, step, config)
+    return enough and len(graph.window) >= config.initial_frames
+
+
+def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> bool:
     """Remove the frames of the first window that do not show the scene of the newest ones.
 
     They are a segment of their own, with the keyframes that have left the window, if they are as many as an
@@ -110,10 +131,13 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
         graph: of the sequence; the window is not initialised yet.
         step: of the model on the window, after some steps.
         config: settings of the tracker.
+
+    Returns:
+        True if frames were removed.
     """
     window, count = graph.window, last_unrelated(step, config)
     if not count:
-        return
+        return False
     first = window.frames[count].identifier
     earlier = (window.ii < count) & (window.jj < count)
     rows = len(graph.log.rows(graph.segment, last=first - 1))
@@ -126,6 +150,7 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
             graph.log.lose(graph.discard(0).identifier, NO_MATCH)
     if graph.log.rows(graph.segment, last=first - 1):
         graph.split_segment(first)
+    return True
 
 
 def worth_keeping(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, last: bool) -> bool:

@@ -31,7 +31,7 @@ from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_ev
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
 from dvo.odometry.initial_pose import first_pose
-from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise, leave_minimum, worth_keeping
+from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise_related, leave_minimum, worth_keeping
 from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
 from dvo.odometry.protocol import Estimate, Result, Status
@@ -243,11 +243,9 @@ class PatchOdometry:
                 return self._estimate(record, None, Status.INITIALISING, confidence)
         self._place(record, keyframe.identifier)
         if len(window) >= config.initial_frames:
-            enough = initialise(window, self.step, config)
-            drop_unrelated(self.graph, self.step, config)
+            enough = initialise_related(self.graph, self.step, config)
             evidence = newest_evidence(self.step)
-            supported = len(window) >= config.initial_frames and evidence.supports(config)
-            state.initialised = enough and supported
+            state.initialised = enough and evidence.supports(config)
             state.adjustable += [self.graph.segment] * state.initialised
             confidence = evidence.confidence
         pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None

@@ -46,6 +46,21 @@ def test_slots_are_unique_and_reused():
     assert len(set(w.edge_slots.tolist())) == len(w.edge_slots) == 4
 
 
+def test_reset_keeps_frames_patches_and_edges_but_not_what_was_estimated():
+    w = window()
+    w.connect(torch.tensor([0, 1, 6]), torch.tensor([1, 1, 2]))
+    w.poses_cw = se3.exp(torch.arange(24.0).view(4, 6) / 10)
+    w.patches[:, 2] = 3.0
+    for name in ("hidden", "targets", "weights", "confidence"):
+        setattr(w, name, getattr(w, name) + 1.0)
+    first, places = w.poses_cw[0].clone(), w.patches[:, :2].clone()
+    w.reset()
+    assert torch.equal(w.poses_cw, first.expand(4, 7)) and torch.equal(w.patches[:, :2], places)
+    assert (w.patches[:, 2] == 1).all()
+    assert not any(getattr(w, name).any() for name in ("hidden", "targets", "weights", "confidence"))
+    assert w.kk.tolist() == [0, 1, 6] and w.jj.tolist() == [1, 1, 2] and len(w) == 4
+
+
 def test_prediction_goes_on_with_half_the_motion():
     step = torch.tensor([0.2, 0.0, 0.1, 0.0, 0.04, 0.0], dtype=torch.float64)
     a = se3.exp(torch.tensor([1.0, 2, 3, 0.1, 0.2, 0.3], dtype=torch.float64))

@@ -184,17 +184,47 @@ def _leave_minimum(
     n, m = min(options.restart_frames, len(depths)), depths.shape[1]
     patches = torch.cat([part.patches[:, :2], depths.reshape(-1, 1, 1, 1)], 1)
     measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
-    settings = RestartOptions(options.kernels[0], options.kernels[-1], options.max_residual)
+    settings = RestartOptions(options.kernels[0], options.kernels[-1], options.max_residual, resection=8, iterations=20)
     targets, weights, ii, jj, kk = (x[early] for x in measured[1:])
     some = (part.intrinsics[:n], targets, weights, ii, jj, kk)
     better = better_start(poses_cw[:n], patches[: n * m], some, fixed[:n], settings)
     if better is None:
         return poses_cw, depths
-    settings = replace(settings, iterations=3 * options.iterations)
+    # The whole may be in another minimum than its beginning: both the better beginning, extended, and the better start.
     known = replace(options, kernels=options.kernels[-1:])
     poses_cw, depths, cost = solve_part(part, poses_cw, depths, fixed, known)
+    start = _extended(poses_cw, depths, better[1], better[2][:, 2, 0, 0].reshape(n, m)[:, ::2])
+    settings = replace(settings, iterations=3 * options.iterations)
     poses, found, new = restart(poses_cw, patches, measured, fixed, better[0], settings)
-    return (poses, found[:, 2, 0, 0].reshape_as(depths)) if new < cost else (poses_cw, depths)
+    ways = [
+        (poses_cw, depths, cost),
+        (poses, found[:, 2, 0, 0].reshape_as(depths), new),
+        solve_part(part, *start, fixed, replace(options, iterations=3 * options.iterations)),
+    ]
+    poses_cw, depths, _ = min(ways, key=lambda way: way[2])
+    return poses_cw, depths
+
+
+def _extended(poses_cw: Tensor, depths: Tensor, first_cw: Tensor, solved: Tensor) -> tuple[Tensor, Tensor]:
+    """Start of all frames from another solution of the first ones.
+
+    Later frames keep their motion; their patches, whose relief belongs to the old solution, get equal depths.
+
+    Args:
+        poses_cw, depths: ``(N, 7)`` and ``(N, M)`` of the old solution.
+        first_cw: ``(n, 7)`` of the new one.
+        solved: ``(n, M / 2)`` inverse depths of the new one, of every second patch.
+
+    Returns:
+        Poses ``(N, 7)`` and inverse depths ``(N, M)``.
+    """
+    n = len(first_cw)
+    scale = float((depths[:n, ::2].median(1).values / solved.median(1).values).median())
+    change = _Change(poses_cw[n - 1], first_cw[-1], scale)
+    depths = (depths.median(1, keepdim=True).values / scale).expand_as(depths).clone()
+    depths[:n] = solved.median(1, keepdim=True).values
+    depths[:n, ::2] = solved
+    return torch.cat([first_cw, change(poses_cw[n:])]), depths
 
 
 def solve_part(

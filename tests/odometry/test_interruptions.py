@@ -62,12 +62,19 @@ def test_no_pose_without_a_view_and_a_segment_of_its_own_after_it(film, clear, k
     assert result.breaks[0].start == times[CUT - 1] and result.breaks[0].end == times[CUT + dark]
     assert {e.segment for e in estimates if e.pose_wc is not None} == set(range(len(result.segments)))
     assert len(result.trajectory) == max(len(segment) for segment in result.segments)
-    # The segment after the interruption begins as soon as a start with its frames would, and is as good.
-    alone, fresh, _ = track(clear[CUT + dark :])
-    first, expected = (next(k for k, e in enumerate(some) if e.status is Status.TRACKING) for some in (after, alone))
-    assert first <= expected + 2
-    errors = [evaluate(rows, film.groundtruth).ate_rmse for rows in (result.segments[1].trajectory, fresh.trajectory)]
-    assert errors[0] < 1.3 * errors[1]
+    # The segment after the interruption begins as soon as a start with its frames would, and is as good as such starts
+    # are: over these twelve poses their errors differ by up to 1.7 times with the seed.
+    starts = [track(clear[CUT + dark :], seed) for seed in (0, 1, 2)]
+    first, *expected = (
+        next(k for k, e in enumerate(some) if e.status is Status.TRACKING)
+        for some in (after, *(alone for alone, _, _ in starts))
+    )
+    assert first <= min(expected) + 2
+    error, *errors = (
+        evaluate(rows, film.groundtruth).ate_rmse
+        for rows in (result.segments[1].trajectory, *(fresh.trajectory for _, fresh, _ in starts))
+    )
+    assert error < 1.3 * max(errors)
     # Lost frames leave the graph: no keyframe of the archive is one of them.
     archived = [keyframe.timestamp for keyframe in odometry.graph.archive]
     assert not np.isin(times[CUT : CUT + dark], archived).any()

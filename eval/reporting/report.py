@@ -25,6 +25,7 @@ from eval.scoring.summary import (
     FIGURES,
     NOTHING,
     NULL,
+    RECOVERY,
     RESOURCES,
     UNITS,
     VOID,
@@ -62,7 +63,7 @@ OVERALL = (
     ("ATE m, true scale per frame", "ate_per_frame_scale", 3),
 )
 AREAS = ("auc", "pose_auc_1", "pose_auc_2", "pose_auc_5", "pose_auc_10")  # means over runs; the rest are medians
-BLACKOUT = (("segment ATE %", "segment_ate_percent", 2), ("recovery s", "recovery_s", 1))
+BLACKOUT = (("segment ATE %", "segment_ate_percent", 2), *RECOVERY)
 
 
 @dataclass(frozen=True)

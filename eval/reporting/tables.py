@@ -13,6 +13,7 @@ from eval.execution.plan import Manifest
 from eval.scoring.score import COLUMNS, Row
 from eval.scoring.summary import (
     FIGURES,
+    RECOVERY,
     RESOURCES,
     axes_of,
     axis_cells,
@@ -81,7 +82,8 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     rows = [row for row in rows if row.suite == suite.name]
     systems = list(dict.fromkeys(row.system for row in rows))
     extra = segment_columns(rows)
-    names = ["sequence", "system", "runs failed", *(title for title, _, _ in FIGURES), "complete %"]
+    figures = [*FIGURES, *(RECOVERY if any(one.judged_by == "recovery_s" for one in suite.sequences) else ())]
+    names = ["sequence", "system", "runs failed", *(title for title, _, _ in figures), "complete %"]
     names += [title for title, _, _, _ in extra]
     names += [title for title, _, _ in RESOURCES]
     lines = [protocol(manifest, suite, rows), "", _line(names), _line(["---"] * 2 + ["--:"] * (len(names) - 2))]
@@ -91,7 +93,7 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
         judged = judged_cells(sequence, groups)
         for position, (name, group) in enumerate(groups.items()):
             cells = []
-            for _, field, digits in FIGURES:
+            for _, field, digits in figures:
                 text = error_cell(group, field).text(digits)
                 cells.append(f"**{text}**" if field == sequence.judged_by and judged[name].best else text)
             cells.append(summarise([100 * row.completeness for row in group]).text(0))
@@ -129,6 +131,8 @@ def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     said = "by ATE in percent of the path" + (f", {', '.join(turned)} by RPE in degrees" if turned else "")
     if judges == ["rpe_rot_deg"]:
         said = "by RPE in degrees"
+    elif judges == ["recovery_s"]:
+        said = "by the seconds until the pose is right again in the world of before the dark"
     sentences = [
         f"**{suite.label}** (suite `{suite.name}`).",
         f"Alignment {suite.alignment}; every {suite.stride}. image fed;"

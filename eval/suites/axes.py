@@ -1,4 +1,4 @@
-"""Rendered suites of configs/eval/axes.yaml: seed and options of each sequence."""
+"""Rendered suites of configs/eval/axes.yaml and memory.yaml: seed and options of each sequence."""
 
 from __future__ import annotations
 
@@ -43,15 +43,17 @@ class Tier:
 
 @dataclass(frozen=True)
 class Axis:
-    """Options of the sequences of a suite; ``about`` and ``judged_by`` as in :class:`eval.suites.suite.Sequence`."""
+    """Options of the sequences of a suite; ``about`` and ``judged_by`` as in :class:`eval.suites.suite.Sequence`, and
+    ``seconds`` in place of those of the tier."""
 
-    RANGES: ClassVar[dict[str, Range]] = {"seed": _SEED}
+    RANGES: ClassVar[dict[str, Range]] = {"seed": _SEED, "seconds": (0.1, 3600)}
 
     seed: int
     about: str
     options: dict[str, Any]
     families: tuple[str, ...] | None = None
     judged_by: str | None = None
+    seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def expand(table: Axes, axis: str, split: str, tier: str) -> Table:
             **what.options,
             "seed": part.seed + what.seed + size.seed + k,
             "family": families[(number + k) % len(families)],
-            "frames": round(size.seconds * size.fps),
+            "frames": round((what.seconds or size.seconds) * size.fps),
             "fps": float(size.fps),
             "width": width,
             "height": height,

@@ -19,9 +19,9 @@ from eval.suites.rendered import rendered_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITES = ROOT / "configs" / "eval"
-AXES = "axes"  # the file of the rendered suites, and the name of them all
+RENDERED = ("axes", "memory")  # files of rendered suites; each is also the name of all suites in it
 LONGEST_NAME = 100
-Judge = Literal["ate_percent", "rpe_rot_deg"]
+Judge = Literal["ate_percent", "rpe_rot_deg", "recovery_s"]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class Sequence:
     Attributes:
         name: in the tables.
         path: folder or file, relative to the data folder; empty if rendered.
-        judged_by: the column that decides between systems: ``ate_percent`` or, where scale is weak, ``rpe_rot_deg``.
+        judged_by: the column that decides between systems: ``ate_percent``, where scale is weak ``rpe_rot_deg``, or
+            ``recovery_s`` where the question is if a place is found again.
         about: a few words.
         calib, times, groundtruth: files relative to the folder, where the layout itself does not say.
         rendered: options of :func:`dvo.synth.make_sequence` and ``version``, as pairs, for a sequence that is rendered
@@ -102,8 +103,8 @@ def read_suites(text: str) -> list[Suite]:
     """Suites by name.
 
     ``fast`` is the mini tier of the validation split of a rendered axis, ``fast/test``, ``fast/large`` and
-    ``fast/test/large`` the others; ``axes`` (or ``axes/test``, ...) names all twelve. Anything else is the name of
-    a config or a file, as for :func:`read_suite`.
+    ``fast/test/large`` the others; ``axes`` (or ``axes/test``, ...) names all twelve, ``memory`` those in which a
+    place is seen again. Anything else is the name of a config or a file, as for :func:`read_suite`.
 
     Args:
         text: NAME, NAME/SPLIT/TIER, or a file.
@@ -111,13 +112,15 @@ def read_suites(text: str) -> list[Suite]:
     Raises:
         DvoError: no such suite.
     """
-    name, table = text.split("/")[0], _axes()
-    if name != AXES and name not in table.axes:
-        return [read_suite(text)]
-    return [
-        _suite(expand(table, axis, split, tier), SUITES / f"{AXES}.yaml")
-        for axis, split, tier in choose(text, table, AXES)
-    ]
+    name = text.split("/")[0]
+    for group in RENDERED:
+        table = _rendered(group)
+        if name == group or name in table.axes:
+            return [
+                _suite(expand(table, axis, split, tier), SUITES / f"{group}.yaml")
+                for axis, split, tier in choose(text, table, group)
+            ]
+    return [read_suite(text)]
 
 
 def read_suite(name_or_file: str | Path) -> Suite:
@@ -133,13 +136,14 @@ def read_suite(name_or_file: str | Path) -> Suite:
     if path.suffix not in (".yaml", ".yml"):
         path = SUITES / f"{name_or_file}.yaml"
     if not path.is_file():
-        names = ", ".join([*sorted(file.stem for file in SUITES.glob("*.yaml")), *_axes().axes])
+        axes = [axis for group in RENDERED for axis in _rendered(group).axes]
+        names = ", ".join([*sorted(file.stem for file in SUITES.glob("*.yaml")), *axes])
         raise DvoError("no such suite", file=path, field="--suite", remedy=f"give a file, or one of: {names}")
     return _suite(read_yaml(path), path)
 
 
-def _axes() -> Axes:
-    file = SUITES / f"{AXES}.yaml"
+def _rendered(group: str) -> Axes:
+    file = SUITES / f"{group}.yaml"
     return read_axes(read_yaml(file), file)
 
 

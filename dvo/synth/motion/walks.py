@@ -8,13 +8,16 @@ from dvo.errors import DvoError
 from dvo.synth import salts
 from dvo.synth.motion.motion import SplinePath
 from dvo.synth.motion.paths import KINDS, find_start
+from dvo.synth.motion.returns import INTERVAL, begun_again, jump, jump_parts, there_and_back
 from dvo.synth.render.renderer import render_depth
 from dvo.synth.scenes.scene import Scene
 
 Array = np.ndarray
-# Long paths add to the kinds of short ones: a closed circuit, a way without turns, a hasty hand.
-LONG_KINDS = tuple(dict.fromkeys((*KINDS, "loop", "straight", "fast")))
+# Long paths add to the kinds of short ones: a closed circuit, a way without turns, a hasty hand; and, for loop closure,
+# a circuit on which the camera faces along the way, a way there and back, and one that jumps back to its start.
+LONG_KINDS = tuple(dict.fromkeys((*KINDS, "loop", "straight", "fast", "revisit", "return", "kidnap")))
 TURNS = 1.4  # rounds of a loop
+CONTROL_INTERVAL = 0.8  # seconds between control points
 
 
 def _yaw_towards(direction: Array) -> float:
@@ -50,11 +53,11 @@ def long_path(
     best: tuple[float, SplinePath] | None = None
     for attempt in range(24):
         pace = speed * 0.85 ** (attempt // 4)
-        if kind == "loop":
-            path = _draw_loop(scene, rng, duration, pace, shake)
-        else:
-            path = _draw_long(scene, rng, kind, duration, pace, shake)
+        path = _draw(scene, rng, kind, duration, pace, shake)
         times = np.linspace(0, duration, max(20, int(duration * 10)))
+        if kind == "kidnap":
+            begin, end = jump(duration)
+            times = times[(times < begin) | (times > end)]
         room_left = scene.clearance(path.poses_wc(times)[:, :3]).min() / scene.scale
         if room_left < 0.03:
             continue
@@ -71,11 +74,24 @@ def long_path(
     return best[1]
 
 
+def _draw(scene: Scene, rng: np.random.Generator, kind: str, duration: float, pace: float, shake: float) -> SplinePath:
+    """Draw a path of any kind."""
+    if kind in ("loop", "revisit"):
+        return _draw_loop(scene, rng, duration, pace, shake, follow=kind == "revisit")
+    if kind == "return":
+        return there_and_back(_draw_long(scene, rng, "handheld", duration / 2, pace, shake), duration)
+    if kind == "kidnap":  # control points follow each other faster than they were planned for
+        planned = jump_parts(duration) * CONTROL_INTERVAL
+        pace *= INTERVAL / CONTROL_INTERVAL
+        return begun_again(_draw_long(scene, rng, "handheld", planned, pace, shake), duration)
+    return _draw_long(scene, rng, kind, duration, pace, shake)
+
+
 def _draw_long(
     scene: Scene, rng: np.random.Generator, kind: str, duration: float, speed: float, shake: float
 ) -> SplinePath:
-    """Draw a path of any kind except ``loop``."""
-    interval = 0.8
+    """Draw a path of any kind that is not made of another's."""
+    interval = CONTROL_INTERVAL
     count = int(np.ceil(duration / interval)) + 4
     start = find_start(scene, rng, 2)
     heading = scene.hints.get("heading")
@@ -173,14 +189,16 @@ def _longest_way(scene: Scene, rng: np.random.Generator, position: Array) -> tup
     return best
 
 
-def _draw_loop(scene: Scene, rng: np.random.Generator, duration: float, speed: float, shake: float) -> SplinePath:
+def _draw_loop(
+    scene: Scene, rng: np.random.Generator, duration: float, speed: float, shake: float, follow: bool = False
+) -> SplinePath:
     """Draw a rounded circuit of ``TURNS`` rounds: the second round repeats the first except for the shake.
 
     If the duration allows it the camera turns all the way round, else it looks about and returns to its first
-    direction.
+    direction. If it is to ``follow`` the way, it always turns all the way round.
     """
     once = duration / TURNS
-    steps = max(8, int(np.ceil(once / 0.8)))
+    steps = max(8, int(np.ceil(once / CONTROL_INTERVAL)))
     interval = once / steps
     count = int(np.ceil(duration / interval)) + 4
     radius = 0.1 * scene.scale * speed * once / (2 * np.pi)
@@ -195,7 +213,7 @@ def _draw_loop(scene: Scene, rng: np.random.Generator, duration: float, speed: f
     offset = np.stack([np.cos(angle), np.sin(angle), 0.12 * np.sin(angle + phase[2])], -1) * bulge[:, None]
     position = centre + offset * np.minimum(radius, 0.6 * room)
     forward = start.rotation[:, 2]
-    if once > 9 and rng.random() < 0.6:
+    if follow or (once > 9 and rng.random() < 0.6):
         way = np.gradient(position, axis=0)
         yaw = np.unwrap(np.arctan2(-way[:, 0], way[:, 1])) + rng.choice([0.0, -0.7, 0.7])
     else:

@@ -61,6 +61,27 @@ def test_twelve_axes_two_tiers_two_splits() -> None:
     assert len(set(names)) == len(names)
 
 
+def test_places_seen_again_are_suites_of_their_own() -> None:
+    others = {dict(q.rendered or ())["seed"] for split in ("validation", "test") for tier in ("mini", "large")
+              for suite in read_suites(f"axes/{split}/{tier}") for q in suite.sequences}  # fmt: skip
+    seeds = []
+    for split in ("validation", "test"):
+        for tier, count in (("mini", 3), ("large", 6)):
+            suites = read_suites(f"memory/{split}/{tier}")
+            assert [suite.name.split("/")[0] for suite in suites] == ["revisit", "kidnap"]
+            for suite in suites:
+                options = [dict(sequence.rendered or ()) for sequence in suite.sequences]
+                assert len(options) == count and {one["family"] for one in options} == set(HELD_OUT)
+                assert suite.label.startswith(f"rendered, {split}") and all(one["apart"] for one in options)
+                seeds += [one["seed"] for one in options]
+                longest = min(one["frames"] / one["fps"] for one in options)
+                assert longest >= 120 if suite.name.startswith("revisit") else longest == 40
+                assert all(one.get("blackout") == (None if one["kind"] == "revisit" else 2.0) for one in options)
+    assert len(set(seeds)) == len(seeds) == 36 and not others & set(seeds)
+    assert read_suites("kidnap/test") == [read_suites("memory/test")[1]]
+    assert {q.judged_by for q in read_suites("kidnap")[0].sequences} == {"recovery_s"}
+
+
 def test_names_on_the_command_line() -> None:
     assert [suite.name for suite in read_suites("fast")] == ["fast"]
     assert [suite.name for suite in read_suites("fast/test/large")] == ["fast/test/large"]

@@ -13,7 +13,7 @@ from dvo.data.root import data_root
 from dvo.errors import DvoError
 from eval.execution.plan import Plan, read_manifest
 from eval.execution.runner import predict_all
-from eval.reporting.report import AXES, PAGE, RESULTS, TABLE, write_report, write_tables
+from eval.reporting.report import AXES, LOOPS, PAGE, RESULTS, TABLE, write_report, write_tables
 from eval.scoring.score import score_all
 from eval.suites.selection import config_names, folder_of_data, is_rendered, load_suites, settle
 from eval.suites.suite import read_suites
@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     listing = verbs.add_parser("list", help="systems with licence and state; suites with their sequences")
     listing.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings")
     ahead = verbs.add_parser("prepare", help="render suites ahead of an evaluation")
-    ahead.add_argument("suites", nargs="+", metavar="SUITE", help="axes, axes/test, fast, fast/test/large, ...")
+    ahead.add_argument("suites", nargs="+", metavar="SUITE", help="axes, axes/test, fast/test/large, memory, ...")
     ahead.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet too")
     words = verbs.add_parser("vocabulary", help="train a vocabulary for ORB-SLAM3 on rendered pictures")
     words.add_argument("--out", type=Path, required=True, metavar="FILE", help="text file that ORB-SLAM3 reads")
@@ -177,7 +177,7 @@ def _finish(out: Path, page: bool) -> None:
     manifest = read_manifest(out)
     rows = score_all(out, manifest)
     print(write_tables(out, manifest, rows), end="")
-    files = [RESULTS, TABLE, AXES]
+    files = [RESULTS, TABLE, AXES, *([LOOPS] if (out / LOOPS).is_file() else [])]
     if page:
         write_report(out, manifest, rows)
         files.append(PAGE)

@@ -17,6 +17,7 @@ from dvo.odometry.protocol import Segment
 from eval.execution.cache import slug
 from eval.execution.plan import Manifest, groundtruth_file
 from eval.execution.predict import RECORD, read_prediction, read_segments
+from eval.reporting.loops import NOTE, TITLES, loop_lines, loop_table
 from eval.reporting.plots import plot_axis, plot_sequence, plot_speed, styles
 from eval.reporting.tables import MADE_UP_NOTE, SEGMENTS_NOTE, axis_table, markdown, one_line, speed_note, write_csv
 from eval.reporting.verdict import verdicts
@@ -46,6 +47,7 @@ from eval.scoring.summary import (
 from eval.suites.suite import Sequence, Suite
 
 RESULTS, TABLE, AXES, PAGE, FIGURE_FOLDER = "results.csv", "table.md", "axes.md", "report.html", "figures"
+LOOPS = "loops.md"
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 # Title, field, digits, meaning; of the table of systems.
 OVERALL = (
@@ -78,7 +80,7 @@ class Shown:
 
 
 def write_tables(out: Path, manifest: Manifest, rows: list[Row]) -> str:
-    """Write results.csv, table.md (a table per suite) and axes.md; returns the text of table.md.
+    """Write results.csv, table.md (a table per suite), axes.md and, with revisits, loops.md; returns that of table.md.
 
     Args:
         out: folder of the evaluation.
@@ -89,6 +91,11 @@ def write_tables(out: Path, manifest: Manifest, rows: list[Row]) -> str:
     table = "\n".join(markdown(manifest, suite, rows) for suite in manifest.suites)
     (out / TABLE).write_text(table, encoding="utf-8")
     (out / AXES).write_text(axis_table(manifest, rows), encoding="utf-8")
+    loops = loop_table(manifest, rows)
+    if loops:
+        (out / LOOPS).write_text(loops, encoding="utf-8")
+    else:
+        (out / LOOPS).unlink(missing_ok=True)
     return table
 
 
@@ -157,6 +164,7 @@ def content(out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str],
         "overall_titles": [column[0] for column in (*OVERALL, *segment_columns(rows), *RESOURCES)],
         "overall": [(name, overall(name, rows)) for name in manifest.systems],
         "notes": {"segments": SEGMENTS_NOTE, "made-up poses": MADE_UP_NOTE},
+        "loops": {"note": NOTE, "titles": TITLES, "lines": loop_lines(manifest, rows)},
         "failures": [(row, one_line(row.reason)) for row in rows if row.failed],
         "sections": sections,
         "open_sections": len(sections) <= 6,

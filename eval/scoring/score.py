@@ -16,6 +16,7 @@ from eval.execution.plan import Manifest, Run, groundtruth_file
 from eval.execution.predict import RECORD, Prediction, read_prediction, read_segments
 from eval.scoring.blackout import dark_spans
 from eval.scoring.errors import Errors, all_errors
+from eval.scoring.loops import LoopErrors, loop_errors
 from eval.suites.suite import Sequence as Recording
 from eval.suites.suite import Suite, reference_for
 
@@ -43,6 +44,7 @@ class Row:
         scored: share of the frames fed that have a pose in a segment that counts for the ATE.
         unseen: number of frames without a view, see :func:`eval.scoring.blackout.without_view`.
         made_up: share of them that carry a pose; nan without such a frame.
+        loops, false_loops, revisit_s, loop_recall: see :class:`eval.scoring.loops.LoopErrors`.
         threads, parallel, device: how the resources were measured; ``parallel`` above 1 means on a shared machine.
     """
 
@@ -90,6 +92,10 @@ class Row:
     scored: float
     unseen: int
     made_up: float
+    loops: float
+    false_loops: float
+    revisit_s: float
+    loop_recall: float
     threads: int
     parallel: int
     device: str
@@ -171,6 +177,8 @@ def score(
         unseen = np.isin(stamps, prediction.unseen)
         most = most_worlds(frames, len(dark_spans(stamps, unseen)))
         errors = all_errors(segments, reference_for(groundtruth, stamps), suite, prediction.dark, most)
+    ran = prediction.status == "ok"
+    loops = loop_errors(prediction.info, sequence, prediction.stamps, prediction.unseen) if ran else LoopErrors()
     metrics = errors.metrics
     completeness = prediction.tracked / frames if frames else math.nan
     scored = completeness if math.isnan(errors.scored) else completeness * errors.scored
@@ -232,6 +240,10 @@ def score(
         scored=scored,
         unseen=len(prediction.unseen),
         made_up=made_up_share(prediction.unseen, segments) if prediction.status == "ok" else math.nan,
+        loops=loops.loops,
+        false_loops=loops.false,
+        revisit_s=loops.revisit_s,
+        loop_recall=loops.recall,
         threads=prediction.threads,
         parallel=prediction.parallel,
         device=prediction.device,

@@ -32,8 +32,8 @@ from dvo.odometry.front_end import encode_image
 from dvo.synth.sequence import make_sequence
 from dvo.threads import settle_threads
 from eval.benchmarks.place_recognition.methods import Method, fit_vlad, grid_method, orb_method, vlad_method
-from eval.benchmarks.place_recognition.overlap import depth_maps, shared_view
 from eval.benchmarks.place_recognition.scoring import COUNTS, Recall, recall_of
+from eval.scoring.overlap import depth_maps, shared_view
 from eval.suites.rendered import rendered_folder
 from eval.systems.peers.orbslam3 import vocabulary_file
 

@@ -8,8 +8,8 @@ from dvo.errors import DvoError
 from dvo.graph.places import PlaceIndex
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.place_recognition.methods import aggregate, bag_of_words, fit_vlad, score_words, vlad_method
-from eval.benchmarks.place_recognition.overlap import depth_maps, shared_view
 from eval.benchmarks.place_recognition.scoring import recall_of
+from eval.scoring.overlap import depth_maps, shared_view
 from eval.systems.peers.vocabulary import read_vocabulary, train, write_vocabulary
 
 K = np.array([40.0, 40.0, 31.5, 23.5])

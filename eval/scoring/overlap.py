@@ -6,6 +6,7 @@ import numpy as np
 
 from dvo.geometry.poses import pose_matrices
 from dvo.synth.render.renderer import render_depth
+from dvo.synth.scenes.bodies import Stage
 from dvo.synth.sequence import SyntheticSequence
 
 SIZE = (48, 64)
@@ -20,7 +21,7 @@ def depth_maps(sequence: SyntheticSequence, indices: np.ndarray) -> tuple[np.nda
     """Depth of some frames at a low resolution.
 
     Args:
-        sequence: of a scene that does not move.
+        sequence: rendered; bodies that move are left out.
         indices: ``(N,)`` of the frames.
 
     Returns:
@@ -28,7 +29,8 @@ def depth_maps(sequence: SyntheticSequence, indices: np.ndarray) -> tuple[np.nda
     """
     camera = sequence.camera.resized(SIZE[1], SIZE[0])
     poses = sequence.groundtruth.poses_wc[indices]
-    maps = [render_depth(sequence.scene, pose[None], camera.intrinsics, *SIZE)[0][0].cpu().numpy() for pose in poses]
+    scene = sequence.scene.scene if isinstance(sequence.scene, Stage) else sequence.scene
+    maps = [render_depth(scene, pose[None], camera.intrinsics, *SIZE)[0][0].cpu().numpy() for pose in poses]
     return np.stack(maps).astype(np.float32), camera.intrinsics
 
 
@@ -44,9 +46,24 @@ def shared_view(depth: np.ndarray, intrinsics: np.ndarray, poses_wc: np.ndarray,
     Returns:
         ``(N, N)`` float32, 0 for other pairs.
     """
+    return np.minimum(*both_shares(depth, intrinsics, poses_wc, pairs))
+
+
+def both_shares(
+    depth: np.ndarray, intrinsics: np.ndarray, poses_wc: np.ndarray, pairs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shares of the pixels of either frame of a pair that the other one sees.
+
+    Args:
+        depth, intrinsics, poses_wc, pairs: as for :func:`shared_view`.
+
+    Returns:
+        ``(N, N)`` float32 of the pixels of the first frame (row) seen by the second (column), and of the second's seen
+        by the first.
+    """
     matrices = pose_matrices(poses_wc)
     there = seen_share(depth, intrinsics, matrices, pairs)
-    return np.minimum(there, seen_share(depth, intrinsics, matrices, pairs.T).T)
+    return there, seen_share(depth, intrinsics, matrices, pairs.T).T
 
 
 def seen_share(depth: np.ndarray, intrinsics: np.ndarray, matrices: np.ndarray, pairs: np.ndarray) -> np.ndarray:

@@ -39,6 +39,8 @@ CATALOGUE = (
            about="filter: EKF over camera and inverse-depth points, active search, one-point RANSAC"),
     System("keyframe", f"{_BASELINES}.keyframe.system:KeyframeOdometry",
            about="two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)"),
+    System("keyframe-loops", f"{_BASELINES}.keyframe.system:KeyframeOdometry", {"loops": True},
+           about="keyframe with loop closure: ORB matches, PnP, pose graph in Sim(3)"),
     System("direct", f"{_BASELINES}.direct.system:DirectOdometry",
            about="semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)"),
     System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",

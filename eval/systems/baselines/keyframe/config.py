@@ -29,6 +29,10 @@ class KeyframeConfig:
         iterations: of local bundle adjustment.
         redundant: a keyframe goes when this part of its points is seen by three others or more.
         patience: lost frames after which a new map may be started; relocalisation goes on until it is.
+        loops: close loops, see :mod:`eval.systems.baselines.keyframe.loops`.
+        loop_seconds: smallest time between the two visits of a place.
+        loop_every: keyframes after a loop until the next search.
+        loop_points: smallest number of points by which a loop is verified.
     """
 
     corners: int = 700
@@ -52,3 +56,7 @@ class KeyframeConfig:
     iterations: int = 8
     redundant: float = 0.92
     patience: int = 10
+    loops: bool = False
+    loop_seconds: float = 10.0
+    loop_every: int = 4
+    loop_points: int = 30

@@ -36,20 +36,20 @@ def relocalise(
     small = thumbnail(grey)
     if not world.keyframes or small is None:
         return None
-    alike = [-float((small * _feature(k, "thumbnail")).sum()) for k in world.keyframes]
+    alike = [-float((small * feature(k, "thumbnail")).sum()) for k in world.keyframes]
     order = [world.keyframes[-1]] + [world.keyframes[i] for i in np.argsort(alike, kind="stable")[:3]]
     corners = detect(grey, np.zeros((0, 2)), config.corners, quality=config.quality, spacing=5)
     described = [describe(grey, corners, octave) for octave in OCTAVES]
     for keyframe in dict.fromkeys(order):
         points = world.xyz[keyframe.ids]
         for rows, descriptors in described:
-            pairs = match(_feature(keyframe, "descriptors"), descriptors)
-            known = ~np.isnan(points[_feature(keyframe, "rows")[pairs[:, 0]], 0])
+            pairs = match(feature(keyframe, "descriptors"), descriptors)
+            known = ~np.isnan(points[feature(keyframe, "rows")[pairs[:, 0]], 0])
             pairs = pairs[known]
             if len(pairs) < config.pose_points:
                 continue
             found = two_view.pose_from_points(
-                points[_feature(keyframe, "rows")[pairs[:, 0]]], corners[rows[pairs[:, 1]]], intrinsics, 4.0, seed
+                points[feature(keyframe, "rows")[pairs[:, 0]]], corners[rows[pairs[:, 1]]], intrinsics, 4.0, seed
             )
             if found is not None and found[1].sum() >= max(config.pose_points, 0.2 * len(pairs)):
                 return found[0], keyframe
@@ -146,8 +146,13 @@ def search(
     return np.concatenate(ids), np.concatenate(uv)
 
 
-def _feature(keyframe: Keyframe, name: str) -> np.ndarray:
-    """Thumbnail, descriptors, or the rows that are described; computed on first use."""
+def feature(keyframe: Keyframe, name: str) -> np.ndarray:
+    """Thumbnail, descriptors, or the rows that are described; computed on first use.
+
+    Args:
+        keyframe: that keeps them.
+        name: ``thumbnail`` (zeros for an image without contrast), ``descriptors`` or ``rows``.
+    """
     if name not in keyframe.features:
         if name == "thumbnail":
             small = thumbnail(keyframe.grey)

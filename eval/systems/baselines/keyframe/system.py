@@ -3,7 +3,8 @@
 Reads like this: :meth:`KeyframeOdometry.track` follows the corners into the new image and takes the pose from those
 with a known point (:meth:`_follow`, :meth:`_pose`), or starts a map (:meth:`_try_start`), or looks for the lost camera
 in the map (:meth:`_recover`). Every so often the frame becomes a keyframe (:meth:`_insert`): points are found again,
-triangulated and adjusted, and new corners begin. No loop closing: nothing older than the neighbourhood is corrected.
+triangulated and adjusted, and new corners begin. Without the setting ``loops`` nothing older than the neighbourhood is
+corrected.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from eval.systems.baselines.frame_log import FrameLog
 from eval.systems.baselines.keyframe.adjust import adjust, neighbourhood
 from eval.systems.baselines.keyframe.config import KeyframeConfig
 from eval.systems.baselines.keyframe.initialise import start_from_two_views
+from eval.systems.baselines.keyframe.loops import LoopCloser
 from eval.systems.baselines.keyframe.map import Keyframe, Map
 from eval.systems.baselines.keyframe.pose import centre, refine_pose
 from eval.systems.baselines.keyframe.relocalise import relocalise, search
@@ -35,6 +37,7 @@ class KeyframeOdometry:
     def __init__(self, config: KeyframeConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = replace(config or KeyframeConfig(), **settings)
         self._seed = seed
+        self._loops = LoopCloser(self.config, seed) if self.config.loops else None
         self._log = FrameLog()
         self._intrinsics, self._size = np.ones(4), (0, 0)
         self._map, self._old = Map(), Map()  # the map in use or being started; the one before it
@@ -81,6 +84,7 @@ class KeyframeOdometry:
             "working_intrinsics": self._intrinsics.tolist(),
             **self._counts,
             "config": asdict(self.config),
+            **({} if self._loops is None else self._loops.information(self._log.keyframes)),
         }
         return self._log.result(SparseMap(np.concatenate(points), np.concatenate(colors)), info)
 
@@ -203,9 +207,19 @@ class KeyframeOdometry:
         gone = world.redundant(c.redundant, spared=4)
         if gone is not None:
             self._drop(gone)
+        self._close_loop(newest)
         self._T = newest.T_cw
         good = np.isin(self._ids, newest.ids)
         self._ids, self._uv = self._ids[good], self._uv[good]
+
+    def _close_loop(self, newest: Keyframe) -> None:
+        """Look for an earlier visit of the place of the newest keyframe; the motion model takes the corrected unit."""
+        if self._loops is None:
+            return
+        scale = self._loops.visit(self._map, newest, self._log.keyframes, self._intrinsics)
+        if scale is not None:
+            self._motion[:3, 3] /= scale
+            self._speed = None if self._speed is None else self._speed / scale
 
     def _keyframe(self, index: int, T: np.ndarray, grey: np.ndarray) -> Keyframe:
         """Add a keyframe of the present tracks to the map; its frame is anchored to it."""

@@ -71,6 +71,12 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for dvo.load_map")
     run.set_defaults(run="dvo.commands.run:run")
 
+    summary = commands.add_parser("summary", help="write the page summary.html of a results folder anew")
+    summary.add_argument("source", metavar="RESULTS", help="results folder of dvo run or dvo demo")
+    summary.add_argument("--groundtruth", metavar="FILE", help="TUM trajectory (camera to world) to compare with")
+    summary.add_argument("--out", metavar="FILE", help="file to write (default: RESULTS/summary.html)")
+    summary.set_defaults(run="dvo.commands.summary:summary")
+
     export = commands.add_parser("export", help="write the trajectory of a results folder for another program")
     export.add_argument("source", metavar="RESULTS", help="results folder of dvo run or dvo demo")
     export.add_argument("out", metavar="OUT", help="new folder")

@@ -19,7 +19,7 @@ import dvo
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
 
-FILES = ["map.ply", "run.json", "trajectory.png", "trajectory.txt"]
+FILES = ["frames.csv", "map.ply", "run.json", "summary.html", "trajectory.png", "trajectory.txt"]
 
 
 def arguments(images: Path, out: Path, *more: str) -> list[str]:

@@ -65,12 +65,12 @@ def test_a_disk_that_gets_full_midway(given, image_folder, tmp_path, capsys, sma
 
 
 def test_a_disk_that_is_full_at_the_end(given, image_folder, tmp_path, capsys, small_files):
-    """The picture does not fit; everything else does, and says that it is not all."""
+    """Picture and page do not fit; everything else does, and says that it is not all."""
     given(at_frame={19: lambda: small_files(8000)})
     assert main(arguments(image_folder, tmp_path / "out")) == 2
     (error,) = errors(capsys.readouterr().err)
     assert "trajectory.png" in error and "File too large" in error and "--out" in error
-    assert names(tmp_path / "out") == ["map.ply", "run.json", "trajectory.txt"]
+    assert names(tmp_path / "out") == ["frames.csv", "map.ply", "run.json", "trajectory.txt"]
     assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 20
     assert summary(tmp_path / "out")["finished"] is False
 

@@ -121,7 +121,8 @@ def test_sigterm_finishes_and_exits_143(given, image_folder, tmp_path, capsys):
     assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 9
     written = summary(tmp_path / "out")
     assert written["interrupted"] is True and written["finished"] is True
-    assert names(tmp_path / "out") == ["map.ply", "run.json", "trajectory.png", "trajectory.txt"]
+    expected = ["frames.csv", "map.ply", "run.json", "summary.html", "trajectory.png", "trajectory.txt"]
+    assert names(tmp_path / "out") == expected
     assert "interrupted after 9 frames" in capsys.readouterr().err
 
 

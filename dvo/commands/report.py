@@ -144,7 +144,7 @@ def print_report(folder: Path, run: Run, scores: Scores) -> None:
     elif metrics is not None:
         relative = f"RPE {metrics.rpe_trans:.3g} m and {metrics.rpe_rot_deg:.3g} deg a frame"
         say(f"{error_text(metrics)} after Sim(3) alignment{' of the longest segment' if several else ''}, {relative}")
-    files = [results.TRAJECTORY, results.MAP, results.PICTURE, results.SUMMARY]
+    files = [results.TRAJECTORY, results.MAP, results.PICTURE, results.PAGE, results.FRAMES, results.SUMMARY]
     if several:
         last = len(result.segments) - 1
         files.insert(1, f"{results.segment_file(0)}{',' if last == 1 else ' ...'} {results.segment_file(last)}")

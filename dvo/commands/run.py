@@ -18,12 +18,14 @@ from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.commands.picture import draw
 from dvo.commands.report import Scores, headline, print_report, score
+from dvo.commands.summary import page_writers
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.export.formats import check_formats, export_run, remove_exports
 from dvo.odometry import results, session
 from dvo.odometry.files import check_writable
+from dvo.odometry.frame_table import FrameTable
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.recorder import Recorder
 from dvo.settings import parse_settings, read_settings
@@ -196,12 +198,13 @@ def _track(
 ) -> int:
     printed = set(clip.warnings)
     facts = {"odometry": odometry.name, **facts}
-    recorder = Recorder(folder, odometry, facts, warn=warn)
+    recorder, table = Recorder(folder, odometry, facts, warn=warn), FrameTable()
 
     def on_frame(frame: Frame, estimate: Estimate | None) -> None:
         if not recorder.started:
             remove_exports(folder / EXPORT)
         recorder.update(frame, estimate)
+        table.update(frame, estimate)
         progress.update(frame, estimate)
 
     with InterruptSwitch() as switch, TrackingProgress(clip.frame_count) as progress:
@@ -219,7 +222,8 @@ def _track(
         done = replace(done, warnings=(*done.warnings, *recorder.warnings))
         scores = score(done, clip.groundtruth)
         writer = None if save_map is None else partial(_save, odometry, save_map)
-        _write(folder, done, scores, clip, facts, writer)
+        pages = partial(page_writers, clip.name, table=table, odometry=odometry, groundtruth=clip.groundtruth)
+        _write(folder, done, scores, clip, facts, writer, pages)
     for warning in new_warnings:
         warn(warning)
     print_report(folder, done, scores)
@@ -255,6 +259,7 @@ def _write(
     clip: Clip,
     facts: dict[str, Any],
     save_map: Callable[[], dict[str, Any]] | None,
+    pages: Callable[..., dict[str, Callable[[Path], None]]],
 ) -> None:
     """Replace the files of the recorder with the final ones, and write the map file, which run.json names."""
     facts = {**facts, "map_file": None, "metrics": None if scores.longest is None else asdict(scores.longest)}
@@ -270,7 +275,10 @@ def _write(
         )
 
     try:
-        results.write_results(folder, done, facts, draw=picture, segment_facts=scores.segment_facts, also=save_map)
+        more = pages(run=done, scores=scores, facts=facts)
+        results.write_results(
+            folder, done, facts, draw=picture, more=more, segment_facts=scores.segment_facts, also=save_map
+        )
     except KeyboardInterrupt:
         aborted = replace(done, interrupted=True, warnings=(*done.warnings, _ABORTED))
         with contextlib.suppress(OSError):

@@ -12,6 +12,8 @@ from dvo.data.output import PART
 from dvo.errors import DvoError
 from dvo.odometry.protocol import SparseMap
 
+_PLY_LAYOUT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
+
 
 def check_writable(folder: Path) -> None:
     """Write a small file into a folder and remove it.
@@ -57,8 +59,7 @@ def write_ply(path: Path | str, sparse_map: SparseMap) -> None:
         path: file to write.
         sparse_map: the points.
     """
-    layout = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    vertices = np.zeros(len(sparse_map.points), dtype=layout)
+    vertices = np.zeros(len(sparse_map.points), dtype=_PLY_LAYOUT)
     for column, name in enumerate(("x", "y", "z")):
         vertices[name] = sparse_map.points[:, column]
     for column, name in enumerate(("red", "green", "blue")):
@@ -70,3 +71,32 @@ def write_ply(path: Path | str, sparse_map: SparseMap) -> None:
     with open(path, "wb") as file:
         file.write("\n".join(header).encode("ascii"))
         file.write(vertices.tobytes())
+
+
+def read_ply(path: Path) -> SparseMap:
+    """Read a map that :func:`write_ply` has written.
+
+    Args:
+        path: the file.
+
+    Returns:
+        The points.
+
+    Raises:
+        DvoError: the file cannot be read, or has another layout.
+    """
+    remedy = "give a map that dvo has written"
+    try:
+        header, end, body = path.read_bytes().partition(b"end_header\n")
+    except OSError as error:
+        raise DvoError(error.strerror or str(error), file=path, remedy=remedy) from error
+    lines = header.decode("ascii", "replace").splitlines()
+    properties = [line.split()[-1] for line in lines if line.startswith("property ")]
+    if not end or "format binary_little_endian 1.0" not in lines or properties != [name for name, _ in _PLY_LAYOUT]:
+        raise DvoError("not a map of dvo", file=path, remedy=remedy)
+    layout = np.dtype(_PLY_LAYOUT)
+    if len(body) % layout.itemsize or f"element vertex {len(body) // layout.itemsize}" not in lines:
+        raise DvoError("the number of points differs from its header", file=path, remedy=remedy)
+    vertices = np.frombuffer(body, layout)
+    points = np.column_stack([vertices[name] for name in ("x", "y", "z")]).astype(np.float32)
+    return SparseMap(points, np.column_stack([vertices[name] for name in ("red", "green", "blue")]))

@@ -1,6 +1,7 @@
 """Results folder of a run: trajectory.txt, a trajectory file for each of several segments, map.ply and run.json.
 
-:mod:`dvo.odometry.recorder` writes them while a run goes on, :mod:`dvo.viz.plot` draws trajectory.png.
+:mod:`dvo.odometry.recorder` writes them while a run goes on, :mod:`dvo.viz.plot` draws trajectory.png,
+:mod:`dvo.viz.run_page` summary.html, and :mod:`dvo.odometry.frame_table` writes frames.csv.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import math
 import platform
 import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, is_dataclass, replace
 from datetime import datetime
 from enum import Enum
@@ -28,7 +29,9 @@ from dvo.errors import DvoError
 from dvo.odometry.files import check_writable, write_error, write_ply
 from dvo.odometry.session import Run
 
-FILES = TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
+TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
+FRAMES, PAGE = "frames.csv", "summary.html"
+FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, SUMMARY)
 SEGMENT_FILE = re.compile(r"trajectory-\d+\.txt")
 
 
@@ -135,6 +138,7 @@ def write_results(
     facts: dict[str, Any],
     *,
     draw: Callable[[Path], None] | None = None,
+    more: Mapping[str, Callable[[Path], None]] | None = None,
     segment_facts: Sequence[dict[str, Any]] = (),
     also: Callable[[], dict[str, Any]] | None = None,
 ) -> None:
@@ -148,6 +152,7 @@ def write_results(
         run: record of the session.
         facts: metadata of the caller (source, seed, device, config, metrics), the first entries of run.json.
         draw: writes the plot to the file that it is given.
+        more: writers of further files, by name (one of :data:`FILES`).
         segment_facts: further entries for each segment in run.json.
         also: writes a further file after these, anywhere, and returns entries for run.json about it.
 
@@ -162,6 +167,7 @@ def write_results(
     writers[MAP] = lambda path: write_ply(path, result.map)
     if draw is not None:
         writers[PICTURE] = draw
+    writers |= more or {}
     failures: list[DvoError] = []
     for name, write in writers.items():
         try:

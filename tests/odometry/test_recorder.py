@@ -182,12 +182,14 @@ def test_results_of_an_earlier_run_go_at_the_first_frame(tmp_path):
         "trajectory-12.txt",
         "map.ply",
         "trajectory.png",
+        "frames.csv",
+        "summary.html",
         ".part-map.ply",
     ):
         (tmp_path / name).write_text("old")
     (tmp_path / "notes.txt").write_text("mine")
     run = Run(tmp_path)
-    assert len(names(tmp_path)) == 7, "a run that fails before its first frame changes nothing"
+    assert len(names(tmp_path)) == 9, "a run that fails before its first frame changes nothing"
     run.feed()
     assert names(tmp_path) == ["notes.txt", "run.json", "trajectory.txt"]
 

@@ -1,0 +1,152 @@
+"""summary.html and frames.csv of ``dvo run``, and ``dvo summary``."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dvo.cli import main
+from dvo.data.trajectory import read_tum, write_tum
+from dvo.odometry.frame_table import read_frames
+from tests.command_line import arguments, errors, summary
+
+
+def data_of(file: Path) -> dict:
+    return json.loads(re.search(r'id="data">(.*?)</script>', file.read_text(encoding="utf-8"), re.DOTALL)[1])
+
+
+def floats(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+@pytest.fixture
+def run(given, image_folder, tmp_path):
+    """``run(truth=True, **options)`` tracks the folder and gives the results folder."""
+
+    def go(truth: bool = True, **options) -> Path:
+        given(**options)
+        more = ["--groundtruth", str(image_folder.parent / "truth.txt")] if truth else []
+        assert main(arguments(image_folder, tmp_path / "out", *more)) == 0
+        return tmp_path / "out"
+
+    return go
+
+
+def test_the_page_of_a_run_with_ground_truth(run):
+    out = run(lost=(7,), new_segment=(8,))
+    data = data_of(out / "summary.html")
+    (world,) = data["worlds"]
+    assert (world["name"], world["unit"]) == ("ground truth", "m")
+    assert [track["segment"] for track in world["tracks"]] == [0, 1]
+    error = floats(data["frames"]["error"])
+    assert np.isnan(error[7]) and np.nanmax(error) < 1e-5, "both segments know the answer, up to a Sim(3)"
+    truth = floats(world["truth"]).reshape(-1, 3)
+    for track in world["tracks"]:
+        distances = np.linalg.norm(floats(track["poses"]).reshape(-1, 7)[:, None, :3] - truth, axis=2)
+        assert distances.min(axis=1).max() < 1e-4
+    assert len(floats(world["points"])) == 30
+    text = (out / "summary.html").read_text()
+    assert "19 of 20" in text and "black image" in text and "a new segment" in text and "ATE m" in text
+
+
+def test_segments_without_ground_truth_have_worlds_of_their_own(run):
+    data = data_of(run(truth=False, new_segment=(8,)) / "summary.html")
+    assert [world["name"] for world in data["worlds"]] == ["segment 1", "segment 0"], "the longest first"
+    assert [len(floats(world["points"])) for world in data["worlds"]] == [30, 0], "the map is of the longest"
+    assert not np.isfinite(floats(data["frames"]["error"])).any()
+
+
+def test_the_table_of_frames(run):
+    rows = read_frames(run(lost=(7,)) / "frames.csv")
+    assert [row.status for row in rows] == ["tracking"] * 7 + ["lost"] + ["tracking"] * 12
+    assert rows[7].reason == "black image" and rows[0].true_position is not None
+
+
+def test_summary_of_a_folder_is_the_page_of_the_run(run, capsys):
+    out = run(lost=(7,), new_segment=(8,))
+    before = data_of(out / "summary.html")
+    (out / "summary.html").unlink()
+    assert main(["summary", str(out)]) == 0
+    assert "summary.html" in capsys.readouterr().out
+    after = data_of(out / "summary.html")
+    assert [after["states"], after["ribbons"]] == [before["states"], before["ribbons"]]
+    for key in ("time", "segment", "colour"):
+        assert after["frames"][key] == before["frames"][key]
+    old, new = before["worlds"][0], after["worlds"][0]
+    np.testing.assert_allclose(floats(new["tracks"][0]["poses"]), floats(old["tracks"][0]["poses"]), atol=1e-5)
+    assert (new["colors"], new["name"]) == (old["colors"], old["name"])
+
+
+def test_summary_of_a_folder_of_an_older_version(run, tmp_path):
+    """Without the table of frames: states and segments by trajectories and breaks."""
+    out = run(truth=False, lost=(3, 7), new_segment=(8,))
+    states = data_of(out / "summary.html")["states"]
+    (out / "frames.csv").unlink()
+    assert main(["summary", str(out), "--out", str(tmp_path / "page.html")]) == 0
+    data = data_of(tmp_path / "page.html")
+    assert [state[2:] for state in data["states"]] == [state[2:] for state in states]
+    np.testing.assert_allclose([s[0] for s in data["states"]], [s[0] for s in states], atol=1e-6)
+
+
+def test_summary_with_another_ground_truth(run, image_folder, tmp_path):
+    out = run(truth=False)
+    truth = read_tum(image_folder.parent / "truth.txt")
+    truth.poses_wc[10:, 1] += 0.5
+    write_tum(tmp_path / "other.txt", truth)
+    assert main(["summary", str(out), "--groundtruth", str(tmp_path / "other.txt")]) == 0
+    data = data_of(out / "summary.html")
+    assert data["worlds"][0]["name"] == "ground truth"
+    assert 0.02 < np.nanmax(floats(data["frames"]["error"])) < 0.6
+    assert "ATE after Sim(3)" in (out / "summary.html").read_text()
+    assert summary(out)["metrics"] is None, "the results stay"
+
+
+def test_a_run_without_a_pose(given, image_folder, tmp_path):
+    given(lost=tuple(range(20)))
+    assert main(arguments(image_folder, tmp_path / "out")) == 1
+    assert [state[2:] for state in data_of(tmp_path / "out" / "summary.html")["states"]] == [
+        ["lost", "black image", 20]
+    ]
+    assert main(["summary", str(tmp_path / "out")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("run.json", "[1]", "not the description of a run"),
+        ("run.json", "{", "not JSON"),
+        ("run.json", '{"breaks": 3}', "has no valid"),
+        ("map.ply", "ply\n", "not a map of dvo"),
+        ("frames.csv", "a,b\n", "not a table of frames"),
+        ("trajectory.txt", "1 2\n", "trajectory.txt"),
+    ],
+)
+def test_a_folder_with_a_spoilt_file(run, capsys, file, content, message):
+    out = run()
+    (out / file).write_text(content)
+    assert main(["summary", str(out)]) == 2
+    (line,) = errors(capsys.readouterr().err)
+    assert message in line and file in line
+
+
+def test_a_segment_outside_of_the_folder_is_not_read(run, capsys):
+    out = run()
+    facts = summary(out)
+    facts["segments"][0]["file"] = "../clip/truth.txt"
+    (out / "run.json").write_text(json.dumps(facts))
+    assert main(["summary", str(out)]) == 2
+    assert "unknown file" in capsys.readouterr().err
+
+
+def test_no_results_folder_and_no_place_for_the_page(run, tmp_path, capsys):
+    out = run()
+    assert main(["summary", str(tmp_path / "none")]) == 2
+    assert main(["summary", str(tmp_path)]) == 2
+    assert main(["summary", str(out), "--out", str(tmp_path / "no" / "page.html")]) == 2
+    first, second, third = errors(capsys.readouterr().err)
+    assert "not a results folder" in first and "run.json" in second and "cannot be written" in third

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
+from dvo.commands.view_options import add_view_options
 from dvo.errors import DvoError
 from dvo.threads import wait_passively
 
@@ -69,6 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="write the results for other programs too: colmap, colmap-text, nerfstudio, tum, kitti, euroc; by commas",
     )
     run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for dvo.load_map")
+    add_view_options(run)
     run.set_defaults(run="dvo.commands.run:run")
 
     summary = commands.add_parser("summary", help="write the page summary.html of a results folder anew")

@@ -16,6 +16,7 @@ import torch
 import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
 from dvo.commands.report import Scores, headline, print_report, score
 from dvo.commands.summary import page_writers
@@ -26,6 +27,7 @@ from dvo.export.formats import check_formats, export_run, remove_exports
 from dvo.odometry import results, session
 from dvo.odometry.files import check_writable
 from dvo.odometry.frame_table import FrameTable
+from dvo.odometry.observer import Observer
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.recorder import Recorder
 from dvo.settings import parse_settings, read_settings
@@ -93,7 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
         "stride": arguments.stride,
     }
     seed_everything(arguments.seed)
-    with results.results_folder(arguments.out, source.name) as folder:  # checked before the weights load
+    folders = results.results_folder(arguments.out, source.name)  # checked before the weights load
+    with folders as folder, open_observers(arguments, source.name) as observers:
         odometry = load_odometry(arguments, device)
         check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
@@ -105,6 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
             facts=facts,
             export=arguments.export,
             save_map=save_map,
+            observers=observers,
         )
 
 
@@ -161,6 +165,7 @@ def track(
     facts: dict[str, Any],
     export: Sequence[str] = (),
     save_map: Path | None = None,
+    observers: Sequence[Observer] = (),
 ) -> int:
     """Track a clip, write the results folder and print a summary.
 
@@ -176,6 +181,7 @@ def track(
         facts: metadata to write into run.json.
         export: formats to write the results in too, into ``export/NAME`` of the results folder.
         save_map: map file to write at the end; the odometry is :class:`dvo.odometry.protocol.Saveable`.
+        observers: told of every frame and of the result; the caller closes them.
 
     Returns:
         Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C, 143 after SIGTERM.
@@ -184,7 +190,7 @@ def track(
         DvoError: no frame could be read, or a result cannot be written.
     """
     with results.results_folder(out, clip.name) as folder:
-        return _track(odometry, clip, folder, stride, facts, export, save_map)
+        return _track(odometry, clip, folder, stride, facts, export, save_map, observers)
 
 
 def _track(
@@ -195,8 +201,11 @@ def _track(
     facts: dict[str, Any],
     export: Sequence[str],
     save_map: Path | None,
+    observers: Sequence[Observer],
 ) -> int:
     printed = set(clip.warnings)
+    for observer in observers:
+        observer.begin(odometry)
     facts = {"odometry": odometry.name, **facts}
     recorder, table = Recorder(folder, odometry, facts, warn=warn), FrameTable()
 
@@ -205,6 +214,8 @@ def _track(
             remove_exports(folder / EXPORT)
         recorder.update(frame, estimate)
         table.update(frame, estimate)
+        for observer in observers:
+            observer.update(frame, estimate)
         progress.update(frame, estimate)
 
     with InterruptSwitch() as switch, TrackingProgress(clip.frame_count) as progress:
@@ -224,6 +235,8 @@ def _track(
         writer = None if save_map is None else partial(_save, odometry, save_map)
         pages = partial(page_writers, clip.name, table=table, odometry=odometry, groundtruth=clip.groundtruth)
         _write(folder, done, scores, clip, facts, writer, pages)
+        for observer in observers:
+            observer.finish(done)
     for warning in new_warnings:
         warn(warning)
     print_report(folder, done, scores)

@@ -1,0 +1,30 @@
+"""Options of ``dvo run`` that show the run, in a module that imports nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+
+VIEWER = ""  # value of --rerun without a file
+
+
+def add_view_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options.
+
+    Args:
+        parser: of the command.
+    """
+    parser.add_argument(
+        "--rerun",
+        nargs="?",
+        const=VIEWER,
+        type=_recording,
+        metavar="FILE.rrd",
+        help="log images, patches, edges and poses for the viewer Rerun: into FILE, or start the viewer (dvo[viz])",
+    )
+
+
+def _recording(text: str) -> str:
+    if text != VIEWER and not text.endswith(".rrd"):
+        hint = "to start the viewer, put --rerun after SOURCE or write '--rerun -- SOURCE'"
+        raise argparse.ArgumentTypeError(f"expected a file named .rrd, got {text[:60]!r} ({hint})")
+    return text

@@ -1,0 +1,98 @@
+"""Log of a run for Rerun. Those tests that read it back need the package (extra ``viz``)."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from dvo.cli import main
+from dvo.commands.view_options import VIEWER
+from dvo.viz.rerun_log import _loop_lines, _pixels, _shade
+from tests.command_line import arguments, errors, names
+
+
+@pytest.fixture
+def rerun():
+    """The package, or a skip."""
+    return pytest.importorskip("rerun", reason="needs rerun-sdk (pip install 'dvo[viz]')")
+
+
+def test_without_the_package_the_remedy_is_named(given, image_folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    odometry = given()
+    assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(tmp_path / "a.rrd"))) == 2
+    (line,) = errors(capsys.readouterr().err)
+    assert "rerun-sdk is not installed" in line and "pip install 'dvo[viz]'" in line
+    assert not odometry.asked and not (tmp_path / "out").exists(), "before the weights load"
+
+
+def test_a_source_after_the_option_is_no_file(given, image_folder, tmp_path, capsys):
+    given()
+    assert main(["run", "--rerun", str(image_folder), "--out", str(tmp_path / "out")]) == 2
+    assert "put --rerun after SOURCE" in capsys.readouterr().err
+
+
+def test_the_option_without_a_file_asks_for_the_viewer():
+    from dvo.cli import build_parser
+
+    parse = build_parser().parse_args
+    assert parse(["run", "a", "--rerun"]).rerun == VIEWER and parse(["run", "a"]).rerun is None
+    assert parse(["run", "a", "--rerun", "x.rrd"]).rerun == "x.rrd"
+
+
+def entities(file) -> set[str]:
+    """Entities of a recording."""
+    RrdReader = pytest.importorskip("rerun.chunk", reason="needs rerun-sdk with a reader of its files").RrdReader
+    found: set[str] = set()
+    for chunk in RrdReader(file).stream():
+        found.add(str(chunk.entity_path))
+    return found
+
+
+def test_an_odometry_without_a_graph_logs_poses_and_images(rerun, given, image_folder, tmp_path):
+    given(lost=(4, 5), new_segment=(12,))
+    file = tmp_path / "clip.rrd"
+    assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(file))) == 0
+    found = entities(file)
+    assert {"/world/camera", "/world/camera/image", "/confidence", "/status", "/final/map"} <= found
+    assert {"/world/trajectory/0/0", "/world/trajectory/1/0", "/final/trajectory/0"} <= found
+    assert not {path for path in found if "edges" in path or "matches" in path}
+    assert names(tmp_path / "out") == [
+        "frames.csv", "map.ply", "run.json", "summary.html", "trajectory-0.txt", "trajectory-1.txt", "trajectory.png",
+        "trajectory.txt",
+    ]  # fmt: skip
+
+
+def test_a_file_that_cannot_be_written(rerun, given, image_folder, tmp_path, capsys):
+    odometry = given()
+    assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(tmp_path / "none" / "a.rrd"))) == 2
+    (line,) = errors(capsys.readouterr().err)
+    assert "a.rrd" in line and "--rerun" in line and not odometry.asked
+
+
+def test_shades_go_from_red_to_green():
+    shades = _shade(np.array([0.0, 0.5, 1.0])).astype(int)
+    assert shades[0][0] > 200 > shades[0][1] and shades[2][1] > 200 > shades[2][0]
+    assert min(shades[1][:2]) > 200
+
+
+def test_rays_become_pixels_of_the_frame():
+    from dvo.data.frame import Frame
+    from dvo.geometry.camera import Camera
+
+    frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(50, 40, 31.5, 23.5, 64, 48))
+    np.testing.assert_allclose(_pixels(np.array([[0.1, -0.2]]), frame), [[36.5, 15.5]])
+
+
+def test_loops_join_the_positions_of_both_visits(fake_odometry):
+    from dataclasses import replace
+
+    from dvo.data.trajectory import Trajectory
+
+    result = fake_odometry().finish()
+    poses = np.arange(35.0).reshape(5, 7)
+    result = replace(result, trajectory=Trajectory(np.arange(5.0), poses), info={"loops": [{"from": 4.0, "to": 1.0}]})
+    np.testing.assert_array_equal(_loop_lines(result), [[poses[4, :3], poses[1, :3]]])
+    assert _loop_lines(replace(result, info={"loops": [{"from": 4.0, "to": 9.0}]})).shape == (0, 2, 3)

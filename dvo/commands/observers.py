@@ -32,4 +32,9 @@ def open_observers(arguments: argparse.Namespace, name: str) -> Iterator[list[Ob
 
             found.append(RerunLog(None if arguments.rerun == VIEWER else Path(arguments.rerun), name))
             stack.callback(found[-1].close)
+        if arguments.overlay is not None:
+            from dvo.viz.overlay import OverlayVideo
+
+            found.append(OverlayVideo(Path(arguments.overlay)))
+            stack.callback(found[-1].close)
         yield found

@@ -21,6 +21,15 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.rrd",
         help="log images, patches, edges and poses for the viewer Rerun: into FILE, or start the viewer (dvo[viz])",
     )
+    parser.add_argument(
+        "--overlay", type=_video, metavar="FILE.mp4", help="video of the frames with the tracked patches"
+    )
+
+
+def _video(text: str) -> str:
+    if not text.lower().endswith((".mp4", ".avi")):
+        raise argparse.ArgumentTypeError(f"--overlay needs a file named .mp4 or .avi, got {text[:200]!r}")
+    return text
 
 
 def _recording(text: str) -> str:

@@ -18,6 +18,7 @@ from dvo.errors import DvoError
 from dvo.odometry.observer import WindowView, archived_lines, graph_of, window_view
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
 from dvo.odometry.session import Run
+from dvo.viz.marks import pixels, shade
 from dvo.viz.plot import COLOURS
 
 APPLICATION = "dvo"
@@ -182,14 +183,14 @@ class RerunLog:
         stream.log("world/keyframes", rr.Points3D(centres, colors=[230, 140, 40], radii=rr.Radius.ui_points(4)))
         if len(view.pairs):
             strips = centres[view.pairs]
-            stream.log("world/edges/active", rr.LineStrips3D(strips, colors=_shade(view.pair_confidence)))
+            stream.log("world/edges/active", rr.LineStrips3D(strips, colors=shade(view.pair_confidence)))
         if self._count % POINTS_EVERY == 0:
             stream.log("world/points", rr.Points3D(view.points, colors=view.colors))
         if view.timestamp == frame.timestamp:
-            own, matches = _pixels(view.patches, frame), _pixels(view.matches, frame)
+            own, matches = pixels(view.patches, frame.camera), pixels(view.matches, frame.camera)
             radius = rr.Radius.ui_points(2.5)
             stream.log("world/camera/image/patches", rr.Points2D(own, colors=[255, 255, 255], radii=radius))
-            shown = rr.Points2D(matches, colors=_shade(view.confidence), radii=radius)
+            shown = rr.Points2D(matches, colors=shade(view.confidence), radii=radius)
             stream.log("world/camera/image/matches", shown)
         else:  # the frame has left the window
             stream.log("world/camera/image/patches", rr.Clear(recursive=False))
@@ -211,19 +212,6 @@ class RerunLog:
             row_shares=[3, 1, 1],
         )
         return rrb.Blueprint(rrb.Horizontal(views, beside, column_shares=[3, 2]), collapse_panels=True)
-
-
-def _pixels(rays: np.ndarray, frame: Frame) -> np.ndarray:
-    """Pixels of the frame from positions on the plane at depth 1."""
-    camera = frame.camera
-    return rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-
-
-def _shade(confidence: np.ndarray) -> np.ndarray:
-    """``(N, 3)`` uint8 RGB: from red (0) over yellow to green (1)."""
-    value = np.clip(confidence, 0, 1)
-    red, green = np.clip(2 - 2 * value, 0, 1), np.clip(2 * value, 0, 1)
-    return np.column_stack([230 * red + 20, 200 * green + 30, np.full(len(value), 60.0)]).astype(np.uint8)
 
 
 def _colour(segment: int) -> list[int]:

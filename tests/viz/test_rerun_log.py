@@ -9,7 +9,7 @@ import pytest
 
 from dvo.cli import main
 from dvo.commands.view_options import VIEWER
-from dvo.viz.rerun_log import _loop_lines, _pixels, _shade
+from dvo.viz.rerun_log import _loop_lines
 from tests.command_line import arguments, errors, names
 
 
@@ -70,20 +70,6 @@ def test_a_file_that_cannot_be_written(rerun, given, image_folder, tmp_path, cap
     assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(tmp_path / "none" / "a.rrd"))) == 2
     (line,) = errors(capsys.readouterr().err)
     assert "a.rrd" in line and "--rerun" in line and not odometry.asked
-
-
-def test_shades_go_from_red_to_green():
-    shades = _shade(np.array([0.0, 0.5, 1.0])).astype(int)
-    assert shades[0][0] > 200 > shades[0][1] and shades[2][1] > 200 > shades[2][0]
-    assert min(shades[1][:2]) > 200
-
-
-def test_rays_become_pixels_of_the_frame():
-    from dvo.data.frame import Frame
-    from dvo.geometry.camera import Camera
-
-    frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(50, 40, 31.5, 23.5, 64, 48))
-    np.testing.assert_allclose(_pixels(np.array([[0.1, -0.2]]), frame), [[36.5, 15.5]])
 
 
 def test_loops_join_the_positions_of_both_visits(fake_odometry):

@@ -27,6 +27,8 @@ EXIT_CODES = (
     "143 terminated (results so far are written)"
 )
 
+_MERGE_CODES = "exit codes: 0 done, 1 the second map was not recognised in the first (nothing is written), 2 bad input"
+
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
@@ -70,6 +72,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="write the results for other programs too: colmap, colmap-text, nerfstudio, tum, kitti, euroc; by commas",
     )
     run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for dvo.load_map")
+    run.add_argument("--map", metavar="FILE", help="map file (.dvo) of an earlier recording, to be localised in")
     add_view_options(run)
     run.set_defaults(run="dvo.commands.run:run")
 
@@ -79,10 +82,19 @@ def build_parser() -> argparse.ArgumentParser:
     summary.add_argument("--out", metavar="FILE", help="file to write (default: RESULTS/summary.html)")
     summary.set_defaults(run="dvo.commands.summary:summary")
 
-    export = commands.add_parser("export", help="write the trajectory of a results folder for another program")
-    export.add_argument("source", metavar="RESULTS", help="results folder of dvo run or dvo demo")
+    merge = commands.add_parser("merge", help="join two maps of one place", epilog=_MERGE_CODES)
+    merge.add_argument("first", metavar="FIRST", help="map file (.dvo), which keeps its world and scale")
+    merge.add_argument("second", metavar="SECOND", help="map file (.dvo) of a single recording")
+    merge.add_argument("--out", "-o", metavar="FILE", required=True, help="map file to write")
+    merge.add_argument("--device", metavar="D", default="auto", help="torch device (default: accelerator if available)")
+    merge.set_defaults(run="dvo.commands.maps:merge")
+
+    export = commands.add_parser("export", help="write a results folder or a map for another program")
+    export.add_argument("source", metavar="SOURCE", help="results folder of dvo run or dvo demo, or map file (.dvo)")
     export.add_argument("out", metavar="OUT", help="new folder")
-    export.add_argument("--to", metavar="NAME", required=True, help="format: tum, kitti or euroc")
+    export.add_argument(
+        "--to", metavar="NAME", required=True, help="format: tum, kitti or euroc; of a map also colmap, ..."
+    )
     export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
     export.set_defaults(run="dvo.commands.export:export")
 

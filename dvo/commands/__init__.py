@@ -2,6 +2,7 @@
 
 OK = 0
 NOTHING_TRACKED = 1
+NOT_RECOGNISED = 1  # of dvo merge
 BAD_INPUT = 2  # or results that cannot be written
 INTERRUPTED = 130
 TERMINATED = 143

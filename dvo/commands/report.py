@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,19 @@ def _describe_break(found: Break) -> str:
     return f"{text}, new segment at {found.end:.2f} s" if found.new_segment and found.end is not None else text
 
 
+def describe_localisation(loop: Mapping[str, Any]) -> str:
+    """Describe the loop by which a recording was recognised in a map.
+
+    Args:
+        loop: ``localised`` of the metadata of a result.
+
+    Returns:
+        Text such as ``localised at 1.20 s (61 % of 432 measurements are inliers) in the world``.
+    """
+    share = f"{100 * loop['inliers']:.0f} % of {loop['edges']} measurements are inliers"
+    return f"localised at {loop['from']:.2f} s ({share}) in the world"
+
+
 def print_report(folder: Path, run: Run, scores: Scores) -> None:
     """Print counts, breaks, segments, errors and the names of the files.
 
@@ -137,6 +151,10 @@ def print_report(folder: Path, run: Run, scores: Scores) -> None:
             f"{len(result.segments)} segments, {worlds}; {results.TRAJECTORY} and "
             f"{results.MAP} hold the longest, segment {result.longest}{whole}"
         )
+    if "localised" in result.info:
+        found = result.info["localised"]
+        outside = "not recognised in the map: the poses have a world and a scale of their own"
+        say(outside if found is None else f"{describe_localisation(found)} of the map")
     if result.info.get("readout_from") == "images":
         say(f"rolling shutter with a readout of {1000 * result.info['readout']:.1f} ms, estimated from the images")
     if metrics is not None and metrics.reason:

@@ -16,6 +16,7 @@ import torch
 import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.commands.maps import check_place, load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
 from dvo.commands.report import Scores, headline, print_report, score
@@ -25,7 +26,6 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.export.formats import check_formats, export_run, remove_exports
 from dvo.odometry import results, session
-from dvo.odometry.files import check_writable
 from dvo.odometry.frame_table import FrameTable
 from dvo.odometry.observer import Observer
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
@@ -100,6 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
         odometry = load_odometry(arguments, device)
         check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
+        facts["map"] = arguments.map
         return track(
             odometry,
             source,
@@ -117,22 +118,14 @@ def _map_file(text: str, odometry: Odometry) -> Path:
     if not isinstance(odometry, Saveable):
         message = f"the odometry {odometry.name} has no map that can be saved"
         raise DvoError(message, field="--save-map", remedy="use weights of patch_vo, such as small")
-    file = Path(text)
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        check_writable(file.parent)
-        reason = "is a folder" if file.is_dir() else ""
-    except OSError as error:
-        reason = error.strerror or str(error)
-    if reason:
-        raise DvoError(reason, file=file, field="--save-map", remedy="give a file in a folder that can be written")
-    return file
+    check_place(Path(text), "--save-map")
+    return Path(text)
 
 
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
     """Load the odometry of ``--weights`` with the settings of ``--preset``, ``--config``, ``--set`` and ``--no-loops``.
 
-    The later ones win.
+    The later ones win. With ``--map`` it is that of a new recording in a map.
 
     Args:
         arguments: of the command line.
@@ -153,6 +146,8 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
     if reserved:
         raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")
+    if getattr(arguments, "map", None) is not None:
+        return load_in_map(arguments.map, arguments.weights, device, arguments.seed, settings)
     return dvo.load(arguments.weights, device=device, seed=arguments.seed, **settings)
 
 

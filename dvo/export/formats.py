@@ -147,7 +147,8 @@ def export_run(odometry: Odometry, result: Result, formats: Iterable[str], folde
     said = []
     for name in formats:
         if name in MAP_FORMATS:
-            said.append(f"{name}: {export_map(odometry, folder / name, name, result.longest)}")
+            chosen = None if result.longest is None else result.longest + graph_of(odometry).recording.segment
+            said.append(f"{name}: {export_map(odometry, folder / name, name, chosen)}")
             continue
         export_trajectory(result.trajectory, folder / name, name)
         if len(result.segments) > 1:

@@ -119,7 +119,7 @@ class _Patches:
 
 
 def longest_segment(graph: KeyframeGraph) -> int:
-    """Segment with the most frames.
+    """Segment of the last recording with the most frames.
 
     Args:
         graph: of a sequence.
@@ -127,7 +127,8 @@ def longest_segment(graph: KeyframeGraph) -> int:
     Returns:
         Its number; the first of several equally long ones, 0 without frames.
     """
-    counts = np.bincount([r.segment for r in graph.log.frames if not r.lost and r.anchor is not None], minlength=1)
+    frames = graph.log.frames[graph.recording.frame :]
+    counts = np.bincount([r.segment for r in frames if not r.lost and r.anchor is not None], minlength=1)
     return int(counts.argmax())
 
 

@@ -18,6 +18,7 @@ from dvo.geometry import se3
 from dvo.graph.archive import Archive, ArchiveConfig, ArchivedEdges, ArchivedKeyframe, encode_jpeg
 from dvo.graph.keyframe_log import KeyframeLog
 from dvo.graph.problem import GraphProblem, graph_problem
+from dvo.graph.recordings import Recording
 from dvo.graph.window import Keyframe, Window
 
 NEAR = 0.05
@@ -46,6 +47,7 @@ class KeyframeGraph:
         starts: first keyframe and number of each segment, by increasing keyframe; -1 for a rejected segment.
         worlds: number of the earliest segment with the same world, of segments that have been joined.
         loops: number of loops whose measurements are archived.
+        recordings: beginnings of the sequences that were tracked in this graph, of which there is mostly one.
 
     Example:
         Global bundle adjustment of everything that a tracker has archived:
@@ -76,6 +78,12 @@ class KeyframeGraph:
         self.starts: list[tuple[int, int]] = [(0, 0)]
         self.worlds: dict[int, int] = {}
         self.loops = 0
+        self.recordings = [Recording()]
+
+    @property
+    def recording(self) -> Recording:
+        """The last recording; keyframes before it are its map."""
+        return self.recordings[-1]
 
     def begin_segment(self, first: int, keep: bool = True, reason: str = "") -> None:
         """Begin a segment. The window must be empty.

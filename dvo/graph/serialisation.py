@@ -11,6 +11,7 @@ anchors that lead nowhere or in a circle, sizes that do not belong together, tim
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,6 +23,7 @@ from dvo.graph.archive import ArchiveConfig, ArchivedEdges, ArchivedKeyframe
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.keyframe_log import FrameRecord, KeyframeLog
 from dvo.graph.map_file import MapReader, open_map_file, write_map_file
+from dvo.graph.recordings import Recording, increase
 from dvo.graph.window_arrays import read_window, window_arrays
 
 Arrays = dict[str, np.ndarray]
@@ -41,6 +43,7 @@ class GraphTable:
         reasons: causes of losses and breaks that the log refers to.
         loops: number of loops whose measurements are archived.
         worlds: by segment, the earliest segment with the same world; none where no segments have been joined.
+        recordings: first frame, keyframe and segment of the second recording and of those after it.
     """
 
     per_frame: int
@@ -51,6 +54,7 @@ class GraphTable:
     reasons: tuple[str, ...]
     loops: int = 0
     worlds: tuple[int, ...] = ()
+    recordings: tuple[tuple[int, int, int], ...] = ()
 
     RANGES: ClassVar[dict[str, tuple[float, float]]] = {
         "per_frame": (1, 2**14),
@@ -115,6 +119,7 @@ def graph_arrays(graph: KeyframeGraph) -> tuple[dict[str, Any], Arrays]:
     table = GraphTable(
         window.per_frame, window.patches.shape[-1], window.hidden.shape[1], graph.segment, graph.archive.config,
         tuple(reasons), graph.loops, tuple(map(graph.world_of, range(graph.segment + 1))) if graph.worlds else (),
+        tuple((begun.frame, begun.keyframe, begun.segment) for begun in graph.recordings[1:]),
     )  # fmt: skip
     starts = {"segments": np.array(graph.starts, np.int64)}
     return asdict(table), starts | _log_arrays(graph.log, reasons) | _archive_arrays(graph) | window_arrays(window)
@@ -142,7 +147,12 @@ def read_graph(source: MapReader, graph: KeyframeGraph, table: GraphTable) -> No
     source.require(ordered, "does not list segments by their first keyframe, from 0", "segments")
     source.require((starts[:, 1] <= table.segment).all(), "numbers segments beyond the last one", "segments")
     graph.starts[:] = [(int(keyframe), int(number)) for keyframe, number in starts]
+    begun = [(0, 0, 0), *table.recordings]
+    listed = all(a <= b <= _LAST for one, two in pairwise(begun) for a, b in zip(one, two, strict=True))
+    source.require(listed and begun[-1][2] <= table.segment, "does not list recordings in order", "graph: recordings")
+    graph.recordings[:] = [Recording(*row) for row in begun]
     _read_log(source, graph.log, table)
+    source.require(begun[-1][0] <= len(graph.log.frames), "begins after the last frame", "graph: recordings")
     _read_archive(source, graph)
     read_window(source, graph.window)
     _check_keyframes(source, graph)
@@ -172,7 +182,8 @@ def _log_arrays(log: KeyframeLog, reasons: list[str]) -> Arrays:
 def _read_log(source: MapReader, log: KeyframeLog, table: GraphTable) -> None:
     times = source.array("log/times", np.float64, (None,))
     n = len(times)
-    source.require((np.diff(times) > 0).all(), "holds times that do not increase", "log/times")
+    begun = [first for first, _, _ in table.recordings]
+    source.require(increase(times, begun), "holds times that do not increase", "log/times")
     anchors = source.array("log/anchors", np.int64, (n,), -1, _LAST)
     lost = source.array("log/lost", np.uint8, (n,), 0, 1)
     segments = source.array("log/segments", np.int64, (n,), 0, table.segment)
@@ -309,7 +320,8 @@ def _check_keyframes(source: MapReader, graph: KeyframeGraph) -> None:
     times = dict(frames)
     source.require(len(times) == len(frames), "holds a keyframe twice", "archive/keyframes")
     ordered = np.array([times[identifier] for identifier in sorted(times)])
-    source.require((np.diff(ordered) > 0).all(), "holds keyframes whose times do not increase", "archive/times")
+    begun = np.searchsorted(sorted(times), [recording.keyframe for recording in graph.recordings]).tolist()
+    source.require(increase(ordered, begun), "holds keyframes whose times do not increase", "archive/times")
     # A dropped keyframe whose anchor was discarded is left out of everything; an anchor that is there leads on.
     dropped = [frame.anchor for frame in graph.archive if frame.anchor is not None and frame.anchor in graph.archive]
     further = {graph.archive[anchor].anchor for anchor in dropped} - {None}

@@ -23,6 +23,7 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.problem import GraphProblem
+from dvo.graph.recordings import count_earlier, increasing_times
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.settings import check_settings
 
@@ -104,7 +105,8 @@ def adjust_segment(
     """Solve for the archived keyframes and inverse depths of a segment, in place.
 
     Args:
-        graph: the whole segment is archived; its poses and inverse depths are replaced.
+        graph: the whole segment is archived; its poses and inverse depths are replaced. Those of earlier recordings in
+            the same world stay.
         segment: its number.
         options: kernels, iterations and size of the blocks.
         shutter: timing of the rows; None, or a readout time of 0, for a global shutter.
@@ -121,15 +123,16 @@ def adjust_segment(
     identifiers = np.array([frame.identifier for frame in frames])
     if len(identifiers) < 3:
         return 0
-    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
+    times, map_size = increasing_times(graph, frames), count_earlier(graph, identifiers)
     old = graph.poses_cw(identifiers)
     now = old.clone()
     # Frames whose measurements have been released to save memory stay; with some more they hold the scale of the rest.
     edges = graph.archive.edges()
-    linked = np.isin(identifiers, np.concatenate([edges.source, edges.target]))
+    linked = np.isin(identifiers, np.concatenate([edges.source, edges.target]))[map_size:]
     if not linked.any():
         return 0
-    held = min(int(linked.argmax()) + options.overlap, len(identifiers) - 1) if not linked[0] else 1
+    held = min(map_size + int(linked.argmax()) + options.overlap, len(identifiers) - 1)
+    held = held if not linked[0] else max(map_size, 1)
     start = solved = held
     block = options.loop_block if graph.loops else options.block
     change = _Change(old[held - 1], old[held - 1], 1.0)
@@ -140,7 +143,8 @@ def adjust_segment(
     while solved < len(identifiers):
         end = min(max(start + block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
-        part = graph.problem(True, segment, 0 if start == held else int(identifiers[start]), int(identifiers[end - 1]))
+        whole = start == held and not map_size
+        part = graph.problem(True, segment, 0 if whole else int(identifiers[start]), int(identifiers[end - 1]))
         rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))
         fixed, new = rows < start, rows >= solved
         now[solved:end] = change(old[solved:end])
@@ -149,7 +153,7 @@ def adjust_segment(
         poses, found = now[rows], depths
         if first:
             poses, found, _ = solve_part(part, poses, found, fixed, replace(options, kernels=first))
-        if start == 1:
+        if start == 1 and not map_size:
             poses, found = _leave_minimum(part, poses, found, fixed, options)
         for _ in range(options.shutter_rounds if rolling is not None else 0):
             assert rolling is not None

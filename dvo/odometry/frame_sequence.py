@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from statistics import median
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
+from dvo.odometry.working_image import working_size
 
 RECENT = 30
 """Number of intervals that the usual one is the median of."""
@@ -30,11 +32,46 @@ class Gap:
         return f"image frozen for {self.seconds:.2f} s" if self.frozen else f"gap of {self.seconds:.2f} s"
 
 
+@dataclass(frozen=True)
+class RequiredSize:
+    """Size of the working images of the map that a recording is tracked in.
+
+    Attributes:
+        size: width and height.
+        pixels: of the working images of the recording, see :func:`dvo.odometry.working_image.working_size`.
+    """
+
+    size: tuple[int, int]
+    pixels: int
+
+    def check(self, frame: Frame) -> None:
+        """Check the working size of the first frame.
+
+        Args:
+            frame: the frame.
+
+        Raises:
+            DvoError: it is another one.
+        """
+        height, width = frame.image.shape[:2]
+        found = working_size(width, height, self.pixels)
+        if found != self.size:
+            wanted = "x".join(map(str, self.size))
+            raise DvoError(
+                f"a working image of {found[0]}x{found[1]} from {width}x{height}, the images of the map are {wanted}",
+                field=f"frame {frame.index}",
+                remedy=f"give a recording of the same aspect and at least that size, or pixels={math.prod(self.size)}",
+            )
+
+
 class FrameSequence:
     """Order, size and intervals of the frames of a sequence.
 
     Args:
         max_gap: time between two images above which they are separated by a gap, in medians of the recent intervals.
+
+    Attributes:
+        required: size of the working images, if a map demands one.
 
     Example:
         >>> sequence = FrameSequence(max_gap=4)
@@ -44,6 +81,7 @@ class FrameSequence:
 
     def __init__(self, max_gap: float) -> None:
         self.max_gap = max_gap
+        self.required: RequiredSize | None = None
         self._intervals: deque[float] = deque(maxlen=RECENT)
         self._size: tuple[int, int] | None = None
         self._last: float | None = None  # time of the last frame
@@ -98,6 +136,8 @@ class FrameSequence:
                 field=f"frame {frame.index}",
                 remedy="give frames of one size",
             )
+        if self._size is None and self.required is not None:
+            self.required.check(frame)
         self._size = size
 
     def tick(self, time: float) -> Gap | None:

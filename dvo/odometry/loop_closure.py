@@ -4,10 +4,14 @@ A confirmed loop adds its measurements to the archive, where the final adjustmen
 all keyframes of its world by a pose graph in Sim(3) (Strasdat, Montiel and Davison, "Scale drift-aware large scale
 monocular SLAM", 2010). A loop between two segments joins their worlds. Corrections happen at fixed frames: the same
 frames give the same result, bit for bit on the CPU.
+
+In a map (a graph with keyframes of earlier recordings) only keyframes of the last recording search. Those of the map
+stay where they are; what joins their world is moved.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.pose_graph import optimise_pose_graph
+from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
 from dvo.geometry import sim3, so3
 from dvo.graph.archive import ArchivedKeyframe
 from dvo.graph.correction import apply_similarities, move_window, similarity_between
@@ -108,11 +112,13 @@ class LoopCloser:
             True if poses were corrected.
         """
         corrected = self.advance(segments)
-        if not self.loops:
+        loops = self._own_loops()
+        if not loops:
             return corrected
         options, kept = self.finder.options, self.finder.kept
-        known = np.array([kept.index(loop.new) for loop in self.loops])
-        rows = np.arange(options.neighbours, len(kept) - options.neighbours)
+        first = bisect_left(kept, self.graph.recording.keyframe)
+        known = np.array([kept.index(loop.new) for loop in loops])
+        rows = np.arange(first + options.neighbours, len(kept) - options.neighbours)
         rows = rows[np.abs(rows[:, None] - known).min(1) >= options.every][:: options.every]
         if len(rows) > searches:
             rows = rows[np.linspace(0, len(rows) - 1, searches).round().astype(int)]
@@ -123,24 +129,34 @@ class LoopCloser:
         return corrected
 
     def information(self) -> dict[str, Any]:
-        """Confirmed loops for run.json, in the order of time; nothing if loops are not searched for."""
+        """Confirmed loops of the recording for run.json, in the order of time; nothing if they are not searched for.
+
+        In a map also ``localised``: the loop by which the recording was recognised in it, None if it was not.
+        """
         if not self.enabled:
             return {}
-        loops = [
+        loops, begun = self._own_loops(), self.graph.recording.keyframe
+        entries: list[dict[str, Any]] = [
             {
                 "from": loop.new_time, "to": loop.old_time, "kind": loop.kind, "inliers": round(loop.inliers, 3),
-                "edges": loop.count, "joins_segments": loop.joins,
+                "edges": loop.count, "joins_segments": loop.joins, **({"in_map": loop.old < begun} if begun else {}),
             }
-            for loop in self.loops
+            for loop in loops
         ]  # fmt: skip
-        return {"loops": sorted(loops, key=lambda loop: loop["from"]), "loop_corrections": self.corrections}
+        found = {"loops": sorted(entries, key=lambda loop: loop["from"]), "loop_corrections": self.corrections}
+        return found | ({"localised": next((e for e in entries if e["in_map"]), None)} if begun else {})
+
+    def _own_loops(self) -> list[Loop]:
+        """Confirmed loops of the last recording."""
+        return [loop for loop in self.loops if loop.new >= self.graph.recording.keyframe]
 
     def _visit(self, frame: ArchivedKeyframe) -> bool:
         """Take a kept keyframe into the list, and search for a loop if it is time to."""
         kept, options = self.finder.kept, self.finder.options
         self.finder.keep(frame.identifier)
         self.wait -= 1
-        if self.wait > 0 or len(kept) <= 2 * options.neighbours:
+        own = len(kept) > 2 * options.neighbours and kept[-1 - 2 * options.neighbours] >= self.graph.recording.keyframe
+        if self.wait > 0 or not own:
             return False
         loop = self.finder.find(kept[-1 - options.neighbours])
         self.wait = options.every
@@ -184,9 +200,10 @@ class LoopCloser:
         kept = [k for k in self.finder.kept if graph.world_of(graph.segment_of(k)) in worlds]
         identifiers = np.array(kept)
         before = graph.poses_cw(identifiers)
-        found = self._solve(identifiers, self._start(identifiers, before, loop))
+        held = self._held(identifiers)
+        found = self._solve(identifiers, self._start(identifiers, before, loop), held)
         here = [row for row, k in enumerate(kept) if graph.segment_of(k) == graph.segment]
-        apply_similarities(graph, identifiers, found)
+        apply_similarities(graph, identifiers[~held], found[torch.from_numpy(~held)])
         if here:
             move_window(graph, before[here[-1]], found[here[-1]])
         self._rescale(identifiers, found)
@@ -196,20 +213,32 @@ class LoopCloser:
         return True
 
     def _start(self, identifiers: np.ndarray, poses_cw: Tensor, loop: Loop) -> Tensor:
-        """Similarities ``(N, 8)`` world to camera to start from; a joining segment is moved into the older world."""
+        """Similarities ``(N, 8)`` world to camera to start from; a joining segment is moved into the older world.
+
+        In a map the later of the two worlds is moved, whichever keyframe is the older one.
+        """
         start = sim3.from_se3(poses_cw)
         if not loop.joins:
             return start
-        graph, newer = self.graph, self.graph.world_of(self.graph.segment_of(loop.new))
+        graph, worlds = self.graph, [self.graph.world_of(self.graph.segment_of(k)) for k in (loop.old, loop.new)]
         old, new = graph.poses_cw(np.array([loop.old, loop.new]))
         there = sim3.compose(loop.measurement, sim3.from_se3(old))  # older world to the newer camera, in its unit
         found_cw, scale = torch.cat([there[:3] / there[7], there[3:7]]), float(1 / there[7])
         change = sim3.inverse(similarity_between(new, found_cw, scale))
+        newer = worlds[1]
+        if graph.recording.keyframe and worlds[0] > worlds[1]:
+            newer, change = worlds[0], sim3.inverse(change)
         moving = torch.tensor([graph.world_of(graph.segment_of(int(k))) == newer for k in identifiers])
         return torch.where(moving[:, None], sim3.compose(start, change), start)
 
-    def _solve(self, identifiers: np.ndarray, start: Tensor) -> Tensor:
-        """Solve the pose graph of consecutive keyframes and loops."""
+    def _held(self, identifiers: np.ndarray) -> np.ndarray:
+        """Mask ``(N,)`` of the keyframes of the map, in the world that stays; none without a map."""
+        graph = self.graph
+        worlds = np.array([graph.world_of(graph.segment_of(int(k))) for k in identifiers])
+        return (identifiers < graph.recording.keyframe) & (worlds == worlds.min())
+
+    def _solve(self, identifiers: np.ndarray, start: Tensor, held: np.ndarray) -> Tensor:
+        """Solve the pose graph of consecutive keyframes and loops; ``held (N,)`` poses stay, else the first one."""
         graph, archive = self.graph, self.graph.archive
         segments = np.array([graph.segment_of(int(k)) for k in identifiers])
         depth = torch.tensor([1.0 / float(np.median(archive[int(k)].inverse_depth)) for k in identifiers]).double()
@@ -225,9 +254,10 @@ class LoopCloser:
         ends = torch.cat([jj, new])
         shape = deviation[:, [0, 0, 0, 1, 1, 1, 2]].clone()
         shape[:, :3] *= depth[ends, None]
+        options = PoseGraphOptions(fixed=torch.from_numpy(held)) if held.any() else PoseGraphOptions()
         result = optimise_pose_graph(
             start, torch.cat([ii, old]), ends, torch.cat([measured, *(loop.measurement[None] for loop in loops)]),
-            shape.square().reciprocal(),
+            shape.square().reciprocal(), options,
         )  # fmt: skip
         return sim3.normalise(result.poses_cw)
 

@@ -150,6 +150,15 @@ class LoopFinder:
                 wanted = {identifier, *window, *waiting}
                 self._recent = {k: row for k, row in self._recent.items() if k in wanted}
 
+    def describe(self, identifier: int, descriptor: np.ndarray) -> None:
+        """Take the descriptor of a keyframe of another map, until the keyframe is taken into the list.
+
+        Args:
+            identifier: of the keyframe.
+            descriptor: unit vector.
+        """
+        self._recent[identifier] = descriptor
+
     def keep(self, identifier: int) -> None:
         """Take a keyframe that was archived and not dropped into the list and the index.
 
@@ -247,14 +256,16 @@ class LoopFinder:
         frame = self.graph.archive[new]
         poses_cw = self.graph.poses_cw(np.append(earlier, new))
         fx, fy, cx, cy = torch.from_numpy(frame.intrinsics).double()
+        cameras = np.stack([self.graph.archive[int(k)].intrinsics for k in earlier])  # a map may be of another camera
+        fu, fv, cu, cv = torch.from_numpy(cameras).double().T[:, :, None]
         x, y = torch.from_numpy(frame.centres).double().unbind(-1)
         rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1)
         depth = 1.0 / torch.from_numpy(frame.inverse_depth).double().clamp(min=1e-6)
         world = se3.act(se3.inverse(poses_cw[-1]), rays * depth[:, None])
         seen = se3.act(poses_cw[:-1, None], world[None])
         z = seen[..., 2].clamp(min=1e-9)
-        u, v = fx * seen[..., 0] / z + cx, fy * seen[..., 1] / z + cy
-        inside = (u >= 0) & (u <= 2 * cx) & (v >= 0) & (v <= 2 * cy) & (seen[..., 2] > 0)
+        u, v = fu * seen[..., 0] / z + cu, fv * seen[..., 1] / z + cv
+        inside = (u >= 0) & (u <= 2 * cu) & (v >= 0) & (v <= 2 * cv) & (seen[..., 2] > 0)
         alike = (z / depth > 0.5) & (z / depth < 2.0)
         return (inside & alike).double().mean(-1).numpy()
 

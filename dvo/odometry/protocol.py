@@ -38,6 +38,8 @@ class Estimate:
         segment: number of the segment that the pose belongs to, from 0. Poses of two segments have different worlds and
             different scales.
         reason: cause of the status ``lost``, such as ``"black image"``; empty otherwise.
+        recovered: the first pose after the segment was joined to an earlier world (of an earlier segment, or of a map):
+            this pose and those after it are in that world and scale, earlier ones of the segment were not.
     """
 
     timestamp: float
@@ -46,6 +48,7 @@ class Estimate:
     confidence: float = 0.0
     segment: int = 0
     reason: str = ""
+    recovered: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,12 +95,14 @@ class Segment:
         trajectory: camera-to-world pose of every tracked frame of the segment.
         start, end: timestamps of its first and last row, seconds.
         joined_to: number of the segment whose world and scale it shares; None for its own.
+        in_map: its world and scale are those of the map that the recording was tracked in.
     """
 
     trajectory: Trajectory
     start: float
     end: float
     joined_to: int | None = None
+    in_map: bool = False
 
     def __len__(self) -> int:
         return len(self.trajectory)
@@ -128,7 +133,8 @@ class Result:
 
     Attributes:
         trajectory: camera-to-world pose of every tracked frame of the longest segment, with those that share its world,
-            frames before the initialisation included; lost frames have no row.
+            frames before the initialisation included; lost frames have no row. In a map, of the segments that share its
+            world, if there are any.
         map: sparse coloured map in the world of ``trajectory``, empty for systems without one.
         frames_read: number of input frames.
         frames_lost: number of input frames without a row in any segment.

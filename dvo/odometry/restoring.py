@@ -15,6 +15,7 @@ from dvo.graph.map_file import MapReader
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.frame_sequence import RECENT
 from dvo.odometry.front_end import View, encode_image, observe
+from dvo.odometry.new_recording import require_size
 from dvo.odometry.protocol import Estimate, Status
 from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.window_alignment import WindowAlignment
@@ -121,10 +122,12 @@ def restore_tracker(source: MapReader, odometry: PatchOdometry, table: TrackerTa
     state.finished, state.adjustable = table.finished, list(table.adjustable)
     state.joining, state.skipped, state.info = table.joining, table.skipped, table.info
     state.shutter = Shutter(table.readout, table.rows)
-    if log.frames:
+    if len(log.frames) > odometry.graph.recording.frame:
         last = log.frames[-1].timestamp
         source.require(table.new <= last, "a time after the last frame", "tracker: new")
         state.sequence.restore(table.size, table.intervals, last, table.new)
+    else:
+        require_size(odometry)
     try:
         state.generator.set_state(torch.from_numpy(source.array("tracker/generator", np.uint8, (None,))))
     except (RuntimeError, TypeError) as error:
@@ -138,6 +141,7 @@ def restore_tracker(source: MapReader, odometry: PatchOdometry, table: TrackerTa
         e = table.last
         estimate = Estimate(log.frames[-1].timestamp, pose, Status(e.status), e.confidence, e.segment, e.reason)
         state.last = image, estimate
+    state.world = odometry.graph.world_of(odometry.graph.segment)  # before a first pose this makes no difference
     _restore_window(source, odometry, size)
     _restore_waiting(source, odometry, table, size)
 
@@ -145,7 +149,8 @@ def restore_tracker(source: MapReader, odometry: PatchOdometry, table: TrackerTa
 def _working_size(source: MapReader, odometry: PatchOdometry, table: TrackerTable) -> tuple[int, int]:
     """Height and width of the working images of the sequence; 0 before its first frame."""
     if table.size is None:
-        source.require(not odometry.graph.log.frames, "no size, but frames", "tracker: size")
+        begun = len(odometry.graph.log.frames) > odometry.graph.recording.frame
+        source.require(not begun, "no size, but frames", "tracker: size")
         return 0, 0
     width, height = table.size
     fits = width > 0 and height > 0 and width * height <= MAX_PIXELS

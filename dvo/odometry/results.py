@@ -230,6 +230,7 @@ def summary(run: Run, segment_facts: Sequence[dict[str, Any]] = ()) -> dict[str,
                 "end": segment.end,
                 "frames": len(segment),
                 "joined_to": segment.joined_to,
+                "in_map": segment.in_map,
                 "file": segment_file(number) if len(result.segments) > 1 else TRAJECTORY,
                 **(segment_facts[number] if segment_facts else {}),
             }

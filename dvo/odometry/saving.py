@@ -28,6 +28,7 @@ from dvo.models.weights import LoadedWeights, load_weights, tensor_digest
 from dvo.odometry.front_end import View
 from dvo.odometry.load import source_of
 from dvo.odometry.loop_saving import loops_arrays, loops_table, restore_loops
+from dvo.odometry.new_recording import new_recording as begin_new
 from dvo.odometry.restoring import EstimateTable, TrackerTable, WeightsTable, restore_tracker
 from dvo.threads import settle_threads
 
@@ -56,18 +57,30 @@ def save_map(file: str | Path, odometry: PatchOdometry) -> None:
 
 
 def load_map(
-    file: str | Path, *, device: torch.device | str = "cpu", weights: str | Path | LoadedWeights | None = None
+    file: str | Path,
+    *,
+    device: torch.device | str = "cpu",
+    weights: str | Path | LoadedWeights | None = None,
+    new_recording: bool = False,
+    seed: int | None = None,
+    **overrides: Any,
 ) -> PatchOdometry:
-    """Load a tracker from a map file, to go on with its sequence or to use its map.
+    """Load a tracker from a map file: to go on with its sequence, to use its map, or for a new recording in the map.
 
     Args:
         file: written by ``odometry.save`` or ``dvo run --save-map``.
         device: of all computation.
         weights: of the network, if they are not found by the name in the file: a name, a file, or a network in memory.
+        new_recording: begin another recording in the map (:mod:`dvo.odometry.new_recording`): of any time, with any
+            camera whose working images have the size of those of the map. A sequence that is not finished is finished.
+        seed: of the patch centres of the new recording; None for that of the map.
+        overrides: single settings of the new recording, and ``preset``, as of :func:`dvo.load`; others are those of the
+            map.
 
     Returns:
         The tracker as it was saved. A finished one takes no frames; ``finish`` gives its result again, and ``graph`` is
-        its map.
+        its map. Of a new recording, a tracker before its first frame; its result holds the poses of the new recording
+        alone, in the world and the scale of the map from the first of them on if it was recognised in it.
 
     Raises:
         DvoError: no such file; not a map of a tracker, one of a newer version, or an invalid content, with the name of
@@ -82,7 +95,18 @@ def load_map(
         >>> for frame in second_half:
         ...     odometry.track(frame)
         >>> result = odometry.finish()
+
+        Another recording of the same place:
+
+        >>> odometry = dvo.load_map("office.dvo", new_recording=True)
+        >>> result = dvo.run(odometry, dvo.open("video2.mp4", calib="calib.txt")).result
+        >>> result.info["localised"] is not None, [segment.in_map for segment in result.segments]
+        (True, [True])
     """
+    if not new_recording and (seed is not None or overrides):
+        name = next(iter(overrides), "seed")
+        remedy = "leave it out, or give new_recording=True"
+        raise DvoError("a sequence goes on with the settings that it began with", field=name, remedy=remedy)
     settle_threads()
     with open_map_file(file) as source:
         if "tracker" not in source.description:
@@ -95,7 +119,7 @@ def load_map(
         with torch.inference_mode():
             restore_tracker(source, odometry, table)
             restore_loops(source, odometry.loops, odometry.state.adjustable)
-        return odometry
+    return begin_new(odometry, seed=seed, **overrides) if new_recording else odometry
 
 
 def _tracker_table(odometry: PatchOdometry) -> TrackerTable:

@@ -11,33 +11,36 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.keyframe_log import KeyframeLog
+from dvo.graph.recordings import Recording
 from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
 
 def segments_of(
-    log: KeyframeLog, poses: Mapping[int, np.ndarray] | None = None, worlds: Mapping[int, int] | None = None
+    log: KeyframeLog,
+    poses: Mapping[int, np.ndarray] | None = None,
+    worlds: Mapping[int, int] | None = None,
+    recording: Recording = Recording(),  # noqa: B008 (frozen)
 ) -> tuple[Segment, ...]:
-    """Segments of a log that have rows, in order of time.
+    """Segments of a recording that have rows, in order of time.
 
     Args:
         log: of every frame, with its segment.
         poses: ``T_cw`` of keyframes that are still being optimised.
         worlds: number of the segment whose world a segment has joined, by its own number; None if none has.
+        recording: the last of the log.
 
     Returns:
-        The segments; their positions are the numbers of the records.
+        The segments; their positions are the numbers of the records, less that of the first of the recording.
     """
     found: list[Segment] = []
-    place: dict[int, int] = {}
-    for number in sorted({record.segment for record in log.frames if not record.lost}):
+    place: dict[int, int] = {}  # first segment of each world
+    for number in sorted({record.segment for record in log.frames[recording.frame :] if not record.lost}):
         rows = log.trajectory(number, poses)
         if len(rows):
-            place[number] = len(found)
-            joined_to = place.get(worlds.get(number, number)) if worlds else None
-            own = joined_to is None or joined_to == place[number]
-            found.append(
-                Segment(rows, float(rows.timestamps[0]), float(rows.timestamps[-1]), None if own else joined_to)
-            )
+            world = (worlds or {}).get(number, number)
+            first = place.setdefault(world, len(found))
+            joined_to, in_map = None if first == len(found) else first, world < recording.segment
+            found.append(Segment(rows, float(rows.timestamps[0]), float(rows.timestamps[-1]), joined_to, in_map))
     return tuple(found)
 
 
@@ -66,22 +69,24 @@ def find_breaks(times: np.ndarray, owner: np.ndarray, reasons: Mapping[float, st
     return tuple(breaks)
 
 
-def breaks_of(log: KeyframeLog) -> tuple[Break, ...]:
+def breaks_of(log: KeyframeLog, first: int = 0) -> tuple[Break, ...]:
     """Breaks of a log.
 
     Args:
         log: of every frame; a record with a pose and a reason was joined across a gap in time.
+        first: position of the first frame of the recording.
 
     Returns:
         Breaks in order of time.
     """
-    times = np.array([record.timestamp for record in log.frames], dtype=np.float64)
-    owner = np.array([-1 if record.lost else record.segment for record in log.frames], dtype=np.int64)
-    return find_breaks(times, owner, {record.timestamp: record.reason for record in log.frames})
+    frames = log.frames[first:]
+    times = np.array([record.timestamp for record in frames], dtype=np.float64)
+    owner = np.array([-1 if record.lost else record.segment for record in frames], dtype=np.int64)
+    return find_breaks(times, owner, {record.timestamp: record.reason for record in frames})
 
 
 def result_of(graph: KeyframeGraph, info: dict[str, Any], poses: Mapping[int, np.ndarray] | None = None) -> Result:
-    """Result of a tracker.
+    """Result of a tracker, for its last recording.
 
     Args:
         graph: of the sequence.
@@ -89,10 +94,11 @@ def result_of(graph: KeyframeGraph, info: dict[str, Any], poses: Mapping[int, np
         poses: ``T_cw`` of keyframes that are still being optimised.
 
     Returns:
-        All segments, with the trajectory and the map of the world with the most rows.
+        All segments of the recording, with the trajectory and the map of the world with the most rows; if some are in
+        the world of earlier recordings, with those, and the points of these recordings.
     """
-    result, main = result_of_log(graph.log, info, poses, graph.worlds)
-    return replace(result, map=SparseMap(*graph.points(main)))
+    result, main = result_of_log(graph.log, info, poses, graph.worlds, graph.recording)
+    return replace(result, map=SparseMap(*graph.points(graph.recording.segment + main)))
 
 
 def result_of_log(
@@ -100,6 +106,7 @@ def result_of_log(
     info: dict[str, Any],
     poses: Mapping[int, np.ndarray] | None = None,
     worlds: Mapping[int, int] | None = None,
+    recording: Recording = Recording(),  # noqa: B008 (frozen)
 ) -> tuple[Result, int]:
     """Result of an odometry that keeps a log, without a map.
 
@@ -108,19 +115,22 @@ def result_of_log(
         info: metadata for run.json.
         poses: ``T_cw`` of keyframes that are still being optimised.
         worlds: number of the segment whose world a segment has joined, by its own number; None if none has.
+        recording: the last of the log.
 
     Returns:
-        All segments, with the trajectory of the world with the most rows (of several, the first), and the number of the
-        first segment in it.
+        All segments, with the trajectory of the world with the most rows (of several, the first; one of earlier
+        recordings before others), and the number of the first segment in it.
     """
-    segments = segments_of(log, poses, worlds)
+    segments = segments_of(log, poses, worlds, recording)
     rows: dict[int, list[Trajectory]] = {}
     for number, segment in enumerate(segments):
         rows.setdefault(number if segment.joined_to is None else segment.joined_to, []).append(segment.trajectory)
-    main = max(rows, key=lambda number: (sum(map(len, rows[number])), -number), default=0)
+    in_map = [number for number in rows if segments[number].in_map]
+    main = max(in_map or rows, key=lambda number: (sum(map(len, rows[number])), -number), default=0)
     trajectory = _concatenated(rows[main]) if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
-    read, tracked = len(log.frames), sum(len(segment) for segment in segments)
-    return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks_of(log)), main
+    read, tracked = len(log.frames) - recording.frame, sum(len(segment) for segment in segments)
+    breaks = breaks_of(log, recording.frame)
+    return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks), main
 
 
 def _concatenated(parts: Sequence[Trajectory]) -> Trajectory:

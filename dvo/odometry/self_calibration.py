@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.recordings import count_earlier, increasing_times
 from dvo.odometry.final_adjustment import AdjustmentOptions, adjust_segment, solve_part
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
@@ -95,12 +96,14 @@ def find_readout(
         0 for too few frames.
     """
     frames = graph.members(segment)
-    if len(frames) < _FEWEST:
-        return Minimum(0.0, np.inf, 0.0)
     identifiers = np.array([frame.identifier for frame in frames])
-    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
+    earlier = count_earlier(graph, identifiers)  # keyframes of a map, whose camera may be another one
+    if len(frames) - earlier < _FEWEST:
+        return Minimum(0.0, np.inf, 0.0)
+    times = increasing_times(graph, frames)
     now = graph.poses_cw(identifiers)
-    first = _busiest(now, float(np.median([np.median(frame.inverse_depth) for frame in frames])))
+    own = [np.median(frame.inverse_depth) for frame in frames[earlier:]]
+    first = earlier + _busiest(now[earlier:], float(np.median(own)))
     last = min(first + _FRAMES, len(frames)) - 1
     part = graph.problem(True, segment, int(identifiers[first]) if first else 0, int(identifiers[last]))
     index = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))
@@ -117,7 +120,7 @@ def find_readout(
             now[index], depths, found = solve_part(seen, now[index], depths, fixed, settings)
         return found
 
-    interval = float((times[1:] - times[:-1]).median())
+    interval = float((times[1:] - times[:-1])[earlier:].median())
     return profile_minimum(cost, 0.0, _STEP * interval, 0.0, _LONGEST * interval, depths.numel())
 
 
@@ -132,7 +135,7 @@ def adjust_segments(
 
     Args:
         graph: all segments are archived; their poses and inverse depths are replaced.
-        segments: their numbers.
+        segments: their numbers; those of earlier recordings are left out.
         shutter: of the camera; a readout time of 0 is estimated from the longest segment.
         estimate: whether it is estimated, or a global shutter is assumed.
         options: of the adjustment.
@@ -140,7 +143,8 @@ def adjust_segments(
     Returns:
         ``readout`` in seconds, and ``readout_from``: ``camera``, ``images``, or ``none`` for a global shutter.
     """
-    segments = sorted({graph.world_of(segment) for segment in segments})  # joined ones are solved as one
+    own = (segment for segment in segments if segment >= graph.recording.segment)
+    segments = sorted({graph.world_of(segment) for segment in own})  # joined ones are solved as one
     source = "camera" if shutter.readout > 0 else "none"
     sizes = {segment: adjust_segment(graph, segment, options, shutter) for segment in segments}
     if estimate and source == "none" and sizes:

@@ -141,8 +141,7 @@ class PatchOdometry:
             if gap and state.initialised and not state.joining:
                 state.joining, state.skipped = str(gap), not gap.frozen
             seen = observe(self.model, image, camera, self.select, self.device)
-            intrinsics = seen.image_intrinsics.tolist()
-            state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": intrinsics}
+            state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
             estimate = self._take(View([record], seen))
             if len(state.waiting) >= self.config.patience:
                 estimate = self._begin_segment()
@@ -165,9 +164,8 @@ class PatchOdometry:
             self._close_segment(last=True)
             self.loops.complete(state.adjustable)
             if config.final_adjustment and state.adjustable:
-                state.info |= adjust_segments(
-                    self.graph, state.adjustable, state.shutter, config.estimate_readout, config.adjustment
-                )
+                options = config.estimate_readout, config.adjustment
+                state.info |= adjust_segments(self.graph, state.adjustable, state.shutter, *options)
         return self._result({})
 
     @torch.inference_mode()
@@ -193,9 +191,11 @@ class PatchOdometry:
         save_map(file, self)
 
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
+        begun, keyframes = self.graph.recording, self.graph.log.poses
         info = {
-            **self.state.info, **self.loops.information(), "keyframes": self.graph.log.keyframes, "seed": self.seed,
-            "initialised": bool(self.state.adjustable), "config": asdict(self.config),
+            **self.state.info, **self.loops.information(), "keyframes": sum(k >= begun.keyframe for k in keyframes),
+            "seed": self.seed, "initialised": any(k >= begun.segment for k in self.state.adjustable),
+            "config": asdict(self.config),
         }  # fmt: skip
         return result_of(self.graph, info, poses)
 
@@ -213,9 +213,8 @@ class PatchOdometry:
             evidence = self._updated(config.search_updates)
             supported = evidence.supports(config, searched=True)
         if not supported:
-            # The frame leaves the graph, so that the next ones are joined with the frames before it.
             window.restore(before)
-            self.graph.discard(len(window) - 1)
+            self.graph.discard(len(window) - 1)  # so that the next frames are joined with those before it
             state.waiting.append(view)
             return self._lose(record, NO_MATCH)
         self._place(record, keyframe.identifier, state.joining if state.skipped else "")
@@ -224,9 +223,8 @@ class PatchOdometry:
         state.tracked += 1
         if config.restart:
             leave_minimum(window, state.tracked)
-        pose_wc = self._pose_wc(len(window) - 1)
-        self._reduce()
-        return self._estimate(record, pose_wc, Status.TRACKING, evidence.confidence)
+        self._reduce()  # may correct the window
+        return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING, evidence.confidence)
 
     def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
@@ -248,8 +246,8 @@ class PatchOdometry:
             state.initialised = enough and evidence.supports(config)
             state.adjustable += [self.graph.segment] * state.initialised
             confidence = evidence.confidence
-        pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         self._reduce()
+        pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING, confidence)
 
     def _repeat(self, record: FrameRecord) -> Estimate:
@@ -259,7 +257,7 @@ class PatchOdometry:
         record.follow(past)
         if state.waiting and state.waiting[-1].records[-1] is past:
             state.waiting[-1].records.append(record)
-        state.last = state.last[0], replace(state.last[1], timestamp=record.timestamp)
+        state.last = state.last[0], replace(state.last[1], timestamp=record.timestamp, recovered=False)
         return state.last[1]
 
     def _place(self, record: FrameRecord, anchor: int, reason: str = "") -> None:
@@ -341,8 +339,10 @@ class PatchOdometry:
         self.loops.advance(self.state.adjustable)
 
     def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status, confidence: float) -> Estimate:
-        reason = record.reason if status is Status.LOST else ""
-        return Estimate(record.timestamp, pose_wc, status, confidence, self.graph.segment, reason)
+        graph, reason = self.graph, record.reason if status is Status.LOST else ""
+        recovered = pose_wc is not None and self.state.enter(graph.segment, graph.world_of(graph.segment))
+        segment = graph.segment - graph.recording.segment
+        return Estimate(record.timestamp, pose_wc, status, confidence, segment, reason, recovered)
 
     def _pose_wc(self, position: int) -> np.ndarray:
         return se3.inverse(self.window.poses_cw[position]).double().cpu().numpy()

@@ -29,6 +29,7 @@ class TrackerState:
         joining: cause of the interruption that the next frame has to be joined across; empty for none.
         skipped: the interruption is a gap in time.
         last: last working image and its estimate; None before the first frame.
+        world: that of the last pose of the segment (:meth:`KeyframeGraph.world_of`); -1 before its first one.
         shutter: timing of the rows of the last frame.
         info: metadata for run.json.
     """
@@ -44,9 +45,23 @@ class TrackerState:
     joining: str = ""
     skipped: bool = False
     last: tuple[np.ndarray, Estimate] | None = None
+    world: int = -1
     shutter: Shutter = Shutter(0.0, 1.0)
     info: dict[str, object] = field(default_factory=dict)
 
     def begin_segment(self) -> None:
         """Forget the segment that has been closed."""
-        self.initialised, self.joining, self.skipped, self.tracked = False, "", False, 0
+        self.initialised, self.joining, self.skipped, self.tracked, self.world = False, "", False, 0, -1
+
+    def enter(self, segment: int, world: int) -> bool:
+        """Record the world of a pose.
+
+        Args:
+            segment: number of its segment.
+            world: number of the earliest segment with the same world.
+
+        Returns:
+            True if the pose is the first one since the segment was joined to this world.
+        """
+        before, self.world = self.world, world
+        return world not in (segment, before)

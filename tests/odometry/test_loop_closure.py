@@ -123,6 +123,11 @@ def test_segments_that_show_the_same_place_are_joined(film):
     assert len(result.trajectory) == sum(map(len, result.segments)) >= 70
     assert evaluate(result.trajectory, truth).ate_percent < 0.5
     assert {estimate.segment for estimate in estimates} == {0, 1}
+    # From the estimate that tells of it on, poses are in the world of the first segment.
+    (first,) = [k for k, estimate in enumerate(estimates) if estimate.recovered]
+    told = [e for e in (*estimates[:34], *estimates[first:]) if e.status is dvo.Status.TRACKING]
+    rows = Trajectory(np.array([e.timestamp for e in told]), np.stack([e.pose_wc for e in told]))
+    assert estimates[first].segment == 1 and evaluate(rows, truth).ate_percent < 3.0
     _, _, apart = track(dark, loops=False, **alone)
     assert [segment.joined_to for segment in apart.segments] == [None, None]
 

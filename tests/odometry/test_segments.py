@@ -4,6 +4,7 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.graph.keyframe_log import KeyframeLog
+from dvo.graph.recordings import Recording
 from dvo.odometry.protocol import Break, Result, SparseMap
 from dvo.odometry.segments import breaks_of, result_of_log, segments_of
 
@@ -77,3 +78,21 @@ def test_the_trajectory_of_joined_segments_is_not_that_of_a_longer_one_apart():
     assert [segment.joined_to for segment in result.segments] == [None, None, 0]
     apart, main = result_of_log(log, {})
     assert main == 1 and len(apart.trajectory) == 4 and apart.longest == 1
+
+
+def test_a_recording_in_a_map_has_the_rows_of_its_own_segments():
+    log = log_of("0011x2233344")
+    begun = Recording(frame=5, keyframe=5, segment=2)
+    found, main = result_of_log(log, {}, None, {2: 2, 3: 0, 4: 0}, begun)
+    assert [(len(s), s.joined_to, s.in_map) for s in found.segments] == [
+        (2, None, False),
+        (3, None, True),
+        (2, 1, True),
+    ]
+    assert main == 1 and found.trajectory.timestamps.tolist() == [7.0, 8.0, 9.0, 10.0, 11.0]
+    assert (found.frames_read, found.frames_lost) == (7, 0)
+    assert [(b.start, b.end) for b in found.breaks] == [(6.0, 7.0), (9.0, 10.0)]
+    # The world of the map comes first, however short; without it the longest one.
+    short, main = result_of_log(log, {}, None, {4: 1}, begun)
+    assert main == 2 and short.trajectory.timestamps.tolist() == [10.0, 11.0]
+    assert result_of_log(log, {}, None, None, begun)[1] == 1

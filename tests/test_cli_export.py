@@ -1,4 +1,4 @@
-"""``dvo run --export`` and ``dvo export``."""
+"""``dvo run --export`` and ``dvo export`` of results and of maps."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dvo.data.euroc import read_state_groundtruth
 from dvo.data.trajectory import read_kitti_poses, read_tum
 from dvo.geometry.poses import pose_matrices
 from tests.command_line import arguments, errors, names, summary
+from tests.odometry.test_tracker import frames, tracker
 
 
 def same(found, expected):
@@ -105,3 +106,24 @@ def test_no_results_folder_and_no_new_folder(results, tmp_path, capsys):
     assert main(["export", str(results), str(results), "--to", "tum"]) == 2
     first, second = errors(capsys.readouterr().err)
     assert "not a results folder" in first and "is not an empty folder" in second
+
+
+def test_export_of_a_map_file(tmp_path, capsys):
+    odometry, file = tracker(), tmp_path / "a.dvo"
+    for frame in frames(12):
+        odometry.track(frame)
+    odometry.save(file)
+    assert main(["export", str(file), str(tmp_path / "early"), "--to", "kitti"]) == 0
+    assert "the sequence was not finished" in capsys.readouterr().err
+    result = odometry.finish()
+    odometry.save(file)
+    assert main(["export", str(file), str(tmp_path / "kitti"), "--to", "kitti"]) == 0
+    same(read_kitti_poses(tmp_path / "kitti" / "poses.txt"), result.trajectory.poses_wc)
+    assert main(["export", str(file), str(tmp_path / "colmap"), "--to", "colmap-text", "--segment", "0"]) == 0
+    assert (tmp_path / "colmap" / "sparse" / "0" / "points3D.txt").is_file()
+    out = capsys.readouterr().out
+    assert f"exported to {tmp_path / 'kitti'}: {len(result.trajectory)} poses" in out and " images, " in out
+    wrong = (["--to", "kitti", "--segment", "3"], "no segment 3"), (["--to", "obj"], "no export format 'obj'")
+    for options, match in wrong:
+        assert main(["export", str(file), str(tmp_path / "new"), *options]) == 2
+        assert match in capsys.readouterr().err and not (tmp_path / "new").exists()

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from dvo.metrics import Metrics, evaluate
     from dvo.models.weights import load_model
     from dvo.nets.config import ModelConfig
+    from dvo.odometry.calibrate import SelfCalibration, calibrate
     from dvo.odometry.config import TrackerConfig
     from dvo.odometry.load import load
     from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
@@ -50,12 +51,14 @@ _LAZY = {
     "ModelConfig": ("dvo.nets.config", "ModelConfig"),
     "Odometry": ("dvo.odometry.protocol", "Odometry"),
     "Result": ("dvo.odometry.protocol", "Result"),
+    "SelfCalibration": ("dvo.odometry.calibrate", "SelfCalibration"),
     "Segment": ("dvo.odometry.protocol", "Segment"),
     "SparseMap": ("dvo.odometry.protocol", "SparseMap"),
     "Status": ("dvo.odometry.protocol", "Status"),
     "TrackerConfig": ("dvo.odometry.config", "TrackerConfig"),
     "Trajectory": ("dvo.data.trajectory", "Trajectory"),
     "bundle_adjust": ("dvo.ba.layer", "bundle_adjust"),
+    "calibrate": ("dvo.odometry.calibrate", "calibrate"),
     "evaluate": ("dvo.metrics", "evaluate"),
     "export_map": ("dvo.export.formats", "export_map"),
     "export_trajectory": ("dvo.export.formats", "export_trajectory"),
@@ -70,9 +73,9 @@ _LAZY = {
 
 __all__ = [
     "BADamping", "BAOptions", "BAResult", "Break", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "Metrics",
-    "ModelConfig", "Odometry", "Result", "Segment", "SparseMap", "Status", "TrackerConfig", "Trajectory", "__version__",
-    "bundle_adjust", "evaluate", "export_map", "export_trajectory", "load", "load_map", "load_model", "losses", "open",
-    "run", "se3",
+    "ModelConfig", "Odometry", "Result", "Segment", "SelfCalibration", "SparseMap", "Status", "TrackerConfig",
+    "Trajectory", "__version__", "bundle_adjust", "calibrate", "evaluate", "export_map", "export_trajectory", "load",
+    "load_map", "load_model", "losses", "open", "run", "se3",
 ]  # fmt: skip
 
 

@@ -53,7 +53,12 @@ def build_parser() -> argparse.ArgumentParser:
 
     run = commands.add_parser("run", help="track a video, a folder of images or a dataset sequence", epilog=EXIT_CODES)
     run.add_argument("source", metavar="SOURCE", help="video, folder of images, or dataset sequence folder")
-    run.add_argument("--calib", metavar="FILE", help="'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML file")
+    run.add_argument(
+        "--calib",
+        metavar="FILE",
+        help="'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML file (default: that of a data set, else the "
+        "focal length is found in the images)",
+    )
     _tracking_options(run)
     run.add_argument("--stride", type=_positive_int, default=1, metavar="N", help="track every N-th frame")
     times = run.add_mutually_exclusive_group()

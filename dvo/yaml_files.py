@@ -40,6 +40,21 @@ def read_yaml(file: str | Path, remedy: str = "fix the file") -> Any:
     return parse_yaml(read_text(path, remedy), path, remedy=remedy)
 
 
+def is_shell_pipe(path: Path) -> bool:
+    """True for a pipe that a shell has opened, as for ``<(command)`` and ``/dev/stdin``: reading it comes to an end.
+
+    A named pipe might wait for a writer forever.
+
+    Args:
+        path: any.
+    """
+    opened = str(path) == "/dev/stdin" or str(path.parent) in ("/dev/fd", "/proc/self/fd")
+    try:
+        return opened and path.is_fifo()
+    except (OSError, ValueError):
+        return False
+
+
 def read_text(file: Path, remedy: str = "fix the file") -> str:
     """Read a text file in UTF-8, with a byte order mark or without, of :data:`MAX_BYTES` at most.
 
@@ -50,7 +65,7 @@ def read_text(file: Path, remedy: str = "fix the file") -> str:
     Raises:
         DvoError: no such file, a larger one, or another encoding.
     """
-    if not file.is_file():
+    if not (file.is_file() or is_shell_pipe(file)):
         raise DvoError("no such file", file=file, remedy=remedy)
     try:
         with file.open("rb") as stream:

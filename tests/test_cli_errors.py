@@ -37,12 +37,6 @@ def test_missing_source(tmp_path, capsys):
     assert "nowhere.mp4" in error_of(["run", str(tmp_path / "nowhere.mp4")], tmp_path, capsys)
 
 
-def test_no_calibration(image_folder, tmp_path, capsys):
-    (image_folder.parent / "calib.txt").unlink()
-    line = error_of(["run", str(image_folder)], tmp_path, capsys)
-    assert "calib" in line and "--calib" in line
-
-
 def test_calibration_file_missing(image_folder, tmp_path, capsys):
     assert "gone.txt" in error_of(["run", str(image_folder), "--calib", "gone.txt"], tmp_path, capsys)
 

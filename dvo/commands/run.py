@@ -15,6 +15,7 @@ import torch
 
 import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
+from dvo.commands.camera import with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.commands.maps import check_place, load_in_map
 from dvo.commands.observers import open_observers
@@ -80,6 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         times=arguments.times,
         fps=arguments.fps,
         groundtruth=arguments.groundtruth,
+        guess=True,
     )
     for warning in source.warnings:
         warn(warning, "note")
@@ -101,12 +103,13 @@ def run(arguments: argparse.Namespace) -> int:
         check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
         facts["map"] = arguments.map
+        source, camera = with_calibration(source, odometry, arguments, device, folder)
         return track(
             odometry,
             source,
             folder,
             stride=arguments.stride,
-            facts=facts,
+            facts=facts | camera,
             export=arguments.export,
             save_map=save_map,
             observers=observers,

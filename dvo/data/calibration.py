@@ -9,11 +9,16 @@ from typing import Any
 import numpy as np
 
 from dvo.data.files import MAX_NUMBER, is_file
+from dvo.data.named_values import read_named_values
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
-from dvo.yaml_files import parse_yaml, read_text
+from dvo.yaml_files import is_shell_pipe, parse_yaml, read_text
 
 _LINE = "write 'fx fy cx cy [k1 k2 p1 p2 [k3]]' on one line, or a YAML with fx, fy, cx, cy"
+_TURN = (
+    "the images stand upright, the calibration is that of the sensor: turn it too (fx and fy, and cx and cy, change "
+    "places)"
+)
 _MODELS: dict[str, DistortionModel] = {
     "": "none",
     "none": "none",
@@ -76,7 +81,7 @@ class Calibration:
                 f"calibration is for {self.width}x{self.height} images, but these are {width}x{height}",
                 file=self.file,
                 field="intrinsics",
-                remedy=remedy,
+                remedy=_TURN if (self.width, self.height) == (height, width) else remedy,
             )
         for name, focal in (("fx", self.fx), ("fy", self.fy)):
             if not 0.1 * width <= focal <= 20 * width:  # NaN fails too
@@ -90,7 +95,14 @@ class Calibration:
             numbers = (self.fx, self.fy, self.cx, self.cy)
             return Camera(*numbers, width, height, self.model, self.coefficients, self.readout)
         except DvoError as error:
-            raise DvoError(error.message, file=self.file, field=error.field, remedy=error.remedy) from None
+            turned = error.field == "intrinsics" and self._fits_turned(width, height)
+            remedy = _TURN if turned else error.remedy or remedy
+            raise DvoError(error.message, file=self.file, field=error.field, remedy=remedy) from None
+
+    def _fits_turned(self, width: int, height: int) -> bool:
+        """True if the principal point is not near the centre of these images, but near that of the same ones turned."""
+        upright, turned = (abs(self.cx - w / 2) + abs(self.cy - h / 2) for w, h in ((width, height), (height, width)))
+        return width != height and turned < min(0.1 * max(width, height), 0.5 * upright)
 
     def doubts(self, width: int, height: int) -> list[str]:
         """Oddities of the calibration for images of this size, in sentences; nothing in it need be wrong.
@@ -99,7 +111,12 @@ class Calibration:
             width, height: size of the images in pixels.
         """
         found = []
-        if abs(self.cx - width / 2) > width / 4 or abs(self.cy - height / 2) > height / 4:
+        if self._fits_turned(width, height):
+            found.append(
+                f"the principal point ({self.cx:g}, {self.cy:g}) is the centre of {height}x{width} images, but these "
+                f"are {width}x{height}: {_TURN}"
+            )
+        elif abs(self.cx - width / 2) > width / 4 or abs(self.cy - height / 2) > height / 4:
             found.append(
                 f"the principal point ({self.cx:g}, {self.cy:g}) lies far from the centre of the {width}x{height} "
                 "images: is the calibration that of another resolution?"
@@ -113,12 +130,12 @@ def read_calibration(path: Path | str) -> Calibration:
     """Read a calibration file.
 
     Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` (radial-tangential) separated by blanks or commas, ``#`` comments;
-    or a 3x3 matrix K on three lines. YAML: ``fx, fy, cx, cy`` with optional ``width, height,
-    model: none|radtan|fisheye, coefficients``; EuRoC ``sensor.yaml``; Kalibr camchain (its ``cam0``); ROS camera_info
-    and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state ``depth_scale`` (ORB-SLAM:
-    ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too;
-    and ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global one, if it is left
-    out; Kalibr's ``line_delay`` is not read).
+    the same by name, ``fx=525 fy=525 cx=320 cy=240``; or a 3x3 matrix K on three lines. YAML: ``fx, fy, cx, cy`` with
+    optional ``width, height, model: none|radtan|fisheye, coefficients``; EuRoC ``sensor.yaml``; Kalibr camchain (its
+    ``cam0``); ROS camera_info and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state
+    ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is
+    ``fx`` times it) too; and ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global
+    one, if it is left out; Kalibr's ``line_delay`` is not read).
 
     Args:
         path: text or YAML file.
@@ -133,7 +150,7 @@ def read_calibration(path: Path | str) -> Calibration:
         525.0
     """
     path = Path(path)
-    if not is_file(path):
+    if not (is_file(path) or is_shell_pipe(path)):
         raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
     text = read_text(path, _LINE)
     looks_yaml = path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
@@ -147,8 +164,9 @@ def read_calibration(path: Path | str) -> Calibration:
 
 
 def _from_text(text: str, path: Path) -> Calibration:
-    rows: list[list[float]] = []
-    for line in text.splitlines():
+    named = read_named_values(text, path, _LINE)
+    rows: list[list[float]] = [] if named is None else [named]
+    for line in text.splitlines() if named is None else ():
         fields = line.split("#")[0].replace(",", " ").replace(";", " ").split()
         if not fields:
             continue

@@ -13,6 +13,7 @@ import numpy as np
 
 from dvo.data.calibration import Calibration, read_calibration
 from dvo.data.files import is_file, lookups
+from dvo.data.focal_guess import FocalGuess, guess_focal
 from dvo.data.frame import Frame, InertialSamples, StereoView
 from dvo.data.groundtruth import read_groundtruth
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
@@ -23,6 +24,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import Undistorter, needs_undistortion
+from dvo.yaml_files import is_shell_pipe
 
 
 class Source:
@@ -36,6 +38,8 @@ class Source:
         path: file or folder that was opened.
         camera: the camera of every frame (without distortion if frames are undistorted).
         recorded_camera: the camera as calibrated, distortion included.
+        guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
+        turned: degrees by which the frames of a video are turned to stand upright, as the file asks for.
         stride: every how many-th frame is read.
         frame_count: frames to expect, the stride taken into account; None if a video does not say. A video's header may
             promise more than can be read.
@@ -62,6 +66,20 @@ class Source:
         count = recording.frame_count
         self.frame_count: int | None = None if count is None else -(-count // stride)
         self._doubts = doubts
+        self.guess: FocalGuess | None = None
+        self.turned: int = getattr(recording, "turned", 0)
+
+    def recalibrated(self, calibration: Calibration) -> Source:
+        """The same recording with another calibration.
+
+        Args:
+            calibration: of the images as recorded.
+
+        Raises:
+            DvoError: intrinsics that do not fit the images.
+        """
+        camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
+        return Source(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
 
     def __len__(self) -> int:
         """``frame_count``.
@@ -191,6 +209,7 @@ def open_source(
     groundtruth: Path | str | None = None,
     undistort: bool = True,
     reader: str | None = None,
+    guess: bool = False,
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
     ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it).
@@ -209,6 +228,8 @@ def open_source(
         undistort: resample images, depth and right images to pinhole cameras; otherwise frames carry the distorted
             cameras.
         reader: name of the reader (``dvo.data.registry.READERS``); None: the first whose layout matches.
+        guess: where there is no calibration, guess the focal length (:mod:`dvo.data.focal_guess`), for
+            :func:`dvo.calibrate`.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -242,11 +263,15 @@ def open_source(
         recording = find_reader(path, reader).open(path, request)
     first = _first_frame(recording)
     calibration = recording.calibration if request.calibration is None else request.calibration
-    if calibration is None:
-        raise _no_calibration(path)
     height, width = first.image.shape[:2]
-    doubts = calibration.doubts(width, height)
+    guessed = None
+    if calibration is None:
+        if not guess:
+            raise _no_calibration(path)
+        guessed = guess_focal(recording.images[0] if isinstance(recording, ImageRecording) else path, width, height)
+        calibration = guessed.calibration
     turned = getattr(recording, "turned", 0)
+    doubts = calibration.doubts(width, height)
     if turned and calibration.readout:  # rows of the images are columns of the sensor, or come in reverse order
         calibration = replace(calibration, readout=0.0)
         doubts.append(f"the video is turned by {turned} degrees: the readout of the calibration was not used")
@@ -255,7 +280,9 @@ def open_source(
     if groundtruth is not None:
         truth = read_groundtruth(_locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
     try:
-        return Source(recording, camera, truth, stride, undistort, doubts)
+        found = Source(recording, camera, truth, stride, undistort, doubts)
+        found.guess = guessed
+        return found
     except DvoError as error:  # the lens model does not know its file
         raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None
 
@@ -264,7 +291,7 @@ def _locate(given: Path | str, source: Path, field: str) -> Path:
     path = Path(given)
     base = source if source.is_dir() else source.parent
     for option in (path, base / path):
-        if is_file(option):
+        if is_file(option) or (field == "calib" and is_shell_pipe(option)):
             return option
     raise DvoError("no such file", file=path, field=field, remedy=f"give an existing file to --{field}")
 
@@ -288,5 +315,6 @@ def _no_calibration(path: Path) -> DvoError:
         "no calibration",
         file=path,
         field="calib",
-        remedy=f"give --calib FILE{hint}: a text file with 'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML",
+        remedy=f"give --calib FILE{hint}: a text file with 'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML; or "
+        "guess=True, and dvo.calibrate",
     )

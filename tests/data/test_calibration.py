@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import pytest
 
 from dvo.data import Calibration, read_calibration
@@ -179,3 +182,30 @@ def test_readout_is_0_unless_it_is_stated(make):
     assert read_calibration(make.text("c.txt", "500 510 320 240")).readout == 0
     with pytest.raises(DvoError, match="0 to 1 s"):
         Calibration(500, 510, 320, 240, readout=20).camera(640, 480)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1080, 1920), (720, 1280)])
+def test_a_calibration_that_is_not_turned_with_the_images_is_noted(width, height):
+    found = Calibration(1500, 1500, (height - 1) / 2, (width - 1) / 2)
+    assert any("turn it too" in doubt for doubt in found.doubts(width, height))
+    assert Calibration(1500, 1500, (width - 1) / 2, (height - 1) / 2).doubts(width, height) == []
+    stated = Calibration(1500, 1500, (height - 1) / 2, (width - 1) / 2, width=height, height=width)
+    with pytest.raises(DvoError, match="turn it too"):
+        stated.camera(width, height)
+
+
+def test_a_principal_point_outside_of_turned_images_names_the_turn():
+    with pytest.raises(DvoError, match="lies outside.*turn it too"):
+        Calibration(1500, 1500, 959.5, 359.5).camera(720, 1920)
+    with pytest.raises(DvoError, match="scale it"):
+        Calibration(1500, 1500, 2000, 2000).camera(720, 1920)
+
+
+@pytest.mark.parametrize("kind", ["fd", "stdin"])
+def test_a_calibration_from_a_pipe_of_the_shell(tmp_path, kind):
+    code = "from dvo.data import read_calibration; import sys; print(read_calibration(sys.argv[1]).fx)"
+    place = {"fd": "/dev/fd/0", "stdin": "/dev/stdin"}[kind]
+    done = subprocess.run(
+        [sys.executable, "-c", code, place], input="500 510 320 240\n", capture_output=True, text=True
+    )
+    assert done.stdout == "500.0\n", done.stderr

@@ -1,0 +1,67 @@
+"""Camera of ``dvo run``: the calibration of the source, or a focal length that is found in the images."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dvo.commands.console import TrackingProgress, say, seed_everything, warn
+from dvo.data.source import Source
+from dvo.odometry.calibrate import SelfCalibration, calibrate, is_foreign
+from dvo.odometry.protocol import Odometry
+from dvo.odometry.tracker import PatchOdometry
+
+CALIBRATION = "calib.txt"
+"""Calibration file in the results folder of a run without a calibration, for the next run."""
+
+
+def with_calibration(
+    source: Source, odometry: Odometry, arguments: argparse.Namespace, device: torch.device, folder: Path
+) -> tuple[Source, dict[str, Any]]:
+    """Find the focal length of a source that was opened with a guess, print it and write it into a calibration file.
+
+    Args:
+        source: to track; one with a calibration is returned as it is.
+        odometry: that will track it; if it keeps no measurements, the weights ``small`` find the focal length.
+        arguments: of the command line.
+        device: of all computation.
+        folder: results folder.
+
+    Returns:
+        The source with the camera to track it with, and the entries ``camera`` and ``self_calibration`` of run.json.
+
+    Raises:
+        DvoError: no frame could be read.
+        OSError: the calibration file cannot be written.
+    """
+    found, file = None, folder / CALIBRATION
+    if source.guess is not None:
+        warn(_announcement(source), "note")
+        weights = arguments.weights if isinstance(odometry, PatchOdometry) else "small"
+        with TrackingProgress(None) as progress:
+            found = calibrate(source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update)
+        seed_everything(arguments.seed)  # the same bytes as a run with the calibration file
+        say(str(found))
+        if not found.write(file):
+            warn(f"{file} is not a file of dvo, and was not replaced")
+        source = source.recalibrated(found.calibration)
+    elif not is_foreign(file):
+        file.unlink(missing_ok=True)  # of an earlier run
+    camera = {**asdict(source.recorded_camera), "turned": source.turned}
+    return source, {"camera": camera, "self_calibration": None if found is None else _facts(found)}
+
+
+def _announcement(source: Source) -> str:
+    near = (folder / CALIBRATION for folder in (source.path, source.path.parent))
+    hint = next((f" ({file} is there: is it the one?)" for file in near if file.is_file()), "")
+    return f"no calibration: looking for the focal length in the images; --calib FILE gives one{hint}"
+
+
+def _facts(found: SelfCalibration) -> dict[str, Any]:
+    size = [found.width, found.height]
+    facts = {name: getattr(found, name) for name in ("focal", "deviation", "source", "frames", "reason")}
+    return {**facts, "image_size": size, "guess": asdict(found.guess)}

@@ -1,0 +1,270 @@
+"""Calibration of a camera from its own images: ``dvo.calibrate``.
+
+The beginning of a clip is tracked with a guess of the focal length, which is then estimated from the measurements
+(:mod:`dvo.odometry.focal_length`); measurements made with a focal length far off are worse ones, so this is repeated
+with what was found. The motion may not tell the focal length; then the guess is kept, and the result says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dvo.data.calibration import Calibration
+from dvo.data.focal_guess import FocalGuess, centred, guess_from_angle
+from dvo.data.frame import Frame
+from dvo.data.output import replaced
+from dvo.errors import DvoError
+from dvo.odometry.focal_length import FocalProfile, find_focal
+from dvo.odometry.load import load
+from dvo.odometry.protocol import Estimate, Odometry, Status
+from dvo.settings import check_settings
+
+if TYPE_CHECKING:
+    import torch
+
+SELF_CALIBRATED = "self-calibration"
+"""Source of a focal length that was found in the images."""
+
+_HEADER = "# focal length found by dvo; a run without a calibration replaces this file\n"
+_RANGES = {
+    "frames": (3, 10**6),
+    "rounds": (1, 100),
+    "interval": (0, 1e6),
+    "settled": (0, 10),
+    "min_contrast": (0, 100),
+    "max_deviation": (0, 10),
+    "inflation": (1, 1000),
+    "floor": (0, 1),
+}
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Options of :func:`calibrate`.
+
+    Attributes:
+        frames: tracked frames that the focal length is estimated from. If they cannot tell it, twice as many are tried.
+        rounds: times that they are tracked, at most.
+        interval: seconds between frames, at least; of a faster camera frames are left out.
+        settled: change of the logarithm of the focal length in a round below which it has settled.
+        min_contrast: increase of the cost at focal lengths a fifth off below which the motion does not tell.
+        max_deviation: largest standard deviation of the logarithm of the focal length that is believed.
+        inflation: factor of the standard deviation that the curvature of the cost gives; measurements of a patch in
+            several frames share their errors.
+        floor: standard deviation, of the logarithm, of what is not modelled (distortion, principal point).
+
+    Raises:
+        DvoError: a value of another type or out of range.
+    """
+
+    frames: int = 120
+    rounds: int = 4
+    interval: float = 0.03
+    settled: float = 0.02
+    min_contrast: float = 0.02
+    max_deviation: float = 0.1
+    inflation: float = 3.0
+    floor: float = 0.02
+
+    def __post_init__(self) -> None:
+        check_settings(self, _RANGES)
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """Focal length of a camera without a calibration.
+
+    Attributes:
+        focal: fx and fy, pixels.
+        deviation: standard deviation, pixels.
+        source: ``self-calibration``, or that of the guess that was kept (:class:`dvo.data.focal_guess.FocalGuess`).
+        width, height: of the images, pixels.
+        frames: tracked frames that it was estimated from.
+        reason: cause for keeping the guess; empty for a focal length that was found.
+        guess: at the start.
+    """
+
+    focal: float
+    deviation: float
+    source: str
+    width: int
+    height: int
+    frames: int
+    reason: str
+    guess: FocalGuess
+
+    @property
+    def found(self) -> bool:
+        """True if the focal length was found in the images."""
+        return self.source == SELF_CALIBRATED
+
+    @property
+    def calibration(self) -> Calibration:
+        """Square pixels, principal point at the centre, no distortion."""
+        return centred(self.focal, self.width, self.height)
+
+    def __str__(self) -> str:
+        """Sentence for people."""
+        value = f"{self.focal:.0f} +- {self.deviation:.0f} px"
+        if self.found:
+            return f"focal length {value} (self-calibrated from {self.frames} frames)"
+        origin = {"prior": "the usual angle of view", "exif": "EXIF data", "video": "metadata of the video"}
+        return f"focal length: cannot tell ({self.reason}): keeps {value}, from {origin.get(self.source, self.source)}"
+
+    def write(self, file: Path | str) -> bool:
+        """Write a calibration file for the next run, unless a file that somebody else has written is in its place.
+
+        Args:
+            file: text file, ``fx fy cx cy``.
+
+        Returns:
+            Whether it was written.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        if is_foreign(Path(file)):
+            return False
+        c = self.calibration
+        with replaced(Path(file)) as part:
+            part.write_text(f"{_HEADER}# {self}\n{c.fx:.3f} {c.fy:.3f} {c.cx:.1f} {c.cy:.1f}\n", encoding="utf-8")
+        return True
+
+
+def is_foreign(file: Path) -> bool:
+    """True for a file that :meth:`SelfCalibration.write` has not written.
+
+    Args:
+        file: may be missing.
+    """
+    if not file.exists():
+        return False
+    with file.open("rb") as stream:
+        return stream.read(len(_HEADER)) != _HEADER.encode()
+
+
+def calibrate(
+    frames: Iterable[Frame],
+    guess: FocalGuess | None = None,
+    *,
+    weights: str = "small",
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    options: CalibrationOptions = CalibrationOptions(),  # noqa: B008 (frozen)
+    on_frame: Callable[[Frame, Estimate | None], None] | None = None,
+) -> SelfCalibration:
+    """Estimate the focal length of the camera that has recorded a clip.
+
+    Args:
+        frames: from the beginning of the clip: a :class:`dvo.data.Source`, or a list. Their cameras are not used, but
+            for the readout time. An iterator is read as far as needed and its frames are kept in memory.
+        guess: to begin with; None for that of the source, or the usual angle of view.
+        weights: of the architecture ``patch_vo``.
+        device, seed: as in :func:`dvo.load`.
+        options: number of frames, and what is believed.
+        on_frame: called after each frame of each round.
+
+    Returns:
+        The focal length with its standard deviation, or the guess if the images do not tell.
+
+    Raises:
+        DvoError: no frames, or weights of another architecture.
+
+    Example:
+        >>> source = dvo.open("video.mp4", guess=True)
+        >>> found = dvo.calibrate(source)
+        >>> print(found)
+        focal length 531 +- 9 px (self-calibrated from 120 frames)
+        >>> run = dvo.run(dvo.load("small"), source.recalibrated(found.calibration))
+    """
+    limit = 8 * options.frames  # with those that are left out or lost
+    clip = list(islice(frames, limit)) if isinstance(frames, Iterator) else frames
+    first = next(iter(clip), None)
+    if first is None:
+        raise DvoError("no frames", field="frames", remedy="give a video or a folder with images")
+    width, height = first.camera.width, first.camera.height
+    if guess is None:
+        guess = getattr(frames, "guess", None) or guess_from_angle(width, height)
+
+    def result(focal: float, deviation: float, source: str, count: int, reason: str = "") -> SelfCalibration:
+        return SelfCalibration(focal, deviation, source, width, height, count, reason, guess)
+
+    focal, wanted, reason = guess.focal, options.frames, ""
+    start, count = focal, 0
+    for number in range(options.rounds):
+        odometry = load(weights, device=device, seed=seed, loops=False)
+        seen = _track(odometry, islice(clip, limit), focal, wanted, options.interval, on_frame)
+        profile, count = _profile(odometry), seen
+        deviation = math.hypot(options.inflation * profile.minimum.deviation, options.floor)
+        reason = _doubt(profile, deviation, focal, guess, options)
+        if reason:
+            if seen < wanted or wanted > options.frames or number + 1 == options.rounds:
+                break
+            focal, wanted = start, 2 * wanted
+            continue
+        before, focal = focal, focal * math.exp(profile.minimum.value)
+        if abs(math.log(focal / before)) <= options.settled or number + 1 == options.rounds:
+            return result(focal, deviation * focal, SELF_CALIBRATED, count)
+    return result(guess.focal, guess.deviation, guess.source, count, reason)
+
+
+def _track(
+    odometry: Odometry,
+    frames: Iterable[Frame],
+    focal: float,
+    wanted: int,
+    interval: float,
+    on_frame: Callable[[Frame, Estimate | None], None] | None,
+) -> int:
+    """Track frames with a focal length until as many as wanted have a pose; gives their number."""
+    tracked, last = 0, -math.inf
+    for frame in frames:
+        if frame.timestamp < last + interval:
+            continue
+        last, height, width = frame.timestamp, frame.camera.height, frame.camera.width
+        camera = replace(centred(focal, width, height), readout=frame.camera.readout).camera(width, height)
+        estimate = odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera))
+        if on_frame is not None:
+            on_frame(frame, estimate)
+        tracked += estimate.status is Status.TRACKING
+        if tracked >= wanted:
+            break
+    odometry.finish()
+    return tracked
+
+
+def _profile(odometry: Odometry) -> FocalProfile:
+    """Profile of the longest segment."""
+    from dvo.odometry.tracker import PatchOdometry
+
+    if not isinstance(odometry, PatchOdometry):
+        raise DvoError(
+            f"the odometry {odometry.name} keeps no measurements", field="weights", remedy="use weights of patch_vo"
+        )
+    graph, state = odometry.graph, odometry.state
+    segments = state.adjustable or [0]
+    longest = max(segments, key=lambda segment: len(graph.members(segment)))
+    readout = state.info.get("readout", 0.0)
+    shutter = replace(state.shutter, readout=readout if isinstance(readout, float) else 0.0)
+    return find_focal(graph, longest, shutter, odometry.config.adjustment)
+
+
+def _doubt(
+    profile: FocalProfile, deviation: float, focal: float, guess: FocalGuess, options: CalibrationOptions
+) -> str:
+    """Reason for not believing a minimum; empty for one that is believed."""
+    if not np.isfinite(deviation) and profile.contrast == 0 and profile.minimum.gain == 0:
+        return "too few frames could be tracked"
+    if not deviation <= options.max_deviation or profile.contrast < options.min_contrast:
+        return "the motion does not tell: the measurements fit a wide range of focal lengths"
+    found = math.log(focal / guess.focal) + profile.minimum.value
+    if abs(found) > 4 * guess.deviation / guess.focal:
+        return f"the measurements fit {math.exp(found) * guess.focal:.0f} px best, which is hardly possible"
+    return ""

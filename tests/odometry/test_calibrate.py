@@ -1,0 +1,73 @@
+"""Calibration of a camera from its images: ``dvo.calibrate``."""
+
+from dataclasses import replace
+
+import pytest
+
+import dvo
+from dvo.data import read_calibration
+from dvo.data.focal_guess import FocalGuess, guess_from_angle
+from dvo.errors import DvoError
+from dvo.odometry.calibrate import CalibrationOptions, SelfCalibration, calibrate
+from dvo.synth.sequence import make_sequence
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return list(
+        make_sequence(77, frames=45, height=144, width=192, fps=30.0, family="room", kind="handheld", apart=True)
+    )
+
+
+@pytest.fixture(scope="module")
+def found(clip):
+    guess = FocalGuess(1.12 * clip[0].camera.fx, 0.3 * clip[0].camera.fx, "given", 192, 144)
+    return calibrate(clip, guess, options=CalibrationOptions(rounds=2))
+
+
+def test_the_focal_length_of_a_rendered_walk_is_found(clip, found):
+    camera = clip[0].camera
+    assert found.found and found.reason == ""
+    assert found.focal == pytest.approx((camera.fx + camera.fy) / 2, rel=0.04)
+    assert 0 < found.deviation < 0.1 * found.focal
+    assert f"focal length {found.focal:.0f} +- {found.deviation:.0f} px (self-calibrated from" in str(found)
+
+
+def test_the_same_seed_and_an_iterator_give_the_same_bytes(clip):
+    options = CalibrationOptions(frames=20, rounds=1)
+    assert calibrate(iter(clip), options=options) == calibrate(clip, options=options)
+
+
+def test_the_file_for_the_next_run(tmp_path, found):
+    file = tmp_path / "calib.txt"
+    assert found.write(file) and found.write(file)
+    camera = read_calibration(file).camera(192, 144)
+    assert camera.fx == camera.fy == pytest.approx(found.focal, abs=1e-3) and (camera.cx, camera.cy) == (95.5, 71.5)
+    file.write_text("1 2 3 4\n")
+    assert not found.write(file) and file.read_text() == "1 2 3 4\n"
+
+
+def test_a_still_camera_keeps_the_guess(clip):
+    still = [replace(clip[0], index=i, timestamp=i / 30) for i in range(30)]
+    found = calibrate(still)
+    guess = guess_from_angle(192, 144)
+    assert (found.focal, found.deviation, found.source) == (guess.focal, guess.deviation, "prior") and not found.found
+    assert "cannot tell (too few frames could be tracked): keeps" in str(found)
+
+
+def test_frames_of_a_fast_camera_are_left_out(clip):
+    options = CalibrationOptions(rounds=1, interval=0.06)
+    seen = []
+    calibrate(clip[:12], options=options, on_frame=lambda frame, estimate: seen.append(frame.index))
+    assert seen == list(range(0, 12, 2))
+
+
+def test_it_is_part_of_the_public_interface():
+    assert dvo.calibrate is calibrate and dvo.SelfCalibration is SelfCalibration
+
+
+def test_bad_input_is_named():
+    with pytest.raises(DvoError, match="no frames"):
+        calibrate([])
+    with pytest.raises(DvoError, match="rounds"):
+        CalibrationOptions(rounds=0)

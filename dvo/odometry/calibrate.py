@@ -86,7 +86,7 @@ class SelfCalibration:
         deviation: standard deviation, pixels.
         source: ``self-calibration``, or that of the guess that was kept (:class:`dvo.data.focal_guess.FocalGuess`).
         width, height: of the images, pixels.
-        frames: tracked frames that it was estimated from.
+        frames: number of frames that it was estimated from.
         reason: cause for keeping the guess; empty for a focal length that was found.
         guess: at the start.
     """
@@ -196,23 +196,45 @@ def calibrate(
     def result(focal: float, deviation: float, source: str, count: int, reason: str = "") -> SelfCalibration:
         return SelfCalibration(focal, deviation, source, width, height, count, reason, guess)
 
-    focal, wanted, reason = guess.focal, options.frames, ""
-    start, count = focal, 0
+    focal, wanted, reason, count = guess.focal, options.frames, "", 0
+    walk: list[tuple[float, float]] = []
     for number in range(options.rounds):
         odometry = load(weights, device=device, seed=seed, loops=False)
         seen = _track(odometry, islice(clip, limit), focal, wanted, options.interval, on_frame)
-        profile, count = _profile(odometry), seen
+        profile, count = _profile(odometry)
         deviation = math.hypot(options.inflation * profile.minimum.deviation, options.floor)
         reason = _doubt(profile, deviation, focal, guess, options)
+        is_last = number + 1 == options.rounds
         if reason:
-            if seen < wanted or wanted > options.frames or number + 1 == options.rounds:
+            if seen < wanted or wanted > options.frames or is_last:
                 break
-            focal, wanted = start, 2 * wanted
+            focal, wanted, walk = guess.focal, 2 * wanted, []
             continue
-        before, focal = focal, focal * math.exp(profile.minimum.value)
-        if abs(math.log(focal / before)) <= options.settled or number + 1 == options.rounds:
+        walk.append((math.log(focal), profile.minimum.value))
+        step = _step(walk)
+        focal *= math.exp(step)
+        if abs(step) <= options.settled or is_last:
             return result(focal, deviation * focal, SELF_CALIBRATED, count)
     return result(guess.focal, guess.deviation, guess.source, count, reason)
+
+
+def _step(walk: list[tuple[float, float]]) -> float:
+    """Step to the focal length at which the measurements ask for no further one, in logarithms.
+
+    Measurements lean towards the focal length that they were tracked with, so that a step that they ask for is too
+    short. The secant through the last two rounds tells by how much.
+
+    Args:
+        walk: logarithm of the focal length of each round, and the step that its measurements ask for.
+
+    Returns:
+        The last step, lengthened 2.5 times at most.
+    """
+    (at, step) = walk[-1]
+    if len(walk) == 1 or at == walk[-2][0]:
+        return step
+    slope = (walk[-2][1] - step) / (at - walk[-2][0])
+    return step / min(max(slope, 0.4), 1.0)
 
 
 def _track(
@@ -240,8 +262,8 @@ def _track(
     return tracked
 
 
-def _profile(odometry: Odometry) -> FocalProfile:
-    """Profile of the longest segment."""
+def _profile(odometry: Odometry) -> tuple[FocalProfile, int]:
+    """Profile of the longest segment, and its number of frames."""
     from dvo.odometry.tracker import PatchOdometry
 
     if not isinstance(odometry, PatchOdometry):
@@ -253,7 +275,7 @@ def _profile(odometry: Odometry) -> FocalProfile:
     longest = max(segments, key=lambda segment: len(graph.members(segment)))
     readout = state.info.get("readout", 0.0)
     shutter = replace(state.shutter, readout=readout if isinstance(readout, float) else 0.0)
-    return find_focal(graph, longest, shutter, odometry.config.adjustment)
+    return find_focal(graph, longest, shutter, odometry.config.adjustment), len(graph.members(longest))
 
 
 def _doubt(

@@ -127,7 +127,7 @@ class TrackerConfig:
     estimate_readout: bool = True
     loops: bool = True
     robust: float = 0.3
-    sigma: float = 0.064
+    sigma: float = 0.061
     restart: bool = True
     updates: int = 1
     initial_motion: float = 0.5

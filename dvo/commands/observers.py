@@ -7,8 +7,56 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from dvo.commands.console import warn
 from dvo.commands.view_options import VIEWER
+from dvo.data.frame import Frame
 from dvo.odometry.observer import Observer
+from dvo.odometry.protocol import Estimate, Odometry
+from dvo.odometry.session import Run
+
+
+class GuardedObserver:
+    """Observer that ends with a warning at its first failure, which costs no frame and no result of the run.
+
+    Args:
+        observer: to call.
+        option: of the command line that asks for it, for the warning.
+    """
+
+    def __init__(self, observer: Observer, option: str) -> None:
+        self._observer, self._option, self._failed = observer, option, False
+
+    def begin(self, odometry: Odometry) -> None:
+        """See :class:`dvo.odometry.observer.Observer`."""
+        if not self._failed:
+            with self._guard():
+                self._observer.begin(odometry)
+
+    def update(self, frame: Frame, estimate: Estimate | None) -> None:
+        """See :class:`dvo.odometry.observer.Observer`."""
+        if not self._failed:
+            with self._guard():
+                self._observer.update(frame, estimate)
+
+    def finish(self, run: Run) -> None:
+        """See :class:`dvo.odometry.observer.Observer`."""
+        if not self._failed:
+            with self._guard():
+                self._observer.finish(run)
+
+    def close(self) -> None:
+        """Release files and connections, also after a failure."""
+        with self._guard():
+            self._observer.close()
+
+    @contextlib.contextmanager
+    def _guard(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            if not self._failed:
+                warn(f"{self._option} ended by {type(error).__name__}: {error}; the run goes on without it")
+            self._failed = True
 
 
 @contextlib.contextmanager
@@ -20,21 +68,24 @@ def open_observers(arguments: argparse.Namespace, name: str) -> Iterator[list[Ob
         name: of the clip.
 
     Yields:
-        Observers, closed at the end.
+        Observers, closed at the end; a failure of one is a warning.
 
     Raises:
         DvoError: a package is missing, or a file cannot be written.
     """
     with contextlib.ExitStack() as stack:
         found: list[Observer] = []
+
+        def add(observer: Observer, option: str) -> None:
+            found.append(GuardedObserver(observer, option))
+            stack.callback(found[-1].close)
+
         if arguments.rerun is not None:
             from dvo.viz.rerun_log import RerunLog
 
-            found.append(RerunLog(None if arguments.rerun == VIEWER else Path(arguments.rerun), name))
-            stack.callback(found[-1].close)
+            add(RerunLog(None if arguments.rerun == VIEWER else Path(arguments.rerun), name), "--rerun")
         if arguments.overlay is not None:
             from dvo.viz.overlay import OverlayVideo
 
-            found.append(OverlayVideo(Path(arguments.overlay)))
-            stack.callback(found[-1].close)
+            add(OverlayVideo(Path(arguments.overlay)), "--overlay")
         yield found

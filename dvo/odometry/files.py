@@ -35,6 +35,17 @@ def check_writable(folder: Path) -> None:
             probe.unlink(missing_ok=True)
 
 
+def remove_empty(file: Path) -> None:
+    """Remove a file without content, which only a check that it can be written has made.
+
+    Args:
+        file: may be missing.
+    """
+    with contextlib.suppress(OSError):
+        if file.stat().st_size == 0:
+            file.unlink()
+
+
 def write_error(path: Path, error: OSError) -> DvoError:
     """Describe a file that could not be written.
 

@@ -32,6 +32,8 @@ from dvo.odometry.session import Run
 TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
 FRAMES, PAGE = "frames.csv", "summary.html"
 FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, SUMMARY)
+VIEWS = (PICTURE, FRAMES, PAGE)
+"""Files that show what the others hold; an error in drawing one costs no other file."""
 SEGMENT_FILE = re.compile(r"trajectory-\d+\.txt")
 
 
@@ -175,6 +177,10 @@ def write_results(
                 write(part)
         except OSError as error:
             failures.append(write_error(folder / name, error))
+        except Exception as error:
+            if name not in VIEWS:
+                raise
+            failures.append(DvoError(f"{type(error).__name__}: {error}", file=folder / name, remedy="report this"))
     if also is not None:
         try:
             facts = {**facts, **also()}

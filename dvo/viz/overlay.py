@@ -9,6 +9,7 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
+from dvo.odometry.files import remove_empty
 from dvo.odometry.observer import graph_of, window_view
 from dvo.odometry.protocol import Estimate, Odometry, Status
 from dvo.odometry.session import Run
@@ -34,7 +35,7 @@ class OverlayVideo:
         self._size = (0, 0)
         self._odometry: Odometry | None = None
         try:
-            file.open("wb").close()  # OpenCV does not tell why it cannot write
+            file.open("ab").close()  # OpenCV does not tell why it cannot write; an earlier video stays until a frame
         except OSError as error:
             raise self._error(error.strerror or str(error)) from error
 
@@ -76,9 +77,10 @@ class OverlayVideo:
         self.close()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; without a frame an empty one is removed."""
         if self._writer is not None:
             self._writer.release()
+        remove_empty(self.file)
 
     def _picture(self, frame: Frame, estimate: Estimate) -> np.ndarray:
         """RGB image of the frame with the marks of its patches."""

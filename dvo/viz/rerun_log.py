@@ -15,6 +15,7 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
+from dvo.odometry.files import remove_empty
 from dvo.odometry.observer import WindowView, archived_lines, graph_of, window_view
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
 from dvo.odometry.session import Run
@@ -61,18 +62,17 @@ class RerunLog:
     def __init__(self, file: Path | None, name: str) -> None:
         self._rr = rr = import_rerun()
         self._stream = rr.RecordingStream(APPLICATION)
+        self._file = file
         self._odometry: Odometry | None = None
         self._path: list[np.ndarray] = []
         self._piece = self._segment = self._count = 0
         self._start: float | None = None
         self._status = ""
-        layout = self._layout()
         try:
             if file is None:
-                self._stream.spawn(default_blueprint=layout)
+                self._stream.spawn(default_blueprint=self._layout())
             else:
-                file.open("wb").close()  # rerun only prints an error if it cannot write the file
-                self._stream.save(file, default_blueprint=layout)
+                file.open("ab").close()  # rerun only prints an error if it cannot write the file
         except OSError as error:
             remedy = "give a file in a folder that can be written"
             raise DvoError(error.strerror or str(error), file=file, field="--rerun", remedy=remedy) from error
@@ -84,12 +84,14 @@ class RerunLog:
             self._stream.log(root, rr.ViewCoordinates.RDF, static=True)
 
     def begin(self, odometry: Odometry) -> None:
-        """Take the odometry whose window is read.
+        """Take the odometry whose window is read, and begin the file.
 
         Args:
             odometry: newly built.
         """
         self._odometry = odometry
+        if self._file is not None:  # now, so that a run that cannot begin leaves an earlier file as it is
+            self._stream.save(self._file, default_blueprint=self._layout())
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
         """Log a frame.
@@ -134,9 +136,13 @@ class RerunLog:
             self._lines("final/edges", archived_lines(graph, result.longest), [120, 130, 145])
 
     def close(self) -> None:
-        """Write what is buffered, and close the file."""
-        self._stream.flush()
-        self._stream.disconnect()
+        """Write what is buffered, and close the file; one without content is removed."""
+        try:
+            self._stream.flush()
+        finally:
+            self._stream.disconnect()
+            if self._file is not None:
+                remove_empty(self._file)
 
     # -- parts of a frame ----------------------------------------------------------------------------------------------
 
@@ -230,6 +236,8 @@ def _loop_lines(result: Result) -> np.ndarray:
     times, positions = result.trajectory.timestamps, result.trajectory.positions
     lines = []
     for loop in result.info.get("loops", ()):
+        if loop.get("in_map"):  # the time of the map is on another clock
+            continue
         rows = [np.flatnonzero(np.isclose(times, loop[end], rtol=0, atol=1e-6)) for end in ("from", "to")]
         if all(len(row) for row in rows):
             lines.append(positions[[row[0] for row in rows]])

@@ -13,6 +13,7 @@ import pytest
 from dvo.cli import main
 from dvo.data.trajectory import read_tum, write_tum
 from dvo.odometry.frame_table import read_frames
+from dvo.odometry.results_reader import read_results
 from tests.command_line import arguments, errors, summary
 
 
@@ -104,6 +105,37 @@ def test_summary_with_another_ground_truth(run, image_folder, tmp_path):
     assert 0.02 < np.nanmax(floats(data["frames"]["error"])) < 0.6
     assert "ATE after Sim(3)" in (out / "summary.html").read_text()
     assert summary(out)["metrics"] is None, "the results stay"
+
+
+def test_a_recording_in_a_map_that_had_no_calibration(run):
+    """Times of the map are on another clock: they are told, and not drawn."""
+    out = run(truth=False)
+    facts = summary(out)
+    loop = {"from": 0.5, "to": 0.1, "kind": "retrieval", "inliers": 0.8, "edges": 9, "joins_segments": True}
+    facts["info"]["loops"] = [{**loop, "in_map": True}, {**loop, "to": 0.2, "in_map": False}]
+    facts["segments"][0]["in_map"], facts["map"] = True, "office.dvo"
+    facts["self_calibration"] = {"focal": 51.0, "deviation": 1.5, "source": "self-calibration"}
+    (out / "run.json").write_text(json.dumps(facts))
+    assert main(["summary", str(out)]) == 0
+    data, text = data_of(out / "summary.html"), (out / "summary.html").read_text()
+    assert [pair[1] - pair[0] for pair in data["loops"]] == [pytest.approx(-0.3)]
+    assert len(floats(data["worlds"][0]["loops"])) <= 6
+    assert "0.10 of the map" in text and '<td class="words">the map</td>' in text and "office.dvo" in text
+    assert "51.0 ± 1.5 px (self-calibration)" in text
+    assert read_results(out).result.segments[0].in_map
+
+
+@pytest.mark.parametrize("broken", ["write_page", "write_frames"])
+def test_a_page_that_cannot_be_drawn_costs_no_other_file(image_folder, tmp_path, given, monkeypatch, capsys, broken):
+    def fail(*_):
+        raise ValueError("a wrong number")
+
+    given()
+    monkeypatch.setattr(f"dvo.commands.summary.{broken}", fail)
+    assert main(arguments(image_folder, tmp_path / "out")) == 2
+    assert "ValueError: a wrong number" in capsys.readouterr().err
+    facts = summary(tmp_path / "out")
+    assert not facts["finished"] and facts["frames"]["tracked"] == 20 and (tmp_path / "out" / "map.ply").is_file()
 
 
 def test_a_run_without_a_pose(given, image_folder, tmp_path):

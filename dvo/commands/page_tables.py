@@ -12,7 +12,7 @@ from dvo.odometry.frame_table import FrameRow
 from dvo.viz.run_page import colour_of
 
 SETTINGS = ("source", "kind", "odometry", "weights", "device", "seed", "stride", "calibration", "readout",
-            "groundtruth", "map_file")  # fmt: skip
+            "groundtruth", "map", "map_file")  # fmt: skip
 INFO = ("working_size", "working_intrinsics", "readout", "readout_from", "loop_corrections")
 
 
@@ -90,6 +90,10 @@ def tables(facts: dict[str, Any], start: float) -> str:
     ]
     settings = [(name, facts[name]) for name in SETTINGS if facts.get(name) is not None]
     settings += [(name, info[name]) for name in INFO if info.get(name) is not None and name not in dict(settings)]
+    calibrated = facts.get("self_calibration")
+    if calibrated:
+        value = f"{calibrated['focal']:.1f} ± {calibrated['deviation']:.1f} px ({calibrated['source']})"
+        settings.append(("focal length", value))
     settings += [(f"seconds of {name}", f"{value:.1f}") for name, value in (facts.get("seconds") or {}).items()]
     if start:
         settings.append(("time of the first frame", f"{start:.6f} s; times of this page count from it"))
@@ -114,7 +118,8 @@ def _segments(segments: list[dict[str, Any]], start: float) -> str:
         if scored:
             cells += [_number(segment.get("ate_rmse"), ".3g"), _number(segment.get("ate_percent"), ".2f")]
         joined = segment.get("joined_to")
-        cells.append("its own" if joined is None else f"segment {joined}")
+        own = "the map" if segment.get("in_map") else "its own"
+        cells.append(own if joined is None else f"segment {joined}")
         rows.append([swatch + escape(str(number)), *map(escape, cells)])
     return _section("Segments", _table(titles, rows, words={len(titles) - 1}))
 
@@ -142,7 +147,7 @@ def _loop_table(loops: list[dict[str, Any]], start: float) -> str:
     rows = [
         [
             f"{loop['from'] - start:.2f}",
-            f"{loop['to'] - start:.2f}",
+            f"{loop['to']:.2f} of the map" if loop.get("in_map") else f"{loop['to'] - start:.2f}",
             escape(str(loop.get("kind", ""))),
             _number(None if loop.get("inliers") is None else 100 * loop["inliers"], ".0f"),
             escape(str(loop.get("edges", ""))),

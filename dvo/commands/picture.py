@@ -76,8 +76,8 @@ def _panels(result: Result, chosen: list[int], label: str) -> list[Panel]:
     for colour, number in enumerate(chosen):
         segment = result.segments[number]
         track = Track(segment.trajectory, _label(number, segment, len(result.segments) == 1, label), colour)
-        worlds.setdefault(_root(result, number), []).append(track)
-    longest = None if result.longest is None else _root(result, result.longest)
+        worlds.setdefault(world_root(result, number), []).append(track)
+    longest = None if result.longest is None else world_root(result, result.longest)
     none = np.zeros((0, 3))
     panels = [
         Panel(tuple(tracks), result.map.points if world == longest else none, loops=_loops(result, tracks))
@@ -96,8 +96,13 @@ def _loops(result: Result, tracks: Sequence[Track]) -> np.ndarray:
     return np.array(found).reshape(-1, 3)
 
 
-def _root(result: Result, number: int) -> int:
-    """Number of the segment whose world this one shares, its own if none."""
+def world_root(result: Result, number: int) -> int:
+    """Number of the segment whose world a segment shares, its own if none.
+
+    Args:
+        result: of a run.
+        number: of the segment.
+    """
     chain = [number]
     while (joined := result.segments[chain[-1]].joined_to) is not None and joined not in chain:
         chain.append(joined)

@@ -103,6 +103,8 @@ def run(arguments: argparse.Namespace) -> int:
         check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
         facts["map"] = arguments.map
+        if arguments.map is not None and isinstance(odometry, Saveable):
+            facts["weights"] = getattr(odometry, "weights", "") or arguments.weights
         source, camera = with_calibration(source, odometry, arguments, device, folder)
         return track(
             odometry,

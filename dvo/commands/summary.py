@@ -13,6 +13,7 @@ import numpy as np
 from dvo.commands import OK
 from dvo.commands.console import say
 from dvo.commands.page_tables import figures, headline_of, tables
+from dvo.commands.picture import world_root
 from dvo.commands.report import Scores
 from dvo.data.output import replaced
 from dvo.data.trajectory import Trajectory, read_tum
@@ -147,7 +148,9 @@ def run_page(name: str, result: Result, rows: Sequence[FrameRow], facts: dict[st
 
 
 def _loops(facts: dict[str, Any]) -> list[dict[str, Any]]:
-    return (facts.get("info") or {}).get("loops") or []
+    """Loops within the recording: the earlier visit of one with a map is on another clock."""
+    loops = (facts.get("info") or {}).get("loops") or []
+    return [loop for loop in loops if not loop.get("in_map")]
 
 
 def _truth(rows: Sequence[FrameRow]) -> np.ndarray:
@@ -201,7 +204,7 @@ def _true_world(
 
 def _own_worlds(result: Result, shown: set[int], facts: dict[str, Any]) -> list[World]:
     """A world for the segments that share one and are not shown yet; first the one of the map."""
-    roots = [_root(result, number) for number in range(len(result.segments))]
+    roots = [world_root(result, number) for number in range(len(result.segments))]
     main = None if result.longest is None else roots[result.longest]
     worlds = []
     for root in sorted(set(roots), key=lambda k: (k != main, k)):
@@ -214,15 +217,6 @@ def _own_worlds(result: Result, shown: set[int], facts: dict[str, Any]) -> list[
         mapped = root == main and result.longest not in shown
         worlds.append(replace(world, points=result.map.points, colors=result.map.colors) if mapped else world)
     return worlds
-
-
-def _root(result: Result, number: int) -> int:
-    """Number of the segment whose world this one shares, its own if none."""
-    seen = {number}
-    while (joined := result.segments[number].joined_to) is not None and joined not in seen:
-        seen.add(joined)
-        number = joined
-    return number if joined is None else min(seen)
 
 
 def _loop_positions(tracks: Sequence[TrackLine], facts: dict[str, Any]) -> np.ndarray:

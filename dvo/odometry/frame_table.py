@@ -169,7 +169,8 @@ def keyframe_times(odometry: Odometry, result: Result) -> list[float] | None:
     """
     graph = graph_of(odometry)
     if graph is not None:
-        kept = [frame.timestamp for frame in graph.archive if frame.anchor is None]
+        own = (frame for frame in graph.archive if frame.identifier >= graph.recording.keyframe)  # not of its map
+        kept = [frame.timestamp for frame in own if frame.anchor is None]
         return sorted({*kept, *(frame.timestamp for frame in graph.window.frames)})
     return sorted(depth.timestamp for depth in result.depth) or None
 

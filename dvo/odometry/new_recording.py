@@ -61,7 +61,7 @@ def new_recording(
     with torch.inference_mode():
         finder.places = describe_places(old)
     if not len(finder.places) or not any(map(finder.matcher.can_match, finder.kept)):
-        remedy = "make the map with weights of as many features as small, and with images and features in its archive"
+        remedy = "make the map from a longer recording, with weights of as many features as small"
         raise DvoError("holds no keyframes that can be recognised", field="map", remedy=remedy)
     require_size(found)
     return found

@@ -56,12 +56,12 @@ def read_results(folder: Path) -> Stored:
             Break(found["from"], found["to"], int(found["frames"]), str(found["reason"]), bool(found["new_segment"]))
             for found in facts["breaks"]
         )
-        described = [(str(part["file"]), part["joined_to"]) for part in facts["segments"]]
+        described = [(str(part["file"]), part["joined_to"], bool(part.get("in_map"))) for part in facts["segments"]]
         counts = int(facts["frames"]["read"]), int(facts["frames"]["lost"])
         info = dict(facts["info"])
     except (KeyError, TypeError, ValueError) as error:
         raise DvoError(f"has no valid {error}", file=folder / results.SUMMARY, remedy=_REMEDY) from None
-    segments = tuple(_read_segment(folder, name, joined) for name, joined in described)
+    segments = tuple(_read_segment(folder, *part) for part in described)
     nothing = Trajectory(np.zeros(0), np.zeros((0, 7)))
     trajectory = read_tum(folder / results.TRAJECTORY) if segments else nothing
     map_file = folder / results.MAP
@@ -86,12 +86,12 @@ def _read_facts(file: Path) -> dict[str, Any]:
     return facts
 
 
-def _read_segment(folder: Path, name: str, joined: int | None) -> Segment:
+def _read_segment(folder: Path, name: str, joined: int | None, in_map: bool) -> Segment:
     if name != results.TRAJECTORY and not results.SEGMENT_FILE.fullmatch(name):
         raise DvoError(f"unknown file '{name[:60]}' of a segment", file=folder / results.SUMMARY, remedy=_REMEDY)
     trajectory = read_tum(folder / name)
     times = trajectory.timestamps
-    return Segment(trajectory, float(times[0]), float(times[-1]), None if joined is None else int(joined))
+    return Segment(trajectory, float(times[0]), float(times[-1]), None if joined is None else int(joined), in_map)
 
 
 def rows_of(result: Result) -> list[FrameRow]:

@@ -10,6 +10,7 @@ from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.recordings import begin_recording
 from dvo.graph.window import Keyframe
 from dvo.odometry import session
 from dvo.odometry.frame_table import FrameRow, FrameTable, keyframe_times, near, read_frames, write_frames
@@ -105,6 +106,22 @@ def test_keyframes_of_a_graph_and_of_an_odometry_without_one(fake_odometry):
     odometry.graph.drop(1)
     odometry.graph.archive_oldest()
     assert keyframe_times(odometry, run.result) == [0.0, 1.0, 1.5], "without the dropped one"
+
+
+def test_keyframes_of_a_map_are_not_those_of_the_recording(fake_odometry):
+    odometry = fake_odometry()
+    _, run = tracked(odometry, count=3)
+    odometry.graph = graph = KeyframeGraph(2, 3, 4, torch.device("cpu"))
+    for number, time in enumerate((0.0, 0.5, 0.25, 1.0)):  # two of a map, on a clock of its own
+        if number == 2:
+            graph.begin_segment(2)
+            begin_recording(graph)
+        nothing = torch.zeros(2, 1, 1, 1), torch.zeros(2, 4), torch.zeros(2, 3, dtype=torch.uint8), torch.ones(4)
+        pose = torch.tensor([0.0, 0, 0, 0, 0, 0, 1])
+        graph.window.append(Keyframe(number, time, number, *nothing), pose, torch.ones(2, 3, 3, 3))
+        if number < 3:
+            graph.archive_oldest()
+    assert keyframe_times(odometry, run.result) == [0.25, 1.0]
 
 
 def test_a_row_has_a_whole_true_position_or_none():

@@ -73,6 +73,16 @@ def test_the_file_of_an_earlier_run_does_not_stay(image_folder, tmp_path, calibr
     assert not (out / "calib.txt").exists()
 
 
+def test_the_file_of_an_earlier_run_stays_if_it_is_given(image_folder, tmp_path, calibrated, monkeypatch):
+    out = tmp_path / "out"
+    assert main(["run", str(image_folder), "--out", str(out)]) == 0
+    assert main(["run", str(image_folder), "--calib", str(out / "calib.txt"), "--out", str(out)]) == 0
+    assert (out / "calib.txt").is_file()
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", str(image_folder), "--calib", "out/calib.txt", "--out", "out"]) == 0
+    assert (out / "calib.txt").is_file() and len(calibrated) == 1
+
+
 def test_images_that_tell_nothing_are_tracked_with_the_guess(image_folder, tmp_path, capsys):
     """With the real network: images of noise."""
     out = tmp_path / "out"

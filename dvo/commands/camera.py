@@ -41,7 +41,7 @@ def with_calibration(
     found, file = None, folder / CALIBRATION
     if source.guess is not None:
         warn(_announcement(source), "note")
-        weights = arguments.weights if isinstance(odometry, PatchOdometry) else "small"
+        weights = odometry.weights or arguments.weights if isinstance(odometry, PatchOdometry) else "small"
         with TrackingProgress(None) as progress:
             found = calibrate(source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update)
         seed_everything(arguments.seed)  # the same bytes as a run with the calibration file
@@ -49,10 +49,18 @@ def with_calibration(
         if not found.write(file):
             warn(f"{file} is not a file of dvo, and was not replaced")
         source = source.recalibrated(found.calibration)
-    elif not is_foreign(file):
+    elif not (is_foreign(file) or _is_given(file, source, arguments.calib)):
         file.unlink(missing_ok=True)  # of an earlier run
     camera = {**asdict(source.recorded_camera), "turned": source.turned}
     return source, {"camera": camera, "self_calibration": None if found is None else _facts(found)}
+
+
+def _is_given(file: Path, source: Source, calib: str | None) -> bool:
+    """True if a file is the one that ``--calib`` names, from the working directory or the source's folder."""
+    if calib is None or not file.exists():
+        return False
+    base = source.path if source.path.is_dir() else source.path.parent
+    return any(option.exists() and option.samefile(file) for option in (Path(calib), base / calib))
 
 
 def _announcement(source: Source) -> str:

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, tee
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ import numpy as np
 from dvo.data.calibration import Calibration
 from dvo.data.focal_guess import FocalGuess, centred, guess_from_angle
 from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
 from dvo.data.output import replaced
 from dvo.errors import DvoError
 from dvo.odometry.focal_length import FocalProfile, find_focal
@@ -185,8 +187,8 @@ def calibrate(
         >>> run = dvo.run(dvo.load("small"), source.recalibrated(found.calibration))
     """
     limit = 8 * options.frames  # with those that are left out or lost
-    clip = list(islice(frames, limit)) if isinstance(frames, Iterator) else frames
-    first = next(iter(clip), None)
+    kept = tee(frames, 1)[0] if isinstance(frames, Iterator) else None
+    first = next(_readable(frames if kept is None else copy(kept)), None)
     if first is None:
         raise DvoError("no frames", field="frames", remedy="give a video or a folder with images")
     width, height = first.camera.width, first.camera.height
@@ -200,7 +202,8 @@ def calibrate(
     walk: list[tuple[float, float]] = []
     for number in range(options.rounds):
         odometry = load(weights, device=device, seed=seed, loops=False)
-        seen = _track(odometry, islice(clip, limit), focal, wanted, options.interval, on_frame)
+        clip = islice(_readable(frames if kept is None else copy(kept)), limit)
+        seen = _track(odometry, clip, focal, wanted, options.interval, on_frame)
         profile, count = _profile(odometry)
         deviation = math.hypot(options.inflation * profile.minimum.deviation, options.floor)
         reason = _doubt(profile, deviation, focal, guess, options)
@@ -216,6 +219,19 @@ def calibrate(
         if abs(step) <= options.settled or is_last:
             return result(focal, deviation * focal, SELF_CALIBRATED, count)
     return result(guess.focal, guess.deviation, guess.source, count, reason)
+
+
+def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Frames up to one that cannot be read, which the run itself will tell of; an error at the first one is raised."""
+    started = False
+    try:
+        for frame in frames:
+            checked = checked_frame(frame)
+            started = True
+            yield checked
+    except (DvoError, OSError):
+        if not started:
+            raise
 
 
 def _step(walk: list[tuple[float, float]]) -> float:

@@ -72,6 +72,26 @@ def test_frames_of_a_fast_camera_are_left_out(clip):
     assert seen == list(range(0, 12, 2))
 
 
+def test_frames_that_cannot_be_read_end_the_estimate_only(clip):
+    class Broken:
+        """Source that can be read again and again, up to a fault."""
+
+        def __iter__(self):
+            yield from clip[:6]
+            raise DvoError("this image is 64x48", field="frame 6")
+
+    options, read = CalibrationOptions(rounds=1), []
+
+    def live():
+        for frame in clip:
+            read.append(frame.index)
+            yield frame
+
+    assert calibrate(Broken(), options=options) == calibrate(clip[:6], options=options)
+    calibrate(live(), options=replace(options, frames=3), on_frame=lambda frame, estimate: None)
+    assert len(read) < len(clip), "an iterator is read as far as needed"
+
+
 def test_it_is_part_of_the_public_interface():
     assert dvo.calibrate is calibrate and dvo.SelfCalibration is SelfCalibration
 

@@ -128,6 +128,22 @@ def run_all(
     return runs
 
 
+def check_out(out: Path) -> None:
+    """Check that runs can be kept, before the first one is made.
+
+    Args:
+        out: file to add to; its folder is made if need be.
+
+    Raises:
+        DvoError: it cannot be written.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.open("a", encoding="utf-8").close()
+    except OSError as error:
+        raise DvoError(error.strerror or str(error), file=out, field="--out", remedy="give another file") from error
+
+
 def _append(out: Path, run: Run) -> None:
     """Add a line; the rest of one that was cut off is removed."""
     whole = out.read_text(encoding="utf-8") if out.is_file() else ""
@@ -186,9 +202,13 @@ def main() -> None:
     parser.add_argument("--tables", action="store_true", help="the tables of FILE alone, nothing is run")
     arguments = parser.parse_args()
     try:
+        if arguments.tables and arguments.out is None:
+            raise DvoError("no runs", field="--tables", remedy="give the file of the runs with --out")
         if arguments.tables:
             runs = [run for run in read_runs(arguments.out) if run.mode == arguments.mode]
         else:
+            if arguments.out is not None:
+                check_out(arguments.out)
             runs = run_all(tasks(arguments), arguments.out, alone, lambda text: print(text, flush=True))
         print("\n" + (revisit_table(runs) if arguments.mode == "revisit" else blackout_table(runs)))
     except DvoError as error:

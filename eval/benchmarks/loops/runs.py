@@ -189,7 +189,7 @@ def carry_out(task: Task) -> Run:
     system = find_system(f"{task.system}+loops={str(task.loops).lower()}")
     reason = system.missing()
     if reason:
-        raise DvoError(reason, field="--system", remedy="choose a system that is there")
+        raise DvoError(reason, field="--systems", remedy="choose a system that is there")
     watched = Watched(system.build(task.seed, task.device))
     frames = Fed(source, task.frames, span if task.dark else None, task.seed)
     prediction, segments = drive(watched, frames)  # type: ignore[arg-type]  # it is only iterated

@@ -15,7 +15,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.odometry.protocol import Segment
-from eval.benchmarks.loops.__main__ import blackout_sequences, line, read_runs, run_all
+from eval.benchmarks.loops.__main__ import blackout_sequences, check_out, line, read_runs, run_all
 from eval.benchmarks.loops.runs import Fed, Run, Task, carry_out, joined_world
 from eval.benchmarks.loops.tables import blackout_table, revisit_table
 from eval.scoring.blackout import without_view
@@ -128,6 +128,13 @@ def test_going_on_from_the_lines_of_before(tmp_path: Path) -> None:
     out.write_text("no runs\nat all\n")
     with pytest.raises(DvoError, match="not runs of this benchmark"):
         read_runs(out)
+
+
+def test_a_file_that_cannot_be_written_is_told_before_the_first_run(tmp_path: Path) -> None:
+    check_out(tmp_path / "new" / "runs.jsonl")
+    assert read_runs(tmp_path / "new" / "runs.jsonl") == []
+    with pytest.raises(DvoError, match="--out"):
+        check_out(tmp_path)
 
 
 def test_tables() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from dvo.commands.console import warn
 from dvo.commands.view_options import VIEWER
 from dvo.data.frame import Frame
+from dvo.errors import DvoError
 from dvo.odometry.observer import Observer
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.odometry.session import Run
@@ -71,7 +72,7 @@ def open_observers(arguments: argparse.Namespace, name: str) -> Iterator[list[Ob
         Observers, closed at the end; a failure of one is a warning.
 
     Raises:
-        DvoError: a package is missing, or a file cannot be written.
+        DvoError: a package is missing, a file cannot be written, or it is the source itself.
     """
     with contextlib.ExitStack() as stack:
         found: list[Observer] = []
@@ -87,5 +88,9 @@ def open_observers(arguments: argparse.Namespace, name: str) -> Iterator[list[Ob
         if arguments.overlay is not None:
             from dvo.viz.overlay import OverlayVideo
 
-            add(OverlayVideo(Path(arguments.overlay)), "--overlay")
+            file = Path(arguments.overlay)
+            if file.exists() and file.samefile(arguments.source):
+                message = "is the source, which it would replace"
+                raise DvoError(message, file=file, field="--overlay", remedy="give another file")
+            add(OverlayVideo(file), "--overlay")
         yield found

@@ -29,6 +29,12 @@ def test_every_example_is_run_here():
     assert all(f'"{script.name}' in text for script in EXAMPLES.glob("*.py"))
 
 
+def test_quick_start(tmp_path):
+    out = run(EXAMPLES / "quick_start.py", "--frames", "16", "--out", "plot.png", cwd=tmp_path)
+    assert "16 of 16 frames" in out and re.search(r"ATE \d", out)
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_track_arrays(tmp_path):
     assert "14 of 14 frames" in run(EXAMPLES / "track_arrays.py", "--frames", "14", cwd=tmp_path)
 

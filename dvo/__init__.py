@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from dvo.ba.layer import bundle_adjust
     from dvo.ba.options import BADamping, BAOptions, BAResult
     from dvo.data.frame import Frame
+    from dvo.data.live import LiveFrames
+    from dvo.data.live_source import open_stream
     from dvo.data.source import open_source as open
+    from dvo.data.streams import stream
     from dvo.data.trajectory import Trajectory
     from dvo.export.formats import export_map, export_trajectory
     from dvo.geometry import se3
@@ -47,6 +50,7 @@ _LAZY = {
     "ClipDataset": ("dvo.synth.dataset", "ClipDataset"),
     "Estimate": ("dvo.odometry.protocol", "Estimate"),
     "Frame": ("dvo.data.frame", "Frame"),
+    "LiveFrames": ("dvo.data.live", "LiveFrames"),
     "Metrics": ("dvo.metrics", "Metrics"),
     "ModelConfig": ("dvo.nets.config", "ModelConfig"),
     "Odometry": ("dvo.odometry.protocol", "Odometry"),
@@ -67,15 +71,17 @@ _LAZY = {
     "load_model": ("dvo.models.weights", "load_model"),
     "losses": ("dvo.losses", ""),
     "open": ("dvo.data.source", "open_source"),
+    "open_stream": ("dvo.data.live_source", "open_stream"),
     "run": ("dvo.odometry.session", "run"),
     "se3": ("dvo.geometry.se3", ""),
+    "stream": ("dvo.data.streams", "stream"),
 }
 
 __all__ = [
-    "BADamping", "BAOptions", "BAResult", "Break", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame", "Metrics",
-    "ModelConfig", "Odometry", "Result", "Segment", "SelfCalibration", "SparseMap", "Status", "TrackerConfig",
-    "Trajectory", "__version__", "bundle_adjust", "calibrate", "evaluate", "export_map", "export_trajectory", "load",
-    "load_map", "load_model", "losses", "open", "run", "se3",
+    "BADamping", "BAOptions", "BAResult", "Break", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame",
+    "LiveFrames", "Metrics", "ModelConfig", "Odometry", "Result", "Segment", "SelfCalibration", "SparseMap", "Status",
+    "TrackerConfig", "Trajectory", "__version__", "bundle_adjust", "calibrate", "evaluate", "export_map",
+    "export_trajectory", "load", "load_map", "load_model", "losses", "open", "open_stream", "run", "se3", "stream",
 ]  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
+from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
 from dvo.errors import DvoError
 from dvo.threads import wait_passively
@@ -52,7 +53,11 @@ def build_parser() -> argparse.ArgumentParser:
     demo.set_defaults(run="dvo.demo:demo")
 
     run = commands.add_parser("run", help="track a video, a folder of images or a dataset sequence", epilog=EXIT_CODES)
-    run.add_argument("source", metavar="SOURCE", help="video, folder of images, or dataset sequence folder")
+    run.add_argument(
+        "source",
+        metavar="SOURCE",
+        help="video, images, dataset sequence, webcam:0, rtsp://..., http://... or -",
+    )
     run.add_argument(
         "--calib",
         metavar="FILE",
@@ -78,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for dvo.load_map")
     run.add_argument("--map", metavar="FILE", help="map file (.dvo) of an earlier recording, to be localised in")
+    add_stream_options(run)
     add_view_options(run)
     run.set_defaults(run="dvo.commands.run:run")
 

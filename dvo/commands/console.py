@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -102,11 +103,15 @@ class InterruptSwitch:
     An interrupt in the middle of an update would leave the tracker in an inconsistent state; the caller checks
     :attr:`pressed` between frames instead.
 
+    Args:
+        on_press: called at the first signal, in its handler.
+
     Attributes:
         pressed: the first signal, None before it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, on_press: Callable[[], object] | None = None) -> None:
+        self.on_press = on_press
         self.pressed: signal.Signals | None = None
         self._before: dict[signal.Signals, Any] = {}
 
@@ -124,6 +129,8 @@ class InterruptSwitch:
         if self.pressed is not None:
             raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
         self.pressed = signal.Signals(number)
+        if self.on_press is not None:
+            self.on_press()
 
 
 class StderrConsole(Console):

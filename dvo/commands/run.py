@@ -21,7 +21,9 @@ from dvo.commands.maps import check_place, load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
 from dvo.commands.report import Scores, headline, print_report, score
+from dvo.commands.streams import print_counts, stream_facts, stream_settings
 from dvo.commands.summary import page_writers
+from dvo.data.capture import shown
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
@@ -82,12 +84,14 @@ def run(arguments: argparse.Namespace) -> int:
         fps=arguments.fps,
         groundtruth=arguments.groundtruth,
         guess=True,
+        **stream_settings(arguments),
     )
     for warning in source.warnings:
         warn(warning, "note")
     facts = {
-        "source": str(arguments.source),
+        "source": shown(str(arguments.source)),
         "kind": getattr(source, "kind", None),
+        **stream_facts(source),
         "calibration": arguments.calib,
         "readout": source.camera.readout,
         "groundtruth": arguments.groundtruth,
@@ -106,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.map is not None and isinstance(odometry, Saveable):
             facts["weights"] = getattr(odometry, "weights", "") or arguments.weights
         source, camera = with_calibration(source, odometry, arguments, device, folder)
-        return track(
+        code = track(
             odometry,
             source,
             folder,
@@ -116,6 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
             save_map=save_map,
             observers=observers,
         )
+        print_counts(source)
+        return code
 
 
 def _map_file(text: str, odometry: Odometry) -> Path:
@@ -218,7 +224,7 @@ def _track(
             observer.update(frame, estimate)
         progress.update(frame, estimate)
 
-    with InterruptSwitch() as switch, TrackingProgress(clip.frame_count) as progress:
+    with InterruptSwitch(getattr(clip, "stop", None)) as switch, TrackingProgress(clip.frame_count) as progress:
         try:
             done = session.run(
                 odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None

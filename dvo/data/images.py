@@ -106,17 +106,33 @@ def decode(path: Path) -> np.ndarray | None:
     Raises:
         DvoError: an image of more than :data:`dvo.data.image_header.MAX_PIXELS`.
     """
+    data = read_image_file(path)
+    return None if data is None else decode_bytes(data, path)
+
+
+def decode_bytes(data: bytes, name: object) -> np.ndarray | None:
+    """Decode the bytes of an image file; see :func:`decode`.
+
+    Args:
+        data: the file.
+        name: of it, for messages.
+
+    Returns:
+        As :func:`decode`.
+
+    Raises:
+        DvoError: as :func:`decode`.
+    """
     import cv2
 
-    data = read_image_file(path)
-    if data is None or not is_complete(data):
+    if not is_complete(data):
         return None
     size = image_size(data)
     if size is None:
         return None
     if size[0] * size[1] > MAX_PIXELS:
         raise DvoError(
-            f"image of {size[0]}x{size[1]} pixels, more than {MAX_PIXELS:,}", file=path, remedy="reduce the images"
+            f"image of {size[0]}x{size[1]} pixels, more than {MAX_PIXELS:,}", file=name, remedy="reduce the images"
         )
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)

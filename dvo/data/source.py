@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.calibration import Calibration, read_calibration
+from dvo.data.capture import is_stream
 from dvo.data.files import is_file, lookups
 from dvo.data.focal_guess import FocalGuess, guess_focal
 from dvo.data.frame import Frame, InertialSamples, StereoView
@@ -210,9 +211,11 @@ def open_source(
     undistort: bool = True,
     reader: str | None = None,
     guess: bool = False,
+    queue: int | None = None,
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
-    ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it).
+    ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it); or a stream: ``webcam:0``,
+    ``rtsp://...``, ``http://...`` or ``-``, see :func:`dvo.data.live_source.open_stream`.
 
     Relative paths of the options are looked up from the working directory, then from the source's folder, so that
     ``--calib ../calib.txt`` beside an image folder is found from anywhere.
@@ -230,6 +233,7 @@ def open_source(
         reader: name of the reader (``dvo.data.registry.READERS``); None: the first whose layout matches.
         guess: where there is no calibration, guess the focal length (:mod:`dvo.data.focal_guess`), for
             :func:`dvo.calibrate`.
+        queue: of a stream, frames that may wait.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -245,13 +249,21 @@ def open_source(
             for frame in source:
                 print(frame.timestamp, frame.image.shape, frame.depth is not None)
     """
+    if is_stream(source):
+        from dvo.data.live_source import open_stream
+
+        for field, value in {"times": times, "groundtruth": groundtruth, "reader": reader}.items():
+            if value is not None:
+                raise DvoError("not for a stream", field=field, remedy="leave it out")
+        return open_stream(source, calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort)
+    if queue is not None:
+        raise DvoError("frames of a recording do not wait", field="queue", remedy="leave it out")
     path = Path(source)
     with lookups(path):
         is_there = path.exists()
     if not is_there:
         raise DvoError("no such file or folder", file=path, remedy="give a video, a folder of images or a sequence")
-    if not isinstance(stride, Integral) or stride < 1:
-        raise DvoError(f"stride {str(stride)[:40]}", field="stride", remedy="give a whole number of at least 1")
+    check_stride(stride)
     if times is not None and fps is not None:
         raise DvoError("both times and fps are given", field="times", remedy="give --times or --fps, not both")
     request = Request(
@@ -285,6 +297,19 @@ def open_source(
         return found
     except DvoError as error:  # the lens model does not know its file
         raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None
+
+
+def check_stride(stride: object) -> None:
+    """Check a stride.
+
+    Args:
+        stride: as given by the user.
+
+    Raises:
+        DvoError: no whole number of at least 1.
+    """
+    if not isinstance(stride, Integral) or int(stride) < 1:
+        raise DvoError(f"stride {str(stride)[:40]}", field="stride", remedy="give a whole number of at least 1")
 
 
 def _locate(given: Path | str, source: Path, field: str) -> Path:

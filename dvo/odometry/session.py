@@ -92,6 +92,7 @@ def run(
             frame = next(frames, None)
             feeding.seconds["reading"] += time.perf_counter() - started
             if frame is None:
+                interrupted = should_stop is not None and should_stop()  # a live source ends when it is stopped
                 break
             feeding.take(frame)
         feeding.flush()

@@ -1,0 +1,48 @@
+"""Streams in ``dvo run``: settings from the command line, and the counts of their frames."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+from dvo.commands.console import say
+from dvo.data.live_source import LiveSource
+from dvo.data.source import Source
+
+
+def stream_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of :func:`dvo.open` for a stream.
+
+    Args:
+        arguments: of the command line.
+    """
+    return {"queue": arguments.queue}
+
+
+def stream_facts(source: Source) -> dict[str, Any]:
+    """Entries of run.json about a stream.
+
+    Args:
+        source: any.
+
+    Returns:
+        ``live``: counts, which are updated while it runs; ``clock``: origin of the times, and for the monotonic clock
+        the seconds to add for Unix time. Nothing for a recording that is no stream.
+    """
+    if not isinstance(source, LiveSource):
+        return {}
+    is_monotonic = source.times in ("arrival", "stream")
+    to_unix = round(time.time() - time.monotonic(), 3) if is_monotonic else None
+    return {"live": source.counts, "clock": {"times": source.times, "to_unix": to_unix}}
+
+
+def print_counts(source: Source) -> None:
+    """Print the numbers of frames of a stream.
+
+    Args:
+        source: any; nothing is printed for a recording that is no stream.
+    """
+    if isinstance(source, LiveSource):
+        counts = source.counts
+        say(f"received {counts.received} frames, dropped {counts.dropped} of them")

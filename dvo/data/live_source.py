@@ -1,0 +1,255 @@
+"""Streams as sources: a camera, an address of the web, or images through a pipe."""
+
+from __future__ import annotations
+
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from dvo.data.calibration import Calibration, read_calibration
+from dvo.data.capture import STANDARD_INPUT, Capture, StreamClock, is_stream, shown
+from dvo.data.focal_guess import guess_from_angle
+from dvo.data.frame import InertialSamples
+from dvo.data.image_pipe import pipe_reader, split_images
+from dvo.data.images import decode_bytes, to_rgb8
+from dvo.data.live import LiveFrames, StreamCounts
+from dvo.data.recording import Log, RawFrame
+from dvo.data.sensors import StereoRig
+from dvo.data.source import Source, check_stride
+from dvo.data.stamps import checked_rate
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+
+T = TypeVar("T")
+
+QUEUE = 2
+"""Frames that wait by default: one while another is tracked, and one that arrives in the meantime."""
+_FIRST = 15.0  # seconds to wait for the first image of a camera or an address
+
+
+class LiveRecording(Generic[T]):
+    """A stream in the place of a :class:`dvo.data.recording.Recording`; its frames can be read once.
+
+    Args:
+        live: elements of the stream, which end with the iteration.
+        decode: turns an element into a frame; None if it cannot be decoded.
+        times: origin of the times: ``arrival``, ``stream``, ``file`` or ``fps``.
+    """
+
+    kind = "stream"
+    frame_count: int | None = None
+    calibration: Calibration | None = None
+    groundtruth: Trajectory | None = None
+    stereo: Callable[[], StereoRig | None] | None = None
+    inertial: Callable[[], InertialSamples] | None = None
+
+    def __init__(self, live: LiveFrames[T], decode: Callable[[T], RawFrame | None], times: str) -> None:
+        self.live, self.decode, self.times = live, decode, times
+        self.warnings: list[str] = []
+        self.path = Path(live.name)
+        self.name = re.sub(r"[^A-Za-z0-9._-]+", "-", re.sub(r"^\w+://", "", live.name)).strip("-.") or "stream"
+
+    def first(self, timeout: float | None) -> RawFrame:
+        """Wait for an image, which stays in the stream.
+
+        Args:
+            timeout: seconds; None for any time.
+
+        Raises:
+            DvoError: none in time, or one that does not decode.
+        """
+        found = self.decode(self.live.peek(timeout))
+        if found is None:
+            raise DvoError("the first image does not decode", file=self.live.name, remedy="check the stream")
+        return found
+
+    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.recording.Recording`; the stride counts frames that were not dropped."""
+        for number, item in enumerate(self.live):
+            if number % stride:
+                continue
+            raw = self.decode(item)
+            if raw is None:
+                log.unreadable.append(f"image {number}")
+            else:
+                yield raw
+
+
+class LiveSource(Source):
+    """A stream as a source. Made by :func:`open_stream`.
+
+    It can be iterated once. Reading begins when it is opened and ends with the iteration, or by :meth:`stop`.
+
+    Attributes:
+        counts: frames received and dropped since the iteration began; updated while it runs.
+        times: origin of the times: ``arrival`` (monotonic clock), ``stream`` (stated by the stream, on the same clock),
+            ``file`` (of a served video file) or ``fps``.
+    """
+
+    _recording: LiveRecording[Any]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Faults so far and the number of dropped frames, in sentences for the user."""
+        return [*super().warnings, *self._recording.live.warnings]
+
+    @property
+    def counts(self) -> StreamCounts:
+        """Frames received and dropped."""
+        return self._recording.live.counts
+
+    @property
+    def times(self) -> str:
+        """Origin of the times."""
+        return self._recording.times
+
+    def recalibrated(self, calibration: Calibration) -> LiveSource:
+        """The same stream with another calibration; see :meth:`dvo.data.source.Source.recalibrated`."""
+        camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
+        return LiveSource(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
+
+    def stop(self) -> None:
+        """End the iteration as soon as possible. May be called from any thread, and in a signal handler."""
+        self._recording.live.stop()
+
+    def close(self) -> None:
+        """Stop, and wait for the end of the thread that reads."""
+        self._recording.live.close()
+
+    def __enter__(self) -> LiveSource:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_stream(
+    source: Any,
+    *,
+    calib: Path | str | Calibration | None = None,
+    fps: float | None = None,
+    queue: int | None = None,
+    stride: int = 1,
+    undistort: bool = True,
+) -> LiveSource:
+    """Open a camera, an address, or a pipe of images as a source that is read while it arrives.
+
+    A live stream is never held back: a thread reads it, at most ``queue`` frames wait, and the oldest of them is
+    dropped for a new one. A recording that comes as a stream (a video file behind an address, or a pipe with ``fps``)
+    is held back instead, and every frame is processed.
+
+    Args:
+        source: ``webcam:0``; an address that begins with ``rtsp://`` or ``http://`` (or ``rtsps``, ``https``); ``-``,
+            JPEG or PNG images one after the other in the standard input; or a binary file with such images, for
+            instance ``stdout`` of a process.
+        calib: calibration; without one, the usual angle of view is assumed, with a warning.
+        fps: images a second, for the times. Otherwise times are those of a served video file, those of an RTSP stream,
+            or those of arrival (``time.monotonic()``).
+        queue: frames that may wait, older ones are dropped; 0: none is dropped. None: 2 for a live stream, 0 for a
+            recording.
+        stride: every how many-th of the frames that were not dropped.
+        undistort: resample images to a pinhole camera.
+
+    Returns:
+        Frames to iterate over once.
+
+    Raises:
+        DvoError: it cannot be opened, or no image arrives within 15 s (a pipe: before its end).
+
+    Example:
+        ::
+
+            with dvo.open_stream("webcam:0", calib="calib.txt") as source:
+                for frame in source:
+                    print(odometry.track(frame).pose_wc)
+    """
+    fps = checked_rate(fps)
+    check_stride(stride)
+    if queue is not None and queue < 0:
+        raise DvoError(f"must be 0 or more, got {queue}", field="queue", remedy="give a whole number of frames")
+    if calib is not None and not isinstance(calib, Calibration):
+        calib = read_calibration(calib)
+    stopped = threading.Event()
+    recording: LiveRecording[Any]
+    timeout: float | None
+    if isinstance(source, str) and source != STANDARD_INPUT:
+        recording, timeout = _of_capture(source, fps, queue, stopped)
+    else:
+        recording, timeout = _of_pipe(source, fps, queue, stopped), None
+    try:
+        first = recording.first(timeout)
+        height, width = first.image.shape[:2]
+        doubts = calib.doubts(width, height) if calib else [_assumption(width, height)]
+        camera = (calib or guess_from_angle(width, height).calibration).camera(width, height)
+        return LiveSource(recording, camera, None, stride, undistort, doubts)
+    except BaseException:
+        recording.live.close()
+        raise
+
+
+def _assumption(width: int, height: int) -> str:
+    guess = guess_from_angle(width, height)
+    return (
+        f"no calibration: assuming the usual angle of view, a focal length of {guess.focal:.0f} px; it can be found in "
+        "a recorded clip (dvo run CLIP), which writes a calib.txt for --calib"
+    )
+
+
+def _live(
+    images: Iterator[T], name: str, is_recording: bool, queue: int | None, stopped: threading.Event
+) -> LiveFrames[T]:
+    if queue is None:
+        queue = 0 if is_recording else QUEUE
+    return LiveFrames(images, queue or QUEUE, drop=queue > 0, name=name, interrupt=stopped.set)
+
+
+def _of_capture(
+    address: str, fps: float | None, queue: int | None, stopped: threading.Event
+) -> tuple[LiveRecording[RawFrame], float]:
+    if not is_stream(address):
+        remedy = "give webcam:N, rtsp://..., http://... or -"
+        raise DvoError("neither a camera nor an address", file=shown(address), remedy=remedy)
+    capture = Capture(address, fps)
+    live = _live(capture.images(stopped.is_set), capture.name, capture.is_recording, queue, stopped)
+    return LiveRecording(live, lambda raw: raw, capture.times), _FIRST
+
+
+@dataclass(frozen=True)
+class _Encoded:
+    """Image of a pipe that is decoded only if it is not dropped."""
+
+    index: int
+    timestamp: float
+    data: bytes
+
+
+def _of_pipe(file: Any, fps: float | None, queue: int | None, stopped: threading.Event) -> LiveRecording[_Encoded]:
+    name = "standard input" if file == STANDARD_INPUT else str(getattr(file, "name", "pipe"))
+    if file == STANDARD_INPUT:
+        file = sys.stdin.buffer
+    if not hasattr(file, "read"):
+        remedy = "give webcam:N, rtsp://..., http://..., - or a binary file"
+        raise DvoError(f"a stream cannot be {type(file).__name__}", field="source", remedy=remedy)
+    if hasattr(file, "isatty") and file.isatty():
+        raise DvoError("is a terminal", file=name, remedy="pipe images into it: ffmpeg ... -f image2pipe - | dvo run -")
+
+    def images() -> Iterator[_Encoded]:
+        clock = StreamClock()
+        for index, data in enumerate(split_images(pipe_reader(file, stopped.is_set), name)):
+            yield _Encoded(index, clock(time.monotonic()) if fps is None else index / fps, data)
+
+    times = "arrival" if fps is None else "fps"
+    return LiveRecording(_live(images(), name, fps is not None, queue, stopped), partial(_decoded, name), times)
+
+
+def _decoded(name: str, item: _Encoded) -> RawFrame | None:
+    image = decode_bytes(item.data, name)
+    if image is None:
+        return None
+    return RawFrame(item.index, item.timestamp, to_rgb8(image), f"{name} image {item.index}")

@@ -30,6 +30,9 @@ EXPECTED = [
     "load",
     "load_model",
     "open",
+    "open_stream",
+    "stream",
+    "LiveFrames",
     "DvoError",
 ]
 

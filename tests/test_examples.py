@@ -1,5 +1,8 @@
 """The scripts of ``examples/`` run as they are, on few frames or steps."""
 
+import ast
+import dataclasses
+import inspect
 import os
 import re
 import subprocess
@@ -8,6 +11,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+
+import dvo
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -37,6 +42,32 @@ def test_quick_start(tmp_path):
 
 def test_track_arrays(tmp_path):
     assert "14 of 14 frames" in run(EXAMPLES / "track_arrays.py", "--frames", "14", cwd=tmp_path)
+
+
+def test_webcam(tmp_path, image_folder):
+    """On recorded images: the program has no camera here."""
+    calib = image_folder.parent / "calib.txt"
+    out = run(EXAMPLES / "webcam.py", image_folder, "--calib", calib, cwd=tmp_path)
+    assert len(re.findall(r"^ *\d+\.\d{3} s  (?:initialising|tracking|lost)", out, re.MULTILINE)) == 20
+    assert re.search(r"^\d+ of 20 frames tracked", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", ["ros2_node.py", "webcam.py"])
+def test_live_examples_use_names_that_are_there(name):
+    """There is no ROS here: the file must compile, and the names of dvo and of its frames and estimates exist."""
+    text = (EXAMPLES / name).read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 40
+    tree = ast.parse(text)
+    compile(tree, name, "exec")
+    used = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
+    public = {node.attr for node in used if node.value.id == "dvo"}
+    assert "Estimate" in public or "Frame" in public
+    assert public <= set(dvo.__all__)
+    fields = {field.name for field in dataclasses.fields(dvo.Estimate)}
+    assert {node.attr for node in used if node.value.id == "estimate"} <= fields
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+        if ast.unparse(call.func) in ("dvo.Frame", "dvo.Camera"):
+            inspect.signature(getattr(dvo, call.func.attr)).bind(*call.args, **{k.arg: k for k in call.keywords})
 
 
 def test_fine_tune(tmp_path):

@@ -135,7 +135,7 @@ def _array_of(image: Any, field: str) -> np.ndarray:
         return np.asarray(image)
     torch, pil = sys.modules.get("torch"), sys.modules.get("PIL.Image")
     if torch is not None and isinstance(image, torch.Tensor):
-        return _converted(lambda: _of_tensor(image), image, field)
+        return _converted(lambda: array_of_tensor(image), image, field)
     if pil is not None and isinstance(image, pil.Image):
         direct = image.mode in _PIL_MODES or image.mode.startswith("I;16")
         return _converted(lambda: np.asarray(image if direct else image.convert("RGB")), image, field)
@@ -146,8 +146,12 @@ def _array_of(image: Any, field: str) -> np.ndarray:
     )
 
 
-def _of_tensor(image: Any) -> np.ndarray:
-    """Array of a torch tensor, with the channels last."""
+def array_of_tensor(image: Any) -> np.ndarray:
+    """Array of a torch tensor, with the channels last.
+
+    Args:
+        image: tensor on any device, ``(H, W)``, ``(H, W, C)``, or ``(C, H, W)`` where the shape leaves no doubt.
+    """
     image = image.detach()
     if image.is_floating_point():
         image = image.float()  # NumPy has no bfloat16

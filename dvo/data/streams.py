@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.data.frame_checks import array_of_tensor
 from dvo.data.stamps import checked_rate
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
@@ -83,7 +85,8 @@ def stream(
 
     Args:
         images: any iterable of ``(H, W, 3)`` uint8 RGB (or ``(H, W)`` grey) images, of pairs ``(seconds, image)``, or
-            of :class:`Frame`, which is passed on as it is. Read once, one element at a time.
+            of :class:`Frame`, which is passed on as it is. Arrays may have any memory layout, torch tensors may lie on
+            any device and have their channels first. Read once, one element at a time.
         camera: camera of the images; needed unless the elements are frames.
         timestamps: seconds of the images, in the same order; may be endless.
         fps: images a second, if there are no times.
@@ -159,8 +162,10 @@ def _seconds(time: Any, index: int, name: str) -> float:
 
 def _checked(image: Any, camera: Camera, index: int, name: str) -> np.ndarray:
     """``(H, W, 3)`` uint8 RGB of the camera's size."""
+    torch = sys.modules.get("torch")
     try:
-        image = np.asarray(image)
+        is_tensor = torch is not None and isinstance(image, torch.Tensor)
+        image = array_of_tensor(image) if is_tensor else np.asarray(image)
     except (TypeError, ValueError, OverflowError):  # rows of different lengths
         image = np.zeros(0)
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,)):
@@ -179,4 +184,4 @@ def _checked(image: Any, camera: Camera, index: int, name: str) -> np.ndarray:
         )
     if image.shape[2:] != (3,):
         return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
-    return image
+    return np.ascontiguousarray(image)

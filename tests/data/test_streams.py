@@ -1,7 +1,9 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from dvo.commands.run import track
 from dvo.data import Frame, open_source, stream
@@ -72,6 +74,35 @@ def test_grey_and_distorted_images(make):
     assert found.camera == straight.camera and np.array_equal(found.image, straight.image)
     (kept,) = stream([raw.image], lens, fps=1, undistort=False)
     assert kept.camera == lens and np.array_equal(kept.image, raw.image)
+
+
+def test_any_memory_layout_and_tensors():
+    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    wide = np.zeros((96, 200, 4), np.uint8)
+    wide[::2, 10:138:2, :3] = rgb
+    forms = [
+        rgb,
+        np.asfortranarray(rgb),
+        rgb[::-1].copy()[::-1],
+        wide[::2, 10:138:2, :3],
+        rgb[..., ::-1].copy()[..., ::-1],
+    ]
+    forms += [torch.from_numpy(rgb), torch.from_numpy(rgb).permute(2, 0, 1), torch.from_numpy(wide)[::2, 10:138:2, :3]]
+    assert sum(isinstance(form, np.ndarray) and form.flags.carray for form in forms) == 1
+    for camera in (CAMERA, replace(CAMERA, model="radtan", coefficients=(-0.2, 0.05, 0.0, 0.0))):
+        first, *others = stream(forms, camera, fps=1)
+        assert all(np.array_equal(other.image, first.image) and other.image.flags.c_contiguous for other in others)
+        assert np.array_equal(first.image, rgb) == (camera is CAMERA) and len(others) == 7
+
+
+def test_views_are_tracked_as_their_copies(fake_odometry):
+    """Not contiguous frames reach an odometry as contiguous arrays of the same pixels."""
+    whole = np.random.default_rng(0).integers(0, 256, (6, 48, 128, 3), dtype=np.uint8)
+    views = [Frame(i, 0.1 * i, image[:, ::2][::-1], CAMERA) for i, image in enumerate(whole)]
+    odometry = fake_odometry()
+    assert not views[0].image.flags.c_contiguous and run(odometry, views).frames_fed == 6
+    for view, frame in zip(views, odometry.frames, strict=True):
+        assert frame.image.flags.carray and np.array_equal(frame.image, view.image)
 
 
 @pytest.mark.parametrize(

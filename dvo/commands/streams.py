@@ -12,12 +12,12 @@ from dvo.data.source import Source
 
 
 def stream_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Arguments of :func:`dvo.open` for a stream.
+    """Arguments of :func:`dvo.open` for a stream, or a bag of ROS.
 
     Args:
         arguments: of the command line.
     """
-    return {"queue": arguments.queue}
+    return {"queue": arguments.queue, "topic": arguments.topic}
 
 
 def stream_facts(source: Source) -> dict[str, Any]:

@@ -230,7 +230,19 @@ def _find(data: dict[str, Any], *keys: str) -> Any:
 
 
 def _from_yaml(text: str, path: Path) -> Calibration:
-    data = load_yaml(text, path)
+    return from_values(load_yaml(text, path), path)
+
+
+def from_values(data: Any, path: Path) -> Calibration:
+    """Calibration of the entries of one of the YAML dialects of :func:`read_calibration`.
+
+    Args:
+        data: dictionary of the entries.
+        path: file that they come from, for messages.
+
+    Raises:
+        DvoError: as :func:`read_calibration`; the signs of the focal lengths are not checked.
+    """
     if isinstance(data, dict) and "cam0" in data:
         data = data["cam0"]
     if not isinstance(data, dict):

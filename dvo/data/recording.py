@@ -28,11 +28,13 @@ class Request:
         times: file with the time of every image.
         fps: frames a second.
         calibration: calibration that the user named; wins over the data set's own.
+        topic: of the images, in a bag of ROS.
     """
 
     times: Path | None = None
     fps: float | None = None
     calibration: Calibration | None = None
+    topic: str | None = None
 
 
 @dataclass(frozen=True)

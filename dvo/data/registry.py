@@ -9,6 +9,7 @@ from dvo.errors import DvoError
 from dvo.registry import Registry
 
 _BUILT_IN = {
+    "rosbag": "dvo.data.rosbag:READER",
     "video": "dvo.data.video:READER",
     "euroc": "dvo.data.euroc:READER",
     "kitti": "dvo.data.kitti:READER",

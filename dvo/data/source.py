@@ -19,6 +19,7 @@ from dvo.data.frame import Frame, InertialSamples, StereoView
 from dvo.data.groundtruth import read_groundtruth
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
 from dvo.data.registry import find_reader
+from dvo.data.rosbag import split_topic
 from dvo.data.sensors import StereoRig
 from dvo.data.stamps import checked_rate
 from dvo.data.trajectory import Trajectory
@@ -212,10 +213,11 @@ def open_source(
     reader: str | None = None,
     guess: bool = False,
     queue: int | None = None,
+    topic: str | None = None,
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
-    ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it); or a stream: ``webcam:0``,
-    ``rtsp://...``, ``http://...`` or ``-``, see :func:`dvo.data.live_source.open_stream`.
+    ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it), a bag of ROS; or a stream:
+    ``webcam:0``, ``rtsp://...``, ``http://...`` or ``-``, see :func:`dvo.data.live_source.open_stream`.
 
     Relative paths of the options are looked up from the working directory, then from the source's folder, so that
     ``--calib ../calib.txt`` beside an image folder is found from anywhere.
@@ -234,6 +236,7 @@ def open_source(
         guess: where there is no calibration, guess the focal length (:mod:`dvo.data.focal_guess`), for
             :func:`dvo.calibrate`.
         queue: of a stream, frames that may wait.
+        topic: of the images in a bag of ROS, if there are several; ``bag.mcap:/camera/image`` names it too.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -252,13 +255,13 @@ def open_source(
     if is_stream(source):
         from dvo.data.live_source import open_stream
 
-        for field, value in {"times": times, "groundtruth": groundtruth, "reader": reader}.items():
+        for field, value in {"times": times, "groundtruth": groundtruth, "reader": reader, "topic": topic}.items():
             if value is not None:
                 raise DvoError("not for a stream", field=field, remedy="leave it out")
         return open_stream(source, calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort)
     if queue is not None:
         raise DvoError("frames of a recording do not wait", field="queue", remedy="leave it out")
-    path = Path(source)
+    path, topic = split_topic(source, topic)
     with lookups(path):
         is_there = path.exists()
     if not is_there:
@@ -270,6 +273,7 @@ def open_source(
         _locate(times, path, "times") if times is not None else None,
         checked_rate(fps),
         calib if calib is None or isinstance(calib, Calibration) else read_calibration(_locate(calib, path, "calib")),
+        topic,
     )
     with lookups(path):
         recording = find_reader(path, reader).open(path, request)

@@ -41,7 +41,17 @@ def own(make, monkeypatch):
 
 
 def test_order_of_matching():
-    assert names_in_order() == ["video", "euroc", "kitti", "tartanair", "tum", "icl_nuim", "sequence", "folder"]
+    assert names_in_order() == [
+        "rosbag",
+        "video",
+        "euroc",
+        "kitti",
+        "tartanair",
+        "tum",
+        "icl_nuim",
+        "sequence",
+        "folder",
+    ]
     assert all(READERS.resolve(name).name == name for name in names_in_order())
 
 

@@ -154,7 +154,7 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
 
 
 def worth_keeping(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, last: bool) -> bool:
-    """Whether the frames of a segment that was never initialised are kept.
+    """Decide if the frames of a segment that was never initialised are kept.
 
     Args:
         graph: of the sequence, its window not empty.

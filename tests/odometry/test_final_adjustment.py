@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 import dvo
 from dvo.ba.restart import restart
 from dvo.errors import DvoError
+from dvo.geometry import se3
 from dvo.graph.archive import ArchiveConfig
 from dvo.metrics import evaluate
-from dvo.odometry.final_adjustment import AdjustmentOptions, adjust_segment
+from dvo.odometry.final_adjustment import AdjustmentOptions, _extended, adjust_segment
 from dvo.odometry.session import run
 from dvo.synth.sequence import make_sequence
 from tests.archived_walk import archived_walk
@@ -63,6 +66,18 @@ def test_a_segment_too_short_or_unknown_is_left_alone():
     before = graph.log.trajectory().poses_wc
     assert adjust_segment(graph, 0) == 0 and adjust_segment(graph, 5) == 0
     assert np.array_equal(graph.log.trajectory().poses_wc, before)
+
+
+@given(st.floats(0.3, 3.0), st.integers(3, 9))
+def test_a_better_beginning_is_extended_to_later_frames(scale, first):
+    """Of a solution in another unit, the rest follows the beginning in the right one, with an equal depth by frame."""
+    generator = torch.Generator().manual_seed(first)
+    true_cw = se3.exp(0.3 * torch.randn(12, 6, generator=generator, dtype=torch.float64))
+    true_depths = 0.5 + torch.rand(12, 1, generator=generator, dtype=torch.float64).expand(12, 6)
+    old_cw = torch.cat([scale * true_cw[:, :3], true_cw[:, 3:]], 1)
+    poses, depths = _extended(old_cw, true_depths / scale, true_cw[:first], true_depths[:first, ::2])
+    torch.testing.assert_close(se3.relative(true_cw, poses), se3.identity(dtype=torch.float64).expand(12, 7))
+    torch.testing.assert_close(depths, true_depths)
 
 
 def test_frames_dropped_on_a_slow_walk_get_the_scale_of_the_whole():

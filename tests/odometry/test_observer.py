@@ -1,4 +1,4 @@
-"""What is read of a keyframe graph between two frames."""
+"""Views of a keyframe graph between two frames, for observers."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ BLACK = 1
 
 @dataclass(frozen=True)
 class Task:
-    """What to run.
+    """Sequence, system and settings of a run.
 
     Attributes:
         mode: ``revisit`` or ``blackout``.
@@ -59,7 +59,7 @@ class Task:
 
     @property
     def key(self) -> list[Any]:
-        """What a run is found again by."""
+        """Values that identify the run in a file of results."""
         options = dict(self.sequence.rendered or ())
         return [self.mode, self.system, self.sequence.name, options.get("version"), options.get("seed"), self.loops,
                 self.dark, self.seed, self.device, self.frames]  # fmt: skip

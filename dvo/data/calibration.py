@@ -121,7 +121,7 @@ class Calibration:
                 f"the principal point ({self.cx:g}, {self.cy:g}) lies far from the centre of the {width}x{height} "
                 "images: is the calibration that of another resolution?"
             )
-        if not 0.8 < self.fx / self.fy < 1.25:
+        if not 0.8 * self.fy < self.fx < 1.25 * self.fy:
             found.append(f"fx={self.fx:g} and fy={self.fy:g} differ a lot: were the images stretched?")
         return found
 

@@ -142,11 +142,12 @@ class LiveFrames(Generic[T]):
         """End the iteration as soon as possible; what waits is dropped. May be called from any thread, and in a signal
         handler."""
         with self._changed:
-            self._stopping = True
+            # The lock of an event is not reentrant: a signal handler must not set it while this thread does.
+            is_first, self._stopping = not self._stopping, True
             self.counts.dropped += len(self._waiting)
             self._waiting.clear()
             self._changed.notify_all()
-        if self._interrupt is not None:
+        if is_first and self._interrupt is not None:
             self._interrupt()
 
     def close(self) -> None:
@@ -173,7 +174,10 @@ class LiveFrames(Generic[T]):
                         if error is not None and not self._stopping:
                             raise error
                         return
-                    item = self._waiting.popleft()
+                    try:
+                        item = self._waiting.popleft()
+                    except IndexError:  # a signal handler has called stop since the line above
+                        return
                     self._changed.notify_all()
                 yield item
         finally:

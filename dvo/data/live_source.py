@@ -232,7 +232,9 @@ class _Encoded:
 def _of_pipe(file: Any, fps: float | None, queue: int | None, stopped: threading.Event) -> LiveRecording[_Encoded]:
     name = "standard input" if file == STANDARD_INPUT else str(getattr(file, "name", "pipe"))
     if file == STANDARD_INPUT:
-        file = sys.stdin.buffer
+        file = getattr(sys.stdin, "buffer", None)  # a service may have no standard input
+    if file is None or getattr(file, "closed", False):
+        raise DvoError("is closed", file=name, remedy="pipe images into it: ffmpeg ... -f image2pipe - | dvo run -")
     if not hasattr(file, "read"):
         remedy = "give webcam:N, rtsp://..., http://..., - or a binary file"
         raise DvoError(f"a stream cannot be {type(file).__name__}", field="source", remedy=remedy)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dvo.data.calibration import Calibration, from_values
-from dvo.data.files import is_file, lookups
+from dvo.data.files import MAX_NUMBER, is_file, lookups
 from dvo.data.frame import InertialSamples
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
 from dvo.data.ros_images import decode_message
@@ -148,12 +148,12 @@ class BagRecording:
             return None
         ros1 = hasattr(info, "K")
         k, d, p = (list(getattr(info, key if ros1 else key.lower())) for key in "KDP")
-        if not k[0] > 0:
-            self.warnings.append(f"{name} is not calibrated")
-            return None
         values: dict[str, Any] = {"camera_matrix": k, "distortion_model": info.distortion_model, "D": d}
         if "rect" in parts[-1]:
             values = {"camera_matrix": [*p[0:3], *p[4:7], *p[8:11]]}
+        if not min(values["camera_matrix"][0], values["camera_matrix"][4]) > 0:
+            self.warnings.append(f"{name} is not calibrated")
+            return None
         size = {key: getattr(info, key) for key in ("width", "height") if getattr(info, key)}
         try:
             return from_values({**values, **(size if len(size) == 2 else {})}, self.path)
@@ -218,6 +218,7 @@ def read_inertial(path: Path, topic: str) -> InertialSamples:
             gyro, accel = message.angular_velocity, message.linear_acceleration
             rows.append([_seconds(message), gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z])
     table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    table = table[(np.abs(table) <= MAX_NUMBER).all(axis=1)]  # false for nan too
     _, first = np.unique(table[:, 0], return_index=True)  # sorted: messages may have been recorded out of order
     table = table[first]
     return InertialSamples(table[:, 0].copy(), table[:, 1:4].copy(), table[:, 4:].copy())

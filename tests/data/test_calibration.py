@@ -209,3 +209,10 @@ def test_a_calibration_from_a_pipe_of_the_shell(tmp_path, kind):
         [sys.executable, "-c", code, place], input="500 510 320 240\n", capture_output=True, text=True
     )
     assert done.stdout == "500.0\n", done.stderr
+
+
+def test_focal_lengths_of_zero_are_one_error():
+    calibration = Calibration(500.0, 0.0, 320.0, 240.0)
+    assert calibration.doubts(640, 480)
+    with pytest.raises(DvoError):
+        calibration.camera(640, 480)

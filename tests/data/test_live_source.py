@@ -239,3 +239,13 @@ def test_pipes_that_hold_nothing(make):
     with os.fdopen(terminal, "rb", buffering=0) as file, pytest.raises(DvoError, match="is a terminal.*image2pipe"):
         open_stream(file)
     os.close(leader)
+
+
+def test_a_pipe_that_is_closed_is_told(monkeypatch):
+    closed = io.BytesIO()
+    closed.close()
+    with pytest.raises(DvoError, match="is closed"):
+        open_stream(closed)
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(DvoError, match="standard input: is closed"):
+        open_stream("-")

@@ -85,7 +85,7 @@ class SelfCalibration:
 
     Attributes:
         focal: fx and fy, pixels.
-        deviation: standard deviation, pixels.
+        deviation: standard deviation, pixels, with the set factor and floor of :class:`CalibrationOptions`.
         source: ``self-calibration``, or that of the guess that was kept (:class:`dvo.data.focal_guess.FocalGuess`).
         width, height: of the images, pixels.
         frames: number of frames that it was estimated from.
@@ -183,7 +183,7 @@ def calibrate(
         >>> source = dvo.open("video.mp4", guess=True)
         >>> found = dvo.calibrate(source)
         >>> print(found)
-        focal length 531 +- 9 px (self-calibrated from 120 frames)
+        focal length 520 +- 16 px (self-calibrated from 60 frames)
         >>> run = dvo.run(dvo.load("small"), source.recalibrated(found.calibration))
     """
     limit = 8 * options.frames  # with those that are left out or lost
@@ -216,6 +216,8 @@ def calibrate(
         walk.append((math.log(focal), profile.minimum.value))
         step = _step(walk)
         focal *= math.exp(step)
+        if abs(step) > options.settled:  # the last round may end without having settled
+            deviation = math.hypot(deviation, step)
         if abs(step) <= options.settled or is_last:
             return result(focal, deviation * focal, SELF_CALIBRATED, count)
     return result(guess.focal, guess.deviation, guess.source, count, reason)
@@ -300,7 +302,7 @@ def _doubt(
     """Reason for not believing a minimum; empty for one that is believed."""
     if not np.isfinite(deviation) and profile.contrast == 0 and profile.minimum.gain == 0:
         return "too few frames could be tracked"
-    if not deviation <= options.max_deviation or profile.contrast < options.min_contrast:
+    if not (deviation <= options.max_deviation and profile.contrast >= options.min_contrast):  # nan fails too
         return "the motion does not tell: the measurements fit a wide range of focal lengths"
     found = math.log(focal / guess.focal) + profile.minimum.value
     if abs(found) > 4 * guess.deviation / guess.focal:

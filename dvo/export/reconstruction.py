@@ -159,7 +159,8 @@ def reconstruct(
     if not kept.any():
         remedy = f"finish the odometry first, and give one of the segments 0 to {graph.segment}"
         raise DvoError("no archived keyframes in it", field=f"segment {segment}", remedy=remedy)
-    sizes = [image_size(frame.jpeg) if here and frame.jpeg else None for frame, here in zip(frames, kept, strict=True)]
+    contents = [b"" if frame.jpeg is None else frame.jpeg.tobytes() for frame in frames]
+    sizes = [image_size(content) if here else None for content, here in zip(contents, kept, strict=True)]
     shown = np.array([size is not None for size in sizes], dtype=bool)
     if not shown.any():
         remedy = "track with ArchiveConfig(images=True) and a larger max_bytes"
@@ -185,7 +186,7 @@ def reconstruct(
         identifiers=np.array([frames[image].identifier for image in images]),
         timestamps=np.array([frames[image].timestamp for image in images], dtype=np.float64),
         T_cw=T_cw[images],
-        jpegs=tuple(frames[image].jpeg or b"" for image in images),
+        jpegs=tuple(contents[image] for image in images),
         points=patches.points[seen],
         colors=patches.colors[seen],
         errors=sums / views[seen],

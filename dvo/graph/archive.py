@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dvo.errors import DvoError
+from dvo.graph.storage import ArrayStorage
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class ArchivedKeyframe:
         colors: ``(M, 3)`` uint8 RGB.
         matching: ``(M, C, p, p)`` float16 matching features of the patches, None if not kept.
         context: ``(M, D)`` float16 context features of the patches, None if not kept.
-        jpeg: working image, None if not kept.
+        jpeg: ``(n,)`` uint8 content of a JPEG file with the working image, None if not kept.
     """
 
     identifier: int
@@ -73,13 +74,13 @@ class ArchivedKeyframe:
     colors: np.ndarray
     matching: np.ndarray | None = None
     context: np.ndarray | None = None
-    jpeg: bytes | None = None
+    jpeg: np.ndarray | None = None
 
     @property
     def feature_bytes(self) -> int:
         """Memory of features and image."""
-        arrays = (self.matching, self.context)
-        return sum(a.nbytes for a in arrays if a is not None) + len(self.jpeg or b"")
+        arrays = (self.matching, self.context, self.jpeg)
+        return sum(a.nbytes for a in arrays if a is not None)
 
     @property
     def patch_bytes(self) -> int:
@@ -96,7 +97,7 @@ class ArchivedKeyframe:
             return None
         import cv2
 
-        decoded = cv2.imdecode(np.frombuffer(self.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        decoded = cv2.imdecode(self.jpeg, cv2.IMREAD_COLOR)
         return None if decoded is None else np.ascontiguousarray(decoded[..., ::-1])
 
 
@@ -168,6 +169,7 @@ class Archive:
         # Identifiers in the order of archiving: those with features or an image, and those with patches.
         self._with_features: deque[int] = deque()
         self._with_patches: deque[int] = deque()
+        self._storage = {kind: ArrayStorage() for kind in ("features", "edges", "patches")}  # released in this order
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -219,8 +221,9 @@ class Archive:
         """Add a keyframe, or replace the one of the same identifier.
 
         Args:
-            keyframe: the keyframe.
+            keyframe: the keyframe; its arrays are copied.
         """
+        keyframe = self._stored(keyframe)
         before = self._keyframes.get(keyframe.identifier)
         if before is not None:
             self._bytes -= before.feature_bytes + before.patch_bytes
@@ -235,10 +238,12 @@ class Archive:
         """Add measurements.
 
         Args:
-            edges: the measurements, possibly none.
+            edges: the measurements, possibly none; their arrays are copied.
         """
         if len(edges):
-            self._edges.append(edges)
+            keep = self._storage["edges"].keep
+            columns = edges.source, edges.patch, edges.target, edges.position, edges.weight
+            self._edges.append(ArchivedEdges(*map(keep, columns)))
             self._bytes += edges.nbytes
             self._shrink()
 
@@ -294,6 +299,17 @@ class Archive:
             colors = np.zeros((0, 3), np.uint8)
             self._release(self._with_patches.popleft(), centres=centres, inverse_depth=depth, colors=colors)
 
+    def _stored(self, keyframe: ArchivedKeyframe) -> ArchivedKeyframe:
+        """Keyframe with its arrays in the storage."""
+        features, patches = self._storage["features"].keep, self._storage["patches"].keep
+        matching, context, jpeg = (
+            None if array is None else features(array) for array in (keyframe.matching, keyframe.context, keyframe.jpeg)
+        )
+        centres, depth, colors = map(patches, (keyframe.centres, keyframe.inverse_depth, keyframe.colors))
+        return replace(
+            keyframe, centres=centres, inverse_depth=depth, colors=colors, matching=matching, context=context, jpeg=jpeg
+        )
+
     def _release(self, identifier: int, **without: object) -> None:
         before = self._keyframes[identifier]
         after = replace(before, **without)  # type: ignore[arg-type]
@@ -301,7 +317,7 @@ class Archive:
         self._bytes += after.feature_bytes + after.patch_bytes - before.feature_bytes - before.patch_bytes
 
 
-def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+def encode_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
     """Compress an image.
 
     Args:
@@ -309,9 +325,9 @@ def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
         quality: 1 to 100.
 
     Returns:
-        Content of a JPEG file.
+        ``(n,)`` uint8 content of a JPEG file.
     """
     import cv2
 
     _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return data.tobytes()
+    return data.ravel()

@@ -230,7 +230,7 @@ def _archive_arrays(graph: KeyframeGraph) -> Arrays:
         "archive/matching": _stack([f.matching for f in described], np.float16, (m, 0, p, p)),
         "archive/context": _stack([f.context for f in described], np.float16, (m, 0)),
         "archive/jpeg_bytes": np.array([-1 if f.jpeg is None else len(f.jpeg) for f in frames], np.int64),
-        "archive/jpeg": np.frombuffer(b"".join(f.jpeg or b"" for f in frames), np.uint8),
+        "archive/jpeg": np.concatenate([np.zeros(0, np.uint8), *(f.jpeg for f in frames if f.jpeg is not None)]),
         "edges/parts": np.array([len(part) for part in parts], np.int64),
         "edges/source": edges.source,
         "edges/patch": edges.patch,
@@ -294,18 +294,19 @@ def _read_edges(source: MapReader, graph: KeyframeGraph, per_frame: int) -> None
         graph.archive.add_edges(edges.select(np.arange(end - length, end)))
 
 
-def _split_jpeg(source: MapReader, count: int) -> list[bytes | None]:
+def _split_jpeg(source: MapReader, count: int) -> list[np.ndarray | None]:
     """JPEG of each archived keyframe, all of one size."""
     lengths = source.array("archive/jpeg_bytes", np.int64, (count,), -1, 2**31)
     total = int(lengths.clip(min=0).sum())
-    content = source.array("archive/jpeg", np.uint8, (total,)).tobytes()
-    found: list[bytes | None] = []
+    content = source.array("archive/jpeg", np.uint8, (total,))
+    found: list[np.ndarray | None] = []
     sizes, start = set(), 0
     for length in lengths.tolist():
         found.append(None if length < 0 else content[start : start + length])
         start += max(length, 0)
-        if length >= 0:
-            sizes.add(image_size(found[-1] or b""))
+        jpeg = found[-1]
+        if jpeg is not None:
+            sizes.add(image_size(jpeg.tobytes()))
     source.require(len(sizes) <= 1, "holds images of different sizes", "archive/jpeg")
     for size in sizes:
         fits = size is not None and 0 < size[0] * size[1] <= MAX_PIXELS

@@ -84,7 +84,7 @@ def images_size(graph: KeyframeGraph) -> tuple[int, int] | None:
     Args:
         graph: of a tracker.
     """
-    sizes = (image_size(frame.jpeg) for frame in graph.archive if frame.jpeg)
+    sizes = (image_size(frame.jpeg.tobytes()) for frame in graph.archive if frame.jpeg is not None)
     return next((size for size in sizes if size is not None), None)
 
 

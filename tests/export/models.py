@@ -55,7 +55,7 @@ def one_view(T_cw, camera: Camera, pixel, depth: float) -> tuple[Reconstruction,
     seen = np.array([(pixel[0] - camera.cx) / camera.fx, (pixel[1] - camera.cy) / camera.fy, 1.0]) * depth
     point = T_cw[:3, :3].T @ (seen - T_cw[:3, 3])
     zero = np.zeros(1, dtype=np.int64)
-    jpeg = encode_jpeg(np.zeros((camera.height, camera.width, 3), np.uint8), 90)
+    jpeg = encode_jpeg(np.zeros((camera.height, camera.width, 3), np.uint8), 90).tobytes()
     found = Reconstruction(
         (camera,), zero, zero, np.zeros(1), T_cw[None], (jpeg,), point[None], np.array([[1, 2, 3]], np.uint8),
         np.zeros(1), zero, zero, np.array([pixel], dtype=np.float64), np.zeros(1),

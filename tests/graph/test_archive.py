@@ -20,7 +20,7 @@ M = 3
 
 
 def keyframe(identifier, size=1000, anchor=None):
-    image = bytes(size)
+    image = np.zeros(size, np.uint8)
     pose = np.array([identifier, 0, 0, 0, 0, 0, 1.0])
     return ArchivedKeyframe(
         identifier, 0.1 * identifier, np.ones(4, np.float32), pose, anchor, np.zeros((M, 2), np.float32),

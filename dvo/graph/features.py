@@ -9,14 +9,13 @@ import numpy as np
 from torch import Tensor
 
 from dvo.errors import DvoError
-from dvo.graph.archive import Archive
+from dvo.graph.archive import ArchivedKeyframe
 
 
 class FeatureCache:
     """Least-recently-used cache of feature maps by keyframe.
 
     Args:
-        archive: holds the working images.
         encode: feature maps of an image ``(H, W, 3)`` uint8 RGB.
         capacity: number of keyframes whose maps are kept.
 
@@ -24,31 +23,31 @@ class FeatureCache:
         DvoError: a capacity below 1.
     """
 
-    def __init__(self, archive: Archive, encode: Callable[[np.ndarray], Tensor], capacity: int = 8) -> None:
+    def __init__(self, encode: Callable[[np.ndarray], Tensor], capacity: int = 8) -> None:
         if capacity < 1:
             raise DvoError(f"must be 1 or more, got {capacity}", field="capacity", remedy="keep at least one keyframe")
-        self.archive, self.encode, self.capacity = archive, encode, capacity
+        self.encode, self.capacity = encode, capacity
         self._maps: OrderedDict[int, Tensor] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._maps)
 
-    def maps(self, identifier: int) -> Tensor | None:
+    def maps(self, keyframe: ArchivedKeyframe) -> Tensor | None:
         """Feature maps of a keyframe, from the cache or computed.
 
         Args:
-            identifier: of the keyframe.
+            keyframe: of an archive.
 
         Returns:
             Output of ``encode`` for the working image; None if the image was not kept or has been released.
         """
-        if identifier in self._maps:
-            self._maps.move_to_end(identifier)
-            return self._maps[identifier]
-        image = self.archive[identifier].image() if identifier in self.archive else None
-        if image is None:
-            return None
-        self._maps[identifier] = self.encode(image)
+        identifier = keyframe.identifier
+        if identifier not in self._maps:
+            image = keyframe.image()
+            if image is None:
+                return None
+            self._maps[identifier] = self.encode(image)
+        self._maps.move_to_end(identifier)
         while len(self._maps) > self.capacity:
             self._maps.popitem(last=False)
         return self._maps[identifier]

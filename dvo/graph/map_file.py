@@ -23,7 +23,7 @@ from dvo.data.output import replaced
 from dvo.errors import DvoError
 from dvo.settings import from_table
 
-FORMAT, VERSION = "dvo-map", 1
+FORMAT, VERSION = "dvo-map", 2
 """Name of the format, and the version that is written. Files of older versions are read, newer ones refused."""
 
 _DESCRIPTION = "map.json"
@@ -31,6 +31,7 @@ _LARGEST_DESCRIPTION = 2**24  # bytes
 _DIGITS = 19  # of a whole number in the description
 _LARGEST = {np.dtype(np.float16): 65504.0, np.dtype(np.float32): 1e9, np.dtype(np.float64): 1e12}
 _UNIT = 1e-2  # largest deviation of the length of a quaternion from 1
+_FARTHEST, _SMALLEST_SCALE = 1e9, 1e-9  # of similarities
 _REMEDY = "give a map file as dvo has written it"
 _HEADER = re.compile(
     rb"\{'descr': '([<|][a-z][0-9])', 'fortran_order': False, 'shape': \(((?:[0-9]{1,12},? ?){0,8})\), \} *\n"
@@ -211,6 +212,25 @@ class MapReader:
         found = self.array(name, dtype, (count, 7))
         lengths = np.linalg.norm(found[:, 3:].astype(np.float64), axis=1)
         self.require((np.abs(lengths - 1) < _UNIT).all(), "holds rotations that are no unit quaternions", name)
+        return found
+
+    def similarities(self, name: str, count: int) -> np.ndarray:
+        """Read similarities, with positive scales and quaternions of length 1.
+
+        Args:
+            name: of the array.
+            count: number of similarities.
+
+        Returns:
+            ``(count, 8)`` float64.
+
+        Raises:
+            DvoError: as :meth:`array`, or another quaternion or scale.
+        """
+        found = self.array(name, np.float64, (count, 8), -_FARTHEST, _FARTHEST)
+        lengths = np.linalg.norm(found[:, 3:7], axis=1)
+        valid = (found[:, 7] > _SMALLEST_SCALE).all() and (np.abs(lengths - 1) < _UNIT).all()
+        self.require(valid, "holds no similarities", name)
         return found
 
     def _described(self) -> dict[str, Any]:

@@ -73,6 +73,8 @@ class TrackerConfig:
         estimate_readout: look for a rolling shutter in the final adjustment if the camera states no readout time
             (:mod:`dvo.odometry.self_calibration`).
         loops: close loops, and join segments that show the same place (:mod:`dvo.odometry.loop_closure`).
+        real_time: never wait in ``track`` for a search for loops or a correction by one. Results are then taken when
+            they are there, which depends on the load of the machine: the same frames need not give the same bytes.
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
         sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
             are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). The tracker does not read it;
@@ -126,6 +128,7 @@ class TrackerConfig:
     final_adjustment: bool = True
     estimate_readout: bool = True
     loops: bool = True
+    real_time: bool = False
     robust: float = 0.3
     sigma: float = 0.061
     restart: bool = True

@@ -2,8 +2,11 @@
 
 A confirmed loop adds its measurements to the archive, where the final adjustment finds them, and corrects the poses of
 all keyframes of its world by a pose graph in Sim(3) (Strasdat, Montiel and Davison, "Scale drift-aware large scale
-monocular SLAM", 2010). A loop between two segments joins their worlds. Corrections happen at fixed frames: the same
-frames give the same result, bit for bit on the CPU.
+monocular SLAM", 2010; :mod:`dvo.odometry.loop_correction`). A loop between two segments joins their worlds.
+
+Searches and pose graphs are done beside tracking, in a thread of their own. Their results are taken at a fixed frame,
+``LoopOptions.delay`` frames later, and waited for if they are not there: the same frames give the same result, bit for
+bit on the CPU. In real time they are taken when they are there, and ``track`` never waits.
 
 In a map (a graph with keyframes of earlier recordings) only keyframes of the last recording search. Those of the map
 stay where they are; what joins their world is moved.
@@ -14,27 +17,25 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
 from dvo.geometry import sim3, so3
 from dvo.graph.archive import ArchivedKeyframe
-from dvo.graph.correction import apply_similarities, move_window, similarity_between
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.places import PlaceIndex
 from dvo.models.patch_vo import PatchVO
+from dvo.odometry import loop_correction
+from dvo.odometry.background import Background, Task
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.loop_window import GroupMatcher
 from dvo.odometry.loops import Loop, LoopFinder
 from dvo.odometry.place_descriptors import shipped_descriptor
 
-# Standard deviations of the edges of the pose graph: translation in median depths, rotation in rad, log scale.
-_STEP = (0.01, 0.002, 0.01)
-_LOOP = (0.01, 0.002, 0.01)
 # A loop whose correction is smaller (in the same units) leaves the poses to the final adjustment.
 _SMALL = (0.01, 0.003, 0.01)
 
@@ -50,8 +51,36 @@ def loop_closer(model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, dev
     """
     described = shipped_descriptor(model.config.feature_channels)
     places = PlaceIndex(1 if described is None else described.dimensions)
-    finder = LoopFinder(graph, GroupMatcher(model, config, graph, device), places, described)
-    return LoopCloser(graph, finder, config.loops and not model.config.fine_channels)
+    finder = LoopFinder(graph, GroupMatcher(model, config, device), places, described)
+    return LoopCloser(graph, finder, config.loops and not model.config.fine_channels, config.real_time)
+
+
+@dataclass
+class Searching:
+    """Search in progress.
+
+    Attributes:
+        task: gives the loop, or None.
+        left: frames until its result is taken.
+    """
+
+    task: Task[Loop | None]
+    left: int
+
+
+@dataclass
+class Correcting:
+    """Correction in progress, by the last loop.
+
+    Attributes:
+        task: gives the similarities ``(N, 8)``.
+        left: frames until its result is taken.
+        identifiers: ``(N,)`` of the keyframes.
+    """
+
+    task: Task[Tensor]
+    left: int
+    identifiers: np.ndarray
 
 
 @dataclass
@@ -62,6 +91,7 @@ class LoopCloser:
         graph: of the tracker; corrected in place.
         finder: of loops.
         enabled: search for loops; otherwise nothing is kept or found.
+        real_time: take results as soon as they are there, instead of waiting for them at a fixed frame.
 
     Attributes:
         loops: confirmed loops, in the order of their discovery.
@@ -69,36 +99,51 @@ class LoopCloser:
         wait: kept keyframes until the next search.
         pending: loop that has not been confirmed yet.
         searches: since then.
+        work: search or correction in progress.
     """
 
     graph: KeyframeGraph
     finder: LoopFinder
     enabled: bool = True
+    real_time: bool = False
     loops: list[Loop] = field(default_factory=list)
     corrections: int = 0
     wait: int = 0
     pending: Loop | None = None
     searches: int = 0
+    work: Searching | Correcting | None = None
+    _background: Background = field(default_factory=Background)
 
     def see(self, identifier: int, image: np.ndarray, maps: Tensor) -> None:
         """Describe a new keyframe of the window; see :meth:`dvo.odometry.loops.LoopFinder.see`."""
         if self.enabled:
             self.finder.see(identifier, image, maps)
 
-    def advance(self, segments: Collection[int]) -> bool:
-        """Look at the keyframes that have been archived since the last call.
+    def advance(self, segments: Collection[int], at_once: bool = False) -> bool:
+        """Look at the keyframes that have been archived since the last call, once a frame.
 
         Args:
             segments: those that are initialised. Keyframes of others wait until theirs is.
+            at_once: wait for the result of each search and correction.
 
         Returns:
             True if poses were corrected.
         """
-        corrected = False
-        seen = self.finder.kept[-1] if self.enabled and self.finder.kept else -1
-        for frame in self.graph.archive.kept_after(seen) if self.enabled else []:
+        if not self.enabled:
+            return False
+        corrected, at_once = False, at_once or not self.finder.options.delay
+        seen = self.finder.kept[-1] if self.finder.kept else -1
+        for frame in self.graph.archive.kept_after(seen):
             if self.graph.segment_of(frame.identifier) in segments:
-                corrected |= self._visit(frame)
+                self._visit(frame)
+                corrected |= at_once and self._drain()
+        return self._drain() | corrected if at_once else self._collect(False)
+
+    def _drain(self) -> bool:
+        """Wait for the work in progress, and what follows from it; True if poses were corrected."""
+        corrected = False
+        while self.work is not None:
+            corrected |= self._collect(True)
         return corrected
 
     def complete(self, segments: Collection[int], searches: int = 60) -> bool:
@@ -111,7 +156,7 @@ class LoopCloser:
         Returns:
             True if poses were corrected.
         """
-        corrected = self.advance(segments)
+        corrected = self.advance(segments, at_once=True)
         loops = self._own_loops()
         if not loops:
             return corrected
@@ -150,30 +195,49 @@ class LoopCloser:
         """Confirmed loops of the last recording."""
         return [loop for loop in self.loops if loop.new >= self.graph.recording.keyframe]
 
-    def _visit(self, frame: ArchivedKeyframe) -> bool:
-        """Take a kept keyframe into the list, and search for a loop if it is time to."""
+    def _visit(self, frame: ArchivedKeyframe) -> None:
+        """Take a kept keyframe into the list, and begin to search for a loop if it is time to."""
         kept, options = self.finder.kept, self.finder.options
         self.finder.keep(frame.identifier)
         self.wait -= 1
         own = len(kept) > 2 * options.neighbours and kept[-1 - 2 * options.neighbours] >= self.graph.recording.keyframe
-        if self.wait > 0 or not own:
-            return False
-        loop = self.finder.find(kept[-1 - options.neighbours])
+        if self.wait > 0 or not own or self.work is not None:
+            return
+        search = self.finder.prepare(kept[-1 - options.neighbours], self.pending)
+        self.work = Searching(self._background.start(partial(self.finder.verify, search)), options.delay)
         self.wait = options.every
-        pending, self.searches = self.pending, self.searches + 1
+
+    def _collect(self, at_once: bool) -> bool:
+        """Take the result of the work in progress if its time has come; True if poses were corrected."""
+        work = self.work
+        if work is None:
+            return False
+        work.left -= 1
+        if not (at_once or (work.task.done if self.real_time else work.left <= 0)):
+            return False
+        self.work = None
+        if isinstance(work, Searching):
+            self._found(work.task.result())
+            return False
+        self._apply(work.identifiers, work.task.result())
+        return True
+
+    def _found(self, loop: Loop | None) -> None:
+        """Take the outcome of a search."""
+        options, pending, self.searches = self.finder.options, self.pending, self.searches + 1
         if loop is None:
             if pending is not None:
-                self.wait = 2 if self.searches < options.patience else options.every
-                self.pending = pending if self.searches < options.patience else None
-            return False
+                again = self.searches < options.patience
+                self.wait, self.pending = (2, pending) if again else (options.every, None)
+            return
         if self._needs_confirmation(loop):
             if pending is None or not self.finder.agree(pending, loop):
                 self.pending, self.searches, self.wait = loop, 0, 2
-                return False
+                return
             self._accept(pending)
         self._accept(loop)
         self.pending = None
-        return self._correct(loop)
+        self._correct(loop)
 
     def _needs_confirmation(self, loop: Loop) -> bool:
         """Return True unless the loop changes next to nothing, so that the present poses confirm it."""
@@ -191,80 +255,19 @@ class LoopCloser:
         self.graph.add_loop(loop.edges)
         self.loops.append(replace(loop, edges=None))
 
-    def _correct(self, loop: Loop) -> bool:
-        """Correct all keyframes of the world of a loop, and the window with them."""
-        graph = self.graph
-        worlds = {graph.world_of(graph.segment_of(k)) for k in (loop.old, loop.new)}
-        if len(worlds) == 1 and self._is_small(loop):
-            return False
-        kept = [k for k in self.finder.kept if graph.world_of(graph.segment_of(k)) in worlds]
-        identifiers = np.array(kept)
-        before = graph.poses_cw(identifiers)
-        held = self._held(identifiers)
-        found = self._solve(identifiers, self._start(identifiers, before, loop), held)
-        here = [row for row, k in enumerate(kept) if graph.segment_of(k) == graph.segment]
-        apply_similarities(graph, identifiers[~held], found[torch.from_numpy(~held)])
-        if here:
-            move_window(graph, before[here[-1]], found[here[-1]])
-        self._rescale(identifiers, found)
-        if len(worlds) > 1:
-            graph.join(graph.segment_of(loop.new), graph.segment_of(loop.old))
-        self.corrections += 1
-        return True
+    def _correct(self, loop: Loop) -> None:
+        """Begin to correct all keyframes of the worlds of a loop, unless it changes next to nothing."""
+        if not loop.joins and self._is_small(loop):
+            return
+        correction = loop_correction.prepare(self.graph, self.finder.kept, self.loops, loop)
+        task = self._background.start(correction.solve)
+        self.work = Correcting(task, self.finder.options.delay, correction.identifiers)
 
-    def _start(self, identifiers: np.ndarray, poses_cw: Tensor, loop: Loop) -> Tensor:
-        """Similarities ``(N, 8)`` world to camera to start from; a joining segment is moved into the older world.
-
-        In a map the later of the two worlds is moved, whichever keyframe is the older one.
-        """
-        start = sim3.from_se3(poses_cw)
-        if not loop.joins:
-            return start
-        graph, worlds = self.graph, [self.graph.world_of(self.graph.segment_of(k)) for k in (loop.old, loop.new)]
-        old, new = graph.poses_cw(np.array([loop.old, loop.new]))
-        there = sim3.compose(loop.measurement, sim3.from_se3(old))  # older world to the newer camera, in its unit
-        found_cw, scale = torch.cat([there[:3] / there[7], there[3:7]]), float(1 / there[7])
-        change = sim3.inverse(similarity_between(new, found_cw, scale))
-        newer = worlds[1]
-        if graph.recording.keyframe and worlds[0] > worlds[1]:
-            newer, change = worlds[0], sim3.inverse(change)
-        moving = torch.tensor([graph.world_of(graph.segment_of(int(k))) == newer for k in identifiers])
-        return torch.where(moving[:, None], sim3.compose(start, change), start)
-
-    def _held(self, identifiers: np.ndarray) -> np.ndarray:
-        """Mask ``(N,)`` of the keyframes of the map, in the world that stays; none without a map."""
-        graph = self.graph
-        worlds = np.array([graph.world_of(graph.segment_of(int(k))) for k in identifiers])
-        return (identifiers < graph.recording.keyframe) & (worlds == worlds.min())
-
-    def _solve(self, identifiers: np.ndarray, start: Tensor, held: np.ndarray) -> Tensor:
-        """Solve the pose graph of consecutive keyframes and loops; ``held (N,)`` poses stay, else the first one."""
-        graph, archive = self.graph, self.graph.archive
-        segments = np.array([graph.segment_of(int(k)) for k in identifiers])
-        depth = torch.tensor([1.0 / float(np.median(archive[int(k)].inverse_depth)) for k in identifiers]).double()
-        ii = torch.from_numpy(np.flatnonzero(segments[1:] == segments[:-1]))
-        jj = ii + 1
-        steps = sim3.from_se3(graph.poses_cw(identifiers))
-        measured = sim3.compose(steps[jj], sim3.inverse(steps[ii]))
-        position = {int(k): row for row, k in enumerate(identifiers)}
-        loops = [loop for loop in self.loops if loop.old in position and loop.new in position]
-        old = torch.tensor([position[loop.old] for loop in loops])
-        new = torch.tensor([position[loop.new] for loop in loops])
-        deviation = torch.tensor([_STEP] * len(ii) + [_LOOP] * len(loops)).double()
-        ends = torch.cat([jj, new])
-        shape = deviation[:, [0, 0, 0, 1, 1, 1, 2]].clone()
-        shape[:, :3] *= depth[ends, None]
-        options = PoseGraphOptions(fixed=torch.from_numpy(held)) if held.any() else PoseGraphOptions()
-        result = optimise_pose_graph(
-            start, torch.cat([ii, old]), ends, torch.cat([measured, *(loop.measurement[None] for loop in loops)]),
-            shape.square().reciprocal(), options,
-        )  # fmt: skip
-        return sim3.normalise(result.poses_cw)
-
-    def _rescale(self, identifiers: np.ndarray, similarities: Tensor) -> None:
-        """Express the loops in the new units of the keyframes."""
-        unit = dict(zip(identifiers.tolist(), similarities[:, 7].tolist(), strict=True))
+    def _apply(self, identifiers: np.ndarray, found: Tensor) -> None:
+        """Correct the poses, and express the loops in the new units of the keyframes."""
+        unit = loop_correction.apply(self.graph, self.finder.kept, self.loops[-1], identifiers, found)
         for row, loop in enumerate(self.loops):
             old, new = unit.get(loop.old, 1.0), unit.get(loop.new, 1.0)
             t, q, scale = loop.measurement[:3] / new, loop.measurement[3:7], loop.measurement[7:] * old / new
             self.loops[row] = replace(loop, measurement=torch.cat([t, q, scale]))
+        self.corrections += 1

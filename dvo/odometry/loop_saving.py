@@ -1,9 +1,9 @@
-"""Loop closure in map files: loops, the search for them, and descriptors of places."""
+"""Loop closure in map files: loops, the search for them, work in progress, and descriptors of places."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,11 +13,12 @@ from dvo.errors import DvoError
 from dvo.graph.archive import ArchivedEdges
 from dvo.graph.map_file import MapReader
 from dvo.graph.places import PlaceIndex
-from dvo.odometry.loop_closure import LoopCloser
+from dvo.odometry.background import Task
+from dvo.odometry.loop_closure import Correcting, LoopCloser, Searching
+from dvo.odometry.loop_correction import members
 from dvo.odometry.loops import Loop
 
 _LAST = 2**31 - 1
-_MOST = 1e9  # largest translation of a loop
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ class LoopsTable:
         loops: confirmed ones.
         pending: loop that has not been confirmed yet.
         corrections, wait, searches: see :class:`dvo.odometry.loop_closure.LoopCloser`.
+        searching: frames until the result of the search in progress is taken; 0 if there is none.
+        found: that result.
+        correcting: frames until the correction in progress is made; 0 if there is none.
     """
 
     loops: tuple[LoopTable, ...]
@@ -51,9 +55,13 @@ class LoopsTable:
     corrections: int
     wait: int
     searches: int
+    searching: int = 0
+    found: LoopTable | None = None
+    correcting: int = 0
 
     RANGES: ClassVar[dict[str, tuple[float, float]]] = {
-        "corrections": (0, _LAST), "wait": (-_LAST, _LAST), "searches": (0, _LAST),
+        "corrections": (0, _LAST), "wait": (-_LAST, _LAST), "searches": (0, _LAST), "searching": (0, _LAST),
+        "correcting": (0, _LAST),
     }  # fmt: skip
 
 
@@ -61,24 +69,36 @@ def _table(loop: Loop) -> LoopTable:
     return LoopTable(loop.old, loop.new, loop.kind, loop.inliers, loop.count, loop.joins)
 
 
+def _found(closer: LoopCloser) -> Loop | None:
+    """Result of the search in progress, waited for."""
+    return closer.work.task.result() if isinstance(closer.work, Searching) else None
+
+
 def loops_table(closer: LoopCloser) -> dict[str, Any]:
-    """JSON-able values of a :class:`LoopsTable`."""
-    pending = None if closer.pending is None else _table(closer.pending)
-    loops = tuple(_table(loop) for loop in closer.loops)
-    return asdict(LoopsTable(loops, pending, closer.corrections, closer.wait, closer.searches))
+    """JSON-able values of a :class:`LoopsTable`; waits for the work in progress."""
+    pending, found = (None if loop is None else _table(loop) for loop in (closer.pending, _found(closer)))
+    left = max(closer.work.left, 1) if closer.work is not None else 0
+    searching, correcting = (left if isinstance(closer.work, kind) else 0 for kind in (Searching, Correcting))
+    loops = tuple(map(_table, closer.loops))
+    return asdict(
+        LoopsTable(loops, pending, closer.corrections, closer.wait, closer.searches, searching, found, correcting)
+    )
 
 
 def loops_arrays(closer: LoopCloser) -> dict[str, np.ndarray]:
-    """Arrays of the loop closure by name."""
-    every = [*closer.loops, *([] if closer.pending is None else [closer.pending])]
+    """Arrays of the loop closure by name; waits for the work in progress."""
+    waiting = {"loops": closer.pending, "search": _found(closer)}
+    every = [*closer.loops, *(loop for loop in waiting.values() if loop is not None)]
     measured = [loop.measurement.numpy() for loop in every]
     arrays = {"loops/measurements": np.array(measured, np.float64).reshape(-1, 8)}
     arrays |= {f"places/{name}": values for name, values in closer.finder.places.to_arrays().items()}
-    if closer.pending is not None and closer.pending.edges is not None:
-        edges = closer.pending.edges
-        arrays |= {
-            f"loops/{name}": getattr(edges, name) for name in ("source", "patch", "target", "position", "weight")
-        }
+    for name, loop in waiting.items():
+        if loop is not None and loop.edges is not None:
+            columns = ("source", "patch", "target", "position", "weight")
+            arrays |= {f"{name}/{column}": getattr(loop.edges, column) for column in columns}
+    if isinstance(closer.work, Correcting):
+        arrays["correction/keyframes"] = closer.work.identifiers
+        arrays["correction/similarities"] = closer.work.task.result().numpy()
     return arrays
 
 
@@ -94,10 +114,8 @@ def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[in
         DvoError: a missing or invalid value or array.
     """
     table, archive = source.table(LoopsTable, "loops"), closer.graph.archive
-    tables = [*table.loops, *([] if table.pending is None else [table.pending])]
-    measured = source.array("loops/measurements", np.float64, (len(tables), 8), -_MOST, _MOST)
-    positive = (measured[:, 7] > 1e-9).all() and (np.abs(np.linalg.norm(measured[:, 3:7], axis=1) - 1) < 1e-6).all()
-    source.require(positive, "holds no similarities", "loops/measurements")
+    tables = [*table.loops, *(loop for loop in (table.pending, table.found) if loop is not None)]
+    measured = source.similarities("loops/measurements", len(tables))
     loops = []
     for row, loop in zip(measured, tables, strict=True):
         known = all(k in archive and archive[k].anchor is None for k in (loop.old, loop.new))
@@ -108,40 +126,47 @@ def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[in
             Loop(loop.old, loop.new, *times, loop.kind, loop.inliers, measurement, loop.count, None, loop.joins)
         )
     closer.corrections, closer.wait, closer.searches = table.corrections, table.wait, table.searches
+    source.require(not (table.searching and table.correcting), "searching and correcting at once", "loops: searching")
+    found = _with_edges(source, loops.pop(), closer, "search") if table.found is not None else None
     if table.pending is not None:
-        closer.pending = _pending(source, loops.pop(), closer)
+        closer.pending = _with_edges(source, loops.pop(), closer, "loops")
     closer.loops[:] = loops
+    if table.searching:
+        closer.work = Searching(Task.finished(found), table.searching)
     if not closer.enabled:
         return
     kept = (frame.identifier for frame in archive if frame.anchor is None)
     closer.finder.kept[:] = [k for k in kept if closer.graph.segment_of(k) in segments]
     _restore_places(source, closer)
+    if table.correcting:
+        closer.work = _correction(source, closer, table.correcting)
 
 
-def _pending(source: MapReader, loop: Loop, closer: LoopCloser) -> Loop:
-    """Pending loop with its measurements, which are not archived yet."""
+def _correction(source: MapReader, closer: LoopCloser, left: int) -> Correcting:
+    """Correction in progress."""
+    source.require(bool(closer.loops), "a correction without a loop", "loops: correcting")
+    identifiers = source.array("correction/keyframes", np.int64, (None,), 0, _LAST)
+    wanted = members(closer.graph, closer.finder.kept, closer.loops[-1])
+    whole = len(identifiers) > 0 and np.array_equal(identifiers, wanted[: len(identifiers)])
+    known = whole and {closer.loops[-1].old, closer.loops[-1].new} <= set(identifiers.tolist())
+    source.require(known, "not the keyframes of the last loop", "correction/keyframes")
+    similarities = source.similarities("correction/similarities", len(identifiers))
+    return Correcting(Task.finished(torch.from_numpy(similarities.copy())), left, identifiers)
+
+
+def _with_edges(source: MapReader, loop: Loop, closer: LoopCloser, group: str) -> Loop:
+    """Loop with its measurements, which are not archived yet."""
     n, most, archive = loop.count, closer.graph.window.per_frame - 1, closer.graph.archive
-    ends = [source.array(f"loops/{name}", np.int32, (n,), 0) for name in ("source", "target")]
-    source.require(all(int(k) in archive for k in np.unique(ends)), "keyframes that are not there", "loops/source")
+    ends = [source.array(f"{group}/{name}", np.int32, (n,), 0) for name in ("source", "target")]
+    source.require(all(int(k) in archive for k in np.unique(ends)), "keyframes that are not there", f"{group}/source")
     edges = ArchivedEdges(
         ends[0],
-        source.array("loops/patch", np.int16, (n,), 0, most),
+        source.array(f"{group}/patch", np.int16, (n,), 0, most),
         ends[1],
-        source.array("loops/position", np.float32, (n, 2)),
-        source.array("loops/weight", np.float16, (n, 2), 0),
+        source.array(f"{group}/position", np.float32, (n, 2)),
+        source.array(f"{group}/weight", np.float16, (n, 2), 0),
     )
-    return Loop(
-        loop.old,
-        loop.new,
-        loop.old_time,
-        loop.new_time,
-        loop.kind,
-        loop.inliers,
-        loop.measurement,
-        n,
-        edges,
-        loop.joins,
-    )
+    return replace(loop, edges=edges)
 
 
 def _restore_places(source: MapReader, closer: LoopCloser) -> None:

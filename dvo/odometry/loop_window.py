@@ -19,7 +19,6 @@ from dvo.ba.cold_start import COLD_UPDATES, damping_at
 from dvo.geometry import se3
 from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
 from dvo.graph.features import FeatureCache
-from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
@@ -30,6 +29,9 @@ from dvo.odometry.front_end import encode_image
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
+
+Group = tuple[ArchivedKeyframe, ...]
+"""Keyframe with its neighbours."""
 
 _MAPS = 16  # keyframes whose feature maps are kept for the next match
 
@@ -57,32 +59,28 @@ class GroupMatcher:
     Args:
         model: the network.
         config: of the tracker: sub-pixel alignment and kernel.
-        graph: holds the keyframes.
         device: of the computation.
     """
 
-    def __init__(self, model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device) -> None:
-        self.model, self.config, self.graph, self.device = model, config, graph, device
-        self.maps = FeatureCache(graph.archive, lambda image: encode_image(model, image, device).matching, _MAPS)
+    def __init__(self, model: PatchVO, config: TrackerConfig, device: torch.device) -> None:
+        self.model, self.config, self.device = model, config, device
+        self.maps = FeatureCache(lambda image: encode_image(model, image, device).matching, _MAPS)
 
-    def can_match(self, identifier: int) -> bool:
+    def can_match(self, frame: ArchivedKeyframe) -> bool:
         """Return True if a keyframe still has what a match needs: image, patches, and features of this network."""
-        frame, c = self.graph.archive[identifier], self.model.config
+        c = self.model.config
         if frame.jpeg is None or frame.matching is None or frame.context is None:
             return False
         return frame.matching.shape[1] == c.feature_channels and frame.context.shape[1] == c.hidden_channels
 
-    def match(
-        self, old: Sequence[int], new: Sequence[int], poses_cw: Tensor, updates: tuple[int, int], inliers: float
-    ) -> Match | None:
+    def match(self, old: Group, new: Group, poses_cw: Tensor, decisions: Sequence[tuple[int, float]]) -> Match | None:
         """Match two groups.
 
         Args:
-            old, new: identifiers of the keyframes; each :meth:`can_match`.
+            old, new: keyframes; each :meth:`can_match`.
             poses_cw: ``(n, 7)`` poses ``T_cw`` of the older and the newer group to start from, in the world of the
                 older.
-            updates: steps before the first decision, and further steps of a pair that passes it.
-            inliers: smallest share of inliers of a match.
+            decisions: numbers of updates, each with the share of inliers below which the groups do not match.
 
         Returns:
             The match; None if the groups do not show the same.
@@ -95,7 +93,7 @@ class GroupMatcher:
         across = (window.ii < count) != (window.jj < count)
         before = window.patches[count * window.per_frame :, 2, 0, 0].clone()
         share = 0.0
-        for number in updates:
+        for number, inliers in decisions:
             for _ in range(number):
                 step(StepOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
             share = related_share(step, across)
@@ -109,14 +107,14 @@ class GroupMatcher:
             return None
         return Match(share, poses, scale, self._edges((*old, *new), window, across))
 
-    def _joint(self, old: Sequence[int], new: Sequence[int], poses_cw: Tensor) -> WindowStep:
+    def _joint(self, old: Group, new: Group, poses_cw: Tensor) -> WindowStep:
         """Window of both groups with all edges but those within the older one."""
         c, config, device = self.model.config, self.config, self.device
-        window = Window.empty(self.graph.window.per_frame, c.patch_size, c.hidden_channels, device)
+        window = Window.empty(len(new[0].centres), c.patch_size, c.hidden_channels, device)
         align = None if config.align == "none" else WindowAlignment(window, config.alignment, device)
         step = WindowStep(self.model, window, WindowCorrelation(window, c, device), align, True, config.kernel)
-        for slot, identifier in enumerate((*old, *new)):
-            self._append(step, slot, self.graph.archive[identifier], poses_cw[slot])
+        for slot, frame in enumerate((*old, *new)):
+            self._append(step, slot, frame, poses_cw[slot])
         m, n = window.per_frame, len(window)
         pairs = [(i, j) for i, j in product(range(n), range(n)) if max(i, j) >= len(old)]
         kk = torch.cat([torch.arange(i * m, (i + 1) * m, device=device) for i, _ in pairs])
@@ -125,7 +123,7 @@ class GroupMatcher:
         return step
 
     def _append(self, step: WindowStep, slot: int, frame: ArchivedKeyframe, pose_cw: Tensor) -> None:
-        device, image, maps = self.device, frame.image(), self.maps.maps(frame.identifier)
+        device, image, maps = self.device, frame.image(), self.maps.maps(frame)
         assert image is not None and maps is not None and frame.matching is not None and frame.context is not None
         centres = torch.from_numpy(frame.centres)[None, None].to(device)
         matching, context = (torch.from_numpy(x).float().to(device) for x in (frame.matching, frame.context))
@@ -137,9 +135,9 @@ class GroupMatcher:
         step.window.append(keyframe, pose_cw.to(patches), patches)
 
     @staticmethod
-    def _edges(identifiers: Sequence[int], window: Window, across: Tensor) -> ArchivedEdges:
+    def _edges(group: Group, window: Window, across: Tensor) -> ArchivedEdges:
         known = across & (window.weights > 0).any(-1)
-        frames, m = np.array(identifiers, dtype=np.int32), window.per_frame
+        frames, m = np.array([frame.identifier for frame in group], dtype=np.int32), window.per_frame
         kk, jj = window.kk[known].cpu().numpy(), window.jj[known].cpu().numpy()
         position, weight = (x[known].float().cpu().numpy() for x in (window.targets, window.weights))
         return ArchivedEdges(

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -21,57 +20,12 @@ from dvo.geometry import se3, sim3, so3
 from dvo.graph.archive import ArchivedEdges
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.places import PlaceIndex
-from dvo.odometry.loop_window import GroupMatcher, Match
+from dvo.odometry.loop_candidates import Candidate, by_likeness, by_proximity
+from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.loop_window import Group, GroupMatcher, Match
 from dvo.odometry.place_descriptors import PlaceDescriptor
-from dvo.settings import Range, check_settings
 
 _RECENT = 256  # descriptors beside the index above which those without a keyframe are dropped
-
-
-@dataclass(frozen=True)
-class LoopOptions:
-    """Settings of :class:`LoopFinder`.
-
-    Attributes:
-        seconds: smallest time between the two visits of a place in a segment.
-        every: kept keyframes between two searches.
-        neighbours: keyframes before and after each of the two that are matched along.
-        likeness: smallest similarity of the descriptors of a candidate by retrieval, in [-1, 1].
-        retrieved: candidates by retrieval that are verified, at most.
-        apart: identifiers of two such candidates differ by more than this.
-        overlap: smallest share of the patches in view of a candidate by proximity.
-        updates: updates of the network before a candidate is refused, and further ones of one that is not.
-        inliers: smallest share of inliers of a loop.
-        patience: searches after a loop within which a second one has to confirm it.
-        translation, rotation, scale: largest differences of the corrections of two loops that confirm each other, in
-            median depths, degrees, and as a ratio less one.
-
-    Raises:
-        DvoError: a value of another type or out of range.
-    """
-
-    RANGES: ClassVar[dict[str, Range]] = {
-        "seconds": (0, 1e6), "every": (1, 10**4), "neighbours": (0, 8), "likeness": (-1, 1), "overlap": (0, 1),
-        "retrieved": (0, 100), "apart": (0, 10**4),
-        "inliers": (0, 1), "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180), "scale": (0, 10),
-    }  # fmt: skip
-
-    seconds: float = 10.0
-    every: int = 6
-    neighbours: int = 1
-    likeness: float = 0.3
-    retrieved: int = 2
-    apart: int = 20
-    overlap: float = 0.5
-    updates: tuple[int, int] = (4, 8)
-    inliers: float = 0.4
-    patience: int = 4
-    translation: float = 0.2
-    rotation: float = 3.0
-    scale: float = 0.1
-
-    def __post_init__(self) -> None:
-        check_settings(self, self.RANGES)
 
 
 @dataclass(frozen=True)
@@ -103,12 +57,17 @@ class Loop:
 
 
 @dataclass(frozen=True)
-class _Candidate:
-    """Pair of keyframes to verify, with the pose ``T_cw`` of the later one to start from."""
+class Search:
+    """Candidates of a keyframe, with all that their verification reads.
 
-    old: int
-    kind: str
-    pose_cw: Tensor
+    Attributes:
+        new: identifier of the keyframe.
+        pairs: candidates with the keyframes of both groups, the poses ``(n, 7)`` to start from, and whether the two are
+            of different worlds.
+    """
+
+    new: int
+    pairs: tuple[tuple[Candidate, Group, Group, Tensor, bool], ...]
 
 
 @dataclass
@@ -170,22 +129,55 @@ class LoopFinder:
             self.places.add(identifier, self._recent[identifier])
         self._recent = {other: row for other, row in self._recent.items() if other > identifier}
 
-    def find(self, new: int) -> Loop | None:
+    def find(self, new: int, pending: Loop | None = None) -> Loop | None:
         """Look for an earlier visit of the place of a keyframe.
 
         Args:
             new: identifier of a kept keyframe, whose neighbours are archived as well.
+            pending: loop that waits for its confirmation.
 
         Returns:
             The first candidate that is verified; None if there is none.
         """
-        group = self._group(new)
-        if group is None:
-            return None
-        for candidate in self._candidates(new):
-            found = self._verify(candidate, new, group)
-            if found is not None:
-                return found
+        return self.verify(self.prepare(new, pending))
+
+    def prepare(self, new: int, pending: Loop | None = None) -> Search:
+        """Choose candidates, and gather what their verification needs.
+
+        Args:
+            new, pending: see :meth:`find`.
+
+        Returns:
+            The candidates, the most likely first, possibly none.
+        """
+        group, graph = self._group(new), self.graph
+        pairs = []
+        for candidate in [] if group is None else self._candidates(new, pending):
+            old = self._group(candidate.old)
+            if group is None or old is None:
+                continue
+            poses_cw, at = graph.poses_cw(np.array([*old, *group])), len(old) + group.index(new)
+            moved = se3.relative(poses_cw[at].expand(len(group), 7), poses_cw[len(old) :])
+            start = torch.cat([poses_cw[: len(old)], se3.compose(moved, candidate.pose_cw.expand(len(group), 7))])
+            joins = graph.world_of(graph.segment_of(candidate.old)) != graph.world_of(graph.segment_of(new))
+            pairs.append((candidate, self._frames(old), self._frames(group), start, joins))
+        return Search(new, tuple(pairs))
+
+    def verify(self, search: Search) -> Loop | None:
+        """Match the candidates of a search until one is verified. Nothing of the graph is read or changed.
+
+        Args:
+            search: of :meth:`prepare`.
+
+        Returns:
+            The loop; None if no candidate is one.
+        """
+        o = self.options
+        decisions = tuple(zip(o.updates, (o.hopeful, o.inliers, o.inliers), strict=True))
+        for candidate, old, new, start, joins in search.pairs:
+            match = self.matcher.match(old, new, start, decisions)
+            if match is not None:
+                return _loop(candidate, old, new, match, joins)
         return None
 
     def agree(self, first: Loop, second: Loop) -> bool:
@@ -213,12 +205,19 @@ class LoopFinder:
         return sim3.compose(sim3.from_se3(se3.relative(new, pose_cw)), there)
 
     def _group(self, identifier: int) -> list[int] | None:
-        """Keyframe with its neighbours in its segment; None if one of them cannot be matched."""
-        at, count = bisect_left(self.kept, identifier), self.options.neighbours
-        group = self.kept[max(0, at - count) : at + count + 1]
+        """Keyframe with its neighbours in its segment; None if there are too few, or one of them cannot be matched."""
+        at, size = bisect_left(self.kept, identifier), 2 * self.options.neighbours + 1
         segment = self.graph.segment_of(identifier)
-        whole = len(group) == 2 * count + 1 and all(self.graph.segment_of(member) == segment for member in group)
-        return group if whole and all(self.matcher.can_match(member) for member in group) else None
+        near = range(max(0, at - size + 1), min(at + size, len(self.kept)))
+        known = [row for row in near if self.graph.segment_of(self.kept[row]) == segment]
+        if len(known) < size:
+            return None
+        first = min(max(at - self.options.neighbours, known[0]), known[-1] - size + 1)
+        group = self.kept[first : first + size]
+        return group if all(self.matcher.can_match(self.graph.archive[member]) for member in group) else None
+
+    def _frames(self, group: list[int]) -> Group:
+        return tuple(self.graph.archive[identifier] for identifier in group)
 
     def _earlier(self, new: int) -> np.ndarray:
         """Identifiers ``(N,)`` of the kept keyframes that may be an earlier visit of the place of a keyframe."""
@@ -232,60 +231,29 @@ class LoopFinder:
                 earlier.append(identifier)
         return np.array(earlier, dtype=np.int64)
 
-    def _candidates(self, new: int) -> Iterator[_Candidate]:
+    def _candidates(self, new: int, pending: Loop | None) -> Iterator[Candidate]:
         """Candidates, the most likely first."""
-        earlier, world = self._earlier(new), self.graph.world_of(self.graph.segment_of(new))
+        earlier, graph, options = self._earlier(new), self.graph, self.options
         if not len(earlier):
             return
-        row, o = self.places.descriptor(new), self.options
-        if row is not None and self.descriptor is not None:
-            views = self.descriptor.views(row)
-            found = self.places.query(views, o.retrieved, before=int(earlier[-1]) + 1, apart=o.apart)
-            for old, score in zip(found.identifiers.tolist(), found.scores.tolist(), strict=True):
-                if score >= o.likeness and self.graph.segment_of(old) >= 0:
-                    yield _Candidate(old, "retrieval", self.graph.poses_cw(np.array([old]))[0])
-        shared = np.array([self.graph.world_of(self.graph.segment_of(int(k))) == world for k in earlier])
-        if shared.any():
-            overlap = self._overlap(new, earlier[shared])
-            if overlap.max() >= o.overlap:
-                old = int(earlier[shared][overlap.argmax()])
-                yield _Candidate(old, "proximity", self.graph.poses_cw(np.array([new]))[0])
+        worlds = np.array([graph.world_of(graph.segment_of(int(k))) for k in earlier])
+        pose_cw = graph.poses_cw(np.array([new]))[0]
+        if pending is not None:
+            there = earlier[worlds == graph.world_of(graph.segment_of(pending.old))]
+            yield from by_proximity(graph, new, self._moved(pending, pose_cw), there, replace(options, near=1))
+        yield from by_likeness(graph, self.places, self.descriptor, new, earlier, options)
+        here = earlier[worlds == graph.world_of(graph.segment_of(new))]
+        yield from by_proximity(graph, new, sim3.from_se3(pose_cw), here, options)
 
-    def _overlap(self, new: int, earlier: np.ndarray) -> np.ndarray:
-        """Share ``(N,)`` of the patches of a keyframe that lie in the view of others at a similar depth."""
-        frame = self.graph.archive[new]
-        poses_cw = self.graph.poses_cw(np.append(earlier, new))
-        fx, fy, cx, cy = torch.from_numpy(frame.intrinsics).double()
-        cameras = np.stack([self.graph.archive[int(k)].intrinsics for k in earlier])  # a map may be of another camera
-        fu, fv, cu, cv = torch.from_numpy(cameras).double().T[:, :, None]
-        x, y = torch.from_numpy(frame.centres).double().unbind(-1)
-        rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1)
-        depth = 1.0 / torch.from_numpy(frame.inverse_depth).double().clamp(min=1e-6)
-        world = se3.act(se3.inverse(poses_cw[-1]), rays * depth[:, None])
-        seen = se3.act(poses_cw[:-1, None], world[None])
-        z = seen[..., 2].clamp(min=1e-9)
-        u, v = fu * seen[..., 0] / z + cu, fv * seen[..., 1] / z + cv
-        inside = (u >= 0) & (u <= 2 * cu) & (v >= 0) & (v <= 2 * cv) & (seen[..., 2] > 0)
-        alike = (z / depth > 0.5) & (z / depth < 2.0)
-        return (inside & alike).double().mean(-1).numpy()
 
-    def _verify(self, candidate: _Candidate, new: int, group: list[int]) -> Loop | None:
-        old_group, options = self._group(candidate.old), self.options
-        if old_group is None:
-            return None
-        poses_cw = self.graph.poses_cw(np.array([*old_group, *group]))
-        at, count = group.index(new), len(old_group)
-        moved = se3.relative(poses_cw[count + at].expand(len(group), 7), poses_cw[count:])
-        start = torch.cat([poses_cw[:count], se3.compose(moved, candidate.pose_cw.expand(len(group), 7))])
-        match = self.matcher.match(old_group, group, start, options.updates, options.inliers)
-        return None if match is None else self._loop(candidate, new, match, old_group.index(candidate.old), count + at)
-
-    def _loop(self, candidate: _Candidate, new: int, match: Match, old_at: int, new_at: int) -> Loop:
-        relative = se3.relative(match.poses_cw[old_at], match.poses_cw[new_at])
-        unit = 1.0 / match.scale  # of the newer segment, per unit of the older
-        measurement = sim3.from_se3(torch.cat([relative[:3] * unit, relative[3:]]), unit)
-        graph, old = self.graph, candidate.old
-        worlds = {graph.world_of(graph.segment_of(k)) for k in (old, new)}
-        times = graph.archive[old].timestamp, graph.archive[new].timestamp
-        edges, joins = match.edges, len(worlds) > 1
-        return Loop(old, new, *times, candidate.kind, match.inliers, measurement, len(edges), edges, joins)
+def _loop(candidate: Candidate, old: Group, new: Group, match: Match, joins: bool) -> Loop:
+    pair = [next(k for k, frame in enumerate(group) if frame.identifier == identifier)
+            for group, identifier in ((old, candidate.old), (new, candidate.new))]  # fmt: skip
+    relative = se3.relative(match.poses_cw[pair[0]], match.poses_cw[len(old) + pair[1]])
+    unit = 1.0 / match.scale  # of the newer segment, per unit of the older
+    measurement = sim3.from_se3(torch.cat([relative[:3] * unit, relative[3:]]), unit)
+    times = old[pair[0]].timestamp, new[pair[1]].timestamp
+    edges = match.edges
+    return Loop(
+        candidate.old, candidate.new, *times, candidate.kind, match.inliers, measurement, len(edges), edges, joins
+    )

@@ -60,7 +60,7 @@ def new_recording(
     finder.kept[:] = _kept(old)
     with torch.inference_mode():
         finder.places = describe_places(old)
-    if not len(finder.places) or not any(map(finder.matcher.can_match, finder.kept)):
+    if not len(finder.places) or not any(finder.matcher.can_match(found.graph.archive[k]) for k in finder.kept):
         remedy = "make the map from a longer recording, with weights of as many features as small"
         raise DvoError("holds no keyframes that can be recognised", field="map", remedy=remedy)
     require_size(found)

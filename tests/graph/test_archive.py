@@ -182,13 +182,13 @@ def test_feature_maps_are_computed_again_and_forgotten():
         assert np.abs(image.astype(int) - [200, 20, 90]).max() < 12  # JPEG
         return torch.zeros(1)
 
-    cache = FeatureCache(graph.archive, encode, capacity=2)
+    cache = FeatureCache(encode, capacity=2)
     for identifier in (0, 1, 0, 2, 0, 1):
-        assert cache.maps(identifier) is not None
+        assert cache.maps(graph.archive[identifier]) is not None
     assert len(cache) == 2 and asked == [(40, 40, 3)] * 4
-    assert cache.maps(99) is None
+    assert cache.maps(replace(graph.archive[3], jpeg=None)) is None
     with pytest.raises(DvoError, match="capacity"):
-        FeatureCache(graph.archive, encode, capacity=0)
+        FeatureCache(encode, capacity=0)
 
 
 def test_a_frame_dropped_as_still_has_the_pose_of_its_keyframe_until_it_is_corrected():

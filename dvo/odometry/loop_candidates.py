@@ -1,0 +1,112 @@
+"""Candidates for loops: earlier keyframes that may show what a new one shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.geometry import se3
+from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.places import PlaceIndex
+from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.place_descriptors import PlaceDescriptor
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Pair of keyframes to verify.
+
+    Attributes:
+        old, new: identifiers of the earlier and the later keyframe.
+        kind: ``"retrieval"`` by the likeness of the images, ``"proximity"`` by the poses.
+        pose_cw: ``(7,)`` pose ``T_cw`` of the later one to start from, in the world of the earlier.
+    """
+
+    old: int
+    new: int
+    kind: str
+    pose_cw: Tensor
+
+
+def by_likeness(
+    graph: KeyframeGraph,
+    places: PlaceIndex,
+    descriptor: PlaceDescriptor | None,
+    new: int,
+    earlier: np.ndarray,
+    options: LoopOptions,
+) -> Iterator[Candidate]:
+    """Candidates whose descriptors are like that of a keyframe, the most alike first.
+
+    Args:
+        graph: holds the keyframes.
+        places: their descriptors.
+        descriptor: that made them; None for none.
+        new: identifier of the keyframe.
+        earlier: ``(N,)`` identifiers of the keyframes to choose from, increasing.
+        options: number and likeness.
+    """
+    row = places.descriptor(new)
+    if row is None or descriptor is None:
+        return
+    found = places.query(descriptor.views(row), options.retrieved, before=int(earlier[-1]) + 1, apart=options.apart)
+    for old, score in zip(found.identifiers.tolist(), found.scores.tolist(), strict=True):
+        if score >= options.likeness and graph.segment_of(old) >= 0:
+            yield Candidate(old, new, "retrieval", graph.poses_cw(np.array([old]))[0])
+
+
+def by_proximity(
+    graph: KeyframeGraph, new: int, similarity: Tensor, earlier: np.ndarray, options: LoopOptions
+) -> Iterator[Candidate]:
+    """Candidates that have the patches of a keyframe in view, as far as the poses tell; those with the most first.
+
+    Args:
+        graph: holds the keyframes.
+        new: identifier of the keyframe.
+        similarity: ``(8,)`` from the world of the earlier keyframes to its camera, in the unit of its segment.
+        earlier: ``(N,)`` identifiers of the keyframes to choose from, of one world.
+        options: number and overlap.
+    """
+    if not len(earlier):
+        return
+    scale = similarity[7]
+    pose_cw = torch.cat([similarity[:3] / scale, similarity[3:7]])
+    shares = overlap(graph, new, pose_cw, float(1 / scale), earlier)
+    chosen: list[int] = []
+    for row in np.lexsort((earlier, -shares)):
+        if shares[row] < options.overlap or len(chosen) >= options.near:
+            return
+        old = int(earlier[row])
+        if all(abs(old - other) > options.apart for other in chosen):
+            chosen.append(old)
+            yield Candidate(old, new, "proximity", pose_cw)
+
+
+def overlap(graph: KeyframeGraph, new: int, pose_cw: Tensor, scale: float, others: np.ndarray) -> np.ndarray:
+    """Share ``(N,)`` of the patches of a keyframe that lie in the view of others at a similar depth.
+
+    Args:
+        graph: holds the keyframes.
+        new: identifier of the keyframe.
+        pose_cw: ``(7,)`` its pose ``T_cw`` in the world of the others.
+        scale: of its lengths in that world.
+        others: ``(N,)`` identifiers of the others.
+    """
+    frame, poses_cw = graph.archive[new], graph.poses_cw(others)
+    fx, fy, cx, cy = torch.from_numpy(frame.intrinsics).double()
+    cameras = np.stack([graph.archive[int(k)].intrinsics for k in others])  # a map may be of another camera
+    fu, fv, cu, cv = torch.from_numpy(cameras).double().T[:, :, None]
+    x, y = torch.from_numpy(frame.centres).double().unbind(-1)
+    rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1)
+    depth = scale / torch.from_numpy(frame.inverse_depth).double().clamp(min=1e-6)
+    world = se3.act(se3.inverse(pose_cw), rays * depth[:, None])
+    seen = se3.act(poses_cw[:, None], world[None])
+    z = seen[..., 2].clamp(min=1e-9)
+    u, v = fu * seen[..., 0] / z + cu, fv * seen[..., 1] / z + cv
+    inside = (u >= 0) & (u <= 2 * cu) & (v >= 0) & (v <= 2 * cv) & (seen[..., 2] > 0)
+    alike = (z / depth > 0.5) & (z / depth < 2.0)
+    return (inside & alike).double().mean(-1).numpy()

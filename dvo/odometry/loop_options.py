@@ -1,0 +1,62 @@
+"""Settings of loop closure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from dvo.settings import Range, check_settings
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """Settings of loop closure (:mod:`dvo.odometry.loops`).
+
+    Attributes:
+        seconds: smallest time between the two visits of a place in a segment.
+        every: kept keyframes between two searches.
+        neighbours: keyframes before and after each of the two that are matched along.
+        likeness: smallest similarity of the descriptors of a candidate by retrieval, in [-1, 1].
+        retrieved: candidates by retrieval that are verified, at most.
+        apart: identifiers of two such candidates differ by more than this.
+        overlap: smallest share of the patches in view of a candidate by proximity.
+        near: candidates by proximity that are verified, at most; as far apart.
+        updates: updates of the network before a candidate with fewer than ``hopeful`` inliers is refused, further ones
+            before one with fewer than ``inliers`` is, and further ones of a loop.
+        hopeful, inliers: shares of inliers.
+        delay: frames between the beginning of a search, or of a correction, and the frame that takes its result, so
+            that tracking goes on meanwhile.
+        patience: searches after a loop within which a second one has to confirm it.
+        translation, rotation, scale: largest differences of the corrections of two loops that confirm each other, in
+            median depths, degrees, and as a ratio less one.
+
+    Raises:
+        DvoError: a value of another type or out of range.
+    """
+
+    RANGES: ClassVar[dict[str, Range]] = {
+        "seconds": (0, 1e6), "every": (1, 10**4), "neighbours": (0, 8), "likeness": (-1, 1), "overlap": (0, 1),
+        "retrieved": (0, 100), "near": (0, 100), "apart": (0, 10**4), "delay": (0, 10**4),
+        "hopeful": (0, 1), "inliers": (0, 1), "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180),
+        "scale": (0, 10),
+    }  # fmt: skip
+
+    seconds: float = 10.0
+    every: int = 6
+    neighbours: int = 1
+    likeness: float = 0.3
+    retrieved: int = 2
+    apart: int = 20
+    overlap: float = 0.5
+    near: int = 2
+    updates: tuple[int, int, int] = (2, 2, 8)
+    hopeful: float = 0.03
+    inliers: float = 0.4
+    delay: int = 10
+    patience: int = 4
+    translation: float = 0.2
+    rotation: float = 3.0
+    scale: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_settings(self, self.RANGES)

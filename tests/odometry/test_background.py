@@ -1,0 +1,43 @@
+"""Work beside tracking."""
+
+import threading
+
+import pytest
+import torch
+
+from dvo.odometry.background import Background, Task
+
+
+def test_work_is_done_in_order_in_another_thread_without_gradients():
+    background, order = Background(), []
+
+    def work(number):
+        order.append(number)
+        return number, threading.get_ident(), torch.is_inference_mode_enabled()
+
+    tasks = [background.start(lambda k=k: work(k)) for k in range(5)]
+    results = [task.result() for task in tasks]
+    assert order == [0, 1, 2, 3, 4] == [result[0] for result in results] and all(task.done for task in tasks)
+    assert len({result[1] for result in results}) == 1 and results[0][1] != threading.get_ident()
+    assert all(result[2] for result in results) and not torch.is_inference_mode_enabled()
+
+
+def test_a_task_is_not_done_before_its_work():
+    release = threading.Event()
+    task = Background().start(lambda: release.wait(60))
+    assert not task.done
+    release.set()
+    assert task.result() is True and task.done
+
+
+def test_an_error_of_the_work_is_that_of_the_result():
+    def fail():
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        Background().start(fail).result()
+
+
+def test_a_finished_task_has_its_result():
+    task = Task.finished(3)
+    assert task.done and task.result() == 3

@@ -52,7 +52,7 @@ class LoopOptions:
     updates: tuple[int, int, int] = (2, 2, 8)
     hopeful: float = 0.03
     inliers: float = 0.4
-    delay: int = 10
+    delay: int = 8
     patience: int = 4
     translation: float = 0.2
     rotation: float = 3.0

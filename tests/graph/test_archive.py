@@ -1,5 +1,7 @@
 """Archive of a keyframe graph: its memory bound, its measurements, and global bundle adjustment from it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch

@@ -12,7 +12,7 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.metrics import evaluate
-from dvo.odometry.loops import LoopOptions
+from dvo.odometry.loop_options import LoopOptions
 from dvo.synth.sequence import make_sequence
 
 COUNT = 36
@@ -20,7 +20,7 @@ SHORT = {
     "keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5, "patches": 16, "pixels": 160 * 120,
     "estimate_readout": False,
 }  # fmt: skip
-OPTIONS = LoopOptions(every=2)
+OPTIONS = LoopOptions(every=2, delay=2)
 
 
 def room() -> tuple[list[Frame], np.ndarray]:

@@ -230,5 +230,5 @@ def test_the_description_is_readable(tmp_path):
 
     with zipfile.ZipFile(saved(tmp_path)) as container:
         found = json.loads(container.read("map.json"))
-    assert (found["format"], found["version"]) == ("dvo-map", 1)
+    assert (found["format"], found["version"]) == ("dvo-map", 2)
     assert TrackerConfig.from_dict(found["tracker"]["config"]) == SMALL

@@ -62,7 +62,9 @@ def by_likeness(
 def by_proximity(
     graph: KeyframeGraph, new: int, similarity: Tensor, earlier: np.ndarray, options: LoopOptions
 ) -> Iterator[Candidate]:
-    """Candidates that have the patches of a keyframe in view, as far as the poses tell; those with the most first.
+    """Candidates that have the patches of a keyframe in view, as far as the poses tell: the best of different visits.
+
+    The earliest visit comes first, since a loop with it corrects the most drift.
 
     Args:
         graph: holds the keyframes.
@@ -76,14 +78,15 @@ def by_proximity(
     scale = similarity[7]
     pose_cw = torch.cat([similarity[:3] / scale, similarity[3:7]])
     shares = overlap(graph, new, pose_cw, float(1 / scale), earlier)
+    times = np.array([graph.archive[int(k)].timestamp for k in earlier])
     chosen: list[int] = []
     for row in np.lexsort((earlier, -shares)):
         if shares[row] < options.overlap or len(chosen) >= options.near:
-            return
-        old = int(earlier[row])
-        if all(abs(old - other) > options.apart for other in chosen):
-            chosen.append(old)
-            yield Candidate(old, new, "proximity", pose_cw)
+            break
+        if all(abs(times[row] - times[other]) >= options.seconds for other in chosen):
+            chosen.append(int(row))
+    for row in sorted(chosen):
+        yield Candidate(int(earlier[row]), new, "proximity", pose_cw)
 
 
 def overlap(graph: KeyframeGraph, new: int, pose_cw: Tensor, scale: float, others: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ stay where they are; what joins their world is moved.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -146,7 +147,7 @@ class LoopCloser:
             corrected |= self._collect(True)
         return corrected
 
-    def complete(self, segments: Collection[int], searches: int = 60) -> bool:
+    def complete(self, segments: Collection[int], searches: int = 100) -> bool:
         """Search once more with the corrected poses, where no loop has been found so far; for the end of a sequence.
 
         Args:
@@ -161,15 +162,18 @@ class LoopCloser:
         if not loops:
             return corrected
         options, kept = self.finder.options, self.finder.kept
+        # The poses, which confirmed loops have corrected, confirm another one as a second loop would.
+        agreement = options.translation, math.radians(options.rotation), options.scale
         first = bisect_left(kept, self.graph.recording.keyframe)
         known = np.array([kept.index(loop.new) for loop in loops])
         rows = np.arange(first + options.neighbours, len(kept) - options.neighbours)
-        rows = rows[np.abs(rows[:, None] - known).min(1) >= options.every][:: options.every]
+        step = max(1, options.every // 2)
+        rows = rows[np.abs(rows[:, None] - known).min(1) >= step][::step]
         if len(rows) > searches:
             rows = rows[np.linspace(0, len(rows) - 1, searches).round().astype(int)]
         for row in rows.tolist():
             loop = self.finder.find(kept[row])
-            if loop is not None and not self._needs_confirmation(loop):
+            if loop is not None and not loop.joins and self._is_within(loop, agreement):
                 self._accept(loop)
         return corrected
 
@@ -241,14 +245,15 @@ class LoopCloser:
 
     def _needs_confirmation(self, loop: Loop) -> bool:
         """Return True unless the loop changes next to nothing, so that the present poses confirm it."""
-        return loop.joins or not self._is_small(loop)
+        return loop.joins or not self._is_within(loop, _SMALL)
 
-    def _is_small(self, loop: Loop) -> bool:
+    def _is_within(self, loop: Loop, limits: tuple[float, float, float]) -> bool:
+        """Return True if a loop agrees with the poses: translation in median depths, rotation in rad, log scale."""
         old, new = sim3.from_se3(self.graph.poses_cw(np.array([loop.old, loop.new])))
         error = sim3.compose(loop.measurement, sim3.inverse(sim3.compose(new, sim3.inverse(old))))
         far = float(error[:3].norm()) * float(np.median(self.graph.archive[loop.new].inverse_depth))
         parts = far, float(so3.log(error[3:7]).norm()), abs(float(error[7].log()))
-        return all(part <= limit for part, limit in zip(parts, _SMALL, strict=True))
+        return all(part <= limit for part, limit in zip(parts, limits, strict=True))
 
     def _accept(self, loop: Loop) -> None:
         assert loop.edges is not None
@@ -257,7 +262,7 @@ class LoopCloser:
 
     def _correct(self, loop: Loop) -> None:
         """Begin to correct all keyframes of the worlds of a loop, unless it changes next to nothing."""
-        if not loop.joins and self._is_small(loop):
+        if not loop.joins and self._is_within(loop, _SMALL):
             return
         correction = loop_correction.prepare(self.graph, self.finder.kept, self.loops, loop)
         task = self._background.start(correction.solve)

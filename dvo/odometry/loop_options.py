@@ -20,7 +20,7 @@ class LoopOptions:
         retrieved: candidates by retrieval that are verified, at most.
         apart: identifiers of two such candidates differ by more than this.
         overlap: smallest share of the patches in view of a candidate by proximity.
-        near: candidates by proximity that are verified, at most; as far apart.
+        near: candidates by proximity that are verified, at most; ``seconds`` apart.
         updates: updates of the network before a candidate with fewer than ``hopeful`` inliers is refused, further ones
             before one with fewer than ``inliers`` is, and further ones of a loop.
         hopeful, inliers: shares of inliers.

@@ -19,6 +19,7 @@ from dvo.odometry.config import with_changes
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.reset import start_again
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_settings
@@ -156,6 +157,10 @@ class DeepVOOdometry:
             "config": asdict(self.config),
         }  # fmt: skip
         return result_of_estimates(self._estimates, self._reasons, info)
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new odometry with the same seed would."""
+        start_again(self, DeepVOOdometry(self.model, self.config, seed=self.seed, device=self.device, name=self.name))
 
     def _advance(self, image: np.ndarray) -> float:
         """Move on to an image, or begin a segment with it.

@@ -29,6 +29,7 @@ from dvo.odometry.droid_config import PRESETS, DenseConfig
 from dvo.odometry.evidence import NO_MATCH, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.reset import start_again
 from dvo.odometry.segments import result_of_log
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_seed
@@ -197,6 +198,10 @@ class DroidOdometry:
         )  # fmt: skip
         points = fused([cloud for item, cloud in zip(maps, clouds, strict=True) if item.segment == main])
         return replace(result, map=points, depth=tuple(maps))
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new odometry with the same seed would."""
+        start_again(self, DroidOdometry(self.model, self.config, seed=self.seed, device=self.device, name=self.name))
 
     # -- frames --------------------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from dvo.ba.options import BAOptions
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.graph.window import Window
+from dvo.models.step import recent_depth
 from dvo.odometry.config import InitialPose, TrackerConfig
 from dvo.odometry.front_end import Observation
 from dvo.odometry.motion import predict_pose
@@ -21,6 +22,7 @@ from dvo.odometry.motion import predict_pose
 AGREEMENT = 2.0
 """Distance of a match from its reprojection up to which it agrees with a pose, feature pixels."""
 
+_DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a new frame
 _WIDTHS = (8.0, 4.0, 2.0)  # of the kernels, feature pixels: wide ones first, since the pose may be far off
 _LEAST = 8  # matches that must agree with a pose; six unknowns leave two of them to contradict it
 _SHARE = 1 / 3  # and their share of all
@@ -42,6 +44,22 @@ def first_pose(window: Window, seen: Observation, time: float, config: TrackerCo
     """
     predicted = predict_pose(window.poses_cw, [f.timestamp for f in window.frames], time, config.motion_damping)
     return initial_pose(window, seen, predicted, config.initial_pose) if initialised else predicted
+
+
+def first_depth(window: Window, config: TrackerConfig, initialised: bool) -> Tensor:
+    """Inverse depth that the patches of a new frame begin with: the median of the newest frames, before these are
+    initialised 1.
+
+    Args:
+        window: keyframes without the frame, possibly none.
+        config: settings of the tracker.
+        initialised: the tracker is.
+
+    Returns:
+        ``(1, M)``.
+    """
+    depth = torch.ones(1, config.patches, device=window.patches.device)
+    return depth * recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES) if initialised else depth
 
 
 def initial_pose(window: Window, seen: Observation, predicted: Tensor, method: InitialPose) -> Tensor:

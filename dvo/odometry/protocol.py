@@ -234,6 +234,17 @@ class Interim(Protocol):
 
 
 @runtime_checkable
+class Resettable(Protocol):
+    """Interface of an odometry that can track one sequence after another."""
+
+    def reset(self) -> None:
+        """Forget the sequence, and begin the next one as a new odometry with the same network, settings and seed would:
+        the same frames give the same bytes. Results that it has given stay as they are.
+        """
+        ...
+
+
+@runtime_checkable
 class Saveable(Protocol):
     """Interface of an odometry that can be written to a map file."""
 

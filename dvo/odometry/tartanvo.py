@@ -26,6 +26,7 @@ from dvo.odometry.config import with_changes
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.reset import start_again
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.two_view import parallax_of, returning_share
 from dvo.odometry.working_image import working_image
@@ -247,6 +248,10 @@ class TartanOdometry:
         """
         info = {**self._info, "seed": self.seed, "config": asdict(self.config)}
         return result_of_estimates(self._estimates, self._reasons, info)
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new odometry with the same seed would."""
+        start_again(self, TartanOdometry(self.model, self.config, seed=self.seed, device=self.device, name=self.name))
 
     def _stranger(self, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> str:
         """Find out if a frame with content does not show the scene of the frame before it, and remember it."""

@@ -24,17 +24,18 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.keyframe_log import FrameRecord
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
-from dvo.models.step import StepOptions, recent_depth
+from dvo.models.step import StepOptions
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
-from dvo.odometry.initial_pose import first_pose
+from dvo.odometry.initial_pose import first_depth, first_pose
 from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise_related, leave_minimum, worth_keeping
 from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
 from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.reset import start_again
 from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
@@ -44,8 +45,6 @@ from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
 from dvo.odometry.working_image import working_image
-
-_DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a new frame
 
 
 class PatchOdometry:
@@ -179,6 +178,11 @@ class PatchOdometry:
         known = {frame.identifier: pose for frame, pose in zip(self.window.frames, poses, strict=True)}
         return self._result(known if self.state.initialised else {})
 
+    def reset(self) -> None:
+        """Begin a new sequence as a new tracker with the same seed would; a map that it was loaded with is left."""
+        build = partial(PatchOdometry, self.model, self.config, seed=self.seed, device=self.device, name=self.name)
+        start_again(self, build(archive=self.graph.archive.config, weights=self.weights))
+
     def save(self, file: str | Path) -> None:
         """Write everything to a map file: to go on later (:func:`dvo.load_map`), or as a map. Tracking may go on.
 
@@ -307,9 +311,7 @@ class PatchOdometry:
                             seen.colors, seen.intrinsics, seen.image, seen.fine)  # fmt: skip
         self.state.keyframes += 1
         self.loops.see(keyframe.identifier, seen.image, seen.maps)
-        depth = torch.ones(1, config.patches, device=self.device)
-        if self.state.initialised:
-            depth *= recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES)
+        depth = first_depth(window, config, self.state.initialised)
         pose = first_pose(window, seen, keyframe.timestamp, config, self.state.initialised)
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
+from dvo.commands.input_options import add_input_options
 from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
 from dvo.errors import DvoError
@@ -83,6 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for dvo.load_map")
     run.add_argument("--map", metavar="FILE", help="map file (.dvo) of an earlier recording, to be localised in")
+    add_input_options(run)
     add_stream_options(run)
     add_view_options(run)
     run.set_defaults(run="dvo.commands.run:run")

@@ -17,6 +17,7 @@ import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
 from dvo.commands.camera import with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.commands.input_options import input_facts, input_settings
 from dvo.commands.maps import check_place, load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
@@ -85,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         groundtruth=arguments.groundtruth,
         guess=True,
         **stream_settings(arguments),
+        **input_settings(arguments),
     )
     for warning in source.warnings:
         warn(warning, "note")
@@ -99,6 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
         "device": str(device),
         "seed": arguments.seed,
         "stride": arguments.stride,
+        **input_facts(arguments),
     }
     seed_everything(arguments.seed)
     folders = results.results_folder(arguments.out, source.name)  # checked before the weights load

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from dvo.data.calibration import Calibration, read_calibration
 from dvo.data.capture import STANDARD_INPUT, Capture, StreamClock, is_stream, shown
@@ -18,15 +18,27 @@ from dvo.data.focal_guess import guess_from_angle
 from dvo.data.frame import InertialSamples
 from dvo.data.image_pipe import pipe_reader, split_images
 from dvo.data.images import decode_bytes, to_rgb8
+from dvo.data.interval import Bound, Interval, limit
 from dvo.data.live import LiveFrames, StreamCounts
+from dvo.data.opening import check_stride
 from dvo.data.recording import Log, RawFrame
 from dvo.data.sensors import StereoRig
-from dvo.data.source import Source, check_stride
+from dvo.data.source import Source
 from dvo.data.stamps import checked_rate
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 
-T = TypeVar("T")
+
+class Timed(Protocol):
+    """Element of a stream of images."""
+
+    @property
+    def timestamp(self) -> float:
+        """Seconds."""
+        ...
+
+
+T = TypeVar("T", bound=Timed)
 
 QUEUE = 2
 """Frames that wait by default: one while another is tracked, and one that arrives in the meantime."""
@@ -43,6 +55,7 @@ class LiveRecording(Generic[T]):
     """
 
     kind = "stream"
+    interval = Interval()
     frame_count: int | None = None
     calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
@@ -71,14 +84,14 @@ class LiveRecording(Generic[T]):
 
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; the stride counts frames that were not dropped."""
-        for number, item in enumerate(self.live):
-            if number % stride:
-                continue
+        numbered = enumerate(self.live)
+        for number, item in self.interval.select(numbered, lambda item: item[1].timestamp, stride, self.live.name):
             raw = self.decode(item)
             if raw is None:
                 log.unreadable.append(f"image {number}")
             else:
                 yield raw
+        self.live.stop()  # at the end of an interval the stream goes on
 
 
 class LiveSource(Source):
@@ -137,6 +150,7 @@ def open_stream(
     queue: int | None = None,
     stride: int = 1,
     undistort: bool = True,
+    end: Bound | None = None,
 ) -> LiveSource:
     """Open a camera, an address, or a pipe of images as a source that is read while it arrives.
 
@@ -155,6 +169,8 @@ def open_stream(
             recording.
         stride: every how many-th of the frames that were not dropped.
         undistort: resample images to a pinhole camera.
+        end: seconds since the first frame that is processed, or the number of frames, such as ``"120f"``, after which
+            the stream is closed.
 
     Returns:
         Frames to iterate over once.
@@ -175,6 +191,7 @@ def open_stream(
         raise DvoError(f"must be 0 or more, got {queue}", field="queue", remedy="give a whole number of frames")
     if calib is not None and not isinstance(calib, Calibration):
         calib = read_calibration(calib)
+    interval = Interval.of(None, end)
     stopped = threading.Event()
     recording: LiveRecording[Any]
     timeout: float | None
@@ -183,6 +200,7 @@ def open_stream(
     else:
         recording, timeout = _of_pipe(source, fps, queue, stopped), None
     try:
+        limit(recording, interval)
         first = recording.first(timeout)
         height, width = first.image.shape[:2]
         doubts = calib.doubts(width, height) if calib else [_assumption(width, height)]

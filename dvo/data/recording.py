@@ -15,6 +15,7 @@ from dvo.data.calibration import Calibration
 from dvo.data.depth import read_depth
 from dvo.data.frame import InertialSamples
 from dvo.data.images import read_image
+from dvo.data.interval import Interval
 from dvo.data.sensors import Sensors, StereoRig
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
@@ -173,9 +174,14 @@ class ImageRecording:
         name: of the sequence; the folder's by default.
         sensors: files of other sensors.
 
+    Attributes:
+        interval: that is read, see :func:`dvo.data.interval.limit`.
+
     Raises:
         DvoError: no images, or times that are not finite.
     """
+
+    interval = Interval()
 
     def __init__(
         self,
@@ -223,7 +229,8 @@ class ImageRecording:
 
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
         """See :class:`Recording`."""
-        for index in range(0, len(self.images), stride):
+        numbered = enumerate(self.timestamps.tolist())
+        for index, _ in self.interval.select(numbered, lambda item: item[1], stride, self.path):
             frame = self.frame(index, log)
             if frame is None:
                 log.unreadable.append(self.images[index].name)

@@ -17,6 +17,7 @@ import numpy as np
 from dvo.data.calibration import Calibration, from_values
 from dvo.data.files import MAX_NUMBER, is_file, lookups
 from dvo.data.frame import InertialSamples
+from dvo.data.interval import Interval
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
 from dvo.data.ros_images import decode_message
 from dvo.data.sensors import StereoRig
@@ -111,6 +112,7 @@ class BagRecording:
     """
 
     kind = "rosbag"
+    interval = Interval()
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
 
@@ -165,9 +167,13 @@ class BagRecording:
         """See :class:`dvo.data.recording.Recording`; messages passed over by the stride are not decoded."""
         previous, late = -np.inf, False
         with _opened(self.path) as reader:
-            for index, (connection, recorded, data) in enumerate(_messages(reader, self.topic)):
-                if index % stride:
-                    continue
+            numbered = ((index, *item) for index, item in enumerate(_messages(reader, self.topic)))
+
+            def time(item: tuple[int, Any, int, bytes]) -> float:
+                index, connection, recorded, data = item
+                return self._time(index, reader.deserialize(data, connection.msgtype), recorded)
+
+            for index, connection, recorded, data in self.interval.select(numbered, time, stride, self.path):
                 message = reader.deserialize(data, connection.msgtype)
                 timestamp = self._time(index, message, recorded)
                 if not timestamp > previous:

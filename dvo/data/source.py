@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import islice
-from numbers import Integral
 from pathlib import Path
 
 import numpy as np
 
 from dvo.data.calibration import Calibration, read_calibration
 from dvo.data.capture import is_stream
-from dvo.data.files import is_file, lookups
+from dvo.data.files import lookups
 from dvo.data.focal_guess import FocalGuess, guess_focal
 from dvo.data.frame import Frame, InertialSamples, StereoView
 from dvo.data.groundtruth import read_groundtruth
+from dvo.data.interval import Bound, Interval, expected_frames, limit
+from dvo.data.opening import check_stride, first_frame, locate, no_calibration
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
 from dvo.data.registry import find_reader
 from dvo.data.rosbag import split_topic
@@ -26,7 +26,6 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import Undistorter, needs_undistortion
-from dvo.yaml_files import is_shell_pipe
 
 
 class Source:
@@ -65,7 +64,7 @@ class Source:
         self._undistorter = Undistorter(recorded_camera) if undistort and needs_undistortion(recorded_camera) else None
         self._right_undistorter: Undistorter | None = None  # the size of right images is not known before the first
         self.camera = self._undistorter.camera if self._undistorter else recorded_camera
-        count = recording.frame_count
+        count = expected_frames(recording)
         self.frame_count: int | None = None if count is None else -(-count // stride)
         self._doubts = doubts
         self.guess: FocalGuess | None = None
@@ -214,6 +213,8 @@ def open_source(
     guess: bool = False,
     queue: int | None = None,
     topic: str | None = None,
+    start: Bound | None = None,
+    end: Bound | None = None,
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
     ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it), a bag of ROS; or a stream:
@@ -237,6 +238,10 @@ def open_source(
             :func:`dvo.calibrate`.
         queue: of a stream, frames that may wait.
         topic: of the images in a bag of ROS, if there are several; ``bag.mcap:/camera/image`` names it too.
+        start, end: read from the first of these until before the second: seconds since the first frame, or the number
+            of a frame, such as ``"120f"``. Indices and times of the frames stay those of the whole recording, and
+            ``stride`` counts from the start. Frames before the start are not decoded; those of a video are, since only
+            that finds a frame exactly, but not converted.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -255,10 +260,10 @@ def open_source(
     if is_stream(source):
         from dvo.data.live_source import open_stream
 
-        for field, value in {"times": times, "groundtruth": groundtruth, "reader": reader, "topic": topic}.items():
+        for field, value in dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start).items():
             if value is not None:
                 raise DvoError("not for a stream", field=field, remedy="leave it out")
-        return open_stream(source, calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort)
+        return open_stream(source, calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort, end=end)
     if queue is not None:
         raise DvoError("frames of a recording do not wait", field="queue", remedy="leave it out")
     path, topic = split_topic(source, topic)
@@ -267,23 +272,25 @@ def open_source(
     if not is_there:
         raise DvoError("no such file or folder", file=path, remedy="give a video, a folder of images or a sequence")
     check_stride(stride)
+    interval = Interval.of(start, end)
     if times is not None and fps is not None:
         raise DvoError("both times and fps are given", field="times", remedy="give --times or --fps, not both")
     request = Request(
-        _locate(times, path, "times") if times is not None else None,
+        locate(times, path, "times") if times is not None else None,
         checked_rate(fps),
-        calib if calib is None or isinstance(calib, Calibration) else read_calibration(_locate(calib, path, "calib")),
+        calib if calib is None or isinstance(calib, Calibration) else read_calibration(locate(calib, path, "calib")),
         topic,
     )
     with lookups(path):
         recording = find_reader(path, reader).open(path, request)
-    first = _first_frame(recording)
+    first = first_frame(recording)
+    limit(recording, interval)
     calibration = recording.calibration if request.calibration is None else request.calibration
     height, width = first.image.shape[:2]
     guessed = None
     if calibration is None:
         if not guess:
-            raise _no_calibration(path)
+            raise no_calibration(path)
         guessed = guess_focal(recording.images[0] if isinstance(recording, ImageRecording) else path, width, height)
         calibration = guessed.calibration
     turned = getattr(recording, "turned", 0)
@@ -294,56 +301,10 @@ def open_source(
     camera = calibration.camera(width, height)
     truth = recording.groundtruth
     if groundtruth is not None:
-        truth = read_groundtruth(_locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
+        truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
     try:
         found = Source(recording, camera, truth, stride, undistort, doubts)
         found.guess = guessed
         return found
     except DvoError as error:  # the lens model does not know its file
         raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None
-
-
-def check_stride(stride: object) -> None:
-    """Check a stride.
-
-    Args:
-        stride: as given by the user.
-
-    Raises:
-        DvoError: no whole number of at least 1.
-    """
-    if not isinstance(stride, Integral) or int(stride) < 1:
-        raise DvoError(f"stride {str(stride)[:40]}", field="stride", remedy="give a whole number of at least 1")
-
-
-def _locate(given: Path | str, source: Path, field: str) -> Path:
-    path = Path(given)
-    base = source if source.is_dir() else source.parent
-    for option in (path, base / path):
-        if is_file(option) or (field == "calib" and is_shell_pipe(option)):
-            return option
-    raise DvoError("no such file", file=path, field=field, remedy=f"give an existing file to --{field}")
-
-
-def _first_frame(recording: Recording) -> RawFrame:
-    log = Log()
-    found = next(islice(recording.frames(log), 1), None)
-    if found is None:
-        raise DvoError(
-            f"none of the {len(log.unreadable)} images decodes",
-            file=recording.path,
-            remedy="check that the files are images that other programs can show",
-        )
-    return found
-
-
-def _no_calibration(path: Path) -> DvoError:
-    nearby = [option for option in (path / "calib.txt", path.parent / "calib.txt") if option.is_file()]
-    hint = f" (is it {nearby[0]}?)" if nearby else ""
-    return DvoError(
-        "no calibration",
-        file=path,
-        field="calib",
-        remedy=f"give --calib FILE{hint}: a text file with 'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML; or "
-        "guess=True, and dvo.calibrate",
-    )

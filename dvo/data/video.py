@@ -16,6 +16,7 @@ from dvo.data.files import is_file, lookups
 from dvo.data.frame import InertialSamples
 from dvo.data.image_header import MAX_PIXELS
 from dvo.data.images import SUFFIXES, to_rgb8
+from dvo.data.interval import Interval
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
 from dvo.data.sensors import StereoRig
 from dvo.data.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
@@ -111,6 +112,7 @@ class VideoRecording:
         request: options of the user.
 
     Attributes:
+        interval: that is read, see :func:`dvo.data.interval.limit`; frames before it are decoded, but not converted.
         turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
             rows of the sensor in the order in which it reads them.
 
@@ -119,6 +121,7 @@ class VideoRecording:
     """
 
     kind = "video"
+    interval = Interval()
     calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
@@ -160,12 +163,18 @@ class VideoRecording:
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; only every ``stride``-th frame is converted."""
         read, previous, dropped = 0, -np.inf, 0
-        with _capture(self.path) as capture:
+
+        def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
+            nonlocal read
             for index, milliseconds, failed in _grabs(capture):
                 log.unreadable.extend(f"frame {number}" for number in range(index - failed, index))
                 read += 1
-                if index % stride:
-                    continue
+                yield index, milliseconds
+
+        with _capture(self.path) as capture:
+            for index, milliseconds in self.interval.select(
+                grabbed(capture), lambda item: self._time(*item), stride, self.path
+            ):
                 timestamp = self._time(index, milliseconds)
                 if timestamp is None or not previous < timestamp < np.inf:  # NaN fails too
                     dropped += 1
@@ -179,7 +188,7 @@ class VideoRecording:
                 previous = timestamp
                 yield RawFrame(index, timestamp, to_rgb8(image), f"{self.path} frame {index}")
         missing = (self.frame_count or 0) - read - len(log.unreadable)
-        if missing > 0:
+        if missing > 0 and self.interval.end is None:
             # healthy files may be off by a frame or so: estimated counts, edit lists
             verdict = ": it is cut short or damaged" if missing > max(1, (self.frame_count or 0) // 200) else ""
             log.notes.append(f"the video announces {self.frame_count} frames, {read} could be read{verdict}")

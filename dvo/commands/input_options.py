@@ -1,0 +1,41 @@
+"""Options of ``dvo run`` about its input, in a module that imports nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+
+def add_input_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options.
+
+    Args:
+        parser: of the command.
+    """
+    parser.add_argument(
+        "--start", metavar="T", help="first frame to track: seconds since the first frame, or its number, such as 120f"
+    )
+    parser.add_argument("--end", metavar="T", help="frame to stop before, in the same form; also of a stream")
+
+
+def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of :func:`dvo.open` for the options.
+
+    Args:
+        arguments: of the command line.
+    """
+    return {"start": arguments.start, "end": arguments.end}
+
+
+def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Entries of run.json about the options.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        ``interval``: start and end as given; None without them.
+    """
+    bounds = {"start": arguments.start, "end": arguments.end}
+    given = any(bound is not None for bound in bounds.values())
+    return {"interval": bounds if given else None}

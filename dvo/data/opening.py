@@ -1,0 +1,81 @@
+"""Checks of the options with which a source is opened."""
+
+from __future__ import annotations
+
+from itertools import islice
+from numbers import Integral
+from pathlib import Path
+
+from dvo.data.files import is_file
+from dvo.data.recording import Log, RawFrame, Recording
+from dvo.errors import DvoError
+from dvo.yaml_files import is_shell_pipe
+
+
+def check_stride(stride: object) -> None:
+    """Check a stride.
+
+    Args:
+        stride: as given by the user.
+
+    Raises:
+        DvoError: no whole number of at least 1.
+    """
+    if not isinstance(stride, Integral) or int(stride) < 1:
+        raise DvoError(f"stride {str(stride)[:40]}", field="stride", remedy="give a whole number of at least 1")
+
+
+def locate(given: Path | str, source: Path, field: str) -> Path:
+    """File of an option, looked up from the working directory, then from the folder of the source.
+
+    Args:
+        given: by the user.
+        source: file or folder that is opened.
+        field: name of the option.
+
+    Raises:
+        DvoError: no such file.
+    """
+    path = Path(given)
+    base = source if source.is_dir() else source.parent
+    for option in (path, base / path):
+        if is_file(option) or (field == "calib" and is_shell_pipe(option)):
+            return option
+    raise DvoError("no such file", file=path, field=field, remedy=f"give an existing file to --{field}")
+
+
+def first_frame(recording: Recording) -> RawFrame:
+    """First frame that decodes.
+
+    Args:
+        recording: as opened.
+
+    Raises:
+        DvoError: there is none.
+    """
+    log = Log()
+    found = next(islice(recording.frames(log), 1), None)
+    if found is None:
+        raise DvoError(
+            f"none of the {len(log.unreadable)} images decodes",
+            file=recording.path,
+            remedy="check that the files are images that other programs can show",
+        )
+    return found
+
+
+def no_calibration(path: Path) -> DvoError:
+    """Error of a source without a calibration, with the name of one that lies near.
+
+    Args:
+        path: file or folder that is opened.
+    """
+    nearby = [option for option in (path / "calib.txt", path.parent / "calib.txt") if option.is_file()]
+    hint = f" (is it {nearby[0]}?)" if nearby else ""
+    return DvoError(
+        "no calibration",
+        file=path,
+        field="calib",
+        remedy=f"give --calib FILE{hint}: a text file with 'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML; or "
+        "guess=True, and dvo.calibrate",
+    )

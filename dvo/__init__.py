@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from dvo import losses
     from dvo.ba.layer import bundle_adjust
     from dvo.ba.options import BADamping, BAOptions, BAResult
+    from dvo.data.extrinsics import base_trajectory
     from dvo.data.frame import Frame
     from dvo.data.live import LiveFrames
     from dvo.data.live_source import open_stream
@@ -61,6 +62,7 @@ _LAZY = {
     "Status": ("dvo.odometry.protocol", "Status"),
     "TrackerConfig": ("dvo.odometry.config", "TrackerConfig"),
     "Trajectory": ("dvo.data.trajectory", "Trajectory"),
+    "base_trajectory": ("dvo.data.extrinsics", "base_trajectory"),
     "bundle_adjust": ("dvo.ba.layer", "bundle_adjust"),
     "calibrate": ("dvo.odometry.calibrate", "calibrate"),
     "evaluate": ("dvo.metrics", "evaluate"),
@@ -80,8 +82,9 @@ _LAZY = {
 __all__ = [
     "BADamping", "BAOptions", "BAResult", "Break", "Camera", "ClipDataset", "DvoError", "Estimate", "Frame",
     "LiveFrames", "Metrics", "ModelConfig", "Odometry", "Result", "Segment", "SelfCalibration", "SparseMap", "Status",
-    "TrackerConfig", "Trajectory", "__version__", "bundle_adjust", "calibrate", "evaluate", "export_map",
-    "export_trajectory", "load", "load_map", "load_model", "losses", "open", "open_stream", "run", "se3", "stream",
+    "TrackerConfig", "Trajectory", "__version__", "base_trajectory", "bundle_adjust", "calibrate", "evaluate",
+    "export_map", "export_trajectory", "load", "load_map", "load_model", "losses", "open", "open_stream", "run", "se3",
+    "stream",
 ]  # fmt: skip
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from dvo.cli import main
+from dvo.data.extrinsics import base_trajectory
 from dvo.data.trajectory import read_tum
 from tests.command_line import arguments, errors, summary
 
@@ -39,3 +42,37 @@ def test_an_empty_interval_is_one_line(given, images, tmp_path, capsys):
     assert main(arguments(images, tmp_path / "out", "--start", "3")) == 2
     (line,) = errors(capsys.readouterr().err)
     assert "no frame from 3 s; read were 20 frames, 1.900 s" in line and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("scale", [None, {"unit": "metres", "segments": [{"source": "height"}]}])
+def test_extrinsics(given, images, tmp_path, capsys, monkeypatch, scale):
+    odometry = given()
+    finish = odometry.finish
+
+    def known():
+        result = finish()
+        return replace(result, info={**result.info, "scale": scale})
+
+    odometry.finish = known
+    (tmp_path / "rig.txt").write_text("0 0 1.5  0 0 0 1\n")
+    out = tmp_path / "out"
+    assert main(arguments(images, out, "--extrinsics", str(tmp_path / "rig.txt"))) == 0
+    cameras, bases = read_tum(out / "trajectory.txt"), read_tum(out / "trajectory_base.txt")
+    wanted = base_trajectory(cameras, np.array([0, 0, 1.5, 0, 0, 0, 1]))
+    assert np.array_equal(bases.timestamps, cameras.timestamps) and np.allclose(bases.poses_wc[0], [0] * 6 + [1])
+    assert np.allclose(bases.poses_wc, wanted.poses_wc, atol=1e-7)
+    assert np.abs(bases.positions - (cameras.positions - cameras.positions[0])).max() > 0.1
+    said = errors(capsys.readouterr().err)
+    assert sum("lever arm of 1.5 m" in line for line in said) == (scale is None)
+    assert ("scale of the trajectory is not known" in (out / "trajectory_base.txt").read_text()) == (scale is None)
+    assert summary(out)["extrinsics"] == str(tmp_path / "rig.txt")
+    assert main(arguments(images, out)) == 0
+    assert not (out / "trajectory_base.txt").exists()
+
+
+def test_extrinsics_that_are_none_end_before_tracking(given, images, tmp_path, capsys):
+    odometry = given()
+    (tmp_path / "rig.txt").write_text("0 0 1.5  0 0 0 3\n")
+    assert main(arguments(images, tmp_path / "out", "--extrinsics", str(tmp_path / "rig.txt"))) == 2
+    (line,) = errors(capsys.readouterr().err)
+    assert "quaternion has the length 3" in line and not odometry.frames and not (tmp_path / "out").exists()

@@ -16,6 +16,11 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         "--start", metavar="T", help="first frame to track: seconds since the first frame, or its number, such as 120f"
     )
     parser.add_argument("--end", metavar="T", help="frame to stop before, in the same form; also of a stream")
+    parser.add_argument(
+        "--extrinsics",
+        metavar="FILE",
+        help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
+    )
 
 
 def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -34,8 +39,8 @@ def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:
         arguments: of the command line.
 
     Returns:
-        ``interval``: start and end as given; None without them.
+        ``interval``: start and end as given, None without them; ``extrinsics``: the file.
     """
     bounds = {"start": arguments.start, "end": arguments.end}
     given = any(bound is not None for bound in bounds.values())
-    return {"interval": bounds if given else None}
+    return {"interval": bounds if given else None, "extrinsics": arguments.extrinsics}

@@ -15,6 +15,7 @@ import torch
 
 import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
+from dvo.commands.base_frame import base_observers
 from dvo.commands.camera import with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.commands.input_options import input_facts, input_settings
@@ -106,6 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
     seed_everything(arguments.seed)
     folders = results.results_folder(arguments.out, source.name)  # checked before the weights load
     with folders as folder, open_observers(arguments, source.name) as observers:
+        observers += base_observers(arguments, folder)
         odometry = load_odometry(arguments, device)
         check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)

@@ -25,6 +25,7 @@ from dvo.data.stamps import checked_rate
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.geometry.field_of_view import notice_of_cut
 from dvo.geometry.undistort import Undistorter, needs_undistortion
 
 
@@ -64,6 +65,7 @@ class Source:
         self._undistorter = Undistorter(recorded_camera) if undistort and needs_undistortion(recorded_camera) else None
         self._right_undistorter: Undistorter | None = None  # the size of right images is not known before the first
         self.camera = self._undistorter.camera if self._undistorter else recorded_camera
+        self._cut = notice_of_cut(recorded_camera, self.camera) if self._undistorter else []
         count = expected_frames(recording)
         self.frame_count: int | None = None if count is None else -(-count // stride)
         self._doubts = doubts
@@ -95,7 +97,7 @@ class Source:
     @property
     def warnings(self) -> list[str]:
         """Guesses at opening and faults of the last pass so far, in sentences for the user."""
-        return [*self._recording.warnings, *self._doubts, *self._log.messages()]
+        return [*self._recording.warnings, *self._doubts, *self._cut, *self._log.messages()]
 
     @property
     def skipped(self) -> int:

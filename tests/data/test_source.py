@@ -104,3 +104,16 @@ def test_groundtruth_option(make):
 def test_importing_the_readers_is_light():
     code = "import sys, dvo.data; print([m for m in ('cv2', 'torch', 'yaml', 'scipy') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_what_undistortion_cuts_of_a_fisheye_is_said_once(make):
+    lens = "{fx: 30, fy: 30, cx: 31.5, cy: 23.5, model: fisheye, coefficients: [0, 0, 0, 0]}"
+    calib = make.text("fisheye.yaml", lens)
+    source = open_source(make.images("clip", ["0.png", "1.png"]), calib=calib, fps=1)
+    again = source.recalibrated(Calibration(30, 30, 31.5, 23.5, model="fisheye", coefficients=(0.0,) * 4))
+    for opened in (source, again):
+        list(opened)
+        (said,) = (warning for warning in opened.warnings if "fisheye" in warning)
+        assert "of 122 x 92 degrees of view are kept" in said and "of the pixels are cut" in said
+    undistorted = open_source(make.root / "clip", calib=calib, fps=1, undistort=False)
+    assert not any("fisheye" in warning for warning in undistorted.warnings)

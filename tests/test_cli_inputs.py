@@ -76,3 +76,14 @@ def test_extrinsics_that_are_none_end_before_tracking(given, images, tmp_path, c
     assert main(arguments(images, tmp_path / "out", "--extrinsics", str(tmp_path / "rig.txt"))) == 2
     (line,) = errors(capsys.readouterr().err)
     assert "quaternion has the length 3" in line and not odometry.frames and not (tmp_path / "out").exists()
+
+
+def test_a_mask(given, images, tmp_path):
+    odometry = given()
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:10] = 255
+    assert cv2.imwrite(str(tmp_path / "m.png"), mask)
+    more = ["--mask", str(tmp_path / "m.png"), "--mask-invert", "--end", "3f"]
+    assert main(arguments(images, tmp_path / "out", *more)) == 0
+    assert all(np.array_equal(frame.mask, mask == 0) for frame in odometry.frames) and len(odometry.frames) == 3
+    assert summary(tmp_path / "out")["mask"] == {"file": str(tmp_path / "m.png"), "inverted": True}

@@ -17,6 +17,12 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--end", metavar="T", help="frame to stop before, in the same form; also of a stream")
     parser.add_argument(
+        "--mask",
+        metavar="FILE|FOLDER",
+        help="image of the size of those of the source, or a folder with one for each: white is used, black is ignored",
+    )
+    parser.add_argument("--mask-invert", action="store_true", help="of the mask, black is used and white is ignored")
+    parser.add_argument(
         "--extrinsics",
         metavar="FILE",
         help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
@@ -29,7 +35,8 @@ def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     Args:
         arguments: of the command line.
     """
-    return {"start": arguments.start, "end": arguments.end}
+    masks = {"mask": arguments.mask, "mask_invert": arguments.mask_invert}
+    return {"start": arguments.start, "end": arguments.end, **masks}
 
 
 def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -39,8 +46,10 @@ def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:
         arguments: of the command line.
 
     Returns:
-        ``interval``: start and end as given, None without them; ``extrinsics``: the file.
+        ``interval``: start and end as given, None without them; ``extrinsics``: the file;
+        ``mask``: file or folder, and whether it was inverted.
     """
     bounds = {"start": arguments.start, "end": arguments.end}
     given = any(bound is not None for bound in bounds.values())
-    return {"interval": bounds if given else None, "extrinsics": arguments.extrinsics}
+    mask = None if arguments.mask is None else {"file": arguments.mask, "inverted": arguments.mask_invert}
+    return {"interval": bounds if given else None, "extrinsics": arguments.extrinsics, "mask": mask}

@@ -120,6 +120,7 @@ class Frame:
         right: view of the right camera of a stereo pair.
         inertial: samples later than the previous frame of the same pass, up to this frame's time; without samples for
             the first frame.
+        mask: ``(H, W)`` bool or uint8, 0 (False) for pixels of ``image`` to ignore; None: all are used.
 
     Example:
         >>> import numpy as np
@@ -138,3 +139,4 @@ class Frame:
     depth: Lazy[np.ndarray] = Lazy()
     right: Lazy[StereoView] = Lazy()
     inertial: Lazy[InertialSamples] = Lazy()
+    mask: np.ndarray | None = None

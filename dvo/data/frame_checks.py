@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.data.mask import checked_mask
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 
@@ -31,18 +32,19 @@ def checked_frame(frame: Frame) -> Frame:
 
     Converted are grey and RGBA images (alpha is dropped), uint16 (divided by 257, rounded), floats in 0..1 (times 255,
     rounded), any memory layout, PIL images, torch tensors on any device (also ``(C, H, W)`` where the shape leaves no
-    doubt) and other objects with ``__array__``. Depth, right image and inertial samples are neither read nor checked.
+    doubt) and other objects with ``__array__``. A mask becomes bool. Depth, right
+    image and inertial samples are neither read nor checked.
 
     Args:
         frame: as given by the caller.
 
     Returns:
-        The frame itself if there is nothing to convert, otherwise a copy with another image or time.
+        The frame itself if there is nothing to convert, otherwise a copy with another image, time or mask.
 
     Raises:
         DvoError: an object that is not a frame; an index that is not a whole number; a time that is not a finite
             number; an image of another form or type, without pixels, or with values not finite or out of range; no
-            camera, or one of another image size. Names the frame and the field.
+            camera, or one of another image size; a mask of another type or size. Names the frame and the field.
 
     Example:
         >>> import numpy as np
@@ -65,11 +67,13 @@ def checked_frame(frame: Frame) -> Frame:
         pixels = _with_channels(_array_of(image, f"{name}: image"), f"{name}: image")
         _check_camera(frame.camera, pixels, name)  # before the conversion, which needs memory for all pixels
         image = _rgb8(pixels, f"{name}: image")
-    if image is frame.image and timestamp is frame.timestamp:
+    mask = checked_mask(frame.mask, image.shape[0], image.shape[1], f"{name}: mask")
+    if image is frame.image and timestamp is frame.timestamp and mask is frame.mask:
         return frame
     converted = copy.copy(frame)  # dataclasses.replace would load depth, right image and inertial samples
     object.__setattr__(converted, "image", image)
     object.__setattr__(converted, "timestamp", timestamp)
+    object.__setattr__(converted, "mask", mask)
     return converted
 
 

@@ -20,7 +20,8 @@ from dvo.data.image_pipe import pipe_reader, split_images
 from dvo.data.images import decode_bytes, to_rgb8
 from dvo.data.interval import Bound, Interval, limit
 from dvo.data.live import LiveFrames, StreamCounts
-from dvo.data.opening import check_stride
+from dvo.data.mask import open_masks
+from dvo.data.opening import check_invert, check_stride
 from dvo.data.recording import Log, RawFrame
 from dvo.data.sensors import StereoRig
 from dvo.data.source import Source
@@ -125,7 +126,9 @@ class LiveSource(Source):
     def recalibrated(self, calibration: Calibration) -> LiveSource:
         """The same stream with another calibration; see :meth:`dvo.data.source.Source.recalibrated`."""
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        return LiveSource(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
+        found = LiveSource(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
+        found.masks = self.masks
+        return found
 
     def stop(self) -> None:
         """End the iteration as soon as possible. May be called from any thread, and in a signal handler."""
@@ -151,6 +154,8 @@ def open_stream(
     stride: int = 1,
     undistort: bool = True,
     end: Bound | None = None,
+    mask: Path | str | None = None,
+    mask_invert: bool = False,
 ) -> LiveSource:
     """Open a camera, an address, or a pipe of images as a source that is read while it arrives.
 
@@ -171,6 +176,7 @@ def open_stream(
         undistort: resample images to a pinhole camera.
         end: seconds since the first frame that is processed, or the number of frames, such as ``"120f"``, after which
             the stream is closed.
+        mask, mask_invert: one mask for all images, see :func:`dvo.data.source.open_source`.
 
     Returns:
         Frames to iterate over once.
@@ -187,6 +193,7 @@ def open_stream(
     """
     fps = checked_rate(fps)
     check_stride(stride)
+    check_invert(mask, mask_invert)
     if queue is not None and queue < 0:
         raise DvoError(f"must be 0 or more, got {queue}", field="queue", remedy="give a whole number of frames")
     if calib is not None and not isinstance(calib, Calibration):
@@ -205,7 +212,10 @@ def open_stream(
         height, width = first.image.shape[:2]
         doubts = calib.doubts(width, height) if calib else [_assumption(width, height)]
         camera = (calib or guess_from_angle(width, height).calibration).camera(width, height)
-        return LiveSource(recording, camera, None, stride, undistort, doubts)
+        found = LiveSource(recording, camera, None, stride, undistort, doubts)
+        if mask is not None:
+            found.masks = open_masks(Path(mask), recording, (width, height), mask_invert)
+        return found
     except BaseException:
         recording.live.close()
         raise

@@ -25,6 +25,20 @@ def check_stride(stride: object) -> None:
         raise DvoError(f"stride {str(stride)[:40]}", field="stride", remedy="give a whole number of at least 1")
 
 
+def check_invert(mask: object, invert: bool) -> None:
+    """Check that only a mask that is there is inverted.
+
+    Args:
+        mask: as given by the user.
+        invert: white pixels are ignored.
+
+    Raises:
+        DvoError: there is none.
+    """
+    if invert and mask is None:
+        raise DvoError("there is no mask to invert", field="mask_invert", remedy="give --mask too, or leave it out")
+
+
 def locate(given: Path | str, source: Path, field: str) -> Path:
     """File of an option, looked up from the working directory, then from the folder of the source.
 
@@ -39,7 +53,7 @@ def locate(given: Path | str, source: Path, field: str) -> Path:
     path = Path(given)
     base = source if source.is_dir() else source.parent
     for option in (path, base / path):
-        if is_file(option) or (field == "calib" and is_shell_pipe(option)):
+        if is_file(option) or (field == "calib" and is_shell_pipe(option)) or (field == "mask" and option.is_dir()):
             return option
     raise DvoError("no such file", file=path, field=field, remedy=f"give an existing file to --{field}")
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from dvo.data.focal_guess import FocalGuess, guess_focal
 from dvo.data.frame import Frame, InertialSamples, StereoView
 from dvo.data.groundtruth import read_groundtruth
 from dvo.data.interval import Bound, Interval, expected_frames, limit
-from dvo.data.opening import check_stride, first_frame, locate, no_calibration
+from dvo.data.mask import Masks, open_masks
+from dvo.data.opening import check_invert, check_stride, first_frame, locate, no_calibration
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
 from dvo.data.registry import find_reader
 from dvo.data.rosbag import split_topic
@@ -40,6 +42,7 @@ class Source:
         path: file or folder that was opened.
         camera: the camera of every frame (without distortion if frames are undistorted).
         recorded_camera: the camera as calibrated, distortion included.
+        masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
         turned: degrees by which the frames of a video are turned to stand upright, as the file asks for.
         stride: every how many-th frame is read.
@@ -70,6 +73,7 @@ class Source:
         self.frame_count: int | None = None if count is None else -(-count // stride)
         self._doubts = doubts
         self.guess: FocalGuess | None = None
+        self.masks: Masks | None = None
         self.turned: int = getattr(recording, "turned", 0)
 
     def recalibrated(self, calibration: Calibration) -> Source:
@@ -82,7 +86,9 @@ class Source:
             DvoError: intrinsics that do not fit the images.
         """
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        return Source(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
+        found = Source(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
+        found.masks = self.masks
+        return found
 
     def __len__(self) -> int:
         """``frame_count``.
@@ -161,7 +167,8 @@ class Source:
         inertial = None
         if previous is not None and self._recording.inertial is not None:
             inertial = partial(self._inertial, previous, raw.timestamp)
-        return Frame(raw.index, raw.timestamp, image, self.camera, depth, right, inertial)
+        mask = self.masks(raw.index, self._undistorter) if self.masks else None
+        return Frame(raw.index, raw.timestamp, image, self.camera, depth, right, inertial, mask)
 
     def _depth(self, load: Callable[[], np.ndarray | None], origin: str) -> np.ndarray | None:
         depth = load()
@@ -217,6 +224,8 @@ def open_source(
     topic: str | None = None,
     start: Bound | None = None,
     end: Bound | None = None,
+    mask: Path | str | None = None,
+    mask_invert: bool = False,
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
     ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it), a bag of ROS; or a stream:
@@ -244,6 +253,9 @@ def open_source(
             of a frame, such as ``"120f"``. Indices and times of the frames stay those of the whole recording, and
             ``stride`` counts from the start. Frames before the start are not decoded; those of a video are, since only
             that finds a frame exactly, but not converted.
+        mask: image that is white where the recorded images are used and black where they are ignored, or a folder with
+            one for each image (:func:`dvo.data.mask.open_masks`); for ``Frame.mask``.
+        mask_invert: white is ignored and black used.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -265,7 +277,8 @@ def open_source(
         for field, value in dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start).items():
             if value is not None:
                 raise DvoError("not for a stream", field=field, remedy="leave it out")
-        return open_stream(source, calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort, end=end)
+        options: dict[str, Any] = dict(calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort, end=end)
+        return open_stream(source, **options, mask=mask, mask_invert=mask_invert)
     if queue is not None:
         raise DvoError("frames of a recording do not wait", field="queue", remedy="leave it out")
     path, topic = split_topic(source, topic)
@@ -274,6 +287,7 @@ def open_source(
     if not is_there:
         raise DvoError("no such file or folder", file=path, remedy="give a video, a folder of images or a sequence")
     check_stride(stride)
+    check_invert(mask, mask_invert)
     interval = Interval.of(start, end)
     if times is not None and fps is not None:
         raise DvoError("both times and fps are given", field="times", remedy="give --times or --fps, not both")
@@ -301,12 +315,14 @@ def open_source(
         calibration = replace(calibration, readout=0.0)
         doubts.append(f"the video is turned by {turned} degrees: the readout of the calibration was not used")
     camera = calibration.camera(width, height)
+    masks = None if mask is None else open_masks(locate(mask, path, "mask"), recording, (width, height), mask_invert)
     truth = recording.groundtruth
     if groundtruth is not None:
         truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
     try:
         found = Source(recording, camera, truth, stride, undistort, doubts)
         found.guess = guessed
+        found.masks = masks
         return found
     except DvoError as error:  # the lens model does not know its file
         raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None

@@ -318,6 +318,20 @@ class Undistorter:
         maps, border = self._depth_maps, cv2.BORDER_CONSTANT
         return cv2.remap(depth, *maps, interpolation=cv2.INTER_NEAREST, borderMode=border, borderValue=math.nan)
 
+    def mask(self, mask: np.ndarray) -> np.ndarray:
+        """Resample a mask of ``source`` to the image of ``camera``, to the nearest pixel.
+
+        Args:
+            mask: ``(H, W)`` bool.
+
+        Returns:
+            ``(H, W)`` bool; False also where the real camera does not see.
+
+        Raises:
+            ValueError: a mask of another size than that of ``source``.
+        """
+        return self.depth(mask.astype(np.float32)) == 1
+
     def _check(self, image: np.ndarray) -> None:
         if image.shape[:2] != (self.source.height, self.source.width):
             raise ValueError(f"image {image.shape[:2]} is not {self.source.height}x{self.source.width}")

@@ -195,6 +195,14 @@ class MapReader:
             raise self.refused(f"holds {found.max()}, more than {high:g}", name)
         return found
 
+    def has(self, name: str) -> bool:
+        """True if there is an array of this name.
+
+        Args:
+            name: of the array.
+        """
+        return f"{name}.npy" in self._entries
+
     def poses(self, name: str, dtype: Any, count: int | None) -> np.ndarray:
         """Read poses, with quaternions of length 1.
 

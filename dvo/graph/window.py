@@ -35,6 +35,7 @@ class Keyframe:
         intrinsics: ``(4,)`` fx fy cx cy of the feature map.
         image: ``(H, W, 3)`` uint8 RGB working image, None if it is not kept.
         fine: ``(M, c, p, p)`` features of its patches at the fine level of the correlation, None without one.
+        visible: ``(h, w)`` bool, pixels of its feature map that measurements may lie in, None for all.
     """
 
     identifier: int
@@ -46,6 +47,7 @@ class Keyframe:
     intrinsics: Tensor
     image: np.ndarray | None = None
     fine: Tensor | None = None
+    visible: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,15 @@ class Window:
     def intrinsics(self) -> Tensor:
         """``(n, 4)`` fx fy cx cy of the feature maps."""
         return torch.stack([frame.intrinsics for frame in self.frames])
+
+    @property
+    def visible(self) -> Tensor | None:
+        """``(n, h, w)`` bool, pixels of the feature maps that measurements may lie in; None: all of all frames."""
+        known = next((frame.visible for frame in self.frames if frame.visible is not None), None)
+        if known is None:
+            return None
+        every = torch.ones_like(known)
+        return torch.stack([every if frame.visible is None else frame.visible for frame in self.frames])
 
     @property
     def context(self) -> Tensor:

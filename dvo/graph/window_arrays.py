@@ -25,7 +25,8 @@ def window_arrays(window: Window) -> dict[str, np.ndarray]:
     frames, m, p = window.frames, window.per_frame, window.patches.shape[-1]
     images = [frame.image for frame in frames if frame.image is not None]
     fine = [_array(frame.fine) for frame in frames if frame.fine is not None]
-    return {
+    visible = {} if window.visible is None else {"window/visible": _array(window.visible).astype(np.uint8)}
+    return visible | {
         "window/keyframes": np.array([frame.identifier for frame in frames], np.int64),
         "window/times": np.array([frame.timestamp for frame in frames], np.float64),
         "window/map_slots": np.array([frame.map_slot for frame in frames], np.int64),
@@ -58,6 +59,10 @@ def read_window(source: MapReader, window: Window) -> None:
         DvoError: a missing or invalid array.
     """
     m, p, device = window.per_frame, window.patches.shape[-1], window.jj.device
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(values).to(device)
+
     identifiers = source.array("window/keyframes", np.int64, (None,), 0, _LAST)
     n = len(identifiers)
     times = source.array("window/times", np.float64, (n,))
@@ -77,10 +82,10 @@ def read_window(source: MapReader, window: Window) -> None:
     has_image = source.array("window/has_image", np.uint8, (n,), 0, 1)
     images = source.array("window/images", np.uint8, (int(has_image.sum()), None, None, 3))
     source.require(max(images.shape[1:3]) <= _SIDE, "holds images that are too large", "window/images")
+    visible = None
+    if source.has("window/visible"):  # of frames with masks
+        visible = tensor(source.array("window/visible", np.uint8, (n, None, None), 0, 1) > 0)
     row = np.cumsum(has_image, dtype=np.int64) - 1
-
-    def tensor(values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(values).to(device)
 
     for i, identifier in enumerate(identifiers.tolist()):
         window.frames.append(
@@ -94,6 +99,7 @@ def read_window(source: MapReader, window: Window) -> None:
                 tensor(intrinsics[i]),
                 images[row[i]] if has_image[i] else None,
                 tensor(fine[i]) if len(fine) else None,
+                None if visible is None else visible[i],
             )  # fmt: skip
         )
     window.poses_cw, window.patches = tensor(poses), tensor(patches)

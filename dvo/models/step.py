@@ -20,6 +20,7 @@ from dvo.ba.problem import Factor
 from dvo.geometry.projection import reproject
 from dvo.graph.edges import PatchGraph
 from dvo.nets.correlation import CorrelationLookup
+from dvo.nets.masks import in_sight
 from dvo.nets.update import UpdateOperator
 
 Mode = Literal["joint", "structure", "flow"]
@@ -43,6 +44,7 @@ class UpdateState:
         weights: ``(B, E, 2)`` of the targets in bundle adjustment: the confidence, unless a :class:`Refinement` has
             changed it; None before the first step.
         confidence: ``(B, E, 2)`` of the network, in (0, 1); None before the first step.
+        visible: ``(N, h, w)`` bool, pixels of the feature maps that measurements may lie in; None: all.
         scores: ``(B, K)`` of the patches by :class:`dvo.nets.score.ScoreHead`, for training; None without one.
     """
 
@@ -57,6 +59,7 @@ class UpdateState:
     weights: Tensor | None = None
     confidence: Tensor | None = None
     scores: Tensor | None = None
+    visible: Tensor | None = None
 
     @property
     def frames(self) -> int:
@@ -163,6 +166,8 @@ class StepModel(Protocol):
 def revise(model: StepModel, state: UpdateState, lookup: CorrelationLookup) -> Revision:
     """Run the update operator on all edges; poses and depths do not change.
 
+    Measurements that lie in ignored pixels (``state.visible``) get the weight 0.
+
     Args:
         model: provides the update operator.
         state: its ``coords`` are used if they are set, and computed otherwise.
@@ -180,7 +185,10 @@ def revise(model: StepModel, state: UpdateState, lookup: CorrelationLookup) -> R
     correlation = lookup(coords, graph)
     context = state.context.index_select(1, graph.kk)
     hidden, delta, weights = model.update(state.hidden, context, correlation, graph)
-    return Revision(coords, hidden, delta, weights)
+    revision = Revision(coords, hidden, delta, weights)
+    if state.visible is None:
+        return revision
+    return replace(revision, weights=weights * in_sight(revision.targets, graph.jj, state.visible)[..., None])
 
 
 def step(

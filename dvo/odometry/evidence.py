@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from dvo.geometry.projection import reproject
+from dvo.graph.window import Window
+from dvo.nets.masks import MASK_MARGIN, shrunk
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.window_step import WindowStep
 
@@ -19,12 +21,16 @@ AGREEMENT = 0.5
 """Largest distance of an inlier from the reprojection of its patch after bundle adjustment, feature pixels."""
 
 NO_MATCH = "no match with the frames before"
+MASKED = "masked image"
+"""Reason of a loss of a frame of which its mask leaves too little."""
 
 _BLOCK = 8  # side of the blocks whose means show structure, pixels of the working image
 _CONTRAST = 2.5  # least difference of neighbouring blocks that counts as structure without noise, grey levels
 _NOISE = 6.0  # and its share of the expected difference of blocks of independent noise
 _STRONG_NOISE = 10.0  # difference of neighbouring pixels that sensor noise stays below, grey levels
 _DARK, _BRIGHT = 64.0, 192.0
+
+_LEAST_USED = 0.05  # share of the pixels that a mask leaves, beside a margin
 
 _WIDTH = 160  # of the images whose corners are matched, pixels
 _CORNERS = 150  # at most
@@ -64,7 +70,7 @@ class Evidence:
         return self.confidence >= config.lost_confidence and self.inliers >= inliers
 
 
-def missing_content(image: np.ndarray) -> str:
+def missing_content(image: np.ndarray, mask: np.ndarray | None = None) -> str:
     """Find out if an image shows nothing: its blocks differ no more than those of uniform light and sensor noise would.
 
     Noise is estimated from the median difference of neighbouring pixels. The mean of an ``8x8`` block averages
@@ -73,6 +79,8 @@ def missing_content(image: np.ndarray) -> str:
 
     Args:
         image: ``(H, W, 3)`` uint8 RGB working image.
+        mask: ``(H, W)`` bool, the only pixels that are looked at; None for all. If less than a twentieth of them is
+            left beside a margin, the image is masked.
 
     Returns:
         Description, such as ``"black image"``; empty for an image with content.
@@ -82,14 +90,36 @@ def missing_content(image: np.ndarray) -> str:
         'black image'
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if mask is not None:
+        return _missing_in_mask(grey, mask)
     height, width = (max(2, side // _BLOCK) for side in grey.shape)
     blocks = cv2.resize(grey.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
     steps = np.concatenate([np.abs(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
     structure = float(np.percentile(steps, 99))
     noise = float(np.median(cv2.absdiff(grey[::4, 1:], grey[::4, :-1])))
+    return _judged(structure, noise, float(blocks.mean()))
+
+
+def _missing_in_mask(grey: np.ndarray, mask: np.ndarray) -> str:
+    """Description of an image of which a part is used, as :func:`missing_content`: by the blocks that lie in it."""
+    if shrunk(mask, MASK_MARGIN).mean() < _LEAST_USED:
+        return MASKED
+    height, width = (max(2, side // _BLOCK) for side in grey.shape)
+    share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    blocks = cv2.resize(grey * mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    blocks = np.where(share > 0.5, blocks / np.maximum(share, 0.5), np.nan)
+    steps = np.concatenate([np.abs(np.diff(blocks, axis=axis)).ravel() for axis in (0, 1)])
+    pairs = mask[::4, 1:] & mask[::4, :-1]
+    if not (np.isfinite(steps).any() and pairs.any()):
+        return MASKED
+    noise = float(np.median(cv2.absdiff(grey[::4, 1:], grey[::4, :-1])[pairs]))
+    return _judged(float(np.nanpercentile(steps, 99)), noise, float(np.nanmean(blocks)))
+
+
+def _judged(structure: float, noise: float, mean: float) -> str:
+    """Description of an image by the differences of its blocks and of its pixels, and its brightness."""
     if noise > _STRONG_NOISE or structure > _CONTRAST + _NOISE * noise / _BLOCK:
         return ""
-    mean = float(blocks.mean())
     return "black image" if mean < _DARK else "white image" if mean > _BRIGHT else "image without content"
 
 
@@ -148,11 +178,28 @@ def newest_evidence(step: WindowStep) -> Evidence:
     into = window.jj == newest
     if not bool(into.any()):
         return Evidence(0.0, 0.0)
+    into = measured(window, window.confidence, into)
+    if not bool(into.any()):
+        return Evidence(0.0, 0.0)
     confidence = float(window.confidence[into].mean())
     earlier = into & (window.ii < newest)
     if not bool(earlier.any()):
         return Evidence(confidence, 0.0)
     return Evidence(confidence, _inliers(step, earlier))
+
+
+def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:
+    """Edges whose measurement counts as evidence: those that do not lie in ignored pixels.
+
+    Args:
+        window: of the edges.
+        confidence: ``(E, 2)``, 0 for measurements in ignored pixels.
+        among: ``(E,)`` bool.
+
+    Returns:
+        ``(E,)`` bool; ``among`` itself if no frame has a mask.
+    """
+    return among if window.visible is None else among & (confidence > 0).any(dim=-1)
 
 
 def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
@@ -170,6 +217,7 @@ def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
     for position in range(1, len(window)):
         pair = (window.ii == position - 1) & (window.jj == position)
         pair |= (window.ii == position) & (window.jj == position - 1)
+        pair = measured(window, window.confidence, pair)
         confidence, inliers = float(window.confidence[pair].mean()), _inliers(step, pair)
         if not (confidence >= config.lost_confidence and inliers >= config.initial_inliers):  # NaN fails too
             found = position
@@ -198,7 +246,7 @@ def related_share(step: WindowStep, among: Tensor) -> float:
     Returns:
         In [0, 1]; 0 without such an edge.
     """
-    edges = among & (step.window.ii != step.window.jj)
+    edges = measured(step.window, step.window.confidence, among & (step.window.ii != step.window.jj))
     return _inliers(step, edges) if bool(edges.any()) else 0.0
 
 

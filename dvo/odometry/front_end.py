@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 from dvo.geometry.camera import Camera
 from dvo.graph.keyframe_log import FrameRecord
 from dvo.models.patch_vo import PatchVO
+from dvo.nets.masks import places_of_patches, unmasked_centres, visible_features
 from dvo.nets.patchifier import Features, cut_fine, normalise_images
 
 
@@ -30,6 +32,7 @@ class Observation:
         colors: ``(M, 3)`` uint8 RGB at the patch centres.
         fine_maps: ``(1, 1, c, H / 2, W / 2)`` features of the fine level of the correlation, None without one.
         fine: ``(M, c, p, p)`` those of the patches, None without one.
+        visible: ``(h, w)`` bool, pixels of the feature map that a measurement may lie in; None: all.
     """
 
     image: np.ndarray
@@ -42,6 +45,7 @@ class Observation:
     colors: Tensor
     fine_maps: Tensor | None = None
     fine: Tensor | None = None
+    visible: Tensor | None = None
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -84,6 +88,7 @@ def observe(
     select: Callable[..., Tensor],
     device: torch.device,
     centres: Tensor | None = None,
+    mask: np.ndarray | None = None,
 ) -> Observation:
     """Encode a working image and select its patches.
 
@@ -94,6 +99,7 @@ def observe(
         select: selection of the patches, with their number and the generator given (:mod:`dvo.nets.selection`).
         device: of the network.
         centres: ``(1, 1, M, 2)`` of the patches, if they are known already; nothing is selected then.
+        mask: ``(H, W)`` bool, pixels of the image to use; None for all.
 
     Returns:
         Features and patches.
@@ -102,6 +108,9 @@ def observe(
     features = encode_image(model, image, device)
     if centres is None:
         centres = model.centres(rgb[None, None], features, select)
+        if mask is not None:
+            again = partial(model.centres, rgb[None, None], features, select)
+            centres = unmasked_centres(centres, again, places_of_patches(mask, model.config.patch_size, device))
     matching, context = model.patchify.cut(features, centres)
     fine = cut_fine(features, centres, model.config.patch_size)
     stride = model.config.STRIDE
@@ -117,4 +126,5 @@ def observe(
         colors=rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu(),
         fine_maps=features.fine,
         fine=None if fine is None else fine[0],
+        visible=None if mask is None else visible_features(mask, model.config.patch_size, device),
     )

@@ -11,7 +11,7 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.evidence import NO_MATCH, last_unrelated, related_share, window_inliers
+from dvo.odometry.evidence import NO_MATCH, last_unrelated, measured, related_share, window_inliers
 from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
 
@@ -30,8 +30,8 @@ def median_revision(revision: Revision, window: Window) -> float:
         Feature pixels.
     """
     n = len(window)
-    edges = (window.ii == n - 2) & (window.jj == n - 1)
-    return float(revision.delta[0][edges].norm(dim=-1).median())
+    edges = measured(window, revision.weights[0], (window.ii == n - 2) & (window.jj == n - 1))
+    return float(revision.delta[0][edges].norm(dim=-1).median()) if bool(edges.any()) else 0.0
 
 
 def newest_confidence(revision: Revision, window: Window) -> float:
@@ -45,8 +45,8 @@ def newest_confidence(revision: Revision, window: Window) -> float:
         In [0, 1].
     """
     n = len(window)
-    edges = (window.ii == n - 2) & (window.jj == n - 1)
-    return float(revision.weights[0][edges].mean())
+    edges = measured(window, revision.weights[0], (window.ii == n - 2) & (window.jj == n - 1))
+    return float(revision.weights[0][edges].mean()) if bool(edges.any()) else 0.0
 
 
 def first_motion(revision: Revision, window: Window, config: TrackerConfig) -> tuple[float, bool]:

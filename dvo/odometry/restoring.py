@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
@@ -168,6 +168,8 @@ def _restore_window(source: MapReader, odometry: PatchOdometry, size: tuple[int,
         source.require(shapes == wanted, "not the features of the network", "window/matching")
         fits = frame.image is not None and frame.image.shape[:2] == size
         source.require(fits, "not of the working size, or missing", "window/images")
+        side = None if frame.visible is None else tuple(c.STRIDE * length for length in frame.visible.shape)
+        source.require(side in (None, size), "not of the size of the feature maps", "window/visible")
     if not len(window):
         source.array("tracker/origins", np.int64, (None, 0, 2))
         return
@@ -228,6 +230,10 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
     centres = source.array("waiting/centres", np.int64, (n, odometry.config.patches, 2), 0, 2**20)
     c = odometry.model.config
     _require_inside(source, torch.from_numpy(centres), (size[1] // c.STRIDE, size[0] // c.STRIDE), "waiting/centres")
+    visible = None
+    if source.has("waiting/visible"):  # of frames with masks
+        shape = n, size[0] // c.STRIDE, size[1] // c.STRIDE
+        visible = torch.from_numpy(source.array("waiting/visible", np.uint8, shape, 0, 1) > 0).to(odometry.device)
     for k, view in enumerate(table.waiting):
         try:
             fx, fy, cx, cy = intrinsics[k].tolist()
@@ -236,6 +242,7 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
             raise source.refused(error.message, "waiting/intrinsics") from error
         known = torch.from_numpy(centres[k])[None, None].to(odometry.device)
         seen = observe(odometry.model, images[k], camera, odometry.select, odometry.device, known)
+        seen = seen if visible is None else replace(seen, visible=visible[k])
         odometry.state.waiting.append(View([records[number] for number in view], seen))
 
 

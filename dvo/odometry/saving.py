@@ -155,6 +155,10 @@ def _tracker_arrays(odometry: PatchOdometry) -> dict[str, np.ndarray]:
         arrays["waiting/images"] = np.stack([seen.image for seen in views])
         arrays["waiting/intrinsics"] = np.stack([seen.image_intrinsics for seen in views]).astype(np.float64)
         arrays["waiting/centres"] = np.stack([seen.centres[0, 0].cpu().numpy() for seen in views])
+        if any(seen.visible is not None for seen in views):
+            every = torch.ones(views[0].maps.shape[-2:], dtype=torch.bool)
+            kept = [every if seen.visible is None else seen.visible.cpu() for seen in views]
+            arrays["waiting/visible"] = torch.stack(kept).numpy().astype(np.uint8)
     align = odometry.step.align
     if align is not None and len(odometry.window):
         arrays["alignment/images"] = align.images

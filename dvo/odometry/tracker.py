@@ -44,7 +44,7 @@ from dvo.odometry.tracker_state import TrackerState
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
-from dvo.odometry.working_image import working_image
+from dvo.odometry.working_image import masked_image
 
 
 class PatchOdometry:
@@ -125,7 +125,7 @@ class PatchOdometry:
         if self.state.finished:
             raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
         frame, state = checked_frame(frame), self.state
-        image, camera = working_image(frame, self.config.pixels)
+        image, camera, mask = masked_image(frame, self.config.pixels)
         state.shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
         state.sequence.check(frame)
         record = self.graph.log.add(frame.timestamp)
@@ -133,13 +133,13 @@ class PatchOdometry:
             state.sequence.repeat(frame.timestamp)
             return self._repeat(record)
         gap = state.sequence.tick(frame.timestamp)
-        problem = missing_content(image)
+        problem = missing_content(image, mask)
         if problem:
             estimate = self._lose(record, problem)
         else:
             if gap and state.initialised and not state.joining:
                 state.joining, state.skipped = str(gap), not gap.frozen
-            seen = observe(self.model, image, camera, self.select, self.device)
+            seen = observe(self.model, image, camera, self.select, self.device, mask=mask)
             state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
             estimate = self._take(View([record], seen))
             if len(state.waiting) >= self.config.patience:
@@ -308,7 +308,7 @@ class PatchOdometry:
         slot = window.free_map_slot()
         self.step.keep_frame(slot, seen.image, seen.maps, seen.fine_maps)
         keyframe = Keyframe(self.state.keyframes, view.records[0].timestamp, slot, seen.matching, seen.context,
-                            seen.colors, seen.intrinsics, seen.image, seen.fine)  # fmt: skip
+                            seen.colors, seen.intrinsics, seen.image, seen.fine, seen.visible)  # fmt: skip
         self.state.keyframes += 1
         self.loops.see(keyframe.identifier, seen.image, seen.maps)
         depth = first_depth(window, config, self.state.initialised)

@@ -82,8 +82,9 @@ class WindowStep:
         """
         w = self.window
         return UpdateState(
-            w.edges, w.poses_cw[None], w.patches[None], w.intrinsics[None], w.context[None], w.hidden[None]
-        )
+            w.edges, w.poses_cw[None], w.patches[None], w.intrinsics[None], w.context[None], w.hidden[None],
+            visible=w.visible,
+        )  # fmt: skip
 
     def revise(self) -> Revision:
         """Run the network on the edges of the window, which does not change.

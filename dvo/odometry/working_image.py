@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -29,6 +30,26 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
     return tuple(max(_MULTIPLE * 4, _MULTIPLE * round(side * scale / _MULTIPLE)) for side in (width, height))  # type: ignore[return-value]
 
 
+def masked_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera, np.ndarray | None]:
+    """Resize a frame and its mask, for an odometry that uses masks.
+
+    Args:
+        frame: checked, without lens distortion.
+        pixels: see :func:`working_size`.
+
+    Returns:
+        Image and camera of :func:`working_image`; ``(h, w)`` bool mask by the nearest pixels, None without one.
+
+    Raises:
+        DvoError: see :func:`working_image`.
+    """
+    if frame.mask is None:
+        return *working_image(frame, pixels), None
+    image, camera = working_image(replace(frame, mask=None), pixels)
+    mask = cv2.resize(frame.mask.astype(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    return image, camera, mask > 0
+
+
 def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
     """Resize a frame by area resampling.
 
@@ -40,8 +61,11 @@ def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
         ``(H, W, 3)`` uint8 RGB image and its camera.
 
     Raises:
-        DvoError: the frame's camera has distortion, which the tracker does not model.
+        DvoError: the frame's camera has distortion, which the tracker does not model; the frame has a mask, which the
+            odometry would not see.
     """
+    if frame.mask is not None:
+        raise DvoError("this odometry does not use masks", field="mask", remedy="use weights of patch_vo, or no mask")
     if needs_undistortion(frame.camera):
         raise DvoError(
             f"frames with {frame.camera.model} distortion cannot be tracked",

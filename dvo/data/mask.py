@@ -1,0 +1,138 @@
+"""Masks: pixels of the images that are used; what a bonnet, a watermark or a rim covers is not."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.data.images import decode, list_images
+from dvo.data.recording import ImageRecording
+from dvo.errors import DvoError
+from dvo.geometry.undistort import Undistorter
+
+_HALF = 128  # grey level from which a pixel of a JPEG file is white: its black is not exactly 0
+_REMEDY = "give an image of the size of the recorded ones, white where they are used and black elsewhere"
+
+
+def checked_mask(mask: Any, height: int, width: int, field: str) -> np.ndarray | None:
+    """Check the mask of a frame.
+
+    Args:
+        mask: ``(H, W)`` bool or uint8, 0 for pixels to ignore; None for none.
+        height, width: of the image.
+        field: for messages.
+
+    Returns:
+        ``(H, W)`` bool, True for pixels to use.
+
+    Raises:
+        DvoError: another type or size.
+    """
+    if mask is None:
+        return None
+    if not isinstance(mask, np.ndarray) or mask.dtype not in (np.bool_, np.uint8):
+        kind = (
+            f"an array of {mask.dtype}" if isinstance(mask, np.ndarray) else f"an object of type {type(mask).__name__}"
+        )
+        raise DvoError(f"expected a bool or uint8 array, got {kind}", field=field, remedy="give (H, W), 0: ignore")
+    if mask.shape != (height, width):
+        message = f"has the shape {mask.shape}, the image ({height}, {width})"
+        raise DvoError(message, field=field, remedy="give a mask of the size of the image")
+    return mask if mask.dtype == np.bool_ else mask != 0
+
+
+def read_mask(file: Path, invert: bool = False) -> np.ndarray:
+    """Read a mask.
+
+    Args:
+        file: image of any format that OpenCV reads. Pixels other than black are used; of a JPEG file those brighter
+            than mid-grey, because compression leaves no exact black.
+        invert: the other way round.
+
+    Returns:
+        ``(H, W)`` bool.
+
+    Raises:
+        DvoError: no image.
+    """
+    image = decode(file)
+    if image is None:
+        raise DvoError("cannot be read as an image", file=file, field="mask", remedy=_REMEDY)
+    levels = image if image.ndim == 2 else image[..., : min(3, image.shape[2])].max(axis=2)
+    least = _HALF if file.suffix.lower() in (".jpg", ".jpeg") else 1e-12
+    return (levels >= least) != invert
+
+
+class Masks:
+    """Masks of the images of a recording.
+
+    Args:
+        files: one for all images, or one for each of them by position.
+        size: width and height of the recorded images.
+        invert: white pixels are ignored, black ones used.
+    """
+
+    def __init__(self, files: list[Path], size: tuple[int, int], invert: bool) -> None:
+        self.files, self.size, self.invert = files, size, invert
+        self._read = lru_cache(maxsize=1)(self._load)
+
+    def __call__(self, index: int, undistorter: Undistorter | None) -> np.ndarray:
+        """Mask of an image.
+
+        Args:
+            index: position of the image in the recording.
+            undistorter: of the images; None if they are not undistorted.
+
+        Returns:
+            ``(H, W)`` bool, False also where the lens sees nothing.
+
+        Raises:
+            DvoError: no such mask, or one of another size than the image.
+        """
+        if len(self.files) > 1 and index >= len(self.files):
+            message = f"{len(self.files)} masks, but an image {index}"
+            raise DvoError(message, file=self.files[0].parent, field="mask", remedy="give a mask for every image")
+        return self._read(self.files[index if len(self.files) > 1 else 0], undistorter)
+
+    def _load(self, file: Path, undistorter: Undistorter | None) -> np.ndarray:
+        mask = read_mask(file, self.invert)
+        if mask.shape[::-1] != self.size:
+            found, wanted = (f"{width}x{height}" for width, height in (mask.shape[::-1], self.size))
+            raise DvoError(f"is {found}, the images are {wanted}", file=file, field="mask", remedy=_REMEDY)
+        return mask if undistorter is None else undistorter.mask(mask)
+
+
+def open_masks(path: Path, recording: Any, size: tuple[int, int], invert: bool) -> Masks:
+    """Masks of a recording.
+
+    Args:
+        path: an image, or a folder with one for each image of the recording: of the same stem, or else as many as
+            there are images, in natural order.
+        recording: a :class:`dvo.data.recording.Recording`.
+        size: width and height of its images.
+        invert: white pixels are ignored, black ones used.
+
+    Raises:
+        DvoError: nothing there, another number of masks than of images, or a first mask that cannot be used.
+    """
+    if not path.is_dir():
+        files = [path]
+    else:
+        found = list_images(path)
+        images = recording.images if isinstance(recording, ImageRecording) else []
+        by_stem = {file.stem: file for file in found}
+        count = recording.frame_count
+        if images and all(image.stem in by_stem for image in images):
+            files = [by_stem[image.stem] for image in images]
+        elif len(found) == count:
+            files = found
+        else:
+            images_text = "an unknown number of" if count is None else str(count)
+            message = f"{len(found)} masks for {images_text} images, and not of the same names"
+            raise DvoError(message, file=path, field="mask", remedy="give one mask, or one for every image")
+    masks = Masks(files, size, invert)
+    masks(0, None)
+    return masks

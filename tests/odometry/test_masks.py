@@ -1,0 +1,109 @@
+"""Masks in the tracker: patches, weights, evidence, saved maps, and a clip under an overlay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import dvo
+from dvo.errors import DvoError
+from dvo.metrics import evaluate
+from dvo.nets.masks import in_sight
+from dvo.odometry.evidence import measured, missing_content
+from dvo.odometry.load import build_odometry
+from dvo.odometry.protocol import Status
+from dvo.odometry.saving import load_map
+from tests.odometry.overlay_clip import overlay_clip
+from tests.odometry.test_reset import SETTINGS, frames, network, outcome
+
+MASK = np.ones((72, 96), bool)
+MASK[:, 72:] = False
+
+
+def masked(images, mask=MASK):
+    return [replace(frame, mask=mask) for frame in images]
+
+
+def tracker(weights=None):
+    return build_odometry(weights or network("patch_vo"), **SETTINGS["patch_vo"])
+
+
+def test_no_patch_lies_in_ignored_pixels():
+    odometry = tracker()
+    for frame in masked(frames(1)):
+        odometry.track(frame)
+    assert float(4 * odometry.window.patches[:, 0, 1, 1].max()) < 72 - 12
+    assert len(odometry.finish().trajectory) == 9
+
+
+def test_measurements_in_ignored_pixels_have_no_weight():
+    """Patches of the whole image are looked for in a frame of which the left part is used."""
+    odometry, images = tracker(), frames(1)
+    for frame in images[:-1]:
+        odometry.track(frame)
+    odometry.track(replace(images[-1], mask=np.tile(np.arange(96) < 40, (72, 1))))
+    window = odometry.window
+    into = window.jj == len(window) - 1
+    seen = in_sight(window.targets[None], window.jj, window.visible)[0]
+    assert bool((into & seen).any()) and bool((into & ~seen).any()) and bool(seen[~into].all())
+    assert bool((window.weights[~seen] == 0).all()) and bool((window.weights[seen] > 0).all())
+    assert bool((measured(window, window.confidence, into) == (into & seen)).all())
+
+
+def test_a_mask_that_ignores_nothing_changes_nothing():
+    assert outcome(tracker(), masked(frames(1), np.ones((72, 96), bool))) == outcome(tracker(), frames(1))
+
+
+def test_a_saved_tracker_goes_on_with_its_masks(tmp_path):
+    weights, images = network("patch_vo"), masked(frames(1))
+    whole = tracker(weights)
+    half = tracker(weights)
+    for frame in images[:6]:
+        assert whole.track(frame).status == half.track(frame).status
+    half.save(tmp_path / "half.dvo")
+    loaded = load_map(tmp_path / "half.dvo", weights=weights)
+    assert torch.equal(loaded.window.visible, half.window.visible)
+    assert outcome(loaded, images[6:]) == outcome(whole, images[6:])
+
+
+def test_too_little_is_left():
+    estimate = tracker().track(masked(frames(1, count=1), np.pad(np.ones((8, 8), bool), ((64, 0), (88, 0))))[0])
+    assert (estimate.status, estimate.reason) == (Status.LOST, "masked image")
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_the_overlay_is_no_content(level):
+    """A black or white image under a textured overlay has nothing to see."""
+    image = np.full((240, 320, 3), level, np.uint8)
+    image[200:] = np.random.default_rng(0).integers(0, 256, (10, 80, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1)
+    mask = np.ones((240, 320), bool)
+    mask[200:] = False
+    assert missing_content(image) == ""
+    assert missing_content(image, mask) == ("white image" if level else "black image")
+    image[100:140, 100:200] = 128
+    assert missing_content(image, mask) == ""
+
+
+def test_a_black_overlay_hides_no_content():
+    image = np.zeros((240, 320, 3), np.uint8)
+    image[:60] = np.random.default_rng(0).integers(0, 256, (15, 80, 3), dtype=np.uint8).repeat(4, 0).repeat(4, 1)
+    mask = np.zeros((240, 320), bool)
+    mask[:60] = True
+    assert missing_content(image, mask) == ""
+
+
+@pytest.mark.parametrize("name", ["droid", "tartanvo", "deepvo"])
+def test_other_odometries_refuse_masks(name):
+    odometry = build_odometry(network(name), **SETTINGS.get(name, {}))
+    with pytest.raises(DvoError, match="does not use masks"):
+        odometry.track(masked(frames(1, count=1))[0])
+
+
+@pytest.mark.slow
+def test_a_clip_under_an_overlay():
+    """The overlay ruins the trajectory, and its mask nearly restores it."""
+    _, covered, hidden, truth = overlay_clip()
+    errors = [evaluate(dvo.run(dvo.load("small"), images).result.trajectory, truth) for images in (covered, hidden)]
+    assert errors[0].ate_percent > 3 and errors[1].ate_percent < 1
+    assert 0.2 < 1 - hidden[0].mask.mean() < 0.25

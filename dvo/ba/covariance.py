@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import torch
 from torch import Tensor
 
 from dvo.ba.blocks import POSES
 from dvo.ba.options import BADamping
-from dvo.ba.problem import Problem
+from dvo.ba.problem import NormalEquations, Problem
 from dvo.ba.step import normal_equations, reduced_system
 from dvo.errors import DvoError
+from dvo.geometry import se3
 from dvo.geometry.precision import full_precision
 
 
@@ -23,12 +24,14 @@ def pose_covariance(
     damping: BADamping = BADamping(),  # noqa: B008
     block: str = POSES,
     sigma: float = 1.0,
+    constraint: Tensor | None = None,
 ) -> Tensor:
     """Joint marginal covariance of chosen poses: their part of the inverse Hessian of all unknowns.
 
     It is a covariance if the weights of all factors are inverse variances, in units of ``sigma^-2``. Absolute damping
     stays in the Hessian, where it acts as a weak prior on directions that nothing measures, for example the scale of a
-    monocular problem with one fixed pose; relative damping is left out.
+    monocular problem with one fixed pose; relative damping is left out. A ``constraint`` holds one direction exactly
+    instead: it borders the Hessian (Triggs et al., "Bundle adjustment - a modern synthesis", 9.1).
 
     Args:
         problem: at its solution.
@@ -37,6 +40,8 @@ def pose_covariance(
         block: name of the block.
         sigma: standard deviation of a measurement of weight 1, by which the result is scaled. For the confidence of a
             network see :attr:`dvo.odometry.config.TrackerConfig.sigma`.
+        constraint: ``(B, N, d)`` coefficients of the tangents of all poses whose sum is held at zero, for example
+            :func:`size_gradient`; those of fixed poses are ignored. The direction may be one that nothing measures.
 
     Returns:
         ``(B, d m, d m)`` covariance of the left tangents (``d = 6``: ``[tau, phi]``), zero for fixed poses; infinite on
@@ -51,14 +56,63 @@ def pose_covariance(
     if bad:
         raise DvoError(f"frame {bad[0]} outside 0..{count - 1}", field="frames", remedy="give frames that exist")
     with full_precision(state[block].value.device):
-        equations, _ = normal_equations(problem, damping.depth)
+        sums, _ = normal_equations(problem, damping.depth)
+        # In double precision, as a marginal is the inverse of a difference.
+        equations = NormalEquations(*(getattr(sums, field.name).double() for field in fields(sums)))
+        a = None
+        if constraint is not None:
+            a = _column(problem, block, constraint.to(equations.h_pp))
+            # A prior on the constrained sum makes the system regular, and changes nothing where the sum is zero.
+            mean = equations.h_pp.diagonal(dim1=-2, dim2=-1).mean(-1)
+            weight = mean / a.square().sum(1)[:, 0].clamp(min=torch.finfo(a.dtype).tiny)
+            equations = replace(equations, h_pp=equations.h_pp + weight[:, None, None] * a @ a.mT)
         solver = reduced_system(equations, replace(damping, relative=0.0))
     index = torch.tensor(list(frames), dtype=torch.long, device=state[block].value.device)
     rows = state.rows(block, index).flatten()
     # One unit column for each tangent; the column of a fixed pose, past the last row, is zero.
     columns = torch.nn.functional.one_hot(rows, state.size + 1)[:, : state.size].T.to(solver.factor)
-    inverse = torch.cholesky_solve(columns.expand(len(solver.factor), -1, -1), solver.factor)
-    covariance = sigma**2 * (columns.T @ inverse)
+    columns = columns.expand(len(solver.factor), -1, -1)
+    whole = columns if a is None else torch.cat((columns, a), -1)
+    # The inverse of L L^T between columns is the product of their L^-1.
+    half = torch.linalg.solve_triangular(solver.factor, whole, upper=False)
+    covariance = half.mT @ half
+    if a is not None:
+        last = covariance[:, :-1, -1:]
+        covariance = covariance[:, :-1, :-1] - last @ last.mT / covariance[:, -1:, -1:]
+    covariance = (sigma**2 * covariance).to(state[block].value.dtype)
     good = (solver.ok & torch.isfinite(covariance).all(-1).all(-1))[:, None, None]
     infinite = torch.diag_embed(torch.full_like(covariance[..., 0], torch.inf))
     return torch.where(good, covariance, infinite)
+
+
+def size_gradient(poses_cw: Tensor, reference: int, members: Sequence[int]) -> Tensor:
+    """Gradient of half the sum of squared distances of camera centres from that of one camera.
+
+    As the constraint of :func:`pose_covariance`, with the reference fixed, it fixes the scale of a monocular problem:
+    the RMS distance of the members from the reference does not change.
+
+    Args:
+        poses_cw: ``(B, N, 7)`` world to camera.
+        reference: position of the camera that distances are taken from.
+        members: positions of the others.
+
+    Returns:
+        ``(B, N, 6)`` by the left tangents ``[tau, phi]`` of the members, of which ``phi`` has no part; zero for all
+        other poses.
+    """
+    index = torch.tensor(list(members), dtype=torch.long, device=poses_cw.device)
+    chosen = poses_cw.index_select(1, index)
+    # A centre moves by -R^T tau, and is at c - c_0 = -R^T t from the reference if t is that of T_member T_reference^-1.
+    relative = se3.relative(poses_cw[:, reference : reference + 1].expand_as(chosen), chosen)
+    gradient = poses_cw.new_zeros(*poses_cw.shape[:2], 6)
+    gradient[:, index, :3] = relative[..., :3]
+    return gradient
+
+
+def _column(problem: Problem, block: str, constraint: Tensor) -> Tensor:
+    """Constraint ``(B, N, d)`` as a column ``(B, P, 1)`` of the reduced system."""
+    state = problem.state
+    rows = state.rows(block, torch.arange(constraint.shape[1], device=constraint.device)).flatten()
+    column = constraint.new_zeros(len(constraint), state.size + 1)  # fixed poses share the row past the last
+    column[:, rows] = constraint.flatten(1)
+    return column[:, : state.size, None]

@@ -30,6 +30,7 @@ _RANGES = {
     "removal": (1, 1000),
     "robust": (0, 1e4),
     "sigma": (1e-6, 1e3),
+    "covariance_scale": (1e-6, 1e6),
     "optimisation": (1, 1000),
     "initial_frames": (2, 1000),
     "initial_updates": (1, 1000),
@@ -77,8 +78,11 @@ class TrackerConfig:
             they are there, which depends on the load of the machine: the same frames need not give the same bytes.
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
         sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
-            are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). The tracker does not read it;
-            it is there for callers that give it to :attr:`dvo.ba.options.BAOptions.sigma`, which scales covariances.
+            are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). It scales covariances
+            (:attr:`dvo.odometry.protocol.Estimate.covariance`; :attr:`dvo.ba.options.BAOptions.sigma`); no pose depends
+            on it.
+        covariance_scale: factor of the covariances beyond ``sigma^2``, as errors of measurements are not independent,
+            with the shipped weights: fitted by ``python -m eval.benchmarks.covariance`` (docs/uncertainty.md).
         restart: start the window anew, some frames after the initialisation, and the final adjustment, if that leads to
             a better solution (:mod:`dvo.ba.restart`).
         initial_frames: keyframes before the first joint optimisation.
@@ -131,6 +135,7 @@ class TrackerConfig:
     real_time: bool = False
     robust: float = 0.3
     sigma: float = 0.061
+    covariance_scale: float = 2.0
     restart: bool = True
     updates: int = 1
     initial_motion: float = 0.5

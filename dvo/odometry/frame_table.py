@@ -20,6 +20,7 @@ from dvo.odometry.session import Run
 SKIPPED = "skipped"  # status of a frame that the stride leaves out
 STATUSES = (*(status.value for status in Status), SKIPPED)
 _DIGITS = {"timestamp": 9, "confidence": 4, "seconds": 4, "true_x": 6, "true_y": 6, "true_z": 6}
+_SIGMAS = {"position_sigma": 4, "rotation_sigma": 4}  # significant digits; tables of older versions have no sigmas
 _MAX_ROWS = 10_000_000  # of a table to read
 
 
@@ -37,6 +38,8 @@ class FrameRow:
         seconds: time of tracking the frame; None if it was not tracked.
         reason: cause of the status ``lost``.
         true_x, true_y, true_z: true position of the camera in the world, metres; None without ground truth.
+        position_sigma, rotation_sigma: standard deviations of the estimate right after the frame, relative to its
+            reference, units of the segment and degrees (:class:`dvo.odometry.protocol.Estimate`); None without one.
     """
 
     timestamp: float
@@ -49,6 +52,8 @@ class FrameRow:
     true_x: float | None = None
     true_y: float | None = None
     true_z: float | None = None
+    position_sigma: float | None = None
+    rotation_sigma: float | None = None
 
     @property
     def true_position(self) -> tuple[float, float, float] | None:
@@ -87,6 +92,7 @@ class FrameTable:
             self._rows.append(FrameRow(frame.timestamp, SKIPPED))
         else:
             row = FrameRow(frame.timestamp, estimate.status.value, None, None, float(estimate.confidence))
+            row = replace(row, position_sigma=estimate.position_sigma, rotation_sigma=estimate.rotation_sigma)
             self._rows.append(replace(row, reason=estimate.reason))
 
     def rows(self, run: Run, keyframes: Collection[float] | None, truth: np.ndarray | None = None) -> list[FrameRow]:
@@ -194,6 +200,8 @@ def _cell(name: str, value: Any) -> str:
         return ""
     if isinstance(value, bool):
         return str(int(value))
+    if name in _SIGMAS:
+        return f"{value:.{_SIGMAS[name]}g}"
     return f"{value:.{_DIGITS[name]}f}" if name in _DIGITS else str(value)
 
 
@@ -210,11 +218,13 @@ def read_frames(path: Path) -> list[FrameRow]:
         DvoError: no such file, another header, or a cell that is not of its kind.
     """
     names = [field.name for field in fields(FrameRow)]
+    known = names, [name for name in names if name not in _SIGMAS]
     remedy = "remove it, or track again with dvo run"
     try:
         with open(path, encoding="utf-8", newline="") as file:
             reader = csv.reader(file)
-            if next(reader, None) != names:
+            names = next(reader, [])
+            if names not in known:
                 raise DvoError("not a table of frames", file=path, field="header", remedy=remedy)
             rows = []
             for cells in reader:
@@ -239,8 +249,8 @@ def _row(cells: dict[str, str]) -> FrameRow:
     values: dict[str, Any] = {"status": cells["status"], "reason": cells["reason"]}
     values["segment"] = int(cells["segment"]) if cells["segment"] else None
     values["keyframe"] = cells["keyframe"] == "1" if cells["keyframe"] else None
-    for name in _DIGITS:
-        values[name] = float(cells[name]) if cells[name] else None
+    for name in (*_DIGITS, *_SIGMAS):
+        values[name] = float(cells[name]) if cells.get(name) else None
         if values[name] is not None and not math.isfinite(values[name]):
             raise ValueError(f"{name} is not finite")
     if values["timestamp"] is None:

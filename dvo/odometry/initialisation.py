@@ -49,8 +49,8 @@ def newest_confidence(revision: Revision, window: Window) -> float:
     return float(revision.weights[0][edges].mean()) if bool(edges.any()) else 0.0
 
 
-def first_motion(revision: Revision, window: Window, config: TrackerConfig) -> tuple[float, bool]:
-    """Confidence of the newest frame of a window that is not initialised yet, and whether it has moved.
+def first_motion(revision: Revision, window: Window, config: TrackerConfig) -> bool:
+    """Find out if the newest frame of a window that is not initialised yet has moved.
 
     Args:
         revision: output of the network for the edges of the window.
@@ -58,10 +58,10 @@ def first_motion(revision: Revision, window: Window, config: TrackerConfig) -> t
         config: settings of the tracker.
 
     Returns:
-        Mean confidence in [0, 1]; and False for a confident frame with too little motion to initialise.
+        False for a confident frame with too little motion to initialise.
     """
-    confidence = newest_confidence(revision, window)
-    return confidence, confidence < config.lost_confidence or median_revision(revision, window) >= config.initial_motion
+    confident = newest_confidence(revision, window) >= config.lost_confidence
+    return not confident or median_revision(revision, window) >= config.initial_motion
 
 
 def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:

@@ -34,12 +34,23 @@ class Estimate:
         pose_wc: ``(7,)`` float64 camera to world ``T_wc`` (x y z, quaternion x y z w), or None while there is none:
             never with the status ``lost``, always with ``tracking``.
         status: state of the tracker.
-        confidence: in [0, 1]; comparable within one run only.
+        confidence: in [0, 1], 0 without a pose. Of the patch tracker, the probability that the error of the pose
+            relative to the reference displaces the scene by less than half a pixel of an image of 320x240, in the RMS
+            over the image (:func:`dvo.odometry.uncertainty.confidence_of`): comparable between runs. Of other
+            odometries comparable within one run only.
         segment: number of the segment that the pose belongs to, from 0. Poses of two segments have different worlds and
             different scales.
         reason: cause of the status ``lost``, such as ``"black image"``; empty otherwise.
         recovered: the first pose after the segment was joined to an earlier world (of an earlier segment, or of a map):
             this pose and those after it are in that world and scale, earlier ones of the segment were not.
+        covariance: ``(6, 6)`` float64 of the error ``xi`` of ``pose_wc`` relative to the pose of the reference, which
+            is held fixed, as is the scale of the segment (:mod:`dvo.odometry.uncertainty`). ``xi = [tau, phi]`` is a
+            right tangent, in the coordinates of this camera: ``T_wc_true = T_wc Exp(xi)``, ``tau`` in units of the
+            segment, ``phi`` in radians. (The left tangent of ``T_cw`` is ``-xi``, with the same covariance; that of
+            ``T_wc`` has the covariance ``A C A^T`` with ``A = se3.adjoint(pose_wc)``.) None without a pose, where the
+            measurements do not determine it, and from odometries that have none.
+        reference: timestamp of the reference, seconds: the oldest keyframe of the window that a measurement still
+            reaches; None without one.
     """
 
     timestamp: float
@@ -49,6 +60,18 @@ class Estimate:
     segment: int = 0
     reason: str = ""
     recovered: bool = False
+    covariance: np.ndarray | None = None
+    reference: float | None = None
+
+    @property
+    def position_sigma(self) -> float | None:
+        """Standard deviation of the position relative to the reference, units of the segment: root of the trace."""
+        return None if self.covariance is None else float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def rotation_sigma(self) -> float | None:
+        """Standard deviation of the rotation relative to the reference, degrees: root of the trace."""
+        return None if self.covariance is None else float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
 
 
 @dataclass(frozen=True)

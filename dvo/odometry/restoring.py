@@ -18,6 +18,7 @@ from dvo.odometry.front_end import View, encode_image, observe
 from dvo.odometry.new_recording import require_size
 from dvo.odometry.protocol import Estimate, Status
 from dvo.odometry.rolling_shutter import Shutter
+from dvo.odometry.uncertainty import newest_uncertainty
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.working_image import working_size
 from dvo.settings import LARGEST_SEED
@@ -143,6 +144,10 @@ def restore_tracker(source: MapReader, odometry: PatchOdometry, table: TrackerTa
         state.last = image, estimate
     state.world = odometry.graph.world_of(odometry.graph.segment)  # before a first pose this makes no difference
     _restore_window(source, odometry, size)
+    if state.last is not None and state.last[1].pose_wc is not None and len(odometry.window):
+        image, estimate = state.last
+        again = newest_uncertainty(odometry.step, odometry.config)
+        state.last = image, replace(estimate, covariance=again.covariance, reference=again.reference)
     _restore_waiting(source, odometry, table, size)
 
 

@@ -41,6 +41,7 @@ from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
 from dvo.odometry.self_calibration import adjust_segments
 from dvo.odometry.tracker_state import TrackerState
+from dvo.odometry.uncertainty import UNKNOWN, newest_uncertainty
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
@@ -228,31 +229,28 @@ class PatchOdometry:
         if config.restart:
             leave_minimum(window, state.tracked)
         self._reduce()  # may correct the window
-        return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING, evidence.confidence)
+        return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
 
     def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
         window, config, state, record = self.window, self.config, self.state, view.records[0]
-        state.joining, confidence = "", 0.0
+        state.joining = ""
         if len(window) > 1:
             revision = self.step.revise()
-            confidence, moved = first_motion(revision, window, config)
-            if not moved:
+            if not first_motion(revision, window, config):
                 # Too little motion to initialise: until the final adjustment it shares the pose of the last keyframe.
                 self.step.store(revision)
                 self.graph.drop(len(window) - 1, still=True)
                 self._place(record, keyframe.identifier)
-                return self._estimate(record, None, Status.INITIALISING, confidence)
+                return self._estimate(record, None, Status.INITIALISING)
         self._place(record, keyframe.identifier)
         if len(window) >= config.initial_frames:
             enough = initialise_related(self.graph, self.step, config)
-            evidence = newest_evidence(self.step)
-            state.initialised = enough and evidence.supports(config)
+            state.initialised = enough and newest_evidence(self.step).supports(config)
             state.adjustable += [self.graph.segment] * state.initialised
-            confidence = evidence.confidence
         self._reduce()
         pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
-        return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING, confidence)
+        return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)
 
     def _repeat(self, record: FrameRecord) -> Estimate:
         """Give a frame with the image of the frame before it the same pose and state."""
@@ -273,7 +271,7 @@ class PatchOdometry:
         if self.state.initialised and not self.state.joining:
             self.state.joining = reason
         record.reason = self.state.joining or reason
-        return self._estimate(record, None, Status.LOST, 0.0)
+        return self._estimate(record, None, Status.LOST)
 
     def _begin_segment(self) -> Estimate:
         """Close the segment, and begin the next one with the frames that could not be joined with it."""
@@ -340,11 +338,13 @@ class PatchOdometry:
             self.graph.archive_oldest()
         self.loops.advance(self.state.adjustable)
 
-    def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status, confidence: float) -> Estimate:
+    def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status) -> Estimate:
         graph, reason = self.graph, record.reason if status is Status.LOST else ""
         recovered = pose_wc is not None and self.state.enter(graph.segment, graph.world_of(graph.segment))
         segment = graph.segment - graph.recording.segment
-        return Estimate(record.timestamp, pose_wc, status, confidence, segment, reason, recovered)
+        sure = UNKNOWN if pose_wc is None else newest_uncertainty(self.step, self.config)
+        return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
+                        sure.covariance, sure.reference)  # fmt: skip
 
     def _pose_wc(self, position: int) -> np.ndarray:
         return se3.inverse(self.window.poses_cw[position]).double().cpu().numpy()

@@ -1,0 +1,190 @@
+"""Uncertainty of the newest pose of a tracker: its covariance, from the marginal of the window, and a confidence.
+
+The covariance is that of the pose relative to the *reference*, held fixed: the oldest keyframe of the window that a
+measurement of bundle adjustment still reaches. (All measurements of the keyframes before it have left the window;
+these keyframes wait to be archived.) Scale is a gauge: the RMS distance from the reference of the keyframes between the
+two is held fixed as well, at its value in the segment. All other poses and the inverse depths are marginalised.
+
+Measurements have the variance ``sigma^2 / confidence`` (:attr:`dvo.odometry.config.TrackerConfig.sigma`). Their errors
+are not independent: a patch that is off is off in all frames. :attr:`TrackerConfig.covariance_scale`, the mean
+normalised error squared on rendered sequences, accounts for it (docs/uncertainty.md).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.ba.covariance import pose_covariance, size_gradient
+from dvo.ba.layer import make_problem
+from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.problem import Problem
+from dvo.graph.window import Window
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.window_step import WindowStep
+
+TOLERANCE = 0.5
+"""Reprojection error that the confidence is the probability of staying below, pixels of an image of 320x240."""
+DAMPING = BADamping(pose=1e-6, relative=0.0)
+"""Prior of the marginal, which matters only to unknowns that nothing measures."""
+
+_PIXELS = 320 * 240
+_DEPTH_FRAMES = 3  # newest frames whose median depth is taken for that of the scene
+_GRID = (np.stack(np.meshgrid(np.arange(4), np.arange(3)), -1).reshape(-1, 2) + 0.5) / (4, 3)  # as shares of the image
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Uncertainty of the newest pose of a window.
+
+    Attributes:
+        covariance: ``(6, 6)`` float64, see :attr:`dvo.odometry.protocol.Estimate.covariance`; None if the measurements
+            do not determine the pose.
+        reference: time of the reference, seconds.
+        confidence: in [0, 1], see :func:`confidence_of`.
+    """
+
+    covariance: np.ndarray | None = None
+    reference: float | None = None
+    confidence: float = 0.0
+
+
+UNKNOWN = Uncertainty()
+"""Uncertainty without a pose."""
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """Frames of a window that are held, by their positions.
+
+    Attributes:
+        reference: oldest frame with a measurement.
+        members: frames with measurements between the reference and the newest one; the RMS distance of their centres
+            from that of the reference is held.
+    """
+
+    reference: int
+    members: tuple[int, ...]
+
+
+def window_gauge(window: Window) -> Gauge | None:
+    """Gauge of the covariance of the newest frame.
+
+    Args:
+        window: keyframes and edges.
+
+    Returns:
+        The gauge; None if the newest frame has no measurements, or fewer than two other frames have.
+    """
+    n, counts = len(window), torch.bincount(torch.cat([window.ii, window.jj]), minlength=len(window))
+    found = [k for k, count in enumerate(counts.tolist()) if count]
+    if len(found) < 3 or found[-1] != n - 1:
+        return None
+    return Gauge(found[0], tuple(found[1:-1]))
+
+
+def window_problem(step: WindowStep, gauge: Gauge) -> tuple[Problem, Tensor]:
+    """Bundle adjustment problem of the covariance, at the present poses, on the CPU.
+
+    Args:
+        step: of the model on the window, after a step.
+        gauge: of the window.
+
+    Returns:
+        The problem of the frames from the reference on, with all poses free but those of the reference and of frames
+        without measurements; and the constraint of the scale for :func:`dvo.ba.covariance.pose_covariance`.
+    """
+    w, first = step.window, gauge.reference
+    source = int(w.ii.min())  # of the oldest patches with a measurement
+    # The confidence, also where the weights are those of aligned measurements: sigma belongs to it.
+    tensors = (w.poses_cw[first:], w.patches[source * w.per_frame :], w.intrinsics[first:], w.targets, w.confidence)
+    poses, patches, intrinsics, targets, weights = (x.cpu()[None] for x in tensors)
+    fixed = torch.ones(len(w) - first, dtype=torch.bool)
+    fixed[[k - first for k in (*gauge.members, len(w) - 1)]] = False
+    options = BAOptions(fixed=fixed, bounds=step.bounds, kernel=step.kernel)
+    ii, jj, kk = (w.ii - first).cpu(), (w.jj - first).cpu(), (w.kk - source * w.per_frame).cpu()
+    problem = make_problem(poses, patches, intrinsics, targets, weights, ii, jj, kk, options)
+    return problem, size_gradient(poses, 0, [k - first for k in gauge.members])
+
+
+@torch.no_grad()
+def newest_uncertainty(step: WindowStep, config: TrackerConfig) -> Uncertainty:
+    """Uncertainty of the pose of the newest frame of a window. Nothing changes.
+
+    Args:
+        step: of the model on the window, after a step.
+        config: scale of the covariance.
+
+    Returns:
+        The uncertainty; without covariance and with a confidence of zero where the measurements do not determine the
+        pose.
+    """
+    window, gauge = step.window, window_gauge(step.window)
+    if gauge is None:
+        return UNKNOWN
+    problem, constraint = window_problem(step, gauge)
+    sigma = config.sigma * math.sqrt(config.covariance_scale)
+    newest = len(window) - gauge.reference - 1
+    found = pose_covariance(problem, [newest], DAMPING, sigma=sigma, constraint=constraint)[0].double().numpy()
+    covariance = (found + found.T) / 2
+    reference = window.frames[gauge.reference].timestamp
+    if not np.isfinite(covariance).all():
+        return Uncertainty(None, reference)
+    metric = flow_metric(window.intrinsics[-1].double().cpu().numpy(), step.bounds, median_inverse_depth(window))
+    return Uncertainty(covariance, reference, confidence_of(covariance, metric))
+
+
+def median_inverse_depth(window: Window) -> float:
+    """Median inverse depth of the patches of the newest frames of a window."""
+    return float(window.patches[-_DEPTH_FRAMES * window.per_frame :, 2, 0, 0].median())
+
+
+def flow_metric(intrinsics: np.ndarray, size: tuple[int, int], inverse_depth: float) -> np.ndarray:
+    """Matrix ``M`` of the mean squared displacement ``xi^T M xi`` that a pose error causes in the image.
+
+    The mean is over a grid of 12 points of the image at one depth, in pixels of an image of 320x240 (as many pixels, if
+    the aspect differs).
+
+    Args:
+        intrinsics: ``(4,)`` fx fy cx cy.
+        size: width and height of the image or feature map that they belong to.
+        inverse_depth: of the points, in inverse units of the segment.
+
+    Returns:
+        ``(6, 6)`` float64.
+    """
+    fx, fy, cx, cy = intrinsics
+    points = _GRID * size
+    x, y = (points[:, 0] - cx) / fx, (points[:, 1] - cy) / fy
+    o, d = np.zeros_like(x), np.full_like(x, inverse_depth)
+    along_x, along_y = (d, o, -d * x, -x * y, 1 + x * x, -y), (o, d, -d * y, -1 - y * y, x * y, x)
+    rows = np.stack([fx * np.stack(along_x), fy * np.stack(along_y)]) * math.sqrt(_PIXELS / (size[0] * size[1]))
+    return np.asarray(np.einsum("aip,ajp->ij", rows, rows) / len(points))
+
+
+def confidence_of(covariance: np.ndarray, metric: np.ndarray, tolerance: float = TOLERANCE) -> float:
+    """Probability that the RMS displacement that the pose error causes in the image is below a tolerance.
+
+    Under a Gaussian error the squared displacement is a sum of weighted chi-squares; the gamma distribution with its
+    mean and variance stands for it (Satterthwaite, "An approximate distribution of estimates of variance components",
+    1946).
+
+    Args:
+        covariance: ``(6, 6)`` of the pose error.
+        metric: of :func:`flow_metric`.
+        tolerance: pixels of an image of 320x240.
+
+    Returns:
+        In [0, 1]; 0 for a covariance that is not finite.
+    """
+    product = covariance @ metric
+    mean, half_variance = float(np.trace(product)), float((product * product.T).sum())
+    if not (math.isfinite(half_variance) and mean > 0 and half_variance > 0):
+        return 0.0
+    shape = mean**2 / (2 * half_variance)
+    arguments = torch.tensor([shape, shape * tolerance**2 / mean], dtype=torch.float64)
+    return float(torch.special.gammainc(*arguments))

@@ -1,0 +1,251 @@
+"""Covariance and confidence of the tracker's poses against their errors on rendered sequences.
+
+``python -m eval.benchmarks.covariance [--split calibration] [--suites plain,scale] [--frames 70] [--weights small]``
+
+After every frame the newest pose relative to the reference of its covariance (:mod:`dvo.odometry.uncertainty`) is
+compared with the truth, whose scale is fitted to what the covariance holds fixed: the RMS distance of the keyframes in
+between from the reference. Printed are, by sequence and for all, the normalised error squared ``xi^T C^-1 xi`` for each
+of the six degrees of freedom (its expectation is 1), the same of the rotation and of the position alone, and the
+displacement that the error causes in the image; and for bins of the confidence the share of poses whose displacement is
+below the tolerance that it is the probability of.
+
+The split ``validation`` is that of the suites. ``calibration`` has the same options and other scenes;
+``TrackerConfig.covariance_scale`` is fitted on it: the present one times the geometric mean, over the sequences, of
+their mean normalised error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+from dvo.geometry import se3
+from dvo.graph.window import Window
+from dvo.odometry.load import load
+from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.uncertainty import TOLERANCE, Gauge, flow_metric, median_inverse_depth, window_gauge
+from dvo.synth.sequence import SyntheticSequence, make_sequence
+from dvo.threads import settle_threads
+from eval.benchmarks.weight_calibration import rendered_sequences
+
+SUITES = "plain,scale,textureless,fast,blur,rotation,lighting,dynamic,rolling_shutter,loop"
+CALIBRATION = -500_000_000
+"""Added to the seed of a validation sequence for one of the calibration split."""
+MEDIAN = 5.3481 / 6
+"""Median of chi-square with six degrees of freedom, over six."""
+BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
+
+
+@dataclass
+class Errors:
+    """Errors of the poses of a sequence, an entry for each pose with a covariance.
+
+    Attributes:
+        poses: number of poses, those without a covariance included.
+        joint, rotation, position: normalised errors squared over the degrees of freedom, 6, 3 and 3.
+        displacement: RMS displacement that the error causes in the image, pixels of an image of 320x240.
+        expected: the same as the covariance predicts it: root of the mean of its square.
+        confidence: of the estimates.
+    """
+
+    poses: int = 0
+    joint: list[float] = field(default_factory=list)
+    rotation: list[float] = field(default_factory=list)
+    position: list[float] = field(default_factory=list)
+    displacement: list[float] = field(default_factory=list)
+    expected: list[float] = field(default_factory=list)
+    confidence: list[float] = field(default_factory=list)
+
+    def add(self, xi: np.ndarray, covariance: np.ndarray, metric: np.ndarray, confidence: float) -> None:
+        """Record a pose.
+
+        Args:
+            xi: ``(6,)`` error, see :func:`pose_error`.
+            covariance: ``(6, 6)`` of it.
+            metric: of :func:`dvo.odometry.uncertainty.flow_metric`.
+            confidence: of the estimate.
+        """
+        for values, rows in ((self.joint, slice(6)), (self.position, slice(3)), (self.rotation, slice(3, 6))):
+            part = covariance[rows, rows]
+            values.append(float(xi[rows] @ np.linalg.solve(part, xi[rows])) / len(part))
+        self.displacement.append(float(xi @ metric @ xi) ** 0.5)
+        self.expected.append(float(np.trace(covariance @ metric)) ** 0.5)
+        self.confidence.append(confidence)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Errors]) -> Errors:
+        """All entries, in order."""
+        lists = ([value for part in parts for value in getattr(part, name)] for name in _LISTS)
+        return cls(sum(part.poses for part in parts), *lists)
+
+
+_LISTS = ("joint", "rotation", "position", "displacement", "expected", "confidence")
+
+
+def pose_error(window: Window, gauge: Gauge, true_cw: Tensor) -> np.ndarray:
+    """Error of the newest pose of a window relative to the reference, under the gauge of its covariance.
+
+    Args:
+        window: of a tracker, right after a frame.
+        gauge: of the window.
+        true_cw: ``(n, 7)`` float64 true poses of its frames, world to camera.
+
+    Returns:
+        ``(6,)`` right tangent ``[tau, phi]`` with ``T_wc_true = T_wc Exp(xi)``, in units of the segment and radians.
+    """
+    members, first = list(gauge.members), gauge.reference
+    poses = window.poses_cw.double().cpu(), true_cw
+    found, true = (se3.relative(x[first : first + 1].expand_as(x), x) for x in poses)
+    scale = (found[members, :3].square().sum() / true[members, :3].square().sum()).sqrt()
+    newest = torch.cat([scale * true[-1, :3], true[-1, 3:]])
+    return np.asarray(se3.log(se3.compose(found[-1], se3.inverse(newest))).numpy())
+
+
+def measure(sequence: SyntheticSequence, weights: str, seed: int) -> Errors:
+    """Track a sequence and compare each pose with the truth.
+
+    Args:
+        sequence: rendered.
+        weights: name or file.
+        seed: of the tracker.
+
+    Returns:
+        The errors.
+
+    Raises:
+        DvoError: no such weights, or those of a network without patches.
+    """
+    odometry = load(weights, seed=seed, final_adjustment=False, loops=False)
+    if not isinstance(odometry, PatchOdometry):
+        raise DvoError("has no covariances", file=weights, field="--weights", remedy="give weights of a patch network")
+    times, window = sequence.groundtruth.timestamps, odometry.window
+    poses_cw = se3.inverse(torch.from_numpy(sequence.groundtruth.poses_wc))
+    errors = Errors()
+    for frame in sequence:
+        estimate = odometry.track(frame)
+        errors.poses += estimate.pose_wc is not None
+        gauge = window_gauge(window)
+        if estimate.covariance is None or gauge is None:
+            continue
+        stamps = np.array([keyframe.timestamp for keyframe in window.frames])
+        true_cw = poses_cw[np.abs(times - stamps[:, None]).argmin(1)]
+        intrinsics = window.frames[-1].intrinsics.double().cpu().numpy()
+        metric = flow_metric(intrinsics, odometry.step.bounds, median_inverse_depth(window))
+        errors.add(pose_error(window, gauge, true_cw), estimate.covariance, metric, estimate.confidence)
+    return errors
+
+
+HEADER = (
+    f"{'sequence':30} {'poses':>5} {'with C':>6} | {'NEES/6':>6} {'robust':>6} {'rotation':>8} {'position':>8} |"
+    f" {'median px':>9} {'expected':>8}"
+)
+
+
+def line(name: str, errors: Errors) -> str:
+    """Line of the first table: means of the normalised errors, ``robust`` by the median, and displacements.
+
+    Args:
+        name: of the sequence.
+        errors: of its poses.
+    """
+    if not errors.joint:
+        return f"{name:30} {errors.poses:5} {0:6} |"
+    mean, robust = np.mean(errors.joint), np.median(errors.joint) / MEDIAN
+    return (
+        f"{name:30} {errors.poses:5} {len(errors.joint):6} | {mean:6.2f} {robust:6.2f} {np.mean(errors.rotation):8.2f}"
+        f" {np.mean(errors.position):8.2f} | {np.median(errors.displacement):9.3f} {np.median(errors.expected):8.3f}"
+    )
+
+
+def scale_factor(parts: Sequence[Errors]) -> float:
+    """Geometric mean, over the sequences, of their mean normalised error; nan without any."""
+    means = [float(np.mean(part.joint)) for part in parts if part.joint]
+    return float(np.exp(np.mean(np.log(means)))) if means else float("nan")
+
+
+def confidence_table(groups: dict[str, Errors]) -> Iterator[str]:
+    """Lines of the second table: for each bin of the confidence, the poses of each group that are within the tolerance.
+
+    Args:
+        groups: errors by name.
+    """
+    head = "".join(f" | {name:>9} {'share':>6}" for name in groups)
+    yield f"{'confidence':>12} {'poses':>6} {'mean':>6} {'share':>6} {'median px':>9}{head}"
+    every = Errors.concatenate(list(groups.values()))
+    for low, high in zip(BINS, BINS[1:], strict=False):
+        count, mean, share, median = _bin(every, low, high)
+        parts = (_bin(part, low, high) for part in groups.values())
+        rest = "".join(f" | {part[0]:9} {part[2]:6.2f}" for part in parts)
+        yield f"{f'{low:g} to {high:g}':>12} {count:6} {mean:6.2f} {share:6.2f} {median:9.3f}{rest}"
+
+
+def _bin(errors: Errors, low: float, high: float) -> tuple[int, float, float, float]:
+    """Poses with a confidence in ``[low, high)``: number, mean confidence, share within the tolerance, median error."""
+    confidence, displacement = np.array(errors.confidence), np.array(errors.displacement)
+    rows = (confidence >= low) & ((confidence < high) | (high == BINS[-1]))
+    if not rows.any():
+        return 0, float("nan"), float("nan"), float("nan")
+    inside = displacement[rows] < TOLERANCE
+    return int(rows.sum()), float(confidence[rows].mean()), float(inside.mean()), float(np.median(displacement[rows]))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Track the sequences and print the tables; bad input ends with code 2 and one line.
+
+    Args:
+        arguments: of the command line; None: those of the process.
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m eval.benchmarks.covariance", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("--suites", default=SUITES, help="with commas (%(default)s)")
+    parser.add_argument("--split", choices=("calibration", "validation"), default="validation")
+    parser.add_argument("--frames", type=int, default=70, help="of each sequence, from its first on (%(default)s)")
+    parser.add_argument("--weights", default="small", help="name or file (%(default)s)")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(arguments)
+    settle_threads()
+    try:
+        _print_tables(given.suites, given.split, given.frames, given.weights, given.seed)
+    except DvoError as error:
+        print(f"covariance: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _print_tables(suites: str, split: str, frames: int, weights: str, seed: int) -> None:
+    found: list[Errors] = []
+    families: dict[str, list[Errors]] = {}
+    for number, entry in enumerate(rendered_sequences(suites)):
+        options = {name: value for name, value in entry.rendered or () if name != "version"}
+        options["seed"] += CALIBRATION if split == "calibration" else 0
+        sequence = make_sequence(**options)
+        errors = measure(_beginning(sequence, frames), weights, seed)
+        found.append(errors)
+        families.setdefault(options["family"], []).append(errors)
+        if number == 0:
+            print(HEADER)
+        print(line(entry.name.replace("validation", split), errors), flush=True)
+    print(line("all", Errors.concatenate(found)))
+    print(f"geometric mean of the sequences' NEES/6: {scale_factor(found):.2f}")
+    tolerance = f"share: displacement below {TOLERANCE:g} px"
+    print(f"\n{tolerance}", *confidence_table({k: Errors.concatenate(v) for k, v in families.items()}), sep="\n")
+
+
+def _beginning(sequence: SyntheticSequence, frames: int) -> SyntheticSequence:
+    """The first frames of a sequence; each has the same bytes."""
+    truth = sequence.groundtruth
+    return replace(sequence, groundtruth=Trajectory(truth.timestamps[:frames], truth.poses_wc[:frames]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

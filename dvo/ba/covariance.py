@@ -31,7 +31,8 @@ def pose_covariance(
     It is a covariance if the weights of all factors are inverse variances, in units of ``sigma^-2``. Absolute damping
     stays in the Hessian, where it acts as a weak prior on directions that nothing measures, for example the scale of a
     monocular problem with one fixed pose; relative damping is left out. A ``constraint`` holds one direction exactly
-    instead: it borders the Hessian (Triggs et al., "Bundle adjustment - a modern synthesis", 9.1).
+    instead: it borders the Hessian (Triggs et al., "Bundle adjustment - a modern
+    synthesis", section 9).
 
     Args:
         problem: at its solution.
@@ -55,31 +56,49 @@ def pose_covariance(
     bad = [x for x in frames if not 0 <= x < count]
     if bad:
         raise DvoError(f"frame {bad[0]} outside 0..{count - 1}", field="frames", remedy="give frames that exist")
-    with full_precision(state[block].value.device):
-        sums, _ = normal_equations(problem, damping.depth)
-        # In double precision, as a marginal is the inverse of a difference.
-        equations = NormalEquations(*(getattr(sums, field.name).double() for field in fields(sums)))
-        a = None
-        if constraint is not None:
-            a = _column(problem, block, constraint.to(equations.h_pp))
-            # A prior on the constrained sum makes the system regular, and changes nothing where the sum is zero.
-            mean = equations.h_pp.diagonal(dim1=-2, dim2=-1).mean(-1)
-            weight = mean / a.square().sum(1)[:, 0].clamp(min=torch.finfo(a.dtype).tiny)
-            equations = replace(equations, h_pp=equations.h_pp + weight[:, None, None] * a @ a.mT)
-        solver = reduced_system(equations, replace(damping, relative=0.0))
     index = torch.tensor(list(frames), dtype=torch.long, device=state[block].value.device)
-    rows = state.rows(block, index).flatten()
-    # One unit column for each tangent; the column of a fixed pose, past the last row, is zero.
-    columns = torch.nn.functional.one_hot(rows, state.size + 1)[:, : state.size].T.to(solver.factor)
-    columns = columns.expand(len(solver.factor), -1, -1)
-    whole = columns if a is None else torch.cat((columns, a), -1)
+    column = None if constraint is None else _column(problem, block, constraint)
+    with full_precision(state[block].value.device):
+        equations, _ = normal_equations(problem, damping.depth)
+        found = marginal_covariance(equations, state.rows(block, index).flatten(), damping, column)
+    return (sigma**2 * found).to(state[block].value.dtype)
+
+
+@torch.no_grad()
+def marginal_covariance(
+    equations: NormalEquations, rows: Tensor, damping: BADamping, constraint: Tensor | None = None
+) -> Tensor:
+    """Part of the inverse Hessian; see :func:`pose_covariance`.
+
+    Args:
+        equations: of all unknowns, with the damping of the inverse depths.
+        rows: ``(r,)`` of the reduced system; one past the last stands for something fixed.
+        damping: that of the poses is added.
+        constraint: ``(B, P)`` coefficients of the unknowns of the reduced system whose sum is held at zero.
+
+    Returns:
+        ``(B, r, r)`` in double precision, as a marginal is the inverse of a difference; infinite on the diagonal where
+        the Hessian is not positive definite.
+    """
+    equations = NormalEquations(*(getattr(equations, field.name).double() for field in fields(equations)))
+    if constraint is not None:
+        a = constraint.double()
+        # A prior on the constrained sum makes the system regular, and changes nothing where the sum is zero.
+        mean = equations.h_pp.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+        weighted = mean / a.square().sum(1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny) * a
+        equations = replace(equations, h_pp=equations.h_pp + weighted[:, :, None] * a[:, None])
+    solver = reduced_system(equations, replace(damping, relative=0.0))
+    b, size = equations.g_p.shape
+    # One unit column for each row; that of something fixed, past the last row, is zero.
+    columns = torch.nn.functional.one_hot(rows, size + 1)[:, :size].T.to(solver.factor).expand(b, -1, -1)
+    if constraint is not None:
+        columns = torch.cat((columns, a[..., None]), -1)
     # The inverse of L L^T between columns is the product of their L^-1.
-    half = torch.linalg.solve_triangular(solver.factor, whole, upper=False)
+    half = torch.linalg.solve_triangular(solver.factor, columns, upper=False)
     covariance = half.mT @ half
-    if a is not None:
+    if constraint is not None:
         last = covariance[:, :-1, -1:]
         covariance = covariance[:, :-1, :-1] - last @ last.mT / covariance[:, -1:, -1:]
-    covariance = (sigma**2 * covariance).to(state[block].value.dtype)
     good = (solver.ok & torch.isfinite(covariance).all(-1).all(-1))[:, None, None]
     infinite = torch.diag_embed(torch.full_like(covariance[..., 0], torch.inf))
     return torch.where(good, covariance, infinite)
@@ -110,9 +129,9 @@ def size_gradient(poses_cw: Tensor, reference: int, members: Sequence[int]) -> T
 
 
 def _column(problem: Problem, block: str, constraint: Tensor) -> Tensor:
-    """Constraint ``(B, N, d)`` as a column ``(B, P, 1)`` of the reduced system."""
+    """Constraint ``(B, N, d)`` on the unknowns of the reduced system, ``(B, P)``."""
     state = problem.state
     rows = state.rows(block, torch.arange(constraint.shape[1], device=constraint.device)).flatten()
     column = constraint.new_zeros(len(constraint), state.size + 1)  # fixed poses share the row past the last
     column[:, rows] = constraint.flatten(1)
-    return column[:, : state.size, None]
+    return column[:, : state.size]

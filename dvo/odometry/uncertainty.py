@@ -17,12 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from dvo.ba.covariance import pose_covariance, size_gradient
-from dvo.ba.layer import make_problem
+from dvo.ba.covariance import marginal_covariance, size_gradient
+from dvo.ba.linearisation import NormalEquations
 from dvo.ba.options import BADamping, BAOptions
-from dvo.ba.problem import Problem
+from dvo.ba.window_equations import window_equations
 from dvo.graph.window import Window
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.window_step import WindowStep
@@ -80,35 +79,12 @@ def window_gauge(window: Window) -> Gauge | None:
     Returns:
         The gauge; None if the newest frame has no measurements, or fewer than two other frames have.
     """
-    n, counts = len(window), torch.bincount(torch.cat([window.ii, window.jj]), minlength=len(window))
+    n = len(window)
+    counts = torch.bincount(torch.cat([window.ii, window.jj]), minlength=n)
     found = [k for k, count in enumerate(counts.tolist()) if count]
     if len(found) < 3 or found[-1] != n - 1:
         return None
     return Gauge(found[0], tuple(found[1:-1]))
-
-
-def window_problem(step: WindowStep, gauge: Gauge) -> tuple[Problem, Tensor]:
-    """Bundle adjustment problem of the covariance, at the present poses, on the CPU.
-
-    Args:
-        step: of the model on the window, after a step.
-        gauge: of the window.
-
-    Returns:
-        The problem of the frames from the reference on, with all poses free but those of the reference and of frames
-        without measurements; and the constraint of the scale for :func:`dvo.ba.covariance.pose_covariance`.
-    """
-    w, first = step.window, gauge.reference
-    source = int(w.ii.min())  # of the oldest patches with a measurement
-    # The confidence, also where the weights are those of aligned measurements: sigma belongs to it.
-    tensors = (w.poses_cw[first:], w.patches[source * w.per_frame :], w.intrinsics[first:], w.targets, w.confidence)
-    poses, patches, intrinsics, targets, weights = (x.cpu()[None] for x in tensors)
-    fixed = torch.ones(len(w) - first, dtype=torch.bool)
-    fixed[[k - first for k in (*gauge.members, len(w) - 1)]] = False
-    options = BAOptions(fixed=fixed, bounds=step.bounds, kernel=step.kernel)
-    ii, jj, kk = (w.ii - first).cpu(), (w.jj - first).cpu(), (w.kk - source * w.per_frame).cpu()
-    problem = make_problem(poses, patches, intrinsics, targets, weights, ii, jj, kk, options)
-    return problem, size_gradient(poses, 0, [k - first for k in gauge.members])
 
 
 @torch.no_grad()
@@ -126,16 +102,38 @@ def newest_uncertainty(step: WindowStep, config: TrackerConfig) -> Uncertainty:
     window, gauge = step.window, window_gauge(step.window)
     if gauge is None:
         return UNKNOWN
-    problem, constraint = window_problem(step, gauge)
-    sigma = config.sigma * math.sqrt(config.covariance_scale)
-    newest = len(window) - gauge.reference - 1
-    found = pose_covariance(problem, [newest], DAMPING, sigma=sigma, constraint=constraint)[0].double().numpy()
-    covariance = (found + found.T) / 2
     reference = window.frames[gauge.reference].timestamp
+    covariance = config.sigma**2 * config.covariance_scale * _marginal(step, gauge)
     if not np.isfinite(covariance).all():
         return Uncertainty(None, reference)
-    metric = flow_metric(window.intrinsics[-1].double().cpu().numpy(), step.bounds, median_inverse_depth(window))
+    intrinsics = window.frames[-1].intrinsics.double().cpu().numpy()
+    metric = flow_metric(intrinsics, step.bounds, median_inverse_depth(window))
     return Uncertainty(covariance, reference, confidence_of(covariance, metric))
+
+
+def _marginal(step: WindowStep, gauge: Gauge) -> np.ndarray:
+    """Covariance ``(6, 6)`` of the newest pose for measurements of the variance ``1 / confidence``; on the CPU.
+
+    The problem is that of the frames from the reference on. The weights are the confidence also where measurements are
+    aligned: ``sigma`` belongs to it.
+    """
+    w, first, m = step.window, gauge.reference, step.window.per_frame
+    kk = w.kk.cpu()
+    source = int(kk.min()) // m  # frame of the oldest patches with a measurement
+    centre = w.patches.shape[-1] // 2
+    patches = w.patches[source * m :, :, centre, centre].cpu().unflatten(0, (-1, m))
+    poses, targets, confidence = (x.cpu() for x in (w.poses_cw[first:], w.targets, w.confidence))
+    equations = window_equations(
+        poses, patches[..., :2], patches[..., 2], w.intrinsics[first:].cpu(), targets, confidence, w.jj.cpu() - first,
+        kk - source * m, source - first, BAOptions(bounds=step.bounds, kernel=step.kernel),
+    )  # fmt: skip
+    free = torch.tensor([*gauge.members, len(w) - 1]) - first
+    rows = (6 * free[:, None] + torch.arange(6)).flatten()
+    h_pp, h_pl = equations.h_pp[0, rows][None, :, rows], equations.h_pl[:, rows]
+    equations = NormalEquations(h_pp, h_pl, equations.h_ll + DAMPING.depth, equations.g_p[:, rows], equations.g_l)
+    size = size_gradient(poses[None], 0, free[:-1].tolist())[:, free].flatten(1)
+    found = marginal_covariance(equations, torch.arange(len(rows) - 6, len(rows)), DAMPING, size)[0]
+    return ((found + found.T) / 2).numpy()
 
 
 def median_inverse_depth(window: Window) -> float:
@@ -181,9 +179,11 @@ def confidence_of(covariance: np.ndarray, metric: np.ndarray, tolerance: float =
     Returns:
         In [0, 1]; 0 for a covariance that is not finite.
     """
+    if not np.isfinite(covariance).all():
+        return 0.0
     product = covariance @ metric
     mean, half_variance = float(np.trace(product)), float((product * product.T).sum())
-    if not (math.isfinite(half_variance) and mean > 0 and half_variance > 0):
+    if not (mean > 0 and half_variance > 0):
         return 0.0
     shape = mean**2 / (2 * half_variance)
     arguments = torch.tensor([shape, shape * tolerance**2 / mean], dtype=torch.float64)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from dvo.graph.recordings import begin_recording
 from dvo.graph.window import Keyframe
 from dvo.odometry import session
 from dvo.odometry.frame_table import FrameRow, FrameTable, keyframe_times, near, read_frames, write_frames
+from dvo.odometry.protocol import Estimate, Status
 
 CAMERA = Camera(50, 50, 31.5, 23.5, 64, 48)
 
@@ -66,10 +69,10 @@ def test_the_file_gives_the_rows_back(tmp_path, fake_odometry):
         ("", "header"),
         ("time,status\n", "header"),
         ("{header}\n1.0,tracking\n", "line 2"),
-        ("{header}\n1.0,asleep,,,,,,,,\n", "unknown status 'asleep'"),
-        ("{header}\n1.0,tracking,one,,,,,,,\n", "line 2"),
-        ("{header}\nnan,tracking,,,,,,,,\n", "timestamp is not finite"),
-        ("{header}\n,tracking,,,,,,,,\n", "no timestamp"),
+        ("{header}\n1.0,asleep,,,,,,,,,,\n", "unknown status 'asleep'"),
+        ("{header}\n1.0,tracking,one,,,,,,,,,\n", "line 2"),
+        ("{header}\nnan,tracking,,,,,,,,,,\n", "timestamp is not finite"),
+        ("{header}\n,tracking,,,,,,,,,,\n", "no timestamp"),
     ],
 )
 def test_a_table_that_is_none(tmp_path, text, problem):
@@ -79,6 +82,24 @@ def test_a_table_that_is_none(tmp_path, text, problem):
     with pytest.raises(DvoError, match=problem) as caught:
         read_frames(file)
     assert caught.value.file == file
+
+
+def test_sigmas_are_kept_and_tables_without_them_are_read(tmp_path, fake_odometry):
+    _, run = tracked(fake_odometry(), count=2)
+    table, pose = FrameTable(), np.array([0.0, 0, 0, 0, 0, 0, 1])
+    covariance = np.diag([1e-8, 4e-8, 4e-8, 0, 0, 1e-6])
+    estimates = Estimate(100.0, None, Status.LOST), Estimate(100.1, pose, Status.TRACKING, covariance=covariance)
+    for k, estimate in enumerate(estimates):
+        table.update(Frame(k, estimate.timestamp, np.zeros((48, 64, 3), np.uint8), CAMERA), estimate)
+    file = tmp_path / "frames.csv"
+    write_frames(file, table.rows(run, None))
+    lost, found = read_frames(file)
+    assert lost.position_sigma is None and lost.rotation_sigma is None
+    assert found.position_sigma == 3e-4 and found.rotation_sigma == pytest.approx(np.rad2deg(1e-3), rel=1e-3)
+    lines = file.read_text().splitlines()
+    assert lines[0].endswith(",position_sigma,rotation_sigma")
+    file.write_text("\n".join(line.rsplit(",", 2)[0] for line in lines))
+    assert read_frames(file) == [lost, replace(found, position_sigma=None, rotation_sigma=None)]
 
 
 def test_no_table(tmp_path):

@@ -39,7 +39,9 @@ def content(result):
 
 def told(estimate):
     pose = None if estimate.pose_wc is None else estimate.pose_wc.tobytes()
-    return estimate.timestamp, pose, estimate.status, estimate.confidence, estimate.segment, estimate.reason
+    covariance = None if estimate.covariance is None else estimate.covariance.tobytes()
+    known = estimate.confidence, estimate.reference, covariance
+    return estimate.timestamp, pose, estimate.status, known, estimate.segment, estimate.reason
 
 
 def check_cuts(new, images, cuts, folder, weights=None):

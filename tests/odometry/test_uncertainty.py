@@ -1,0 +1,170 @@
+"""Covariance and confidence of the newest pose: the plain dense marginal, its gauge, and what they leave alone."""
+
+import math
+import pickle
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import dvo
+from dvo.ba.blocks import POSES
+from dvo.ba.covariance import size_gradient
+from dvo.ba.layer import BAOptions, make_problem
+from dvo.ba.reference import dense_rows
+from dvo.geometry import se3
+from dvo.odometry import tracker as tracker_module
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.protocol import Estimate, Status
+from dvo.odometry.uncertainty import (
+    UNKNOWN,
+    confidence_of,
+    flow_metric,
+    newest_uncertainty,
+    window_gauge,
+)
+from dvo.synth.sequence import make_sequence
+
+FAST = {"pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "initial_updates": 6, "restart": False}
+
+
+def walk():
+    size = {"height": 120, "width": 160, "fps": 15.0, "sensor": False}
+    return list(make_sequence(61, frames=22, family="room", kind="handheld", speed=3.0, **size))
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    """A tracker after a walk and a black image, its step before that image, and its estimates."""
+    odometry = dvo.load("small", **FAST)
+    frames = walk()
+    estimates = [odometry.track(frame) for frame in frames]
+    step = copied(odometry.step)
+    black = replace(frames[-1], timestamp=frames[-1].timestamp + 0.1, image=np.zeros_like(frames[-1].image))
+    return odometry, step, [*estimates, odometry.track(black)]
+
+
+def copied(step, poses_cw=None, patches=None):
+    """A step with a copy of its window, with other poses and patches."""
+    w = step.window
+    window = replace(w, frames=list(w.frames), poses_cw=w.poses_cw if poses_cw is None else poses_cw,
+                     patches=w.patches if patches is None else patches)  # fmt: skip
+    return SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
+
+
+def test_every_pose_has_a_covariance_and_nothing_else_has(tracked):
+    odometry, _, estimates = tracked
+    assert [e.covariance is None for e in estimates] == [e.status is not Status.TRACKING for e in estimates]
+    assert estimates[0].status is Status.INITIALISING and estimates[-1].status is Status.LOST
+    for e in estimates:
+        if e.covariance is None:
+            assert (e.confidence, e.reference, e.position_sigma, e.rotation_sigma) == (0.0, None, None, None)
+            continue
+        assert e.covariance.shape == (6, 6) and e.covariance.dtype == np.float64
+        assert np.array_equal(e.covariance, e.covariance.T) and np.linalg.eigvalsh(e.covariance).min() > 0
+        assert 0 < e.confidence <= 1 and e.reference < e.timestamp
+        assert e.position_sigma == pytest.approx(math.sqrt(e.covariance[[0, 1, 2], [0, 1, 2]].sum()))
+        assert e.rotation_sigma == pytest.approx(math.degrees(math.sqrt(e.covariance[[3, 4, 5], [3, 4, 5]].sum())))
+        again = pickle.loads(pickle.dumps(e))
+        assert np.array_equal(again.covariance, e.covariance) and again.reference == e.reference
+    assert estimates[-2].reference in [frame.timestamp for frame in odometry.window.frames]
+
+
+def test_it_is_the_marginal_of_the_whole_information_matrix(tracked):
+    """The dense inverse, bordered with the gauge, in place of the eliminated depths."""
+    _, step, estimates = tracked
+    window, gauge = step.window, window_gauge(step.window)
+    options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, kernel=step.kernel)
+    tensors = window.poses_cw, window.patches, window.intrinsics, window.targets, window.confidence
+    problem = make_problem(
+        *(x[None].double() for x in tensors), window.ii, window.jj, window.kk, options, grouped=False
+    )
+    state, constraint = problem.state, size_gradient(window.poses_cw[None].double(), gauge.reference, gauge.members)
+    _, w, jac_p, jac_l = dense_rows(problem)
+    jacobian = torch.cat((jac_p, jac_l), -1)[0]
+    hessian = jacobian.T @ (w[0, :, None] * jacobian)
+    hessian += torch.diag(torch.cat((torch.full((state.size,), 1e-6), torch.full((jac_l.shape[-1],), 1e-4))))
+    rows = state.rows(POSES, torch.arange(len(window)))
+    column = torch.zeros(len(hessian), 1, dtype=torch.float64)
+    for member in gauge.members:
+        column[rows[member], 0] = constraint[0, member]
+    border = torch.cat((column.T, torch.zeros(1, 1)), 1)
+    inverse = torch.linalg.inv(torch.cat((torch.cat((hessian, column), 1), border)))
+    config = TrackerConfig()
+    plain = config.sigma**2 * config.covariance_scale * inverse[rows[-1]][:, rows[-1]].numpy()
+    scale = np.sqrt(np.outer(plain.diagonal(), plain.diagonal()))
+    np.testing.assert_allclose(estimates[-2].covariance / scale, plain / scale, atol=2e-3)
+
+
+def test_scale_and_world_do_not_matter(tracked):
+    """The tangent is in the camera, so another world changes nothing; another scale, the unit of the positions."""
+    _, step, _ = tracked
+    poses, patches = step.window.poses_cw, step.window.patches
+    plain = newest_uncertainty(step, TrackerConfig())
+    scaled = torch.cat((4 * poses[:, :3], poses[:, 3:]), -1), torch.cat((patches[:, :2], patches[:, 2:] / 4), 1)
+    units = np.diag([4.0, 4, 4, 1, 1, 1])
+    found = newest_uncertainty(copied(step, *scaled), TrackerConfig())
+    tolerance = 1e-2 * math.sqrt(np.abs(plain.covariance).max())
+    np.testing.assert_allclose(found.covariance, units @ plain.covariance @ units, rtol=2e-2, atol=tolerance**2)
+    assert found.confidence == pytest.approx(plain.confidence, abs=1e-2)
+    world = se3.exp(torch.tensor([3.0, -2, 1, 0.5, 1.0, -0.7])).expand_as(poses)
+    found = newest_uncertainty(copied(step, se3.compose(poses, world)), TrackerConfig())
+    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=2e-2, atol=tolerance**2)
+    wide = newest_uncertainty(step, TrackerConfig(sigma=0.122, covariance_scale=8.0))
+    factor = 4 * 8 / TrackerConfig().covariance_scale
+    np.testing.assert_allclose(wide.covariance, factor * plain.covariance, rtol=1e-4)
+    assert wide.confidence < plain.confidence
+
+
+def test_the_gauge_leaves_out_frames_without_measurements(tracked):
+    _, step, _ = tracked
+    window = copied(step).window
+    n = len(window)
+    window.keep((window.ii > 1) & (window.jj > 1))
+    assert window_gauge(window).reference == 2 and window_gauge(window).members == tuple(range(3, n - 1))
+    gradient = size_gradient(window.poses_cw[None], 2, range(3, n - 1))[0]
+    assert (gradient[[0, 1, 2, n - 1]] == 0).all() and (gradient[3 : n - 1, :3] != 0).any(-1).all()
+    window.keep(window.touching(n - 2) & window.touching(n - 1))
+    step = SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
+    assert window_gauge(window) is None and newest_uncertainty(step, TrackerConfig()) is UNKNOWN
+
+
+def test_no_pose_depends_on_it(tracked, monkeypatch):
+    monkeypatch.setattr(tracker_module, "newest_uncertainty", lambda step, config: UNKNOWN)
+    odometry = dvo.load("small", **FAST)
+    for frame, estimate in zip(walk(), tracked[2], strict=False):
+        found = odometry.track(frame)
+        assert found.status is estimate.status and found.covariance is None
+        assert found.pose_wc is None or found.pose_wc.tobytes() == estimate.pose_wc.tobytes()
+
+
+def test_the_metric_is_the_displacement_in_the_image():
+    intrinsics, size, depth = np.array([60.0, 62, 41, 29]), (80, 60), 2.5
+    xi = 1e-4 * np.array([1.0, -2, 3, -1, 2, 1.5])
+    u, v = np.meshgrid((np.arange(4) + 0.5) * 20, (np.arange(3) + 0.5) * 20)
+    rays = np.stack([(u - 41) / 60, (v - 29) / 62, np.ones_like(u)], -1).reshape(-1, 3)
+    moved = se3.act(se3.exp(torch.from_numpy(xi)), torch.from_numpy(depth * rays)).numpy()
+    shift = 4 * intrinsics[:2] * (moved[:, :2] / moved[:, 2:] - rays[:, :2])  # 80x60 to 320x240
+    expected = (shift**2).sum(1).mean()
+    assert xi @ flow_metric(intrinsics, size, 1 / depth) @ xi == pytest.approx(expected, rel=1e-3)
+    half = flow_metric(intrinsics / 2, (40, 30), 1 / depth)
+    np.testing.assert_allclose(half, flow_metric(intrinsics, size, 1 / depth))
+
+
+def test_the_confidence_is_a_probability():
+    one = np.diag([1.0, 0, 0, 0, 0, 0])  # one degree of freedom: the normal distribution
+    for sigma in (0.1, 0.5, 2.0):
+        assert confidence_of(sigma**2 * np.eye(6), one) == pytest.approx(math.erf(0.5 / sigma / math.sqrt(2)))
+    pair = np.diag([1.0, 1, 0, 0, 0, 0])  # two: Rayleigh's
+    assert confidence_of(0.09 * np.eye(6), pair) == pytest.approx(1 - math.exp(-(0.25 / 0.09) / 2))
+    draws = np.random.default_rng(0).normal(size=(100_000, 2)) * (0.4, 0.2)
+    mixed = confidence_of(np.diag([0.16, 0.04, 1, 1, 1, 1]), pair)
+    assert mixed == pytest.approx(((draws**2).sum(1) < 0.25).mean(), abs=0.02)
+    assert confidence_of(np.diag([np.inf] * 6), one) == confidence_of(np.zeros((6, 6)), one) == 0.0
+
+
+def test_an_odometry_without_one_leaves_it_out():
+    estimate = Estimate(0.0, np.array([0.0, 0, 0, 0, 0, 0, 1]), Status.TRACKING)
+    assert estimate.covariance is None and estimate.reference is None and estimate.rotation_sigma is None

@@ -135,7 +135,7 @@ class TrackerConfig:
     real_time: bool = False
     robust: float = 0.3
     sigma: float = 0.061
-    covariance_scale: float = 2.8
+    covariance_scale: float = 2.0
     restart: bool = True
     updates: int = 1
     initial_motion: float = 0.5

@@ -11,7 +11,8 @@ below the tolerance that it is the probability of.
 
 The split ``validation`` is that of the suites. ``calibration`` has the same options and other scenes;
 ``TrackerConfig.covariance_scale`` is fitted on it: the present one times the geometric mean, over the sequences, of
-their mean normalised error.
+``robust``, their median over that of a chi-square, which poses in a second solution (:mod:`dvo.ba.restart`) do not
+move.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.threads import settle_threads
 from eval.benchmarks.weight_calibration import rendered_sequences
 
-SUITES = "plain,scale,textureless,fast,blur,rotation,lighting,dynamic,rolling_shutter,loop"
+SUITES = "plain,scale,textureless,fast,blur,rotation,lighting,dynamic"
 CALIBRATION = -500_000_000
 """Added to the seed of a validation sequence for one of the calibration split."""
 MEDIAN = 5.3481 / 6
@@ -158,17 +159,22 @@ def line(name: str, errors: Errors) -> str:
     """
     if not errors.joint:
         return f"{name:30} {errors.poses:5} {0:6} |"
-    mean, robust = np.mean(errors.joint), np.median(errors.joint) / MEDIAN
+    joint, rotation, position = (float(np.mean(x)) for x in (errors.joint, errors.rotation, errors.position))
     return (
-        f"{name:30} {errors.poses:5} {len(errors.joint):6} | {mean:6.2f} {robust:6.2f} {np.mean(errors.rotation):8.2f}"
-        f" {np.mean(errors.position):8.2f} | {np.median(errors.displacement):9.3f} {np.median(errors.expected):8.3f}"
+        f"{name:30} {errors.poses:5} {len(errors.joint):6} | {joint:6.2f} {robust(errors):6.2f} {rotation:8.2f}"
+        f" {position:8.2f} | {np.median(errors.displacement):9.3f} {np.median(errors.expected):8.3f}"
     )
 
 
+def robust(errors: Errors) -> float:
+    """Median normalised error over that of a Gaussian's."""
+    return float(np.median(errors.joint)) / MEDIAN
+
+
 def scale_factor(parts: Sequence[Errors]) -> float:
-    """Geometric mean, over the sequences, of their mean normalised error; nan without any."""
-    means = [float(np.mean(part.joint)) for part in parts if part.joint]
-    return float(np.exp(np.mean(np.log(means)))) if means else float("nan")
+    """Geometric mean, over the sequences, of their :func:`robust` normalised error; nan without any."""
+    found = [robust(part) for part in parts if part.joint]
+    return float(np.exp(np.mean(np.log(found)))) if found else float("nan")
 
 
 def confidence_table(groups: dict[str, Errors]) -> Iterator[str]:
@@ -236,7 +242,7 @@ def _print_tables(suites: str, split: str, frames: int, weights: str, seed: int)
             print(HEADER)
         print(line(entry.name.replace("validation", split), errors), flush=True)
     print(line("all", Errors.concatenate(found)))
-    print(f"geometric mean of the sequences' NEES/6: {scale_factor(found):.2f}")
+    print(f"geometric mean of the sequences' robust NEES/6: {scale_factor(found):.2f}")
     tolerance = f"share: displacement below {TOLERANCE:g} px"
     print(f"\n{tolerance}", *confidence_table({k: Errors.concatenate(v) for k, v in families.items()}), sep="\n")
 

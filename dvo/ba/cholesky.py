@@ -1,9 +1,10 @@
 """Sparse Cholesky factorisation by dense tiles.
 
 Consecutive block rows of a block-sparse matrix are grouped into tiles, and tiles are eliminated in an order that keeps
-fill small (minimum degree; Davis, "Direct methods for sparse linear systems", 2006, chapter 7). All arithmetic is on
-dense tiles, so the few operations are large ones. Consecutive block rows should be neighbours, as the frames of a video
-are.
+fill small: all tiles of least degree that are no neighbours of each other at once (multiple minimum degree; Liu,
+"Modification of the minimum-degree algorithm by multiple elimination", 1985). All arithmetic is on dense tiles, and
+that of the tiles of a round is one batch, so the few operations are large ones. Consecutive block rows should be
+neighbours, as the frames of a video are.
 """
 
 from __future__ import annotations
@@ -14,16 +15,43 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-TILE_SIZES = (16, 8, 4, 2)
+TILE_SIZES = (16, 8, 4, 2, 1)
 """Block rows of a tile, the candidates."""
-SECONDS_PER_PRODUCT = 1e-10
-"""Rough cost of a multiplication and addition, against which :data:`SECONDS_PER_CALL` is weighed."""
-SECONDS_PER_CALL = 1.5e-5
+SECONDS_PER_ROUND, SECONDS_PER_TILE, SECONDS_PER_NUMBER, SECONDS_PER_PRODUCT = 2e-4, 3e-7, 6e-9, 2e-11
+"""Rough costs of the calls for a round; of a product of tiles, of each number in it, and of a multiplication."""
 
 AT_ONCE = 512
-"""Rows below a tile up to which all products of a column are one product: twice the arithmetic, but few calls."""
+"""Rows below a tile up to which all its products are one product: twice the arithmetic, but few calls."""
+MOST = 2**17
+"""Blocks of the products of a batch, at most, if there is more than one tile in it."""
+LARGE = 256
+"""Numbers of a tile from which adding one after the other is faster than gathering and scattering them all."""
 MAX_PRODUCTS, MAX_NUMBERS = 5e11, 1.2e8
 """Multiplications and stored numbers of a factorisation that is still worth doing."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """Tiles that are eliminated together: no two of them share an entry, and each has ``m`` tiles below it.
+
+    Attributes:
+        tile: ``(g,)`` tile rows.
+        diagonal: ``(g,)`` storage of the diagonal tiles.
+        under: ``(g, m)`` rows of the tiles below.
+        here: ``(g, m)`` storage of these.
+        goes: ``(g, m (m + 1) / 2)`` storage of the tiles that the products of two of those go to, in the order of
+            ``torch.tril_indices``.
+        turns: positions in ``goes``, flattened, in parts of which none holds a storage twice.
+        rows_in_turn: the same for ``under``.
+    """
+
+    tile: Tensor
+    diagonal: Tensor
+    under: Tensor
+    here: Tensor
+    goes: Tensor
+    turns: list[Tensor]
+    rows_in_turn: list[Tensor]
 
 
 @dataclass(frozen=True)
@@ -33,8 +61,7 @@ class TilePlan:
     Attributes:
         size: block rows ``n``.
         width: block rows of a tile.
-        columns: tile columns in the order of elimination: ``(tile row, storage of the diagonal tile, rows below,
-            storage of the tiles below, storage of the tiles that each product of two of those goes to)``.
+        rounds: tiles in the order of elimination.
         tile, row, column: ``(N,)`` storage of each stored block, and its block row and column within the tile.
         flip: ``(N,)`` bool, the block is stored transposed.
         tiles: stored tiles, with fill.
@@ -43,7 +70,7 @@ class TilePlan:
 
     size: int
     width: int
-    columns: list[tuple[int, int, list[int], Tensor, list[Tensor]]]
+    rounds: list[Round]
     tile: Tensor
     row: Tensor
     column: Tensor
@@ -54,7 +81,7 @@ class TilePlan:
     def seconds(self, dim: int) -> float:
         """Rough time of a factorisation with blocks of ``dim``."""
         side = self.width * dim
-        return self.products * (side**3 * SECONDS_PER_PRODUCT) + 3 * self.tiles * SECONDS_PER_CALL
+        return len(self.rounds) * SECONDS_PER_ROUND + self.products * _seconds_per_product(side)
 
     def numbers(self, dim: int) -> int:
         """Stored numbers with blocks of ``dim``."""
@@ -81,31 +108,28 @@ def plan_tiles(size: int, rows: Tensor, columns: Tensor, width: int, limit: floa
         if i != j:
             neighbours[i].add(j)
             neighbours[j].add(i)
-    order, below = _eliminate(neighbours, width, limit)
-    if len(order) < count:
+    chosen = _eliminate(neighbours, limit)
+    if chosen is None:
         return None
-    place = {tile: at for at, tile in enumerate(order)}
+    place = {tile: at for at, (tile, _) in enumerate(pair for group in chosen for pair in group)}
     stored: dict[tuple[int, int], int] = {}
-    for tile, under in zip(order, below, strict=True):
-        under.sort(key=place.__getitem__)
-        for i in (tile, *under):
-            stored[i, tile] = len(stored)
+    for group in chosen:
+        for tile, under in group:
+            under.sort(key=place.__getitem__)
+            for i in (tile, *under):
+                stored[i, tile] = len(stored)
     device = rows.device
     steps = []
-    for tile, under in zip(order, below, strict=True):
-        here = torch.tensor([stored[i, tile] for i in under], dtype=torch.long, device=device)
-        goes = [
-            torch.tensor([stored[i, j] for j in under[: at + 1]], dtype=torch.long, device=device)
-            for at, i in enumerate(under)
-        ]
-        steps.append((tile, stored[tile, tile], under, here, goes))
+    for group in chosen:
+        most = max(1, MOST // max(1, len(group[0][1]) * width) ** 2)
+        steps += [_round(group[k : k + most], stored, device) for k in range(0, len(group), most)]
     rank = torch.tensor([place[tile] for tile in range(count)], device=device)
     flip = rank[a] < rank[b]
     keys = torch.tensor([i * count + j for i, j in stored], dtype=torch.long, device=device)
     sorted_keys, at = keys.sort()
     storage = at[torch.searchsorted(sorted_keys, torch.where(flip, b * count + a, a * count + b))]
     row, column = torch.where(flip, columns, rows) % width, torch.where(flip, rows, columns) % width
-    products = sum((len(under) + 1) * (len(under) + 2) // 2 for under in below)
+    products = sum((len(under) + 1) * (len(under) + 2) // 2 for group in chosen for _, under in group)
     return TilePlan(size, width, steps, storage, row, column, flip, len(stored), products)
 
 
@@ -121,43 +145,89 @@ def best_plan(size: int, rows: Tensor, columns: Tensor, dim: int) -> TilePlan | 
     """
     best: TilePlan | None = None
     for width in TILE_SIZES:
-        each = float((width * dim) ** 3)
-        limit = MAX_PRODUCTS / each if best is None else best.seconds(dim) / (each * SECONDS_PER_PRODUCT)
+        side = width * dim
+        limit = MAX_PRODUCTS / side**3 if best is None else 1.5 * best.seconds(dim) / _seconds_per_product(side)
         plan = plan_tiles(size, rows, columns, width, limit)
+        if plan is None and best is not None:  # smaller tiles take longer still
+            break
         if plan is None or plan.numbers(dim) > MAX_NUMBERS:
             continue
         if best is None or plan.seconds(dim) < best.seconds(dim):
             best = plan
-        elif plan.seconds(dim) > 1.5 * best.seconds(dim):
-            break
     return best
 
 
-def _eliminate(neighbours: list[set[int]], width: int, limit: float) -> tuple[list[int], list[list[int]]]:
-    """Minimum-degree order, and for each eliminated tile its remaining neighbours; cut short at the limit."""
+def _seconds_per_product(side: int) -> float:
+    return SECONDS_PER_TILE + side**2 * SECONDS_PER_NUMBER + side**3 * SECONDS_PER_PRODUCT
+
+
+def _round(group: list[tuple[int, list[int]]], stored: dict[tuple[int, int], int], device: torch.device) -> Round:
+    """Round of tiles with as many tiles below each."""
+
+    count, m = len(group), len(group[0][1])
+    pairs = [(i, j) for i in range(m) for j in range(i + 1)]
+
+    def whole(values: list[int], *shape: int) -> Tensor:
+        return torch.tensor(values, dtype=torch.long, device=device).view(*shape)
+
+    under = whole([i for _, rows in group for i in rows], count, m)
+    goes = whole([stored[rows[i], rows[j]] for _, rows in group for i, j in pairs], count, len(pairs))
+    return Round(
+        whole([tile for tile, _ in group], count), whole([stored[tile, tile] for tile, _ in group], count), under,
+        whole([stored[i, tile] for tile, rows in group for i in rows], count, m), goes,
+        _turns(goes.view(-1)), _turns(under.view(-1)),
+    )  # fmt: skip
+
+
+def _turns(values: Tensor) -> list[Tensor]:
+    """Positions of values ``(N,)`` in parts: the first occurrence of each value, the second of each, and so on."""
+    ordered, position = values.sort(stable=True)
+    _, counts = ordered.unique_consecutive(return_counts=True)
+    first = (counts.cumsum(0) - counts).repeat_interleave(counts)
+    turn = torch.arange(len(values), device=values.device) - first
+    return [position[turn == k].sort().values for k in range(int(counts.max()) if len(counts) else 0)]
+
+
+def _eliminate(neighbours: list[set[int]], limit: float) -> list[list[tuple[int, list[int]]]] | None:
+    """Rounds of tiles, each with its remaining neighbours; None where they take more products than the limit."""
     queue = [(len(x), i) for i, x in enumerate(neighbours)]
     heapq.heapify(queue)
     gone = [False] * len(neighbours)
-    order: list[int] = []
-    below: list[list[int]] = []
+    rounds: list[list[tuple[int, list[int]]]] = []
     products = 0.0
-    while queue and products <= limit:
-        degree, tile = heapq.heappop(queue)
-        if gone[tile] or degree != len(neighbours[tile]):
-            continue
-        gone[tile] = True
-        around = neighbours[tile]
-        order.append(tile)
-        below.append(list(around))
-        products += (len(around) + 1) * (len(around) + 2) / 2
-        for i in around:
-            mine = neighbours[i]
-            mine |= around
-            mine.discard(i)
-            mine.discard(tile)
-            heapq.heappush(queue, (len(mine), i))
-        neighbours[tile] = set()
-    return order, below
+    while queue:
+        least = -1
+        group: list[tuple[int, list[int]]] = []
+        blocked: set[int] = set()
+        touched: set[int] = set()
+        while queue and (not group or queue[0][0] == least):
+            degree, tile = heapq.heappop(queue)
+            if gone[tile] or degree != len(neighbours[tile]):
+                continue
+            if tile in blocked:  # a neighbour of one that is eliminated in this round; its degree may change
+                touched.add(tile)
+                continue
+            least = degree
+            gone[tile] = True
+            around = neighbours[tile]
+            group.append((tile, list(around)))
+            blocked |= around
+            products += (degree + 1) * (degree + 2) / 2
+            if products > limit:
+                return None
+        for tile, around_list in group:
+            around = set(around_list)
+            for i in around_list:
+                neighbours[i] |= around
+                neighbours[i].discard(i)
+                neighbours[i].discard(tile)
+            touched |= around
+            neighbours[tile] = set()
+        for i in sorted(touched):
+            heapq.heappush(queue, (len(neighbours[i]), i))
+        if group:
+            rounds.append(group)
+    return rounds
 
 
 def solve_cholesky(plan: TilePlan, blocks: Tensor, rhs: Tensor) -> Tensor:
@@ -172,41 +242,71 @@ def solve_cholesky(plan: TilePlan, blocks: Tensor, rhs: Tensor) -> Tensor:
         ``(n, D)``; NaN where ``A`` is not positive definite.
     """
     n, dim = rhs.shape
-    side, count = plan.width * dim, len(plan.columns)
+    side, count = plan.width * dim, -(-n // plan.width)
     tiles = blocks.new_zeros(plan.tiles, plan.width, plan.width, dim, dim)
     tiles[plan.tile, plan.row, plan.column] = torch.where(plan.flip[:, None, None], blocks.mT, blocks)
     tiles = tiles.transpose(2, 3).reshape(plan.tiles, side, side)
     unused = count * plan.width - n  # the last tile is filled up
-    for tile, diagonal, *_ in plan.columns:
-        if tile == count - 1 and unused:
-            tiles[diagonal].diagonal()[side - unused * dim :] = 1
+    if unused:
+        last = next(int(r.diagonal[k]) for r in plan.rounds for k in (r.tile == count - 1).nonzero()[:, 0].tolist())
+        tiles[last].diagonal()[side - unused * dim :] = 1
     factors, panels = [], []
-    lower: dict[int, Tensor] = {}
     info = torch.zeros((), dtype=torch.int32, device=rhs.device)
-    for _, diagonal, under, here, goes in plan.columns:
-        factor, bad = torch.linalg.cholesky_ex(tiles[diagonal])
-        info = info + bad.abs()
-        panel = tiles[here].view(-1, side)
-        if under:
+    for step in plan.rounds:
+        factor, bad = torch.linalg.cholesky_ex(tiles.index_select(0, step.diagonal))
+        info = torch.maximum(info, bad.abs().amax())
+        g, m = step.under.shape
+        panel = tiles.index_select(0, step.here.view(-1)).view(g, m * side, side)
+        if m:
             panel = torch.linalg.solve_triangular(factor.mT, panel, upper=True, left=False)
-        if 0 < len(panel) <= AT_ONCE:
-            row, column = lower.setdefault(len(under), torch.tril_indices(*[len(under)] * 2, device=rhs.device))
-            product = (panel @ panel.mT).view(len(under), side, len(under), side)[row, :, column]
-            tiles.index_add_(0, torch.cat(goes), product, alpha=-1)
-            goes = []
-        for at, target in enumerate(goes):
-            product = panel[: (at + 1) * side] @ panel[at * side : (at + 1) * side].mT
-            tiles.index_add_(0, target, product.view(at + 1, side, side).mT, alpha=-1)
+            _subtract_products(tiles, panel, step, side)
         factors.append(factor)
         panels.append(panel)
     if bool(info != 0):
         return torch.full_like(rhs, torch.nan)
     x = torch.nn.functional.pad(rhs, (0, 0, 0, unused)).reshape(count, side, 1)
-    for (tile, _, under, _, _), factor, panel in zip(plan.columns, factors, panels, strict=True):
-        x[tile] = torch.linalg.solve_triangular(factor, x[tile], upper=False)
-        if under:
-            x[under] -= (panel @ x[tile]).view(-1, side, 1)
-    for (tile, _, under, _, _), factor, panel in zip(plan.columns[::-1], factors[::-1], panels[::-1], strict=True):
-        rest = x[tile] - panel.mT @ x[under].view(-1, 1) if under else x[tile]
-        x[tile] = torch.linalg.solve_triangular(factor.mT, rest, upper=True)
+    for step, factor, panel in zip(plan.rounds, factors, panels, strict=True):
+        part = torch.linalg.solve_triangular(factor, x.index_select(0, step.tile), upper=False)
+        x.index_copy_(0, step.tile, part)
+        _subtract(x, (panel @ part).view(-1, side, 1), step.under.view(-1), step.rows_in_turn)
+    for step, factor, panel in zip(plan.rounds[::-1], factors[::-1], panels[::-1], strict=True):
+        rest = x.index_select(0, step.tile)
+        if step.under.numel():
+            below = x.index_select(0, step.under.view(-1)).view(len(rest), -1, 1)
+            rest = rest - panel.mT @ below
+        x.index_copy_(0, step.tile, torch.linalg.solve_triangular(factor.mT, rest, upper=True))
     return x.view(-1, dim)[:n]
+
+
+def _subtract_products(tiles: Tensor, panel: Tensor, step: Round, side: int) -> None:
+    """Subtract the products of the tiles below those of a round, in place.
+
+    Args:
+        tiles: ``(N, side, side)``.
+        panel: ``(g, m * side, side)``.
+        step: the round.
+        side: rows of a tile.
+    """
+    g, m = step.under.shape
+    if m * side <= AT_ONCE:
+        row, column = torch.tril_indices(m, m, device=tiles.device)
+        product = (panel @ panel.mT).view(g, m, side, m, side).transpose(2, 3)[:, row, column]
+        _subtract(tiles, product.reshape(-1, side, side), step.goes.view(-1), step.turns)
+        return
+    for k in range(g):
+        done = 0
+        for at in range(m):
+            part = panel[k, : (at + 1) * side] @ panel[k, at * side : (at + 1) * side].mT
+            target = step.goes[k, done : done + at + 1]  # each once
+            tiles.index_add_(0, target, part.view(at + 1, side, side).mT, alpha=-1)
+            done += at + 1
+
+
+def _subtract(values: Tensor, change: Tensor, index: Tensor, turns: list[Tensor]) -> None:
+    """``values[index] -= change`` in place, also where an index is there several times."""
+    if values[0].numel() >= LARGE:
+        values.index_add_(0, index, change, alpha=-1)
+        return
+    for turn in turns if len(turns) > 1 else [slice(None)] * len(turns):
+        at = index[turn]
+        values.index_copy_(0, at, values.index_select(0, at) - change[turn])

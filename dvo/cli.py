@@ -62,8 +62,8 @@ def build_parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--calib",
         metavar="FILE",
-        help="'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML file (default: that of a data set, else the "
-        "focal length is found in the images)",
+        help="'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, a YAML file, or COLMAP's cameras.txt[:ID] (default: that of "
+        "a data set, else the focal length is found in the images)",
     )
     _tracking_options(run)
     run.add_argument("--stride", type=_positive_int, default=1, metavar="N", help="track every N-th frame")

@@ -102,3 +102,69 @@ def test_a_calibration_from_a_pipe(image_folder, tmp_path):
     finally:
         os.close(read)
     assert code == 0 and json.loads((tmp_path / "out" / "run.json").read_text())["camera"]["fx"] == 52
+
+
+DIALECTS = {
+    "text": ("calib.txt", "50 51 31 23 -0.1 0.01 0.001 0.002 0.003"),
+    "names": ("calib.txt", "fx=50 fy=51 cx=31 cy=23 k1=-0.1 k2=0.01 p1=0.001 p2=0.002 k3=0.003"),
+    "euroc": (
+        "sensor.yaml",
+        "sensor_type: camera\nresolution: [64, 48]\ncamera_model: pinhole\nintrinsics: [50, 51, 31, 23]\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 0.001, 0.002, 0.003]\n",
+    ),
+    "kalibr": (
+        "camchain.yaml",
+        "cam0:\n  camera_model: pinhole\n  intrinsics: [50, 51, 31, 23]\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [-0.1, 0.01, 0.001, 0.002, 0.003]\n  resolution: [64, 48]\n",
+    ),
+    "opencv": (
+        "opencv.yml",
+        "%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n"
+        "   dt: d\n   data: [ 50., 0., 31., 0., 51., 23., 0., 0., 1. ]\ndistortion_coefficients: !!opencv-matrix\n"
+        "   rows: 5\n   cols: 1\n   dt: d\n   data: [ -0.1, 0.01, 0.001, 0.002, 0.003 ]\n",
+    ),
+    "ros": (
+        "ost.yaml",
+        "image_width: 64\nimage_height: 48\ndistortion_model: plumb_bob\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [50, 0, 31, 0, 51, 23, 0, 0, 1]}\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0.001, 0.002, 0.003]}\n",
+    ),
+    "orbslam": (
+        "orbslam.yaml",
+        "%YAML:1.0\nCamera.type: PinHole\nCamera.fx: 50.0\nCamera.fy: 51.0\nCamera.cx: 31.0\nCamera.cy: 23.0\n"
+        "Camera.k1: -0.1\nCamera.k2: 0.01\nCamera.p1: 0.001\nCamera.p2: 0.002\nCamera.k3: 0.003\n"
+        "Camera.width: 64\nCamera.height: 48\n",
+    ),
+    "orbslam3": (
+        "orbslam3.yaml",
+        "%YAML:1.0\nCamera.type: PinHole\nCamera1.fx: 50.0\nCamera1.fy: 51.0\nCamera1.cx: 31.0\nCamera1.cy: 23.0\n"
+        "Camera1.k1: -0.1\nCamera1.k2: 0.01\nCamera1.p1: 0.001\nCamera1.p2: 0.002\nCamera1.k3: 0.003\n",
+    ),
+    "colmap": (
+        "cameras.txt",
+        "# Camera list\n1 FULL_OPENCV 64 48 50 51 31.5 23.5 -0.1 0.01 0.001 0.002 0.003 0 0 0\n",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_dialects_that_calib_takes(dialect, image_folder, tmp_path):
+    name, text = DIALECTS[dialect]
+    (tmp_path / name).write_text(text)
+    assert main(["run", str(image_folder), "--calib", str(tmp_path / name), "--out", str(tmp_path / "out")]) == 0
+    used = json.loads((tmp_path / "out" / "run.json").read_text())["camera"]
+    assert [used[key] for key in ("fx", "fy", "cx", "cy")] == [50, 51, 31, 23]
+    assert used["model"] == "radtan" and used["coefficients"] == [-0.1, 0.01, 0.001, 0.002, 0.003]
+
+
+def test_a_camera_of_a_colmap_model_by_its_number(image_folder, tmp_path, capsys):
+    cameras = image_folder.parent / "cameras.txt"  # found from the folder of the images, as other calibrations
+    cameras.write_text("1 PINHOLE 320 240 200 200 160 120\n7 OPENCV_FISHEYE 64 48 50 51 31.5 23.5 0.1 0 0 0\n")
+    out = tmp_path / "out"
+    assert main(["run", str(image_folder), "--calib", "../cameras.txt", "--out", str(out)]) == 2
+    assert "2 cameras in it: 1, 7. Name one: cameras.txt:1." in capsys.readouterr().err
+    assert main(["run", str(image_folder), "--calib", "../cameras.txt:1", "--out", str(out)]) == 2
+    assert "calibration is for 320x240 images" in capsys.readouterr().err
+    assert main(["run", str(image_folder), "--calib", "../cameras.txt:7", "--out", str(out)]) == 0
+    used = json.loads((out / "run.json").read_text())["camera"]
+    assert (used["model"], used["cx"], used["cy"]) == ("fisheye", 31, 23)

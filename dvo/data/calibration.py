@@ -1,4 +1,4 @@
-"""Calibration files: the common text line, and the YAML dialects of EuRoC, Kalibr, ROS, OpenCV and ORB-SLAM."""
+"""Calibration files: the common text line, COLMAP's cameras, and the YAML of EuRoC, Kalibr, ROS, OpenCV, ORB-SLAM."""
 
 from __future__ import annotations
 
@@ -135,10 +135,11 @@ def read_calibration(path: Path | str) -> Calibration:
     ``cam0``); ROS camera_info and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state
     ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is
     ``fx`` times it) too; and ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global
-    one, if it is left out; Kalibr's ``line_delay`` is not read).
+    one, if it is left out; Kalibr's ``line_delay`` is not read). COLMAP's ``cameras.txt`` and ``cameras.bin``, with
+    ``:ID`` after the name if there are several cameras, see :mod:`dvo.data.colmap_cameras`.
 
     Args:
-        path: text or YAML file.
+        path: text, YAML or COLMAP file.
 
     Raises:
         DvoError: missing or malformed file, an unknown distortion model, or a wrong number of coefficients.
@@ -149,12 +150,16 @@ def read_calibration(path: Path | str) -> Calibration:
         >>> read_calibration("calib.txt").camera(640, 480).fx
         525.0
     """
-    path = Path(path)
+    from dvo.data.colmap_cameras import colmap_calibration, split_camera
+
+    path, camera = split_camera(Path(path))
     if not (is_file(path) or is_shell_pipe(path)):
         raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
-    text = read_text(path, _LINE)
+    text = "" if path.suffix.lower() == ".bin" else read_text(path, _LINE)
     looks_yaml = path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
-    calibration = _from_yaml(text, path) if looks_yaml else _from_text(text, path)
+    calibration = colmap_calibration(path, text, camera)
+    if calibration is None:
+        calibration = _from_yaml(text, path) if looks_yaml else _from_text(text, path)
     values = [calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.coefficients]
     if not (np.abs(values) <= MAX_NUMBER).all():  # NaN fails too
         raise DvoError("not a finite number", file=path, field="intrinsics", remedy=_LINE)

@@ -6,10 +6,10 @@ from itertools import islice
 from numbers import Integral
 from pathlib import Path
 
+from dvo.data.colmap_cameras import is_calibration_file
 from dvo.data.files import is_file
 from dvo.data.recording import Log, RawFrame, Recording
 from dvo.errors import DvoError
-from dvo.yaml_files import is_shell_pipe
 
 
 def check_stride(stride: object) -> None:
@@ -53,7 +53,8 @@ def locate(given: Path | str, source: Path, field: str) -> Path:
     path = Path(given)
     base = source if source.is_dir() else source.parent
     for option in (path, base / path):
-        if is_file(option) or (field == "calib" and is_shell_pipe(option)) or (field == "mask" and option.is_dir()):
+        found = is_calibration_file(option) if field == "calib" else is_file(option)
+        if found or (field == "mask" and option.is_dir()):
             return option
     raise DvoError("no such file", file=path, field=field, remedy=f"give an existing file to --{field}")
 

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
+from dvo.commands.calibrate_options import add_calibrate
 from dvo.commands.input_options import add_input_options
 from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
@@ -88,6 +89,8 @@ def build_parser() -> argparse.ArgumentParser:
     add_stream_options(run)
     add_view_options(run)
     run.set_defaults(run="dvo.commands.run:run")
+
+    add_calibrate(commands)
 
     summary = commands.add_parser("summary", help="write the page summary.html of a results folder anew")
     summary.add_argument("source", metavar="RESULTS", help="results folder of dvo run or dvo demo")

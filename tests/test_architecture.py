@@ -22,6 +22,7 @@ ARROWS: dict[str, set[str]] = {
     "threads": set(),
     "geometry": set(),
     "data": {"geometry"},
+    "boards": {"data", "geometry"},
     "ba": {"geometry"},
     "metrics": {"data", "geometry"},
     "segment_metrics": {"metrics", "odometry", "data", "geometry"},
@@ -33,7 +34,7 @@ ARROWS: dict[str, set[str]] = {
     "losses": {"geometry"},
     "odometry": {"models", "graph", "nets", "ba", "data", "geometry", "threads"},
     "export": {"odometry", "graph", "nets", "data", "geometry"},
-    "viz": {"data", "geometry", "odometry"},
+    "viz": {"boards", "data", "geometry", "odometry"},
 }
 TOP = {"cli", "commands", "demo", "__main__", "__init__"}  # these know everything, nobody below knows them
 

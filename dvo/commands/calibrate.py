@@ -1,0 +1,129 @@
+"""``dvo calibrate``: a camera from a video of a board, or from one of any scene."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress, TextColumn
+
+import dvo
+from dvo.boards.board import Board, CharucoBoard, Checkerboard
+from dvo.boards.calibrate import BoardCalibration, BoardOptions, calibrate_board
+from dvo.commands import NOTHING_TRACKED, OK
+from dvo.commands.camera import CALIBRATION
+from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.data.capture import is_stream
+from dvo.data.output import replaced
+from dvo.data.source import Source
+from dvo.errors import DvoError
+from dvo.odometry import results
+from dvo.odometry.calibrate import calibrate as self_calibrate
+
+FISHEYE = "calib.yaml"
+"""Calibration file of a fisheye, which the text file cannot hold."""
+PICTURE = "calibration.png"
+FACTS = "calibration.json"
+
+
+def calibrate(arguments: argparse.Namespace) -> int:
+    """Entry point of ``dvo calibrate``.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code: 0, or 1 if a scene without a board does not tell the focal length.
+
+    Raises:
+        DvoError: invalid source or option, no board, too few views, or views that do not determine the focal length.
+    """
+    if is_stream(arguments.source):
+        raise DvoError("a stream cannot be calibrated", file=arguments.source, remedy="record a clip, and give that")
+    board = _board(arguments)
+    options = BoardOptions(fisheye=arguments.fisheye, k3=arguments.k3, frames=arguments.frames)
+    if board is None and (arguments.fisheye or arguments.k3):
+        raise DvoError("needs a board", field="--fisheye" if arguments.fisheye else "--k3", remedy="give --board CxR")
+    fps = None if board is None else 30.0  # of views of a board, the times do not matter
+    source = dvo.open(arguments.source, guess=True, undistort=False, fps=fps)
+    for warning in source.warnings:
+        warn(warning, "note")
+    with results.results_folder(arguments.out, source.name) as folder:
+        if board is None:
+            return _without_board(source, folder, arguments)
+        return _with_board(source, board, options, folder)
+
+
+def _board(arguments: argparse.Namespace) -> Board | None:
+    if arguments.board is not None:
+        columns, rows = arguments.board
+        return Checkerboard(columns, rows, arguments.square)
+    if arguments.charuco is not None:
+        columns, rows = arguments.charuco
+        return CharucoBoard(columns, rows, arguments.square, arguments.marker, arguments.dictionary)
+    return None
+
+
+def _with_board(source: Source, board: Board, options: BoardOptions, folder: Path) -> int:
+    from dvo.viz.board import plot_board_calibration
+
+    columns = (TextColumn("searching the board"), TextColumn("{task.fields[text]}"))
+    with Progress(*columns, console=StderrConsole()) as progress:
+        task = progress.add_task("", text="")
+
+        def show(frames: int, views: int) -> None:
+            with contextlib.suppress(OSError):
+                progress.update(task, text=f"{frames} of {source.frame_count or '?'} frames, {views} views")
+
+        found = calibrate_board(source, board, options, name=str(source.path), on_frame=show)
+    say(str(found))
+    for warning in found.warnings:
+        warn(warning)
+    file = folder / (FISHEYE if options.fisheye else CALIBRATION)
+    found.write(file)
+    with replaced(folder / FACTS) as part:
+        part.write_text(json.dumps(_facts(found, str(source.path)), indent=2) + "\n", encoding="utf-8")
+    with replaced(folder / PICTURE) as part:
+        plot_board_calibration(part, found)
+    say(f"calibration in {file}, picture in {folder / PICTURE}")
+    return OK
+
+
+def _facts(found: BoardCalibration, source: str) -> dict[str, Any]:
+    solution = found.solution
+    return {
+        "source": source,
+        "board": found.board,
+        "image_size": [found.width, found.height],
+        "model": found.calibration.model,
+        "parameters": {n: {"value": v, "deviation": d} for n, (v, d) in found.parameters.items()},
+        "rms": solution.rms,
+        "coverage": found.coverage,
+        "examined": found.examined,
+        "found": found.found,
+        "views": [
+            {"frame": view.index, "rms": float(rms), "tilt": float(tilt), "corners": len(view.corners)}
+            for view, rms, tilt in zip(found.views, solution.view_rms, solution.tilts, strict=True)
+        ],
+        "rejected": [view.index for view in found.rejected],
+        "warnings": list(found.warnings),
+    }
+
+
+def _without_board(source: Source, folder: Path, arguments: argparse.Namespace) -> int:
+    device = device_of(arguments.device)
+    seed_everything(arguments.seed)
+    with TrackingProgress(None) as progress:
+        found = self_calibrate(
+            source, weights=arguments.weights, device=device, seed=arguments.seed, on_frame=progress.update
+        )
+    say(str(found))
+    file = folder / CALIBRATION
+    if found.write(file):
+        say(f"calibration in {file}")
+    else:
+        warn(f"{file} is not a file of dvo, and was not replaced")
+    return OK if found.found else NOTHING_TRACKED

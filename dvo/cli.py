@@ -114,7 +114,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
     export.set_defaults(run="dvo.commands.export:export")
 
-    weights = commands.add_parser("weights", help="list, import or describe weights")
+    weights = commands.add_parser("weights", help="list, import, export or describe weights")
     verbs = weights.add_subparsers(dest="verb", required=True, metavar="VERB")
     verbs.add_parser("list", help="weights that ship with dvo").set_defaults(run="dvo.commands.weights:list_shipped")
     importer = verbs.add_parser(
@@ -125,6 +125,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
     importer.add_argument("--out", metavar="FILE", help="safetensors file to write (default: FILE's name, here)")
     importer.set_defaults(run="dvo.commands.weights:import_file")
+    onnx = verbs.add_parser("onnx", help="write the encoder as an ONNX file (extra onnx)")
+    onnx.add_argument("weights", metavar="NAME|FILE")
+    onnx.add_argument("--out", metavar="FILE", help="file to write (default: NAME-encoder.onnx)")
+    onnx.set_defaults(run="dvo.commands.weights:export_onnx")
     info = verbs.add_parser("info", help="architecture, size and origin of weights")
     info.add_argument("weights", metavar="NAME|FILE")
     info.set_defaults(run="dvo.commands.weights:info")

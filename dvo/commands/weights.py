@@ -1,4 +1,4 @@
-"""``dvo weights list``, ``import`` and ``info``."""
+"""``dvo weights list``, ``import``, ``onnx`` and ``info``."""
 
 from __future__ import annotations
 
@@ -61,6 +61,30 @@ def import_file(arguments: argparse.Namespace) -> int:
         raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")
     describe(import_checkpoint(file, out))
     print(f"use it with: dvo run SOURCE --weights {out}")
+    return 0
+
+
+def export_onnx(arguments: argparse.Namespace) -> int:
+    """Entry point of ``dvo weights onnx``: write the encoder as ONNX; an existing file is not overwritten.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        Exit code.
+
+    Raises:
+        DvoError: the output file exists, or see :func:`dvo.models.onnx_export.export_encoder`.
+    """
+    from dvo.models.onnx_export import export_encoder
+
+    out = Path(arguments.out or f"{Path(arguments.weights).stem}-encoder.onnx")
+    if out.exists():
+        raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")
+    found = export_encoder(arguments.weights, out)
+    outputs = ", ".join(f"{name} ({channels} channels)" for name, channels in found.outputs.items())
+    print(f"encoder in {out}: images (n, 3, H, W) float32, RGB 0 to 255, to {outputs}")
+    print(f"largest difference to torch {found.difference:.2g}, {found.relative:.2g} of the largest value")
     return 0
 
 

@@ -23,6 +23,7 @@ from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import PRESETS, ModelConfig
 from dvo.nets.correlation import Correlation, CorrelationVolume
+from dvo.nets.frame_encoder import FrameEncoder
 from dvo.nets.patchifier import Features, Patchifier, cut_fine, normalise_images, patch_coordinates
 from dvo.nets.score import ScoreHead
 from dvo.nets.selection import SELECTIONS, PatchSelection, needs_score, no_score
@@ -60,6 +61,11 @@ class PatchVO(nn.Module):
         self.score = ScoreHead(config.feature_channels) if config.score_head else None
         self.select = self.selection()
         self.update = UPDATE_OPERATORS.resolve(config.update_operator)(config)
+
+    @property
+    def encoder(self) -> FrameEncoder:
+        """Encoder as a module of its own, which shares the parameters; :mod:`dvo.models.onnx_export` writes it."""
+        return FrameEncoder(self.patchify).train(self.training)
 
     def selection(self, name: str = "") -> PatchSelection:
         """Patch selection by name.

@@ -22,6 +22,7 @@ from dvo.data.trajectory import interpolate
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.synth.clip import induced_flow
+from train.data.tartanair import with_trajectories
 
 STEP = 0.15
 """Mean motion between frames of a clip without depth, in the unit of training (rendered clips, whose unit is the median
@@ -33,7 +34,8 @@ class RealData:
     """Selection of recordings to train on.
 
     Attributes:
-        folders: sequence folders with ground truth; a single one may stand without a list.
+        folders: sequence folders with ground truth, or folders with TartanAir's trajectories below; a single one may
+            stand without a list.
         share: of the batches; the others are rendered.
         hops: frame gaps, one drawn a clip.
         flow_low, flow_high: mean induced flow between neighbouring frames, pixels, that a clip with depth should have.
@@ -83,7 +85,7 @@ class RealClips(Dataset[dict[str, Tensor]]):
 
     def __init__(self, seed: int, data: RealData, frames: int, height: int, width: int) -> None:
         self.seed, self.data, self.frames, self.size = seed, data, frames, (height, width)
-        self.sources = [open_source(folder) for folder in data.folders]
+        self.sources = [open_source(folder) for folder in with_trajectories(data.folders)]
         self.poses: list[np.ndarray] = []
         self.starts: list[tuple[int, int, int]] = []
         for number, source in enumerate(self.sources):

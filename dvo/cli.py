@@ -20,6 +20,7 @@ from dvo import __version__
 from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
 from dvo.commands.calibrate_options import add_calibrate
 from dvo.commands.input_options import add_input_options
+from dvo.commands.scale_options import add_scale_options
 from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
 from dvo.errors import DvoError
@@ -88,6 +89,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_input_options(run)
     add_stream_options(run)
     add_view_options(run)
+    add_scale_options(run)
     run.set_defaults(run="dvo.commands.run:run")
 
     add_calibrate(commands)

@@ -80,6 +80,29 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
                 raise DvoError(f"out of range: {shown(value)}", field=item.name, remedy=f"give a number {limits}")
 
 
+def settings_of(kind: type[T], value: Any, field: str) -> T:
+    """Settings dataclass from an instance, or from a table of its values as YAML gives it.
+
+    Args:
+        kind: the dataclass.
+        value: instance, or name to value.
+        field: for messages.
+
+    Returns:
+        The instance.
+
+    Raises:
+        DvoError: neither; an unknown name, or a value of another type or out of range.
+    """
+    if isinstance(value, kind):
+        return value
+    try:
+        return from_table(kind, value, Path(field))
+    except DvoError as error:
+        name = field if error.field in (None, "") else f"{field}: {error.field}"
+        raise DvoError(error.message, field=name, remedy=error.remedy) from None
+
+
 def check_seed(seed: Any) -> None:
     """Check the seed of random numbers.
 

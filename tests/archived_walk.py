@@ -35,6 +35,7 @@ def archived_walk(
     readout: float = 0.0,
     interval: float = INTERVAL,
     archived: bool = True,
+    unit: float = 0.0,
 ) -> tuple[KeyframeGraph, Trajectory]:
     """Graph of a walk with poses that drift in scale; and the true trajectory.
 
@@ -46,6 +47,7 @@ def archived_walk(
         readout: of the rolling shutter that the measurements were made with, seconds.
         interval: between frames, seconds.
         archived: all frames have left the window.
+        unit: metres of the unit of the walk, with depths measured by a depth camera; 0 for none.
     """
     g = torch.Generator().manual_seed(0)
     times = interval * torch.arange(frames, dtype=torch.float64)
@@ -59,6 +61,8 @@ def archived_walk(
         part = slice(i * M, (i + 1) * M)
         frame = Keyframe(i, float(times[i]), i, torch.zeros(M, 8, 3, 3), torch.zeros(M, 4), torch.zeros(M, 3),
                          INTRINSICS.float())  # fmt: skip
+        if unit:
+            frame.measured = torch.stack([depth[0, part] / unit, torch.full((M,), 100.0)], 1)
         graph.window.append(frame, torch.cat([true[i, :3] * drift[i], true[i, 3:]]).float(), patches[0, part])
         graph.log.add(float(times[i]), i)
     kk = torch.arange(frames * M).repeat_interleave(frames)

@@ -27,11 +27,13 @@ class DepthPrior(Factor):
     Attributes:
         value, weight: ``(B, F)`` or broadcastable to it; inverse depth and its inverse variance.
         index: ``(F,)`` patches; None for all of them in order.
+        kernel: robust kernel of the whitened residual.
     """
 
     value: Tensor
     weight: Tensor
     index: Tensor | None = None
+    kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
 
     def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
         depth = values[INVERSE_DEPTHS]
@@ -40,6 +42,8 @@ class DepthPrior(Factor):
             depth = depth.index_select(1, index)
         weight = self.weight.expand(depth.shape)[..., None]
         residual = (self.value - depth)[..., None]
+        scale = self.kernel.weights(residual, weight, -1)
+        weight = weight if scale is None else weight * scale
         return Linearisation(residual, weight, (INVERSE_DEPTHS,), (index,), (torch.ones_like(depth)[..., None, None],))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.trajectory import Trajectory
-from dvo.metrics import align_trajectory, associate, evaluate, fit_alignment
+from dvo.metrics import Alignment, align_trajectory, associate, evaluate, fit_alignment
 from dvo.odometry.protocol import Result, Segment
 from dvo.viz.plot import Panel, Track, plot_panels
 
@@ -18,8 +18,8 @@ MAX_TRACKS = 6  # segments of one picture; a further one would be too small to s
 def draw(path: Path, result: Result, groundtruth: Trajectory | None, *, title: str, subtitle: str, label: str) -> None:
     """Draw the segments of a result, at most the :data:`MAX_TRACKS` longest.
 
-    With a ground truth every segment is aligned with it on its own (Sim(3)) and all share a panel; a segment that
-    cannot be aligned is left out. Without one, segments with unrelated worlds get panels of their own.
+    With a ground truth every segment is aligned with it on its own (Sim(3), in metres SE(3)) and all share a panel; a
+    segment that cannot be aligned is left out. Without one, segments with unrelated worlds get panels of their own.
 
     Args:
         path: image to write.
@@ -58,10 +58,11 @@ def _panels_with_truth(result: Result, chosen: list[int], groundtruth: Trajector
             continue
         i, j = associate(trajectory, groundtruth)
         spans += [j.min(), j.max()]
+        align: Alignment = "se3" if result.is_metric(number) else "sim3"
         if number == result.longest:
-            scale, rotation, shift = fit_alignment(trajectory.positions[i], groundtruth.positions[j], "sim3")
+            scale, rotation, shift = fit_alignment(trajectory.positions[i], groundtruth.positions[j], align)
             points = scale * result.map.points @ rotation.T + shift
-        aligned = align_trajectory(trajectory, groundtruth, "sim3")
+        aligned = align_trajectory(trajectory, groundtruth, align)
         tracks.append(Track(aligned, _label(number, segment, len(result.segments) == 1, label), colour))
     if not tracks:
         return []

@@ -15,19 +15,24 @@ from dvo.odometry.protocol import Break
 from dvo.odometry.session import Run
 
 _SHOWN = 5  # breaks and segments that are printed one by one
+_SCALES = {
+    "depth": "depth images", "height": "the height of the camera", "distance": "known distances", "map": "the map",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors against the ground truth after Sim(3) alignment.
+    """Errors against the ground truth after alignment: SE(3) of segments in metres, Sim(3) of others.
 
     Attributes:
         longest: of the longest segment, which is the trajectory of the run; None without ground truth.
         segments: of each segment, aligned on its own; empty without ground truth or with a single segment.
+        scale: factor from the estimate to the ground truth, of a longest segment in metres; None otherwise.
     """
 
     longest: Metrics | None = None
     segments: tuple[Metrics, ...] = ()
+    scale: float | None = None
 
     @property
     def segment_facts(self) -> list[dict[str, Any]]:
@@ -50,10 +55,16 @@ def score(run: Run, groundtruth: Trajectory | None) -> Scores:
     """
     if groundtruth is None:
         return Scores()
-    segments = run.result.segments if len(run.result.segments) > 1 else ()
+    result = run.result
+    segments = result.segments if len(result.segments) > 1 else ()
+    free = evaluate(result.trajectory, groundtruth, align="sim3")
     return Scores(
-        evaluate(run.result.trajectory, groundtruth, align="sim3"),
-        tuple(evaluate(segment.trajectory, groundtruth, align="sim3") for segment in segments),
+        evaluate(result.trajectory, groundtruth, align="se3") if result.metric else free,
+        tuple(
+            evaluate(segment.trajectory, groundtruth, align="se3" if result.is_metric(number) else "sim3")
+            for number, segment in enumerate(segments)
+        ),
+        free.scale if result.metric and free.reason is None else None,
     )
 
 
@@ -127,6 +138,26 @@ def describe_localisation(loop: Mapping[str, Any]) -> str:
     return f"localised at {loop['from']:.2f} s ({share}) in the world"
 
 
+def describe_scale(scale: Mapping[str, Any]) -> str:
+    """Describe the source of the scale.
+
+    Args:
+        scale: of the metadata of a result, see :func:`dvo.odometry.metric_scale.settle_scale`.
+
+    Returns:
+        Text such as ``poses and map are in metres, from depth images (scale known to 0.21 %)``.
+    """
+    entries = scale["segments"]
+    problems = "; ".join(f"segment {e['segment']}: {e['problem']}" for e in entries if e.get("problem"))
+    known = [e for e in entries if e["source"] != "none"]
+    if not known:
+        return f"no metric scale from {_SCALES[scale['source']]}: {problems or 'no segment was tracked'}"
+    deviations = [e["deviation"] for e in known if e["deviation"] is not None]
+    sure = f" (scale known to {100 * max(deviations):.2g} %)" if deviations else ""
+    sources = " and ".join(dict.fromkeys(_SCALES[e["source"]] for e in known))
+    return f"poses and map are in metres, from {sources}{sure}" + (f"; but {problems}" if problems else "")
+
+
 def print_report(folder: Path, run: Run, scores: Scores) -> None:
     """Print counts, breaks, segments, errors and the names of the files.
 
@@ -157,11 +188,16 @@ def print_report(folder: Path, run: Run, scores: Scores) -> None:
         say(outside if found is None else f"{describe_localisation(found)} of the map")
     if result.info.get("readout_from") == "images":
         say(f"rolling shutter with a readout of {1000 * result.info['readout']:.1f} ms, estimated from the images")
+    if "scale" in result.info:
+        say(describe_scale(result.info["scale"]))
     if metrics is not None and metrics.reason:
         say(f"no error against ground truth: {metrics.reason}")
     elif metrics is not None:
         relative = f"RPE {metrics.rpe_trans:.3g} m and {metrics.rpe_rot_deg:.3g} deg a frame"
-        say(f"{error_text(metrics)} after Sim(3) alignment{' of the longest segment' if several else ''}, {relative}")
+        group = "SE(3)" if metrics.alignment == "se3" else "Sim(3)"
+        wrong = "" if scores.scale is None else f", scale wrong by {100 * abs(1 / scores.scale - 1):.2f} %"
+        longest = " of the longest segment" if several else ""
+        say(f"{error_text(metrics)} after {group} alignment{longest}, {relative}{wrong}")
     files = [results.TRAJECTORY, results.MAP, results.PICTURE, results.PAGE, results.FRAMES, results.SUMMARY]
     if several:
         last = len(result.segments) - 1

@@ -23,6 +23,7 @@ from dvo.commands.maps import check_place, load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
 from dvo.commands.report import Scores, headline, print_report, score
+from dvo.commands.scale import scale_observers, scale_settings, scaled_source
 from dvo.commands.streams import print_counts, stream_facts, stream_settings
 from dvo.commands.summary import page_writers
 from dvo.data.capture import shown
@@ -89,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
         **stream_settings(arguments),
         **input_settings(arguments),
     )
+    source = scaled_source(source, arguments)
     for warning in source.warnings:
         warn(warning, "note")
     facts = {
@@ -108,6 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
     folders = results.results_folder(arguments.out, source.name)  # checked before the weights load
     with folders as folder, open_observers(arguments, source.name) as observers:
         observers += base_observers(arguments, folder)
+        observers += scale_observers(arguments, folder)
         odometry = load_odometry(arguments, device)
         check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
@@ -159,6 +162,7 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
         settings["preset"] = arguments.preset
     if arguments.no_loops:
         settings["loops"] = False
+    settings |= scale_settings(arguments)
     reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
     if reserved:
         raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")

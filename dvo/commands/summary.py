@@ -60,7 +60,7 @@ def _with_truth(stored: Stored, groundtruth: Trajectory) -> Stored:
     """Results compared with another ground truth."""
     truth = true_positions(np.array([row.timestamp for row in stored.rows]), groundtruth)
     rows = [row.at(position) for row, position in zip(stored.rows, truth, strict=True)]
-    metrics = evaluate(stored.result.trajectory, groundtruth, align="sim3")
+    metrics = evaluate(stored.result.trajectory, groundtruth, align="se3" if stored.result.metric else "sim3")
     facts = {**stored.facts, "metrics": asdict(metrics)}
     return Stored(stored.result, rows, facts)
 
@@ -119,7 +119,7 @@ def true_positions(times: np.ndarray, groundtruth: Trajectory) -> np.ndarray:
 def run_page(name: str, result: Result, rows: Sequence[FrameRow], facts: dict[str, Any]) -> RunPage:
     """Contents of the page.
 
-    With true positions every segment is aligned with them on its own (Sim(3)), as for the metrics, and all share a
+    With true positions every segment is aligned with them on its own, as for the metrics, and all share a
     world. Segments that cannot be aligned, or all without ground truth, are shown in worlds of their own.
 
     Args:
@@ -167,7 +167,7 @@ def _matched(result: Result, rows: Sequence[FrameRow], number: int) -> tuple[np.
 
 
 def _fits(result: Result, rows: Sequence[FrameRow]) -> dict[int, Similarity]:
-    """Sim(3) from each segment to the true positions, of those that can be aligned."""
+    """Alignment of each segment with the true positions, of those that can be aligned."""
     truth, fits = _truth(rows), {}
     if not np.isfinite(truth).any():
         return {}
@@ -175,7 +175,7 @@ def _fits(result: Result, rows: Sequence[FrameRow]) -> dict[int, Similarity]:
         i, j = _matched(result, rows, number)
         found, true = segment.trajectory.positions[i], truth[j]
         if len(i) >= MINIMUM_MATCHES and not (stands_still(found) or stands_still(true)):
-            fits[number] = fit_alignment(found, true, "sim3")
+            fits[number] = fit_alignment(found, true, "se3" if result.is_metric(number) else "sim3")
     return fits
 
 

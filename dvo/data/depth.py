@@ -10,10 +10,16 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
+from dvo.data.calibration import Calibration
 from dvo.data.files import is_file
 from dvo.data.image_header import MAX_PIXELS
 from dvo.data.images import decode
 from dvo.errors import DvoError
+from dvo.geometry.camera import Camera
+
+_ASPECT = (
+    0.02  # relative difference of the aspects of a depth image and its image up to which one is the other, resized
+)
 
 
 def read_depth(path: Path, scale: float | None = None) -> np.ndarray | None:
@@ -43,6 +49,58 @@ def read_depth(path: Path, scale: float | None = None) -> np.ndarray | None:
     with np.errstate(over="ignore"):
         metres = depth.astype(np.float32)
     return np.where((metres > 0) & np.isfinite(metres), metres, np.float32(np.nan))
+
+
+def resized_depth(depth: np.ndarray, size: tuple[int, int], origin: str) -> np.ndarray:
+    """Resize a depth image to the nearest pixel, where it is registered to an image of another size.
+
+    Args:
+        depth: ``(h, w)`` metres.
+        size: width and height of the image.
+        origin: of the image, for messages.
+
+    Returns:
+        ``(H, W)`` metres.
+
+    Raises:
+        DvoError: another aspect.
+    """
+    height, width = depth.shape
+    if (width, height) == size:
+        return depth
+    if abs(width * size[1] / (height * size[0]) - 1) > _ASPECT:
+        message = f"the depth image is {width}x{height}, the image {size[0]}x{size[1]}, of another aspect"
+        raise DvoError(message, file=origin, field="depth", remedy="register the depth to the images")
+    x = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
+    y = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
+    return depth[y[:, None], x]
+
+
+def registered_depth(depth: np.ndarray, calibration: Calibration, camera: Camera) -> np.ndarray:
+    """Resample a depth image to another camera with the same centre and axes, to the nearest pixel.
+
+    Args:
+        depth: ``(h, w)`` metres.
+        calibration: of the depth camera.
+        camera: of the image, without distortion.
+
+    Returns:
+        ``(H, W)`` metres, nan where the depth camera does not see.
+
+    Raises:
+        DvoError: a camera with lens distortion.
+    """
+    height, width = depth.shape
+    if camera.model != "none" or calibration.model != "none":
+        message = "depth can be registered between cameras without distortion only"
+        raise DvoError(message, field="depth", remedy="undistort images and depth, or give registered depth")
+    other = calibration.camera(width, height)
+    x = np.rint((np.arange(camera.width) - camera.cx) / camera.fx * other.fx + other.cx).astype(int)
+    y = np.rint((np.arange(camera.height) - camera.cy) / camera.fy * other.fy + other.cy).astype(int)
+    found = depth[y.clip(0, height - 1)[:, None], x.clip(0, width - 1)].astype(np.float32)
+    found[(y < 0) | (y >= height)] = np.nan
+    found[:, (x < 0) | (x >= width)] = np.nan
+    return found
 
 
 def _read_array(path: Path) -> np.ndarray | None:

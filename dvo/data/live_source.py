@@ -106,37 +106,37 @@ class LiveSource(Source):
             ``file`` (of a served video file) or ``fps``.
     """
 
-    _recording: LiveRecording[Any]
+    recording: LiveRecording[Any]
 
     @property
     def warnings(self) -> list[str]:
         """Faults so far and the number of dropped frames, in sentences for the user."""
-        return [*super().warnings, *self._recording.live.warnings]
+        return [*super().warnings, *self.recording.live.warnings]
 
     @property
     def counts(self) -> StreamCounts:
         """Frames received and dropped."""
-        return self._recording.live.counts
+        return self.recording.live.counts
 
     @property
     def times(self) -> str:
         """Origin of the times."""
-        return self._recording.times
+        return self.recording.times
 
     def recalibrated(self, calibration: Calibration) -> LiveSource:
         """The same stream with another calibration; see :meth:`dvo.data.source.Source.recalibrated`."""
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        found = LiveSource(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
+        found = LiveSource(self.recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
         found.masks = self.masks
         return found
 
     def stop(self) -> None:
         """End the iteration as soon as possible. May be called from any thread, and in a signal handler."""
-        self._recording.live.stop()
+        self.recording.live.stop()
 
     def close(self) -> None:
         """Stop, and wait for the end of the thread that reads."""
-        self._recording.live.close()
+        self.recording.live.close()
 
     def __enter__(self) -> LiveSource:
         return self

@@ -12,6 +12,7 @@ import numpy as np
 
 from dvo.data.calibration import Calibration, read_calibration
 from dvo.data.capture import is_stream
+from dvo.data.depth import registered_depth, resized_depth
 from dvo.data.files import lookups
 from dvo.data.focal_guess import FocalGuess, guess_focal
 from dvo.data.frame import Frame, InertialSamples, StereoView
@@ -37,6 +38,7 @@ class Source:
     Depth, right images and inertial samples, where the recording has them, are read when a frame's field is first read.
 
     Attributes:
+        recording: as its reader found it, before cameras and undistortion.
         name: of the sequence.
         kind: name of the reader, see :data:`dvo.data.registry.READERS`.
         path: file or folder that was opened.
@@ -44,6 +46,7 @@ class Source:
         recorded_camera: the camera as calibrated, distortion included.
         masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
+        depth_calibration: of depth images that are not registered to the images; None for others.
         turned: degrees by which the frames of a video are turned to stand upright, as the file asks for.
         stride: every how many-th frame is read.
         frame_count: frames to expect, the stride taken into account; None if a video does not say. A video's header may
@@ -60,7 +63,7 @@ class Source:
         undistort: bool,
         doubts: list[str],
     ) -> None:
-        self._recording = recording
+        self.recording = recording
         self._log = Log()
         self.name, self.kind, self.path = recording.name, recording.kind, recording.path
         self.recorded_camera, self.groundtruth, self.stride = recorded_camera, groundtruth, stride
@@ -74,6 +77,7 @@ class Source:
         self._doubts = doubts
         self.guess: FocalGuess | None = None
         self.masks: Masks | None = None
+        self.depth_calibration: Calibration | None = None
         self.turned: int = getattr(recording, "turned", 0)
 
     def recalibrated(self, calibration: Calibration) -> Source:
@@ -86,8 +90,9 @@ class Source:
             DvoError: intrinsics that do not fit the images.
         """
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        found = Source(self._recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
+        found = Source(self.recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
         found.masks = self.masks
+        found.depth_calibration = self.depth_calibration
         return found
 
     def __len__(self) -> int:
@@ -103,7 +108,7 @@ class Source:
     @property
     def warnings(self) -> list[str]:
         """Guesses at opening and faults of the last pass so far, in sentences for the user."""
-        return [*self._recording.warnings, *self._doubts, *self._cut, *self._log.messages()]
+        return [*self.recording.warnings, *self._doubts, *self._cut, *self._log.messages()]
 
     @property
     def skipped(self) -> int:
@@ -113,7 +118,7 @@ class Source:
     @property
     def timestamps(self) -> np.ndarray | None:
         """Seconds, one for every image of the recording whatever the stride; None for a video."""
-        recording = self._recording
+        recording = self.recording
         return recording.timestamps if isinstance(recording, ImageRecording) else None
 
     def frames_at(self, indices: Sequence[int]) -> list[tuple[Frame, Path]]:
@@ -128,7 +133,7 @@ class Source:
         Raises:
             DvoError: a video, or an image that cannot be read.
         """
-        recording = self._recording
+        recording = self.recording
         if not isinstance(recording, ImageRecording):
             raise DvoError("a video is read in order only", file=self.path, remedy="extract its frames into a folder")
         frames = []
@@ -147,7 +152,7 @@ class Source:
         """
         self._log = log = Log()
         previous = float("inf")
-        for raw in self._recording.frames(log, self.stride):
+        for raw in self.recording.frames(log, self.stride):
             height, width = raw.image.shape[:2]
             if (width, height) != (self.recorded_camera.width, self.recorded_camera.height):
                 raise DvoError(
@@ -165,7 +170,7 @@ class Source:
         depth = partial(self._depth, raw.depth, raw.origin) if raw.depth else None
         right = partial(self._right, raw.right) if raw.right else None
         inertial = None
-        if previous is not None and self._recording.inertial is not None:
+        if previous is not None and self.recording.inertial is not None:
             inertial = partial(self._inertial, previous, raw.timestamp)
         mask = self.masks(raw.index, self._undistorter) if self.masks else None
         return Frame(raw.index, raw.timestamp, image, self.camera, depth, right, inertial, mask)
@@ -174,20 +179,14 @@ class Source:
         depth = load()
         if depth is None:
             return None
-        height, width = depth.shape
-        if (width, height) != (self.recorded_camera.width, self.recorded_camera.height):
-            raise DvoError(
-                f"the depth image is {width}x{height}, the image {self.recorded_camera.width}x"
-                f"{self.recorded_camera.height}",
-                file=origin,
-                field="depth",
-                remedy="register the depth to the images",
-            )
+        if self.depth_calibration is not None:
+            return registered_depth(depth, self.depth_calibration, self.camera)
+        depth = resized_depth(depth, (self.recorded_camera.width, self.recorded_camera.height), origin)
         return self._undistorter.depth(depth) if self._undistorter else depth
 
     @cached_property
     def _rig(self) -> StereoRig | None:
-        return self._recording.stereo() if self._recording.stereo else None
+        return self.recording.stereo() if self.recording.stereo else None
 
     def _right(self, load: Callable[[], np.ndarray | None]) -> StereoView | None:
         rig = self._rig
@@ -203,7 +202,7 @@ class Source:
 
     @cached_property
     def _samples(self) -> InertialSamples | None:
-        return self._recording.inertial() if self._recording.inertial else None
+        return self.recording.inertial() if self.recording.inertial else None
 
     def _inertial(self, previous: float, timestamp: float) -> InertialSamples | None:
         return None if self._samples is None else self._samples.between(previous, timestamp)

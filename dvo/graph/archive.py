@@ -62,6 +62,8 @@ class ArchivedKeyframe:
         matching: ``(M, C, p, p)`` float16 matching features of the patches, None if not kept.
         context: ``(M, D)`` float16 context features of the patches, None if not kept.
         jpeg: ``(n,)`` uint8 content of a JPEG file with the working image, None if not kept.
+        measured: ``(M, 2)`` float32 inverse depths (1/m) by a depth camera and their weights, 0 for none; None without
+            a depth camera, or once released with the patches.
     """
 
     identifier: int
@@ -75,6 +77,7 @@ class ArchivedKeyframe:
     matching: np.ndarray | None = None
     context: np.ndarray | None = None
     jpeg: np.ndarray | None = None
+    measured: np.ndarray | None = None
 
     @property
     def feature_bytes(self) -> int:
@@ -85,7 +88,8 @@ class ArchivedKeyframe:
     @property
     def patch_bytes(self) -> int:
         """Memory of the patches."""
-        return self.centres.nbytes + self.inverse_depth.nbytes + self.colors.nbytes
+        measured = 0 if self.measured is None else self.measured.nbytes
+        return self.centres.nbytes + self.inverse_depth.nbytes + self.colors.nbytes + measured
 
     def image(self) -> np.ndarray | None:
         """Decode the working image.
@@ -287,17 +291,28 @@ class Archive:
             keyframe, pose_cw=np.asarray(pose_cw, np.float64), anchor=anchor, inverse_depth=depth
         )
 
+    def set_measured(self, identifier: int, measured: np.ndarray) -> None:
+        """Give a keyframe measured depths.
+
+        Args:
+            identifier: of the keyframe.
+            measured: ``(M, 2)`` see :class:`ArchivedKeyframe`.
+        """
+        self._change(identifier, measured=measured)
+        self._shrink()
+
     def _shrink(self) -> None:
         """Release memory until the bound holds: features and images, then edges, then patches, each oldest first."""
         limit = self.config.max_bytes
         while self._bytes > limit and self._with_features:
-            self._release(self._with_features.popleft(), matching=None, context=None, jpeg=None)
+            self._change(self._with_features.popleft(), matching=None, context=None, jpeg=None)
         while self._bytes > limit and self._edges:
             self._bytes -= self._edges.popleft().nbytes
         while self._bytes > limit and self._with_patches:
             centres, depth = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
             colors = np.zeros((0, 3), np.uint8)
-            self._release(self._with_patches.popleft(), centres=centres, inverse_depth=depth, colors=colors)
+            gone = self._with_patches.popleft()
+            self._change(gone, centres=centres, inverse_depth=depth, colors=colors, measured=None)
 
     def _stored(self, keyframe: ArchivedKeyframe) -> ArchivedKeyframe:
         """Keyframe with its arrays in the storage."""
@@ -310,9 +325,9 @@ class Archive:
             keyframe, centres=centres, inverse_depth=depth, colors=colors, matching=matching, context=context, jpeg=jpeg
         )
 
-    def _release(self, identifier: int, **without: object) -> None:
+    def _change(self, identifier: int, **fields: object) -> None:
         before = self._keyframes[identifier]
-        after = replace(before, **without)  # type: ignore[arg-type]
+        after = replace(before, **fields)  # type: ignore[arg-type]
         self._keyframes[identifier] = after
         self._bytes += after.feature_bytes + after.patch_bytes - before.feature_bytes - before.patch_bytes
 

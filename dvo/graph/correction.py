@@ -48,6 +48,26 @@ def _rescale_relative(graph: KeyframeGraph, scales: dict[int, float]) -> None:
     graph.log.rescale(scales)
 
 
+def rescale(graph: KeyframeGraph, segment: int, factor: float) -> dict[int, float]:
+    """Multiply all lengths of the world of a segment, from its origin.
+
+    Args:
+        graph: all keyframes of the world are archived; corrected in place.
+        segment: number of any segment with this world.
+        factor: of lengths, new over old.
+
+    Returns:
+        Scale of the similarity of each kept keyframe, see :func:`apply_similarities`: ``1 / factor``.
+    """
+    world = graph.world_of(segment)
+    kept = [f.identifier for f in graph.archive if f.anchor is None]
+    mine = np.array([k for k in kept if graph.segment_of(k) >= 0 and graph.world_of(graph.segment_of(k)) == world], int)
+    if not len(mine):
+        return {}
+    apply_similarities(graph, mine, sim3.from_se3(graph.poses_cw(mine), 1 / factor))
+    return dict.fromkeys(mine.tolist(), 1 / factor)
+
+
 def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> None:
     """Move the window along with a keyframe outside of it, and the keyframes that were dropped from it.
 

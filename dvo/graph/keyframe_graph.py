@@ -47,6 +47,7 @@ class KeyframeGraph:
         starts: first keyframe and number of each segment, by increasing keyframe; -1 for a rejected segment.
         worlds: number of the earliest segment with the same world, of segments that have been joined.
         loops: number of loops whose measurements are archived.
+        metric: by world in metres, what its scale came from; other worlds are up to scale.
         recordings: beginnings of the sequences that were tracked in this graph, of which there is mostly one.
 
     Example:
@@ -78,6 +79,7 @@ class KeyframeGraph:
         self.starts: list[tuple[int, int]] = [(0, 0)]
         self.worlds: dict[int, int] = {}
         self.loops = 0
+        self.metric: dict[int, str] = {}
         self.recordings = [Recording()]
 
     @property
@@ -339,5 +341,6 @@ class KeyframeGraph:
                 matching=frame.matching.half().cpu().numpy() if features else None,
                 context=frame.context.half().cpu().numpy() if features else None,
                 jpeg=None if image is None else encode_jpeg(image, config.jpeg_quality),
+                measured=None if frame.measured is None else frame.measured.float().cpu().numpy(),
             )
         )

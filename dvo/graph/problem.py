@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
+    from dvo.graph.archive import ArchivedKeyframe
     from dvo.graph.keyframe_graph import KeyframeGraph
 
 
@@ -26,6 +27,7 @@ class GraphProblem:
         targets, weights: ``(E, 2)`` float64 measured positions of the patch centres (feature-map pixels), and their
             confidence.
         ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge.
+        measured: ``(K, 2)`` float64 inverse depths by a depth camera and their weights, 0 for none; None without any.
     """
 
     identifiers: np.ndarray
@@ -37,6 +39,7 @@ class GraphProblem:
     ii: Tensor
     jj: Tensor
     kk: Tensor
+    measured: Tensor | None = None
 
 
 def graph_problem(
@@ -67,4 +70,13 @@ def graph_problem(
         ii=torch.from_numpy(ii),
         jj=torch.from_numpy(jj),
         kk=torch.from_numpy(ii * m + edges.patch),
+        measured=_measured(frames, m),
     )
+
+
+def _measured(frames: list[ArchivedKeyframe], per_frame: int) -> Tensor | None:
+    """Measured inverse depths of all patches with their weights; None if there are none."""
+    if all(frame.measured is None for frame in frames):
+        return None
+    none = np.zeros((per_frame, 2))
+    return torch.from_numpy(np.concatenate([none if f.measured is None else f.measured for f in frames])).double()

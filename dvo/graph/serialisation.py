@@ -23,6 +23,7 @@ from dvo.graph.archive import ArchiveConfig, ArchivedEdges, ArchivedKeyframe
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.keyframe_log import FrameRecord, KeyframeLog
 from dvo.graph.map_file import MapReader, open_map_file, write_map_file
+from dvo.graph.measured_arrays import has_measured, measured_arrays, read_measured
 from dvo.graph.recordings import Recording, increase
 from dvo.graph.window_arrays import read_window, window_arrays
 
@@ -44,6 +45,8 @@ class GraphTable:
         loops: number of loops whose measurements are archived.
         worlds: by segment, the earliest segment with the same world; none where no segments have been joined.
         recordings: first frame, keyframe and segment of the second recording and of those after it.
+        measured: keyframes have depths by a depth camera.
+        metric: worlds in metres, and what their scale came from.
     """
 
     per_frame: int
@@ -55,6 +58,8 @@ class GraphTable:
     loops: int = 0
     worlds: tuple[int, ...] = ()
     recordings: tuple[tuple[int, int, int], ...] = ()
+    measured: bool = False
+    metric: tuple[tuple[int, str], ...] = ()
 
     RANGES: ClassVar[dict[str, tuple[float, float]]] = {
         "per_frame": (1, 2**14),
@@ -120,9 +125,10 @@ def graph_arrays(graph: KeyframeGraph) -> tuple[dict[str, Any], Arrays]:
         window.per_frame, window.patches.shape[-1], window.hidden.shape[1], graph.segment, graph.archive.config,
         tuple(reasons), graph.loops, tuple(map(graph.world_of, range(graph.segment + 1))) if graph.worlds else (),
         tuple((begun.frame, begun.keyframe, begun.segment) for begun in graph.recordings[1:]),
+        has_measured(graph), tuple(sorted(graph.metric.items())),
     )  # fmt: skip
-    starts = {"segments": np.array(graph.starts, np.int64)}
-    return asdict(table), starts | _log_arrays(graph.log, reasons) | _archive_arrays(graph) | window_arrays(window)
+    arrays = {"segments": np.array(graph.starts, np.int64)} | _log_arrays(graph.log, reasons) | _archive_arrays(graph)
+    return asdict(table), arrays | window_arrays(window) | (measured_arrays(graph) if table.measured else {})
 
 
 def read_graph(source: MapReader, graph: KeyframeGraph, table: GraphTable) -> None:
@@ -155,6 +161,7 @@ def read_graph(source: MapReader, graph: KeyframeGraph, table: GraphTable) -> No
     source.require(begun[-1][0] <= len(graph.log.frames), "begins after the last frame", "graph: recordings")
     _read_archive(source, graph)
     read_window(source, graph.window)
+    read_measured(source, graph, table.measured, table.metric)
     _check_keyframes(source, graph)
 
 
@@ -247,10 +254,8 @@ def _read_archive(source: MapReader, graph: KeyframeGraph) -> None:
     times = source.array("archive/times", np.float64, (n,))
     intrinsics = source.array("archive/intrinsics", np.float32, (n, 4))
     source.require((intrinsics[:, :2] > 0).all(), "holds a focal length that is not positive", "archive/intrinsics")
-    poses, anchors = (
-        source.poses("archive/poses_cw", np.float64, n),
-        source.array("archive/anchors", np.int64, (n,), -1),
-    )
+    poses = source.poses("archive/poses_cw", np.float64, n)
+    anchors = source.array("archive/anchors", np.int64, (n,), -1)
     source.require((anchors < identifiers).all(), "holds an anchor after its keyframe", "archive/anchors")
     patched, patch_row = _rows(source.array("archive/has_patches", np.uint8, (n,), 0, 1))
     centres = source.array("archive/centres", np.float32, (patched, m, 2))

@@ -36,6 +36,8 @@ class Keyframe:
         image: ``(H, W, 3)`` uint8 RGB working image, None if it is not kept.
         fine: ``(M, c, p, p)`` features of its patches at the fine level of the correlation, None without one.
         visible: ``(h, w)`` bool, pixels of its feature map that measurements may lie in, None for all.
+        measured: ``(M, 2)`` inverse depths (1/m) of its patches by a depth camera, and their weights in bundle
+            adjustment, both 0 for a patch without one; None if no depth camera is used.
     """
 
     identifier: int
@@ -48,6 +50,7 @@ class Keyframe:
     image: np.ndarray | None = None
     fine: Tensor | None = None
     visible: Tensor | None = None
+    measured: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,14 @@ class Window:
     def fine(self) -> Tensor:
         """``(n * M, c, p, p)`` features of its patches at the fine level, for a network that has one."""
         return torch.cat([frame.fine for frame in self.frames if frame.fine is not None])
+
+    @property
+    def measured(self) -> Tensor | None:
+        """``(n * M, 2)`` measured inverse depths and weights, see :class:`Keyframe`; None if no frame has any."""
+        if all(frame.measured is None for frame in self.frames):
+            return None
+        none = self.poses_cw.new_zeros(self.per_frame, 2)
+        return torch.cat([none if frame.measured is None else frame.measured for frame in self.frames])
 
     @property
     def map_slots(self) -> Tensor:
@@ -265,9 +276,14 @@ class Window:
         return self.frames.pop(position)
 
     def reset(self) -> None:
-        """Give all frames the pose of the first and inverse depths of 1, and edges the state of new ones."""
+        """Give all frames the pose of the first, patches the measured inverse depth or 1, and edges the state of new
+        ones."""
         self.poses_cw = self.poses_cw[:1].expand_as(self.poses_cw).clone()
-        self.patches = torch.cat([self.patches[:, :2], torch.ones_like(self.patches[:, 2:])], dim=1)
+        depths, measured = torch.ones_like(self.patches[:, 2:]), self.measured
+        if measured is not None:
+            value, weight = measured[:, :, None, None, None].unbind(1)
+            depths = torch.where(weight > 0, value, depths)
+        self.patches = torch.cat([self.patches[:, :2], depths], dim=1)
         edges = self.hidden, self.targets, self.weights, self.confidence
         self.hidden, self.targets, self.weights, self.confidence = (torch.zeros_like(x) for x in edges)
 

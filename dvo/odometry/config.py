@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 from dvo.nets.alignment import AlignmentOptions
+from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.final_adjustment import AdjustmentOptions
-from dvo.settings import check_names, check_settings, shown
+from dvo.odometry.scale_options import ScaleOptions
+from dvo.settings import check_names, check_settings, settings_of, shown
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -108,6 +110,7 @@ class TrackerConfig:
             bundle adjustment fits a wrong pose to some matches at no cost; where a tenth to a fifth of the patches is
             found, it usually has. Right poses had more than 0.3.
         max_gap: time between frames above which they are separated by a gap, in medians of the recent intervals.
+        scale: observation that metres come from, none for a trajectory up to scale; a table of its values will do.
 
     Raises:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
@@ -134,7 +137,7 @@ class TrackerConfig:
     loops: bool = True
     real_time: bool = False
     robust: float = 0.3
-    sigma: float = 0.061
+    sigma: float = SIGMA
     covariance_scale: float = 2.0
     restart: bool = True
     updates: int = 1
@@ -152,8 +155,10 @@ class TrackerConfig:
     search_inliers: float = 0.1
     join_inliers: float = 0.25
     max_gap: float = 4.5
+    scale: ScaleOptions = ScaleOptions()  # noqa: RUF009 (frozen)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "scale", settings_of(ScaleOptions, self.scale, "scale"))
         check_settings(self, _RANGES)
 
     @property

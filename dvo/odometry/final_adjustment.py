@@ -21,9 +21,11 @@ from dvo.ba.levenberg import LMOptions
 from dvo.ba.restart import RestartOptions, better_start, restart
 from dvo.errors import DvoError
 from dvo.geometry import se3
+from dvo.graph.correction import rescale
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.problem import GraphProblem
 from dvo.graph.recordings import count_earlier, increasing_times
+from dvo.odometry.depth_factor import MOST, depth_factors, far_scale, measured_share, to_measured
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.settings import check_settings
 
@@ -124,6 +126,8 @@ def adjust_segment(
     if len(identifiers) < 3:
         return 0
     times, map_size = increasing_times(graph, frames), count_earlier(graph, identifiers)
+    if not map_size and (far := far_scale(frames)) != 1:
+        rescale(graph, segment, far)
     old = graph.poses_cw(identifiers)
     now = old.clone()
     # Frames whose measurements have been released to save memory stay; with some more they hold the scale of the rest.
@@ -153,7 +157,7 @@ def adjust_segment(
         poses, found = now[rows], depths
         if first:
             poses, found, _ = solve_part(part, poses, found, fixed, replace(options, kernels=first))
-        if start == 1 and not map_size:
+        if start == 1 and not map_size and measured_share(part.measured) < MOST:
             poses, found = _leave_minimum(part, poses, found, fixed, options)
         for _ in range(options.shutter_rounds if rolling is not None else 0):
             assert rolling is not None
@@ -199,10 +203,14 @@ def _leave_minimum(
     poses_cw, depths, cost = solve_part(part, poses_cw, depths, fixed, known)
     start = _extended(poses_cw, depths, better[1], better[2][:, 2, 0, 0].reshape(n, m)[:, ::2])
     settings = replace(settings, iterations=3 * options.iterations)
-    poses, found, new = restart(poses_cw, patches, measured, fixed, better[0], settings)
+    poses, new_patches, new = restart(poses_cw, patches, measured, fixed, better[0], settings)
+    found = new_patches[:, 2, 0, 0].reshape_as(depths)
+    if measured_share(part.measured) > 0:  # a cost without those of measured depths cannot be compared
+        poses, found = to_measured(poses, found, part.measured)
+        poses, found, new = solve_part(part, poses, found, fixed, known)
     ways = [
         (poses_cw, depths, cost),
-        (poses, found[:, 2, 0, 0].reshape_as(depths), new),
+        (poses, found, new),
         solve_part(part, *start, fixed, replace(options, iterations=3 * options.iterations)),
     ]
     poses_cw, depths, _ = min(ways, key=lambda way: way[2])
@@ -254,6 +262,6 @@ def solve_part(
     solver = LMOptions(max_iterations=options.iterations, tolerance=options.tolerance)
     for kernel in options.kernels:
         settings = GlobalBAOptions(fixed=fixed, kernel=kernel, max_residual=options.max_residual, solver=solver)
-        found = global_bundle_adjust(poses_cw, patches, *measured, settings)
+        found = global_bundle_adjust(poses_cw, patches, *measured, settings, depth_factors(part.measured))
         poses_cw, patches, cost = se3.normalise(found.poses_cw), found.patches, found.cost
     return poses_cw, patches[:, 2, 0, 0].reshape_as(depths), cost

@@ -33,6 +33,8 @@ class Observation:
         fine_maps: ``(1, 1, c, H / 2, W / 2)`` features of the fine level of the correlation, None without one.
         fine: ``(M, c, p, p)`` those of the patches, None without one.
         visible: ``(h, w)`` bool, pixels of the feature map that a measurement may lie in; None: all.
+        measured: ``(M, 2)`` inverse depths of the patches by a depth camera (1/m) and their weights in bundle
+            adjustment, both 0 for a patch without one; None if depth is not used.
     """
 
     image: np.ndarray
@@ -46,6 +48,7 @@ class Observation:
     fine_maps: Tensor | None = None
     fine: Tensor | None = None
     visible: Tensor | None = None
+    measured: Tensor | None = None
 
     @property
     def bounds(self) -> tuple[int, int]:

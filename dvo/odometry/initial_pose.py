@@ -46,20 +46,26 @@ def first_pose(window: Window, seen: Observation, time: float, config: TrackerCo
     return initial_pose(window, seen, predicted, config.initial_pose) if initialised else predicted
 
 
-def first_depth(window: Window, config: TrackerConfig, initialised: bool) -> Tensor:
-    """Inverse depth that the patches of a new frame begin with: the median of the newest frames, before these are
-    initialised 1.
+def first_depth(window: Window, config: TrackerConfig, initialised: bool, measured: Tensor | None = None) -> Tensor:
+    """Inverse depth that the patches of a new frame begin with: measured, or the median of the newest frames, before
+    these are initialised 1.
 
     Args:
         window: keyframes without the frame, possibly none.
         config: settings of the tracker.
         initialised: the tracker is.
+        measured: ``(M, 2)`` of the frame, see :func:`dvo.odometry.depth_factor.depth_factors`.
 
     Returns:
         ``(1, M)``.
     """
     depth = torch.ones(1, config.patches, device=window.patches.device)
-    return depth * recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES) if initialised else depth
+    depth = depth * recent_depth(window.patches[None], config.patches, _DEPTH_FRAMES) if initialised else depth
+    known = None if measured is None else measured[:, 1] > 0
+    if measured is None or known is None or not known.any():
+        return depth
+    depth = depth if initialised else torch.full_like(depth, float(measured[known, 0].median()))
+    return torch.where(known, measured[:, 0], depth)
 
 
 def initial_pose(window: Window, seen: Observation, predicted: Tensor, method: InitialPose) -> Tensor:

@@ -11,6 +11,7 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.depth_factor import MOST, match_window, measured_share
 from dvo.odometry.evidence import NO_MATCH, last_unrelated, measured, related_share, window_inliers
 from dvo.odometry.motion import parallax
 from dvo.odometry.window_step import WindowStep
@@ -68,7 +69,8 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
     """Optimise the first window.
 
     After half of the updates the window is also solved from identity poses with the current flow, and the better of the
-    two solutions is kept (:func:`dvo.ba.cold_start.solve_from_nothing`).
+    two solutions is kept (:func:`dvo.ba.cold_start.solve_from_nothing`). With measured depths of most patches there is
+    no other solution to look for, and no parallax is needed.
 
     Args:
         window: the first keyframes; changed in place.
@@ -78,11 +80,15 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
     Returns:
         True if the parallax is sufficient for tracking.
     """
+    measured = measured_share(window.measured) >= MOST
     for age in range(config.initial_updates):
         step(StepOptions(fixed=1, damping=damping_at(age)))
-        if age == config.initial_updates // 2:
+        if age == config.initial_updates // 2 and not measured:
             _solve_again(window, step)
+            match_window(window)
     n = len(window)
+    if measured:
+        return True
     seen = parallax(window, 0, n - 1)
     if n > config.initial_frames:
         seen = max(seen, parallax(window, n // 2, n - 1))
@@ -184,7 +190,7 @@ def leave_minimum(window: Window, age: int) -> bool:
     Returns:
         True if they were changed.
     """
-    if age not in RESTARTS:
+    if age not in RESTARTS or measured_share(window.measured) >= MOST:
         return False
     measured = (window.intrinsics, window.targets, window.weights)
     # On the CPU in double precision, which not every accelerator has; the problem is small.
@@ -195,4 +201,5 @@ def leave_minimum(window: Window, age: int) -> bool:
     found = better_start(poses, patches, (intrinsics, targets, weights, *edges), fixed)
     if found is not None:
         window.poses_cw, window.patches = found[1].to(window.poses_cw), found[2].to(window.patches)
+        match_window(window)
     return found is not None

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -271,8 +271,17 @@ class LoopCloser:
     def _apply(self, identifiers: np.ndarray, found: Tensor) -> None:
         """Correct the poses, and express the loops in the new units of the keyframes."""
         unit = loop_correction.apply(self.graph, self.finder.kept, self.loops[-1], identifiers, found)
+        self.rescale(unit)
+        self.corrections += 1
+
+    def rescale(self, unit: Mapping[int, float]) -> None:
+        """Express the loops in new units of keyframes.
+
+        Args:
+            unit: scale of the similarity of each keyframe (:func:`dvo.graph.correction.apply_similarities`); those that
+                are not named keep theirs.
+        """
         for row, loop in enumerate(self.loops):
             old, new = unit.get(loop.old, 1.0), unit.get(loop.new, 1.0)
             t, q, scale = loop.measurement[:3] / new, loop.measurement[3:7], loop.measurement[7:] * old / new
             self.loops[row] = replace(loop, measurement=torch.cat([t, q, scale]))
-        self.corrections += 1

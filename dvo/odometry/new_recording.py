@@ -131,5 +131,5 @@ def _take_over(graph: KeyframeGraph, old: KeyframeGraph) -> None:
     """Put the content of a graph with an empty window into a new one, and begin a recording in it."""
     graph.archive, graph.log = old.archive, old.log
     graph.segment, graph.starts, graph.worlds, graph.loops = old.segment, old.starts, old.worlds, old.loops
-    graph.recordings = old.recordings
+    graph.recordings, graph.metric = old.recordings, old.metric
     begin_recording(graph)

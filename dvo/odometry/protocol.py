@@ -188,6 +188,20 @@ class Result:
         return sum(len(segment) for segment in self.segments)
 
     @property
+    def metric(self) -> bool:
+        """True if ``trajectory`` and ``map`` are in metres."""
+        return self.longest is not None and self.is_metric(self.longest)
+
+    def is_metric(self, number: int) -> bool:
+        """True if a segment is in metres (``scale`` of the metadata).
+
+        Args:
+            number: of the segment.
+        """
+        entries = self.info.get("scale", {}).get("segments", ())
+        return any(entry["segment"] == number and entry["source"] != "none" for entry in entries)
+
+    @property
     def longest(self) -> int | None:
         """Number of the segment that ``trajectory`` is, of joined ones the longest; None without segments."""
         if not self.segments:

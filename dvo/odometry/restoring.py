@@ -239,6 +239,10 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
     if source.has("waiting/visible"):  # of frames with masks
         shape = n, size[0] // c.STRIDE, size[1] // c.STRIDE
         visible = torch.from_numpy(source.array("waiting/visible", np.uint8, shape, 0, 1) > 0).to(odometry.device)
+    measured = None
+    if odometry.config.scale.depth:
+        values = source.array("waiting/measured", np.float32, (n, odometry.config.patches, 2), 0, 1e12)
+        measured = torch.from_numpy(values).to(odometry.device)
     for k, view in enumerate(table.waiting):
         try:
             fx, fy, cx, cy = intrinsics[k].tolist()
@@ -248,6 +252,7 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
         known = torch.from_numpy(centres[k])[None, None].to(odometry.device)
         seen = observe(odometry.model, images[k], camera, odometry.select, odometry.device, known)
         seen = seen if visible is None else replace(seen, visible=visible[k])
+        seen = seen if measured is None else replace(seen, measured=measured[k])
         odometry.state.waiting.append(View([records[number] for number in view], seen))
 
 

@@ -32,7 +32,8 @@ from dvo.odometry.session import Run
 TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
 FRAMES, PAGE = "frames.csv", "summary.html"
 BASE = "trajectory_base.txt"
-FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, SUMMARY, BASE)
+CLOUD, MESH = "cloud.ply", "mesh.ply"
+FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, CLOUD, MESH, SUMMARY, BASE)
 VIEWS = (PICTURE, FRAMES, PAGE)
 """Files that show what the others hold; an error in drawing one costs no other file."""
 SEGMENT_FILE = re.compile(r"trajectory-\d+\.txt")

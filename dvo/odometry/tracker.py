@@ -28,18 +28,19 @@ from dvo.models.step import StepOptions
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
+from dvo.odometry.finishing import finish_segments
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, observe
 from dvo.odometry.initial_pose import first_depth, first_pose
 from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise_related, leave_minimum, worth_keeping
 from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
+from dvo.odometry.patch_depth import measure_depth
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.reset import start_again
 from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
-from dvo.odometry.self_calibration import adjust_segments
 from dvo.odometry.tracker_state import TrackerState
 from dvo.odometry.uncertainty import UNKNOWN, newest_uncertainty
 from dvo.odometry.window_alignment import WindowAlignment
@@ -141,6 +142,7 @@ class PatchOdometry:
             if gap and state.initialised and not state.joining:
                 state.joining, state.skipped = str(gap), not gap.frozen
             seen = observe(self.model, image, camera, self.select, self.device, mask=mask)
+            seen = measure_depth(seen, frame, self.config.scale)
             state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
             estimate = self._take(View([record], seen))
             if len(state.waiting) >= self.config.patience:
@@ -163,9 +165,7 @@ class PatchOdometry:
                 self._begin_segment()
             self._close_segment(last=True)
             self.loops.complete(state.adjustable)
-            if config.final_adjustment and state.adjustable:
-                options = config.estimate_readout, config.adjustment
-                state.info |= adjust_segments(self.graph, state.adjustable, state.shutter, *options)
+            state.info |= finish_segments(self.graph, state, config, self.loops)
         return self._result({})
 
     @torch.inference_mode()
@@ -305,11 +305,11 @@ class PatchOdometry:
         config, window, seen = self.config, self.window, view.seen
         slot = window.free_map_slot()
         self.step.keep_frame(slot, seen.image, seen.maps, seen.fine_maps)
-        keyframe = Keyframe(self.state.keyframes, view.records[0].timestamp, slot, seen.matching, seen.context,
-                            seen.colors, seen.intrinsics, seen.image, seen.fine, seen.visible)  # fmt: skip
+        features = seen.matching, seen.context, seen.colors, seen.intrinsics, seen.image, seen.fine, seen.visible
+        keyframe = Keyframe(self.state.keyframes, view.records[0].timestamp, slot, *features, seen.measured)
         self.state.keyframes += 1
         self.loops.see(keyframe.identifier, seen.image, seen.maps)
-        depth = first_depth(window, config, self.state.initialised)
+        depth = first_depth(window, config, self.state.initialised, seen.measured)
         pose = first_pose(window, seen, keyframe.timestamp, config, self.state.initialised)
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe

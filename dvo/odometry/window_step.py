@@ -10,6 +10,7 @@ from torch import Tensor
 from dvo.ba.kernels import Kernel
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepModel, StepOptions, UpdateState, revise, step
+from dvo.odometry.depth_factor import depth_factors
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 
@@ -109,12 +110,13 @@ class WindowStep:
 
         Args:
             options: of the step; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that of the
-                tracker.
+                tracker; measured depths join its factors.
             align: use the sub-pixel alignment, if it takes part in every step. Its large weights would keep the first
                 solution of a window from leaving a wrong minimum.
         """
         refine = self.align if align and not self.final else None
-        options = replace(options, bounds=self.bounds, kernel=self.kernel)
+        factors = *options.factors, *depth_factors(self.window.measured)
+        options = replace(options, bounds=self.bounds, kernel=self.kernel, factors=factors)
         after = step(self.model, self.state(), self.lookup, options, refine)
         assert after.targets is not None and after.weights is not None and after.confidence is not None
         window = self.window

@@ -162,6 +162,27 @@ def _write_picture(path: Path, picture: Array) -> None:
         raise DvoError("cannot be written", file=path, remedy="name a folder elsewhere")
 
 
+def write_depth(folder: Path, stamp: str, depth: Array) -> int:
+    """Write a depth image in the layout of TUM RGB-D: ``depth/STAMP.png``, 16 bit, 5000 to a metre, 0 for none.
+
+    Args:
+        folder: of the sequence; ``depth`` is made in it if need be.
+        stamp: name of the image, its time in seconds.
+        depth: ``(H, W)`` metres, 0 for none.
+
+    Returns:
+        Number of pixels that are too far away, 13.1 m or more, and have none.
+
+    Raises:
+        DvoError: the file cannot be written.
+    """
+    (folder / "depth").mkdir(exist_ok=True)
+    units = np.rint(depth.astype(float) * TUM_FACTOR)
+    beyond = units > 65535
+    _write_picture(folder / "depth" / f"{stamp}.png", np.where(beyond, 0, units).astype(np.uint16))
+    return int(beyond.sum())
+
+
 def _write_tum(frames: Iterator[tuple[int, Array, Array]], sequence: SyntheticSequence, out: Path) -> list[str]:
     (out / "rgb").mkdir()
     (out / "depth").mkdir()
@@ -170,11 +191,9 @@ def _write_tum(frames: Iterator[tuple[int, Array, Array]], sequence: SyntheticSe
     beyond = total = 0
     for index, image, depth in frames:
         stamp = f"{times[index]:.6f}"
-        units = np.rint(depth.astype(float) * TUM_FACTOR)
-        beyond += int((units > 65535).sum())
+        beyond += write_depth(out, stamp, depth)
         total += depth.size
         _write_picture(out / "rgb" / f"{stamp}.png", image)
-        _write_picture(out / "depth" / f"{stamp}.png", np.where(units > 65535, 0, units).astype(np.uint16))
         for kind, rows in lists.items():
             rows.append(f"{stamp} {kind}/{stamp}.png")
     for kind, rows in lists.items():

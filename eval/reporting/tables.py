@@ -15,6 +15,7 @@ from eval.scoring.summary import (
     FIGURES,
     RECOVERY,
     RESOURCES,
+    SCALE,
     axes_of,
     axis_cells,
     count_cell,
@@ -82,7 +83,8 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     rows = [row for row in rows if row.suite == suite.name]
     systems = list(dict.fromkeys(row.system for row in rows))
     extra = segment_columns(rows)
-    figures = [*FIGURES, *(RECOVERY if any(one.judged_by == "recovery_s" for one in suite.sequences) else ())]
+    figures = [*FIGURES, *(SCALE if suite.alignment == "se3" else ())]
+    figures += RECOVERY if any(one.judged_by == "recovery_s" for one in suite.sequences) else ()
     names = ["sequence", "system", "runs failed", *(title for title, _, _ in figures), "complete %"]
     names += [title for title, _, _, _ in extra]
     names += [title for title, _, _ in RESOURCES]

@@ -50,6 +50,7 @@ class Errors:
         metrics: ATE, RPE and so on; None without a reference.
         worlds: number of segments, those that share a world counted once.
         scored: share of the matched frames that count for the ATE; nan without any.
+        scale_error: percent by which the scale of the longest world is wrong; nan where the alignment fits it.
     """
 
     metrics: Metrics | None = None
@@ -61,6 +62,7 @@ class Errors:
     per_frame_scale: float = math.nan
     worlds: int = 0
     scored: float = math.nan
+    scale_error: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,16 @@ def all_errors(
         per_frame_scale=absolute_rmse(*rescaled) if rescaled else math.nan,
         worlds=whole.worlds,
         scored=whole.scored_share,
+        scale_error=_scale_error(pieces, align),
     )
+
+
+def _scale_error(pieces: Pieces, align: Alignment) -> float:
+    """Percent by which lengths of the longest world differ from those of the reference, under SE(3)."""
+    if align != "se3" or not pieces.worlds:
+        return math.nan
+    estimate, reference = max(pieces.worlds, key=lambda world: len(world[0]))
+    return 100 * abs(1 / evaluate(estimate, reference, "sim3").scale - 1)
 
 
 def align_segments(

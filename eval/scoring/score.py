@@ -44,6 +44,7 @@ class Row:
         scored: share of the frames fed that have a pose in a segment that counts for the ATE.
         unseen: number of frames without a view, see :func:`eval.scoring.blackout.without_view`.
         made_up: share of them that carry a pose; nan without such a frame.
+        scale_error: percent by which the scale of the longest segment is wrong, with the alignment SE(3).
         loops, false_loops, revisit_s, loop_recall: see :class:`eval.scoring.loops.LoopErrors`.
         threads, parallel, device: how the resources were measured; ``parallel`` above 1 means on a shared machine.
     """
@@ -96,6 +97,7 @@ class Row:
     false_loops: float
     revisit_s: float
     loop_recall: float
+    scale_error: float
     threads: int
     parallel: int
     device: str
@@ -244,6 +246,7 @@ def score(
         false_loops=loops.false,
         revisit_s=loops.revisit_s,
         loop_recall=loops.recall,
+        scale_error=errors.scale_error,
         threads=prediction.threads,
         parallel=prediction.parallel,
         device=prediction.device,

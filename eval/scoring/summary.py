@@ -27,13 +27,14 @@ FIGURES = (
     ("rot. error / rot.", "rotation_error_ratio", 2),
     ("scale drift", "scale_drift", 2),
 )
+SCALE = (("scale error %", "scale_error", 2),)  # shown where the alignment leaves the scale to the systems
 RECOVERY = (("recovery s", "recovery_s", 1),)  # shown where sequences are judged by it
 # Column, field, digits, factor; shown where a run has several segments, or frames without a view.
 SEGMENTS = (("segments", "segments", 0, 1.0), ("scored %", "scored", 0, 100.0))
 MADE_UP = (("made-up poses %", "made_up", 0, 100.0),)
 RESOURCES = (("frames/s", "fps", 1), ("p95 ms", "latency_p95_ms", 0), ("MB", "peak_memory_mb", 0))
 UNITS = {"ate_percent": "ATE %", "rpe_rot_deg": "RPE °", "segment_ate_percent": "segment ATE %", "recovery_s": "s"}
-DIGITS = {field: digits for _, field, digits in (*FIGURES, *RECOVERY)}
+DIGITS = {field: digits for _, field, digits in (*FIGURES, *SCALE, *RECOVERY)}
 NULL = "null"
 VOID = ("no data", "not run", "unavailable")  # states in which a run was never made
 NOTHING = "–"

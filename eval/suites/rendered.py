@@ -55,7 +55,7 @@ def rendered_folder(name: str, options: dict[str, Any]) -> Path:
 
     Args:
         name: of the sequence.
-        options: of :func:`dvo.synth.make_sequence`, and ``version``.
+        options: of :func:`dvo.synth.make_sequence`, and ``version``; with ``depth``, depth images are written too.
 
     Raises:
         DvoError: options that cannot be rendered, or a folder that cannot be written.
@@ -82,11 +82,11 @@ def rendered_folder(name: str, options: dict[str, Any]) -> Path:
 def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
     import cv2  # imported here, like rendering: the evaluation of recordings needs neither
 
-    from dvo.synth.export import write_calibration
+    from dvo.synth.export import write_calibration, write_depth
     from dvo.synth.sequence import make_sequence
 
     begin, clock = time.perf_counter(), time.process_time()
-    chosen = {key: value for key, value in options.items() if key != "version"}
+    chosen = {key: value for key, value in options.items() if key not in ("version", "depth")}
     try:
         sequence = make_sequence(**chosen)
     except TypeError as error:
@@ -98,6 +98,8 @@ def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
         if not cv2.imwrite(str(folder / file), frame.image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise OSError(f"cannot write {file}")
         rows.append(f"{frame.timestamp:.9f} {file}")
+        if options.get("depth"):
+            write_depth(folder, f"{frame.timestamp:.6f}", sequence.rendering(frame.index).depth[0].cpu().numpy())
     (folder / "rgb.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
     write_tum(folder / "groundtruth.txt", sequence.groundtruth)
     write_calibration(sequence.camera, folder)

@@ -83,6 +83,7 @@ def test_jacobians_of_priors_and_relative_poses(seed: int, size: float) -> None:
     for factor in (
         DepthPrior(randn(1, 5), randn(1, 5).exp()),
         DepthPrior(randn(2), torch.tensor(2.0, dtype=F64), some),
+        DepthPrior(randn(1, 5), randn(1, 5).exp(), kernel=Kernel("cauchy", 0.5)),
         PosePrior(near, randn(1, 4, 6).exp()),
         PosePrior(near[:, some], torch.ones(6, dtype=F64), some),
         RelativePose(measured, torch.ones(1, 4, 6, dtype=F64), ii, jj),

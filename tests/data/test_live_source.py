@@ -225,7 +225,7 @@ def test_a_pipe_without_a_rate_is_live(make):
         with os.fdopen(into, "wb") as writer:
             writer.write(b"".join(jpegs(make)))
         source = dvo.open_stream(file, calib=make.calib())
-        while not source._recording.live._ended:
+        while not source.recording.live._ended:
             time.sleep(0.001)
         assert [frame.index for frame in source] == [4, 5] and source.times == "arrival"
 

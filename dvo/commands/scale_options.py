@@ -1,0 +1,54 @@
+"""Options of ``dvo run`` for the metric scale, in a module that imports nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+
+OWN = ""  # value of --depth without a path: the depth of the data set itself
+
+
+def add_scale_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options.
+
+    Args:
+        parser: of the command.
+    """
+    group = parser.add_argument_group("metric scale", "poses and map in metres; one of --depth, --height, --distance")
+    source = group.add_mutually_exclusive_group()
+    source.add_argument(
+        "--depth",
+        nargs="?",
+        const=OWN,
+        metavar="PATH",
+        help="depth images: a folder of 16-bit PNG files, or a list as depth.txt (default: those of the data set)",
+    )
+    source.add_argument("--height", type=_metres, metavar="METRES", help="of the camera over the ground")
+    source.add_argument(
+        "--distance",
+        nargs=3,
+        type=float,
+        action="append",
+        metavar=("T0", "T1", "METRES"),
+        help="straight distance between the camera at two times, seconds; repeatable",
+    )
+    group.add_argument(
+        "--depth-scale",
+        type=_metres,
+        metavar="UNITS",
+        help="units of a metre in depth images (default: 1000; of a list 5000; that of a data set)",
+    )
+    group.add_argument(
+        "--depth-calib",
+        metavar="FILE",
+        help="'fx fy cx cy' of the depth images, where they are not registered to the images",
+    )
+    group.add_argument(
+        "--tsdf", action="store_true", help="with --depth: fuse the depth images to a mesh too, mesh.ply (dvo[tsdf])"
+    )
+
+
+def _metres(text: str) -> float:
+    value = float(text)
+    if not 0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"must be more than 0, got {text[:60]}")
+    return value

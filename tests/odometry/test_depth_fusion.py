@@ -1,0 +1,89 @@
+"""Fused cloud of depth images."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dvo.data.frame import Frame
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+from dvo.geometry.camera import Camera
+from dvo.odometry import depth_fusion
+from dvo.odometry.depth_fusion import DepthCloud, depth_view, fuse_points, view_points
+from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.session import Run
+
+CAMERA = Camera(200.0, 200.0, 159.5, 119.5, 320, 240)
+METRES = {"scale": {"source": "depth", "segments": [{"segment": 0, "source": "depth"}]}}
+
+
+def frame(index, depth):
+    image = np.full((240, 320, 3), (200, 100, 50), np.uint8)
+    return Frame(index, 0.1 * index, image, CAMERA, depth=depth.astype(np.float32))
+
+
+def test_a_view_keeps_the_rays_of_its_pixels_and_no_edges():
+    depth = np.full((240, 320), 2.0)
+    depth[:, 200:] = 3.0
+    view = depth_view(frame(0, depth), depth)
+    assert view.depth.shape == (120, 160)
+    cloud = view_points(view, np.array([1.0, 0, 0, 0, 0, 0, 1]), 10.0)
+    pixels = (cloud.points - [1, 0, 0]) @ np.diag([200, 200, 1]) / cloud.points[:, 2:] + [159.5, 119.5, 0]
+    np.testing.assert_allclose(pixels[:, :2], np.rint(pixels[:, :2]), atol=1e-2)
+    assert set(np.unique(cloud.points[:, 2])) == {2.0, 3.0}
+    assert not ((pixels[:, 0] > 197) & (pixels[:, 0] < 202)).any()
+    assert view_points(view, np.array([0.0, 0, 0, 0, 0, 0, 1]), 2.5).points[:, 2].max() == 2.0
+
+
+def test_points_of_a_cell_are_averaged_in_any_number_of_batches():
+    rng = np.random.default_rng(0)
+    clouds = [SparseMap(rng.uniform(-1, 1, (50, 3)).astype(np.float32), rng.integers(0, 255, (50, 3)).astype(np.uint8))
+              for _ in range(40)]  # fmt: skip
+    fused = fuse_points(clouds, 0.5)
+    points = np.concatenate([c.points for c in clouds])
+    cells = np.floor(points / 0.5).astype(int)
+    assert len(fused.points) == len(np.unique(cells, axis=0)) == 64
+    first = (cells == np.unique(cells, axis=0)[0]).all(1)
+    np.testing.assert_allclose(fused.points[0], points[first].mean(0), atol=1e-6)
+    assert len(fuse_points(clouds, 0.5, least=10**6).points) == 0
+
+
+def run_of(count, info=METRES):
+    times = 0.1 * np.arange(count)
+    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (count, 1))
+    return Run(Result(Trajectory(times, poses), SparseMap(), count, 0, info), count, False)
+
+
+@pytest.mark.parametrize("limit", [400, 3])
+def test_the_cloud_of_a_run_is_a_plane_and_bounded(tmp_path, monkeypatch, limit):
+    monkeypatch.setattr(depth_fusion, "VIEWS", limit)
+    cloud = DepthCloud(tmp_path / "cloud.ply")
+    cloud.begin(object())
+    for k in range(12):
+        cloud.update(frame(k, np.full((240, 320), 2.0)), Estimate(0.1 * k, None, Status.LOST))
+    assert len(cloud._views) <= limit
+    cloud.finish(run_of(12))
+    data = (tmp_path / "cloud.ply").read_bytes()
+    header, body = data.split(b"end_header\n")
+    rows = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    assert f"element vertex {len(rows)}".encode() in header and len(rows) > 1000
+    np.testing.assert_allclose(rows["xyz"][:, 2], 2.0)
+    assert (rows["rgb"] == [200, 100, 50]).all()
+
+
+def test_nothing_is_written_without_depth_or_a_scale(tmp_path):
+    for depth, info in ((None, METRES), (np.full((240, 320), 2.0), {})):
+        cloud = DepthCloud(tmp_path / "cloud.ply")
+        cloud.begin(object())
+        one = frame(0, np.zeros((240, 320)))
+        cloud.update(replace(one, depth=depth), Estimate(0.0, None, Status.LOST))
+        cloud.finish(run_of(1, info))
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_needs_open3d(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(DvoError, match=r"dvo\[tsdf\]"):
+        DepthCloud(tmp_path / "cloud.ply", tmp_path / "mesh.ply")

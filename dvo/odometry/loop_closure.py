@@ -208,7 +208,7 @@ class LoopCloser:
         if self.wait > 0 or not own or self.work is not None:
             return
         search = self.finder.prepare(kept[-1 - options.neighbours], self.pending)
-        self.work = Searching(self._background.start(partial(self.finder.verify, search)), options.delay)
+        self.work = Searching(self._background.start(partial(self.finder.verify, search)), options.delay + 1)
         self.wait = options.every
 
     def _collect(self, at_once: bool) -> bool:
@@ -219,6 +219,11 @@ class LoopCloser:
         work.left -= 1
         if not (at_once or (work.task.done if self.real_time else work.left <= 0)):
             return False
+        try:
+            work.task.result()
+        except Exception:  # but an interruption of the wait (KeyboardInterrupt) leaves the work to the next call
+            self.work = None
+            raise
         self.work = None
         if isinstance(work, Searching):
             self._found(work.task.result())
@@ -270,7 +275,10 @@ class LoopCloser:
 
     def _apply(self, identifiers: np.ndarray, found: Tensor) -> None:
         """Correct the poses, and express the loops in the new units of the keyframes."""
-        unit = loop_correction.apply(self.graph, self.finder.kept, self.loops[-1], identifiers, found)
+        # At the end of a sequence keyframes of these worlds are archived that have not been looked at yet.
+        later = self.graph.archive.kept_after(self.finder.kept[-1])
+        kept = [*self.finder.kept, *(frame.identifier for frame in later)]
+        unit = loop_correction.apply(self.graph, kept, self.loops[-1], identifiers, found)
         self.rescale(unit)
         self.corrections += 1
 

@@ -10,6 +10,7 @@ import torch
 import dvo
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
+from dvo.geometry import se3
 from dvo.metrics import evaluate
 from dvo.odometry.loop_closure import Correcting, LoopCloser, Searching
 from dvo.odometry.loop_options import LoopOptions
@@ -98,6 +99,38 @@ def test_a_sequence_goes_on_from_a_file_with_the_same_bytes(film, closed, saved,
     assert result.info["loops"] == closed[2].info["loops"]
     loaded.save(tmp_path / "done.dvo")
     assert dvo.load_map(tmp_path / "done.dvo").finish().info["loops"] == closed[2].info["loops"]
+
+
+def test_a_correction_at_the_end_moves_keyframes_that_were_not_looked_at(saved):
+    """The window is archived with a correction in progress: its keyframes keep their place after the last one."""
+    loaded = dvo.load_map(saved["correcting"][0])
+    graph, loops = loaded.graph, loaded.loops
+    while len(graph.window):
+        graph.archive_oldest()
+    last, later = loops.finder.kept[-1], [frame.identifier for frame in graph.archive.kept_after(loops.finder.kept[-1])]
+    scale = float(loops.work.task.result()[list(loops.work.identifiers).index(last), 7])
+    steps = [se3.relative(*graph.poses_cw(np.array([last, k]))) for k in later]
+    loops.wait = 1000  # no further search
+    assert loops.advance([0], at_once=True) and loops.corrections == 1
+    assert len(later) > 1 and abs(scale - 1) > 0.005
+    for k, step in zip(later, steps, strict=True):
+        now = se3.relative(*graph.poses_cw(np.array([last, k])))
+        wanted = torch.cat([step[:3] / scale, step[3:]])
+        assert torch.allclose(now, wanted, atol=1e-6)
+
+
+def test_an_interruption_while_a_frame_waits_leaves_the_work(saved, monkeypatch):
+    loaded = dvo.load_map(saved["correcting"][0])
+    loops, work = loaded.loops, loaded.loops.work
+
+    def pressed():
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(work.task, "result", pressed)
+        loops.advance([0], at_once=True)
+    assert loops.work is work and not loops.corrections
+    assert loops.advance([0], at_once=True) and loops.corrections == 1
 
 
 def test_a_search_at_once_finds_the_same_places(film, closed):

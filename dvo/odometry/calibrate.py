@@ -270,7 +270,7 @@ def _track(
             continue
         last, height, width = frame.timestamp, frame.camera.height, frame.camera.width
         camera = replace(centred(focal, width, height), readout=frame.camera.readout).camera(width, height)
-        estimate = odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera))
+        estimate = odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera, mask=frame.mask))
         if on_frame is not None:
             on_frame(frame, estimate)
         tracked += estimate.status is Status.TRACKING

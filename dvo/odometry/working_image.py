@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -41,11 +40,11 @@ def masked_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera, np.ndar
         Image and camera of :func:`working_image`; ``(h, w)`` bool mask by the nearest pixels, None without one.
 
     Raises:
-        DvoError: see :func:`working_image`.
+        DvoError: the frame's camera has distortion.
     """
+    image, camera = _resized(frame, pixels)
     if frame.mask is None:
-        return *working_image(frame, pixels), None
-    image, camera = working_image(replace(frame, mask=None), pixels)
+        return image, camera, None
     mask = cv2.resize(frame.mask.astype(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     return image, camera, mask > 0
 
@@ -66,6 +65,11 @@ def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
     """
     if frame.mask is not None:
         raise DvoError("this odometry does not use masks", field="mask", remedy="use weights of patch_vo, or no mask")
+    return _resized(frame, pixels)
+
+
+def _resized(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
+    """Working image and its camera, whatever the mask."""
     if needs_undistortion(frame.camera):
         raise DvoError(
             f"frames with {frame.camera.model} distortion cannot be tracked",

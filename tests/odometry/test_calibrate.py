@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import dvo
@@ -55,6 +56,13 @@ def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(lean, rounds
         walk.append((at, -(1 - lean) * at))
         at += _step(walk)
     assert at == pytest.approx(0, abs=1e-9)
+
+
+def test_ignored_pixels_are_not_measured(clip):
+    reasons = []
+    hidden = [replace(frame, mask=np.zeros((144, 192), bool)) for frame in clip[:3]]
+    estimate = calibrate(hidden, options=CalibrationOptions(rounds=1), on_frame=lambda _, e: reasons.append(e.reason))
+    assert not estimate.found and reasons == 3 * ["masked image"]
 
 
 def test_a_still_camera_keeps_the_guess(clip):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import dvo
+from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.metrics import evaluate
 from dvo.nets.masks import in_sight
@@ -65,6 +66,18 @@ def test_a_saved_tracker_goes_on_with_its_masks(tmp_path):
     loaded = load_map(tmp_path / "half.dvo", weights=weights)
     assert torch.equal(loaded.window.visible, half.window.visible)
     assert outcome(loaded, images[6:]) == outcome(whole, images[6:])
+
+
+def test_other_sensors_are_not_read():
+    """Depth, right image and inertial samples of a frame are functions until they are asked for."""
+
+    def unwanted():
+        raise AssertionError("loaded")
+
+    (frame,) = frames(1, count=1)
+    full = np.ones((72, 96), bool)
+    lazy = Frame(0, 0.0, frame.image, frame.camera, unwanted, unwanted, unwanted, full)
+    assert tracker().track(lazy).status is Status.INITIALISING
 
 
 def test_too_little_is_left():

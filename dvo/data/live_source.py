@@ -92,7 +92,9 @@ class LiveRecording(Generic[T]):
                 log.unreadable.append(f"image {number}")
             else:
                 yield raw
+        dropped = self.live.counts.dropped
         self.live.stop()  # at the end of an interval the stream goes on
+        self.live.counts.dropped = dropped  # what waits lies behind the interval
 
 
 class LiveSource(Source):

@@ -1,5 +1,6 @@
 import io
 import itertools
+import time
 
 import cv2
 import numpy as np
@@ -122,6 +123,15 @@ def pipe(make, count=10):
 def test_a_stream_ends(make, end):
     source = open_stream(pipe(make), calib=CALIB, fps=10, end=end)
     assert [frame.index for frame in source] == [0, 1, 2, 3]
+
+
+def test_frames_that_wait_at_the_end_of_a_stream_were_not_dropped(make):
+    source = open_stream(pipe(make), calib=CALIB, fps=10, end="4f")
+    live = source._recording.live
+    for frame in source:
+        while frame.index == 3 and len(live._waiting) < 2:
+            time.sleep(0.001)
+    assert source.counts.dropped == 0 and not any("dropped" in warning for warning in source.warnings)
 
 
 def test_a_stream_has_no_start():

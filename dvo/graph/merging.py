@@ -15,7 +15,7 @@ def append_graph(graph: KeyframeGraph, other: KeyframeGraph) -> tuple[int, int]:
 
     Args:
         graph: with an empty window and a recording that has been begun and has no frames; changed in place.
-        other: with an empty window and a single recording; not changed, but its arrays are shared.
+        other: with an empty window and a single recording; not changed.
 
     Returns:
         Numbers to add to the keyframes and to the segments of the other one.

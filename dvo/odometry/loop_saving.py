@@ -118,7 +118,8 @@ def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[in
     measured = source.similarities("loops/measurements", len(tables))
     loops = []
     for row, loop in zip(measured, tables, strict=True):
-        known = all(k in archive and archive[k].anchor is None for k in (loop.old, loop.new))
+        ends = (loop.old, loop.new)
+        known = all(k in archive and archive[k].anchor is None and closer.graph.segment_of(k) >= 0 for k in ends)
         source.require(known and loop.old < loop.new, "between keyframes that are not there", "loops: loops")
         times = archive[loop.old].timestamp, archive[loop.new].timestamp
         measurement = torch.from_numpy(row.copy())
@@ -127,6 +128,7 @@ def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[in
         )
     closer.corrections, closer.wait, closer.searches = table.corrections, table.wait, table.searches
     source.require(not (table.searching and table.correcting), "searching and correcting at once", "loops: searching")
+    source.require(table.found is None or table.searching > 0, "a result without a search", "loops: found")
     found = _with_edges(source, loops.pop(), closer, "search") if table.found is not None else None
     if table.pending is not None:
         closer.pending = _with_edges(source, loops.pop(), closer, "loops")

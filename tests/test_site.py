@@ -77,6 +77,7 @@ def test_site_builds_without_a_warning(tmp_path):
     assert page["method"].count("<svg") > 80 and "arithmatex" not in page["method"]
     assert all(f'id="dvo.{name}"' in page["api"] for name in dvo.__all__ if name != "__version__")
     assert ":class:" not in page["api"]
+    assert (tmp_path / "site" / "first_steps.ipynb").is_file() and 'href="first_steps.ipynb"' in page["quick_start"]
     assert "kitti00_120" in page["accuracy"] and "make_sequence" in page["quick_start"]
     for name, text in page.items():  # reading needs no network
         assert not re.search(r'<(?:script|link|img)[^>]*(?:src|href)="(?:https?:)?//', text), name

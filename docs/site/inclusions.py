@@ -1,6 +1,7 @@
 """Hook of the documentation site: a line that is only a link to a section of the README, or to Python becomes its text.
 
-On a code host the line is the link; files outside ``docs/`` are no pages of the site.
+On a code host the line is the link; files outside ``docs/`` are no pages of the site. Notebooks are files of the site,
+to be downloaded.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ import re
 from pathlib import Path
 from typing import Any
 
+from mkdocs.structure.files import File, Files
+
 ROOT = Path(__file__).resolve().parents[2]
 _SECTION = re.compile(r"^\[[^\]]*\]\(\.\./README\.md#([\w-]+)\)$", re.MULTILINE)
+_NOTEBOOK = re.compile(r"\]\(\.\./examples/(\w+\.ipynb)\)")
 _PYTHON = re.compile(r"^\[[^\]]*\]\(\.\./([\w/]+\.py)\)$", re.MULTILINE)
 
 
@@ -31,6 +35,21 @@ def section(anchor: str) -> str:
     return sections[anchor].replace("](docs/", "](").strip()
 
 
+def on_files(files: Files, config: Any) -> Files:
+    """Add the notebooks of ``examples/``.
+
+    Args:
+        files: of the site.
+        config: of the site.
+
+    Returns:
+        The same files, with the notebooks.
+    """
+    for notebook in sorted((ROOT / "examples").glob("*.ipynb")):
+        files.append(File.generated(config, notebook.name, abs_src_path=str(notebook)))
+    return files
+
+
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Put the texts into a page.
 
@@ -40,5 +59,6 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     Returns:
         Markdown with the texts.
     """
+    markdown = _NOTEBOOK.sub(r"](\1)", markdown)
     markdown = _SECTION.sub(lambda link: section(link[1]), markdown)
     return _PYTHON.sub(lambda link: f"```python\n{(ROOT / link[1]).read_text(encoding='utf-8')}```", markdown)

@@ -213,6 +213,7 @@ def dataset(shell: Terminal) -> Terminal:
     return shell
 
 
+@pytest.mark.slow
 def test_researcher(dataset):
     """Her sequence is tracked and compared with the truth, evaluated beside baselines, and trained on."""
     shell, place = dataset, "campus/walk_01"

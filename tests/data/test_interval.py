@@ -127,7 +127,7 @@ def test_a_stream_ends(make, end):
 
 def test_frames_that_wait_at_the_end_of_a_stream_were_not_dropped(make):
     source = open_stream(pipe(make), calib=CALIB, fps=10, end="4f")
-    live = source._recording.live
+    live = source.recording.live
     for frame in source:
         while frame.index == 3 and len(live._waiting) < 2:
             time.sleep(0.001)

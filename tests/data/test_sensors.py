@@ -93,8 +93,8 @@ def test_a_corrupt_depth_image_keeps_its_frame_and_is_counted(make):
 
 def test_depth_of_another_size_names_the_image(make):
     folder = tum(make)
-    depth_image(make, f"seq/depth/{sorted((folder / 'depth').iterdir())[0].name}", 1, width=32, height=24)
-    with pytest.raises(DvoError, match="depth image is 32x24, the image 64x48"):
+    depth_image(make, f"seq/depth/{sorted((folder / 'depth').iterdir())[0].name}", 1, width=32, height=20)
+    with pytest.raises(DvoError, match="depth image is 32x20, the image 64x48"):
         _ = next(iter(open_source(folder))).depth
 
 

@@ -85,7 +85,10 @@ def saved(film, tmp_path_factory):
     return found
 
 
-@pytest.mark.parametrize("state", STATES)
+QUICK = ("found", "correcting", "closed")
+
+
+@pytest.mark.parametrize("state", [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in STATES])
 def test_a_sequence_goes_on_from_a_file_with_the_same_bytes(film, closed, saved, state, tmp_path):
     file, count = saved[state]
     loaded = dvo.load_map(file)

@@ -13,16 +13,17 @@ import numpy as np
 
 from dvo.data.calibration import Calibration, read_calibration
 from dvo.data.depth import read_depth
-from dvo.data.files import listed_file, parse_number, read_lines
+from dvo.data.files import listed_files
 from dvo.data.images import list_images
 from dvo.data.recording import ImageRecording, Log, RawFrame
 from dvo.data.sensors import Finder, NearestInTime, SameNumbers
 from dvo.data.source import Source
 from dvo.data.stamps import times_from_names
+from dvo.data.tum import DEPTH_SCALE
 from dvo.errors import DvoError
 
-MILLIMETRES, TUM = 1000.0, 5000.0
-"""Units of a metre in 16-bit depth images of a folder, and of a list in the layout of TUM RGB-D."""
+MILLIMETRES = 1000.0
+"""Units of a metre in 16-bit depth images of a folder, unless it is a list in the layout of TUM RGB-D."""
 _ARRAYS = (".npy", ".npz")
 _FIELD = "--depth"
 
@@ -74,7 +75,7 @@ def with_depth(
     if depth is not None:
         path = _existing(depth)
         finder = _listed_finder(path, recording) if path.is_file() else _finder(path, recording)
-        sensors = replace(own, depth=finder, depth_scale=scale or (TUM if path.is_file() else MILLIMETRES))
+        sensors = replace(own, depth=finder, depth_scale=scale or (DEPTH_SCALE if path.is_file() else MILLIMETRES))
     changed = copy.copy(recording)
     changed.sensors = sensors
     found.recording = changed
@@ -164,20 +165,9 @@ def _finder(folder: Path, recording: ImageRecording) -> Finder:
 
 def _listed_finder(listing: Path, recording: ImageRecording) -> Finder:
     """Nearest in time of the files of a list of ``time file`` rows."""
-    rows = []
-    for number, line in read_lines(listing, "give a list of depth images"):
-        fields = line.split("#")[0].split(maxsplit=1)
-        if not fields:
-            continue
-        try:
-            time, name = parse_number(fields[0]), fields[1].strip()
-        except (ValueError, IndexError):
-            raise DvoError(
-                "not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row"
-            ) from None
-        rows.append((time, listed_file(listing, listing.parent, name, number)))
-    nearest = _nearest([file for _, file in rows], np.array([time for time, _ in rows]), recording)
-    if not rows or not any(nearest(image) for image in recording.images):
+    files, stamps = listed_files(listing, "depth images")
+    nearest = _nearest(files, stamps, recording)
+    if not files or not any(nearest(image) for image in recording.images):
         remedy = "give the times of the images on the clock of the depth images (--times)"
         raise DvoError("no depth image is at the time of an image", file=listing, field=_FIELD, remedy=remedy)
     return nearest

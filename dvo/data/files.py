@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+import numpy as np
+
 from dvo.errors import DvoError
 
 MAX_TABLE = 2**30
@@ -154,6 +156,35 @@ def listed_file(listing: Path, folder: Path, name: str, line: int) -> Path:
             remedy="list names relative to the folder, without '..'",
         )
     return folder / name
+
+
+def listed_files(listing: Path, what: str = "images") -> tuple[list[Path], np.ndarray]:
+    """Files and times of a list in the layout of TUM RGB-D, such as ``rgb.txt``: ``timestamp filename`` a row.
+
+    Args:
+        listing: text file; what follows a ``#`` is left out.
+        what: it lists, for messages.
+
+    Returns:
+        Files, which need not exist, and their times ``(N,)`` in seconds, sorted by time.
+
+    Raises:
+        DvoError: the file cannot be read, or a row that is none, with the number of its line.
+    """
+    rows: list[tuple[float, Path]] = []
+    for number, line in read_lines(listing, f"give a list of {what}"):
+        fields = line.split("#")[0].split(maxsplit=1)
+        if not fields:
+            continue
+        try:
+            time, name = parse_number(fields[0]), fields[1].strip()
+        except (ValueError, IndexError):
+            raise DvoError(
+                "not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row"
+            ) from None
+        rows.append((time, listed_file(listing, listing.parent, name, number)))
+    rows.sort(key=lambda row: row[0])
+    return [path for _, path in rows], np.array([time for time, _ in rows])
 
 
 def parse_number(text: str) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.calibration import Calibration
-from dvo.data.files import listed_file, parse_number, read_lines
+from dvo.data.files import listed_files
 from dvo.data.folder import camera_images
 from dvo.data.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
@@ -17,7 +17,6 @@ from dvo.data.sensors import NearestInTime, Sensors
 from dvo.data.sequence import find_calibration
 from dvo.data.stamps import choose_times, read_times, times_from_names
 from dvo.data.trajectory import Trajectory, interpolate, read_tum
-from dvo.errors import DvoError
 
 # The colour cameras as published with the benchmark (file_formats page); freiburg3 is delivered undistorted.
 DEPTH_SCALE = 5000.0  # units of a metre
@@ -45,24 +44,6 @@ def default_calibration(name: str) -> Calibration | None:
     """
     found = re.search(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)", name.lower())
     return CALIBRATIONS[found.group(1)] if found else None
-
-
-def _listed_images(listing: Path) -> tuple[list[Path], np.ndarray]:
-    """Files and times of ``rgb.txt`` (``timestamp filename`` a row), sorted by time."""
-    rows: list[tuple[float, Path]] = []
-    for number, line in read_lines(listing, "give a list of images"):
-        fields = line.split("#")[0].split(maxsplit=1)
-        if not fields:
-            continue
-        try:
-            time, name = parse_number(fields[0]), fields[1].strip()
-        except (ValueError, IndexError):
-            raise DvoError(
-                "not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row"
-            ) from None
-        rows.append((time, listed_file(listing, listing.parent, name, number)))
-    rows.sort(key=lambda row: row[0])
-    return [path for _, path in rows], np.array([time for time, _ in rows])
 
 
 def _groundtruth(path: Path, timestamps: np.ndarray, warnings: list[str]) -> Trajectory | None:
@@ -93,7 +74,7 @@ def open_tum(path: Path, request: Request) -> Recording:
     warnings: list[str] = []
     listing = path / "rgb.txt"
     if listing.is_file():
-        images, times = _listed_images(listing)
+        images, times = listed_files(listing)
         stamps: np.ndarray | None = times
         if request.times is not None:
             times = read_times(request.times, len(images))
@@ -122,7 +103,7 @@ def _sensors(path: Path, images: list[Path], stamps: np.ndarray | None, calibrat
 def _depth_images(path: Path) -> tuple[list[Path], np.ndarray]:
     """Files and times of ``depth.txt``, else of ``depth/`` if its names are stamps."""
     if (path / "depth.txt").is_file():
-        return _listed_images(path / "depth.txt")
+        return listed_files(path / "depth.txt", "depth images")
     images = list_images(path / "depth")
     stamps = times_from_names(images)
     return (images, stamps) if stamps is not None else ([], np.zeros(0))

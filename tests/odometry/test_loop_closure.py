@@ -10,7 +10,7 @@ import torch
 import dvo
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from dvo.geometry import se3
+from dvo.geometry import se3, so3
 from dvo.metrics import evaluate
 from dvo.odometry.loop_closure import Correcting, LoopCloser, Searching
 from dvo.odometry.loop_options import LoopOptions
@@ -54,10 +54,19 @@ def test_loops_are_found_where_the_way_is_repeated(film, closed):
     turn, rows = (THERE - 1) / 15.0, film[1]
     assert sum(loop["to"] < turn < loop["from"] for loop in loops) >= 2
     for loop in loops:
-        new, old = (rows.poses_wc[int(np.abs(rows.timestamps - loop[k]).argmin())] for k in ("from", "to"))
-        near = np.linalg.norm(new[:3] - old[:3]) < 1.5 and abs(new[3:] @ old[3:]) > np.cos(np.deg2rad(5))
-        assert near and loop["from"] - loop["to"] >= OPTIONS.seconds
+        assert loop["from"] - loop["to"] >= OPTIONS.seconds
         assert loop["inliers"] >= OPTIONS.inliers and loop["edges"] > 0 and not loop["joins_segments"]
+    scale = evaluate(result.trajectory, rows).scale
+    for loop in odometry.loops.loops:  # what was measured is the true motion between the visits
+        old, new = (
+            torch.from_numpy(rows.poses_wc[int(np.abs(rows.timestamps - time).argmin())])
+            for time in (loop.old_time, loop.new_time)
+        )
+        true = se3.relative(se3.inverse(old), se3.inverse(new))
+        found = loop.measurement[:3] / loop.measurement[7] * scale
+        assert (found - true[:3]).norm() < 0.15 and so3.angle(loop.measurement[3:7]) == pytest.approx(
+            float(so3.angle(true[3:])), abs=0.02
+        )
     assert evaluate(result.trajectory, film[1]).ate_percent < 0.5
 
 

@@ -17,7 +17,7 @@ from dvo.geometry import so3
 from dvo.nets.flow_pose_net import FlowPoseNet
 from dvo.nets.flow_pyramid import STRIDE, Flows, MatchingNetwork
 from dvo.nets.pwc_net import PWCNet
-from dvo.nets.tartanvo import PRESETS, PoseNetwork, TartanVOConfig
+from dvo.nets.tartanvo import PRESETS, PoseNetwork, TartanVOConfig, derotate
 
 __all__ = ["TartanVO", "TwoFrameMotion"]
 
@@ -31,11 +31,13 @@ class TwoFrameMotion:
             direction is trained.
         rotation: ``(B, 3)`` rotation vector of camera ``b`` in the coordinates of camera ``a``, radians.
         flows: of all levels, feature pixels.
+        passes: translation and rotation after each pass of the pose network, the last one included.
     """
 
     translation: Tensor
     rotation: Tensor
     flows: Flows
+    passes: tuple[tuple[Tensor, Tensor], ...] = ()
 
     def poses_ab(self, lengths: Tensor | float = 1.0) -> Float[Tensor, "B 7"]:
         """Motions as poses ``T_ab``, camera ``b`` in the coordinates of camera ``a``: ``T_wc[b] = T_wc[a] T_ab``.
@@ -140,7 +142,33 @@ class TartanVO(nn.Module):
         Returns:
             Translation, up to scale, and rotation vector of ``T_ab``, radians.
         """
-        return self.pose(flow, intrinsics)
+        return self.motions(flow, intrinsics)[-1]
+
+    def motions(
+        self, flow: Float[Tensor, "B 2 h w"], intrinsics: Float[Tensor, "B 4"]
+    ) -> tuple[tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]], ...]:
+        """Motion of the camera from a flow after each pass of the pose network (:attr:`TartanVOConfig.passes`).
+
+        A pass reads what the rotation of the passes before it leaves of the flow (:func:`dvo.nets.tartanvo.derotate`),
+        so that it sees a smaller motion and corrects the rotation; the gradient of each stays in its pass.
+
+        Args:
+            flow: at a quarter of the resolution, feature pixels.
+            intrinsics: ``fx fy cx cy`` in image pixels.
+
+        Returns:
+            Translation, up to scale, and rotation vector of ``T_ab`` after each pass.
+        """
+        translation, rotation = self.pose(flow, intrinsics)
+        found = [(translation, rotation)]
+        small = intrinsics.float() / self.STRIDE
+        for _ in range(self.config.passes - 1):
+            turned = so3.exp(rotation.detach())
+            translation, change = self.pose(derotate(flow.float(), turned, small), intrinsics)
+            # The point p of camera b is R_ab p + t in camera a; with p' = R p turned back, it is (R_ab R^-1) p' + t.
+            rotation = so3.log(so3.multiply(so3.exp(change), turned))
+            found.append((translation, rotation))
+        return tuple(found)
 
     def between(self, first: list[Tensor], second: list[Tensor], intrinsics: Float[Tensor, "B 4"]) -> TwoFrameMotion:
         """Flow and motion between images whose features are known.
@@ -153,8 +181,8 @@ class TartanVO(nn.Module):
             Flow and motion.
         """
         flows = self.matching.match(first, second)
-        translation, rotation = self.pose(flows.flow, intrinsics)
-        return TwoFrameMotion(translation, rotation, flows)
+        found = self.motions(flows.flow, intrinsics)
+        return TwoFrameMotion(*found[-1], flows, found)
 
     def forward(
         self, a: Float[Tensor, "B 3 H W"], b: Float[Tensor, "B 3 H W"], intrinsics: Float[Tensor, "B 4"]

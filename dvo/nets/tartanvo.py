@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from dvo.errors import DvoError
+from dvo.geometry import so3
 from dvo.nets.encoder import ResidualBlock
 from dvo.nets.flow_pyramid import STRIDE, initialise
 from dvo.nets.sizes import Sizes, check_sizes, named_preset
@@ -27,9 +28,16 @@ Design = Literal["compact", "published"]
 """Layers: those of :mod:`dvo.nets.flow_pyramid` and :class:`PoseNetwork`, or those of the published code, PWC-Net
 (:mod:`dvo.nets.pwc_net`) and residual layers of one size (:mod:`dvo.nets.flow_pose_net`)."""
 
-RANGES = {"stem_channels": (1, 512), "radius": (1, 8), "decoder_channels": (1, 512), "head_channels": (1, 2048)}
+RANGES = {
+    "stem_channels": (1, 512),
+    "radius": (1, 8),
+    "decoder_channels": (1, 512),
+    "head_channels": (1, 2048),
+    "passes": (1, 8),
+}
 LEVELS, CHANNELS, GRID = 6, 1024, 32
 _PIXELS, _RAYS = 0.1, 10.0  # factors that bring usual flows near one: some ten feature pixels, a tenth of a radian
+_LEAST_AHEAD = 0.1  # cosine of the largest angle from the axis at which a turned ray is projected
 _ROTATION = 0.05  # radians to a unit of the output, as TartanVO's scale of its output
 
 
@@ -46,6 +54,8 @@ class TartanVOConfig(Sizes):
         grid: rows and columns to which the last stage is averaged, whatever the size of the image.
         head_channels: hidden channels of the two heads, translation and rotation.
         flow_units: see :data:`FlowUnits`.
+        passes: of the pose network over the flow, each but the first over what the rotation found so far leaves of it
+            (:func:`derotate`); TartanVO has one.
         design: see :data:`Design`; the sizes of ``published`` are fixed: the settings above keep their defaults.
 
     Raises:
@@ -60,6 +70,7 @@ class TartanVOConfig(Sizes):
     grid: tuple[int, ...] = (3, 4)
     head_channels: int = 64
     flow_units: FlowUnits = "pixels"
+    passes: int = 1
     design: Design = "compact"
 
     def __post_init__(self) -> None:
@@ -80,7 +91,7 @@ class TartanVOConfig(Sizes):
 
 PRESETS: dict[str, TartanVOConfig] = {
     # Sized to track 320x240 video on two CPU cores.
-    "small": TartanVOConfig(),
+    "small": TartanVOConfig(flow_units="rays", passes=2),
     # For tests and controlled studies.
     "tiny": TartanVOConfig(
         stem_channels=8,
@@ -115,6 +126,34 @@ def intrinsics_layer(intrinsics: Float[Tensor, "B 4"], height: int, width: int) 
     x = (torch.arange(width, device=intrinsics.device, dtype=intrinsics.dtype) - cx) / fx
     y = (torch.arange(height, device=intrinsics.device, dtype=intrinsics.dtype)[:, None] - cy) / fy
     return torch.stack([x.expand(-1, height, -1), y.expand(-1, -1, width)], 1)
+
+
+def derotate(
+    flow: Float[Tensor, "B 2 h w"], rotation: Float[Tensor, "B 4"], intrinsics: Float[Tensor, "B 4"]
+) -> Float[Tensor, "B 2 h w"]:
+    """Flow that is left when the second camera is turned back by a rotation about its centre.
+
+    The rays of the second image are turned into the orientation of the first one and projected again; no depth is
+    needed. For the true rotation what is left is the flow of the translation alone.
+
+    Args:
+        flow: from the first image to the second, pixels of the map.
+        rotation: ``qx qy qz qw`` of the second camera in the coordinates of the first one.
+        intrinsics: ``fx fy cx cy`` in pixels of the map.
+
+    Returns:
+        Flow to the turned image, differentiable by flow and rotation. Rays that the rotation turns by more than about
+        84 degrees from the axis of the camera are projected as if they were at that angle.
+    """
+    h, w = flow.shape[-2:]
+    fx, fy, cx, cy = (value[:, None, None] for value in intrinsics.unbind(-1))
+    x = torch.arange(w, device=flow.device, dtype=flow.dtype)
+    y = torch.arange(h, device=flow.device, dtype=flow.dtype)[:, None]
+    right, down = (x + flow[:, 0] - cx) / fx, (y + flow[:, 1] - cy) / fy
+    rays = torch.stack([right, down, torch.ones_like(right)], -1)
+    rays = so3.rotate(rotation[:, None, None], rays / rays.norm(dim=-1, keepdim=True))
+    ahead = rays[..., 2].clamp(min=_LEAST_AHEAD)
+    return torch.stack([rays[..., 0] / ahead * fx + cx - x, rays[..., 1] / ahead * fy + cy - y], 1)
 
 
 class PoseNetwork(nn.Module):

@@ -1,6 +1,8 @@
 """The two-frame network: shapes, conventions, weights files."""
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -8,10 +10,11 @@ import torch
 import dvo
 from dvo.errors import DvoError
 from dvo.geometry import se3, so3
+from dvo.losses.two_frame import true_flow
 from dvo.models.registry import build_network, network_class
 from dvo.models.tartanvo import TartanVO, TwoFrameMotion
 from dvo.models.weights import save_weights
-from dvo.nets.tartanvo import preset
+from dvo.nets.tartanvo import PRESETS, preset
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +97,32 @@ def test_weights_files_name_the_network(model, tmp_path):
         assert torch.equal(loaded.flow(a, b), model.flow(a, b))
     assert network_class("tartanvo") is TartanVO
     assert isinstance(build_network("tartanvo", preset("tiny")), TartanVO)
+
+
+def test_each_pass_corrects_the_rotation_of_the_one_before():
+    """With a pose network that finds half of a rotation each time, the error halves from pass to pass."""
+    model = TartanVO(replace(PRESETS["tiny"], passes=4))
+    intrinsics = torch.tensor([[200.0, 200.0, 79.5, 59.5]])
+    true = torch.tensor([[0.02, -0.05, 0.03]])
+    depth = torch.ones(1, 30, 40)
+    poses_ab = torch.cat([torch.zeros(1, 3), so3.exp(true)], -1)
+    flow, _ = true_flow(depth, poses_ab, intrinsics / 4)
+
+    class Half(torch.nn.Module):
+        """Half of the small rotation that a flow of the far scene shows, by least squares."""
+
+        def forward(self, flow, intrinsics):
+            columns = []
+            for axis in torch.eye(3):
+                turn = torch.cat([torch.zeros(3), so3.exp(1e-3 * axis)])[None]
+                columns.append(true_flow(depth, turn, intrinsics / 4)[0].flatten() / 1e-3)
+            found = torch.linalg.lstsq(torch.stack(columns, 1), flow.flatten()[:, None]).solution
+            return torch.ones(1, 3), 0.5 * found.T
+
+    model.pose = Half()
+    passes = model.motions(flow, intrinsics)
+    errors = [float((rotation - true).norm()) for _, rotation in passes]
+    assert len(passes) == 4 and errors[0] == pytest.approx(float(true.norm()) / 2, rel=0.1)
+    for before, after in pairwise(errors):
+        assert after == pytest.approx(before / 2, rel=0.1)
+    assert torch.equal(model.motion(flow, intrinsics)[1], passes[-1][1])

@@ -2,10 +2,14 @@
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dvo.errors import DvoError
+from dvo.geometry import so3
 from dvo.geometry.camera import Camera
-from dvo.nets.tartanvo import PRESETS, PoseNetwork, TartanVOConfig, intrinsics_layer, preset
+from dvo.losses.two_frame import true_flow
+from dvo.nets.tartanvo import PRESETS, PoseNetwork, TartanVOConfig, derotate, intrinsics_layer, preset
 from train.data.augment import crop_and_resize
 
 
@@ -18,6 +22,53 @@ def test_a_pixel_of_the_intrinsics_layer_is_its_ray():
 def test_gradients_reach_the_intrinsics():
     intrinsics = torch.tensor([[3.0, 4.0, 1.4, 1.1]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda value: intrinsics_layer(value, 3, 4), (intrinsics,))
+
+
+CAMERA = torch.tensor([[40.0, 42.0, 9.5, 7.0]], dtype=torch.float64)
+
+
+@given(st.integers(0, 2**31))
+def test_what_a_rotation_leaves_of_a_flow_is_that_of_the_translation(seed):
+    """With R_ab known, the flow that is left is that of the same translation and no rotation."""
+    source = torch.Generator().manual_seed(seed)
+    depth = 1 + torch.rand(1, 12, 16, generator=source, dtype=torch.float64)
+    motion = 0.2 * torch.randn(1, 6, generator=source, dtype=torch.float64).clamp(-1, 1)
+    rotation = so3.exp(motion[:, 3:])
+    both, ahead = true_flow(depth, torch.cat([motion[:, :3], rotation], -1), CAMERA)
+    alone, _ = true_flow(depth, torch.cat([motion[:, :3], so3.exp(0 * motion[:, 3:])], -1), CAMERA)
+    left = derotate(both, rotation, CAMERA)
+    where = ahead[:, None].expand_as(left)
+    torch.testing.assert_close(left[where], alone[where])
+
+
+def test_derotation_is_the_homography_of_the_rotation():
+    """K R K^-1, applied to each end of the flow."""
+    source = torch.Generator().manual_seed(0)
+    flow = torch.randn(1, 2, 5, 6, generator=source, dtype=torch.float64)
+    rotation = so3.exp(torch.tensor([[0.1, -0.2, 0.05]], dtype=torch.float64))
+    fx, fy, cx, cy = CAMERA[0].tolist()
+    k = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    h = k @ so3.matrix(rotation)[0] @ k.inverse()
+    left = derotate(flow, rotation, CAMERA)
+    for v in range(5):
+        for u in range(6):
+            x, y = flow[0, :, v, u].tolist()
+            end = h @ torch.tensor([u + x, v + y, 1.0], dtype=torch.float64)
+            place = torch.tensor([u, v], dtype=torch.float64)
+            torch.testing.assert_close(left[0, :, v, u], end[:2] / end[2] - place)
+
+
+def test_gradients_of_derotation():
+    source = torch.Generator().manual_seed(0)
+    flow = torch.randn(1, 2, 3, 4, generator=source, dtype=torch.float64).requires_grad_()
+    turn = torch.tensor([[0.1, -0.2, 0.05]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda f, r: derotate(f, so3.exp(r), CAMERA), (flow, turn))
+
+
+def test_rays_turned_backwards_stay_finite():
+    half_a_turn = so3.exp(torch.tensor([[0.0, 3.1, 0.0]], dtype=torch.float64))
+    left = derotate(torch.zeros(1, 2, 12, 16, dtype=torch.float64), half_a_turn, CAMERA)
+    assert left.abs().max() < 40 / 0.1 + 16
 
 
 def test_crop_and_resize_carries_the_rays_along():
@@ -74,6 +125,7 @@ def test_the_same_rays_look_the_same_in_units_of_rays():
     [
         {"radius": 0}, {"radius": 1.5}, {"feature_channels": ()}, {"feature_channels": (8, -1)}, {"grid": (3,)},
         {"pose_channels": "wide"}, {"flow_units": "metres"}, {"head_channels": True}, {"grid": (3, 4, 5)},
+        {"passes": 0}, {"passes": 9},
     ],
 )  # fmt: skip
 def test_sizes_out_of_range_are_refused(change):

@@ -11,12 +11,14 @@ from dvo.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.models.tartanvo import TwoFrameMotion
 from dvo.nets.flow_pyramid import Flows
+from dvo.nets.tartanvo import intrinsics_layer
 from dvo.synth.clip import flow_field, make_clip
 from train.data.augment import Augmentation, crop_and_resize
 from train.engine.build import make_program
 from train.engine.checkpoint import read_state
 from train.tasks.tartanvo.objective import LossConfig, objective, truth_of
 from train.tasks.tartanvo.task import TartanVOTask
+from train.tasks.tartanvo.virtual_motions import VirtualMotions, virtual_pairs
 from train.tasks.task import StepContext
 
 
@@ -180,3 +182,59 @@ def test_weights_of_the_loss_out_of_range_are_named(name):
     for value in (-1.0, float("nan"), "1"):
         with pytest.raises(DvoError, match=name):
             LossConfig(**{name: value})
+
+
+def virtual(batch, **changes):
+    settings = VirtualMotions(**({"pairs": 40, "noise": (1e-9, 1e-9)} | changes))
+    depth = batch["depth"].flatten(0, 1)[:, ::4, ::4]
+    return virtual_pairs(depth, 4, settings, 3, 7, tuple(batch["depth"].shape[-2:]))
+
+
+def test_the_flow_of_virtual_pairs_is_that_of_their_motions(runs):
+    """Ends of the flow lie on the epipolar lines of the motion (q^T E p = 0), before errors are added."""
+    batch = runs.batch(0, 1, sizes=[(48, 64)])
+    pairs = virtual(batch)
+    assert pairs.valid.float().mean() > 0.5
+    h, w = pairs.flow.shape[-2:]
+    rays = intrinsics_layer(pairs.intrinsics / 4, h, w)
+    p = torch.cat([rays, torch.ones_like(rays[:, :1])], 1).permute(0, 2, 3, 1)
+    q = torch.cat([rays + pairs.flow / (pairs.intrinsics[:, :2, None, None] / 4), torch.ones_like(rays[:, :1])], 1)
+    turned = so3.rotate(so3.exp(pairs.rotation)[:, None, None], q.permute(0, 2, 3, 1))
+    direction = torch.nn.functional.normalize(pairs.translation, dim=-1)[:, None, None]
+    triple = (torch.linalg.cross(p, turned) * direction).sum(-1).abs()
+    inside = pairs.flow.abs().amax(1) < w  # longer ones are cut off
+    assert triple[pairs.valid][inside[pairs.valid]].max() < 1e-3
+
+
+def test_virtual_pairs_are_drawn_from_the_seed_and_the_step(runs):
+    batch = runs.batch(0, 1, sizes=[(48, 64)])
+    again, other = virtual(batch), virtual(batch, rotation=(0.2, 0.2))
+    assert torch.equal(virtual(batch).flow, again.flow) and not torch.equal(other.rotation, again.rotation)
+    noisy = virtual(batch, noise=(0.5, 0.5))
+    error = (noisy.flow - again.flow)[again.valid]
+    # Linear interpolation along both axes leaves (2/3)^2 of the variance of the errors that neighbours share.
+    assert error.std() == pytest.approx(0.5 * (0.5 + 0.5 * 4 / 9) ** 0.5, rel=0.1)
+    torch.testing.assert_close(other.rotation.norm(dim=-1), torch.full((40,), 0.2))
+
+
+def test_virtual_pairs_train_the_pose_network_alone(runs):
+    part = program(virtual=VirtualMotions(pairs=6), loss=LossConfig(flow=0.0, translation=0.0, rotation=0.0))
+    plain = program(loss=LossConfig(flow=0.0, translation=0.0, rotation=0.0))
+    batch = runs.batch(0, 1, sizes=[(48, 64)])
+    for found in (part, plain):
+        found.task.loss = LossConfig(flow=0.0)
+    net = part.net
+    extra, shown = part.task._virtual_loss(net, batch, 0)
+    extra.backward()
+    assert all(p.grad is None for p in net.matching.parameters())
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.pose.parameters())
+    whole = part.task.compute_loss(StepContext(net, 0, {}), batch)
+    without = plain.task.compute_loss(StepContext(net, 0, {}), batch)
+    torch.testing.assert_close(whole.loss, without.loss + extra)
+    assert shown["virtual_rotation_deg"] > 0 and "virtual_rotation_ratio" in whole.measures
+
+
+@pytest.mark.parametrize("change", [{"pairs": -1}, {"rotation": (0.2, 0.1)}, {"noise": (0.0, 1.0)}, {"focal": (1, 99)}])
+def test_virtual_motions_out_of_range_are_named(change):
+    with pytest.raises(DvoError, match=next(iter(change))):
+        VirtualMotions(**change)

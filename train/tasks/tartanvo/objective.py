@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,10 @@ from dvo.losses.two_frame import (
 )
 from dvo.models.tartanvo import TwoFrameMotion
 from dvo.settings import check_settings
+from train.tasks.tartanvo.virtual_motions import VirtualPairs
+
+Passes = Sequence[tuple[Tensor, Tensor]]
+"""Translation and rotation vector after each pass of the pose network, ``(P, 3)``."""
 
 _RANGES = {name: (0, math.inf) for name in ("flow", "translation", "rotation", "still", "margin")}
 _RANGES["level_decay"] = (0, 1)
@@ -110,15 +115,88 @@ def objective(motion: TwoFrameMotion, truth: PairTruth, config: LossConfig) -> t
     levels = [*motion.flows.levels[:-1], motion.flows.coarse, motion.flows.levels[-1]]
     errors = flow_errors(levels, truth.flow, truth.valid)
     decay = [config.level_decay**k for k in reversed(range(len(levels)))]
-    terms = {
-        "flow": config.flow * (errors * errors.new_tensor(decay)).sum(),
-        "translation": config.translation
-        * translation_loss(motion.translation, truth.translation, config.form, config.still).mean(),
-        "rotation": config.rotation * rotation_loss(motion.rotation, truth.rotation).mean(),
-    }
+    passes = motion.passes or ((motion.translation, motion.rotation),)
+    terms = {"flow": config.flow * (errors * errors.new_tensor(decay)).sum()}
+    terms |= motion_terms(passes, truth.translation, truth.rotation, config)
     loss = torch.stack(list(terms.values())).sum()
     found = measures(motion, truth, config.still) | {f"loss_{name}": value.detach() for name, value in terms.items()}
     return loss, found
+
+
+def motion_terms(
+    passes: Passes, translation: Tensor, rotation: Tensor, config: LossConfig, valid: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Weighted terms of the motion, each a mean over the passes of the pose network and over the pairs.
+
+    Args:
+        passes: translation and rotation vector after each pass, ``(P, 3)``.
+        translation, rotation: the truth, ``(P, 3)``.
+        config: weights of the terms.
+        valid: ``(P,)`` bool, pairs that count; None: all.
+
+    Returns:
+        ``translation`` and ``rotation``, scalars with a graph.
+    """
+    weight = torch.ones_like(translation[:, 0]) if valid is None else valid.to(translation)
+    weight = weight / weight.sum().clamp(min=1) / len(passes)
+    found = {"translation": weight.new_zeros(()), "rotation": weight.new_zeros(())}
+    for t, r in passes:
+        found["translation"] = (
+            found["translation"] + (weight * translation_loss(t, translation, config.form, config.still)).sum()
+        )
+        found["rotation"] = found["rotation"] + (weight * rotation_loss(r, rotation)).sum()
+    return {"translation": config.translation * found["translation"], "rotation": config.rotation * found["rotation"]}
+
+
+def motion_loss(
+    passes: Passes, translation: Tensor, rotation: Tensor, config: LossConfig, valid: Tensor | None = None
+) -> Tensor:
+    """Sum of :func:`motion_terms`, with the same arguments."""
+    return torch.stack(list(motion_terms(passes, translation, rotation, config, valid).values())).sum()
+
+
+@torch.no_grad()
+def virtual_measures(motion: tuple[Tensor, Tensor], pairs: VirtualPairs, still: float) -> dict[str, Tensor]:
+    """Errors of virtual pairs, for the log.
+
+    Args:
+        motion: translation and rotation vector of the last pass.
+        pairs: with their truth.
+        still: see :class:`LossConfig`.
+
+    Returns:
+        Means over the valid pairs: ``virtual_rotation_ratio`` (error over true rotation), ``virtual_rotation_deg`` and
+        ``virtual_direction_deg``.
+    """
+    direction, ratio, rotation = motion_errors(motion, pairs.translation, pairs.rotation, still, pairs.valid)
+    return {
+        "virtual_direction_deg": direction, "virtual_rotation_ratio": ratio, "virtual_rotation_deg": rotation,
+    }  # fmt: skip
+
+
+def motion_errors(
+    motion: tuple[Tensor, Tensor], translation: Tensor, rotation: Tensor, still: float, valid: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean errors of motions.
+
+    Args:
+        motion: translations and rotation vectors, ``(P, 3)``.
+        translation, rotation: the truth.
+        still: see :class:`LossConfig`.
+        valid: ``(P,)`` bool, pairs that count.
+
+    Returns:
+        Angle between the translations of pairs that move, degrees; rotation error over true rotation; rotation error,
+        degrees.
+    """
+    moving = (translation.norm(dim=-1) > still) & valid
+    cosine = torch.cosine_similarity(motion[0], translation, dim=-1).clamp(-1, 1)
+    turn = so3.multiply(so3.conjugate(so3.exp(rotation)), so3.exp(motion[1]))
+    count, degrees = valid.sum().clamp(min=1), 180 / math.pi
+    error = torch.where(valid, so3.angle(turn), 0.0).sum() / count
+    true = torch.where(valid, rotation.norm(dim=-1), 0.0).sum() / count
+    direction = torch.where(moving, cosine.acos(), 0.0).sum() / moving.sum().clamp(min=1)
+    return direction * degrees, error / true.clamp(min=1e-9), error * degrees
 
 
 @torch.no_grad()
@@ -135,18 +213,16 @@ def measures(motion: TwoFrameMotion, truth: PairTruth, still: float) -> dict[str
         that move), ``rotation_deg``, ``rotation_ratio`` (error over true motion), and the shares of flow ``px<1`` and
         ``px<4``.
     """
-    moving = truth.translation.norm(dim=-1) > still
-    cosine = torch.cosine_similarity(motion.translation, truth.translation, dim=-1).clamp(-1, 1)
-    turn = so3.multiply(so3.conjugate(so3.exp(truth.rotation)), so3.exp(motion.rotation))
-    error = so3.angle(turn)
+    every = torch.ones_like(truth.translation[:, 0], dtype=torch.bool)
+    found = motion.translation, motion.rotation
+    direction, ratio, rotation = motion_errors(found, truth.translation, truth.rotation, still, every)
     distance = (motion.flows.flow - truth.flow).norm(dim=1)[truth.valid]
     count = max(1, distance.numel())
-    degrees = 180 / math.pi
     return {
         "flow": distance.sum() / count,
-        "direction_deg": torch.where(moving, cosine.acos(), 0.0).sum() / moving.sum().clamp(min=1) * degrees,
-        "rotation_deg": error.mean() * degrees,
-        "rotation_ratio": error.mean() / truth.rotation.norm(dim=-1).mean().clamp(min=1e-9),
+        "direction_deg": direction,
+        "rotation_deg": rotation,
+        "rotation_ratio": ratio,
         "px<1": (distance < 1).sum() / count,
         "px<4": (distance < 4).sum() / count,
     }

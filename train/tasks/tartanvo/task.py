@@ -13,7 +13,16 @@ from dvo.nets.tartanvo import preset
 from dvo.settings import check_seed, shown
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
-from train.tasks.tartanvo.objective import LossConfig, PairTruth, measures, objective, truth_of
+from train.tasks.tartanvo.objective import (
+    LossConfig,
+    PairTruth,
+    measures,
+    motion_loss,
+    objective,
+    truth_of,
+    virtual_measures,
+)
+from train.tasks.tartanvo.virtual_motions import VirtualMotions, virtual_pairs
 from train.tasks.task import Batch, StepContext, StepLoss, Task
 
 
@@ -28,6 +37,7 @@ class TartanVOTask(Task):
         seed: of the augmentation; step ``n`` draws the same whenever it is run.
         loss: weights of the terms, and the form of the translation loss.
         augmentation: random changes of the clips, None for none.
+        virtual: further pairs for the pose network, whose flow follows from the depth maps of the batch; None: none.
         true_flow_until: step up to which the pose network reads the true flow where it is known, as in the first part
             of TartanVO's training; from then on it reads the estimate, and its loss reaches the matching network.
 
@@ -44,6 +54,7 @@ class TartanVOTask(Task):
         loss: LossConfig | None = None,
         augmentation: Augmentation | None = None,
         true_flow_until: int = 0,
+        virtual: VirtualMotions | None = None,
     ) -> None:
         preset(model)
         check_seed(seed)
@@ -53,7 +64,7 @@ class TartanVOTask(Task):
             raise DvoError(message, field="true_flow_until", remedy="give a whole number, 0 for none")
         self.model, self.seed = model, seed
         self.loss = loss or LossConfig()
-        self.augmentation = augmentation
+        self.augmentation, self.virtual = augmentation, virtual
         self.true_flow_until = true_flow_until
 
     def network(self) -> nn.Module:
@@ -73,6 +84,9 @@ class TartanVOTask(Task):
         truth = truth_of(batch, net.STRIDE, self.loss.margin)
         motion = self._motion(net, batch, truth if context.step < self.true_flow_until else None)
         loss, found = objective(motion, truth, self.loss)
+        if self.virtual is not None and self.virtual.pairs:
+            extra, more = self._virtual_loss(net, batch, context.step)
+            loss, found = loss + extra, found | more
         shown = {name: found.pop(name) for name in ("flow", "direction_deg", "rotation_deg")}
         return StepLoss(loss, found, shown)
 
@@ -87,7 +101,19 @@ class TartanVOTask(Task):
             return net.between(first, second, intrinsics)
         flows = net.matching.match(first, second)
         flow = torch.where(truth.valid[:, None], truth.flow, flows.flow.detach())
-        return TwoFrameMotion(*net.motion(flow, intrinsics), flows)
+        found = net.motions(flow, intrinsics)
+        return TwoFrameMotion(*found[-1], flows, found)
+
+    def _virtual_loss(self, net: TartanVO, batch: Batch, step: int) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the pose network on virtual pairs, and their errors for the log."""
+        assert self.virtual is not None
+        stride, depth = net.STRIDE, batch["depth"]
+        maps = depth.flatten(0, 1)[:, ::stride, ::stride]
+        height, width = depth.shape[-2:]
+        pairs = virtual_pairs(maps, stride, self.virtual, self.seed, step, (height, width))
+        passes = net.motions(pairs.flow, pairs.intrinsics)
+        loss = motion_loss(passes, pairs.translation, pairs.rotation, self.loss, pairs.valid)
+        return loss, virtual_measures(passes[-1], pairs, self.loss.still)
 
     @torch.no_grad()
     def measure(self, net: nn.Module, batch: Batch, seed: int) -> dict[str, float]:

@@ -181,6 +181,7 @@ class DroidVO(nn.Module):
         fixed: int = 1,
         mode: DenseMode = "joint",
         iterations: int = 2,
+        features: DroidFeatures | None = None,
     ) -> Iterator[DenseState]:
         """Run updates on a clip; the training pass.
 
@@ -193,12 +194,13 @@ class DroidVO(nn.Module):
             fixed: number of leading poses that stay.
             mode: see :data:`dvo.models.dense_step.DenseMode`.
             iterations: Gauss-Newton iterations an update.
+            features: of :meth:`encode` of the images, where they are known.
 
         Yields:
             The state after each update, with ``coords``. Poses and depths are detached between updates: only the
             hidden state carries gradients across.
         """
-        features = self.encode(images)
+        features = self.encode(images) if features is None else features
         b, n, _, h, w = features.matching.shape
         ii, jj = ii.to(images.device), jj.to(images.device)
         graph = frame_graph(ii, jj, n, h, w)

@@ -28,6 +28,8 @@ class LossConfig:
         residual: of the distance between the two, feature pixels.
         upsampled: of the error of the flow of the upsampled depth, feature pixels, for networks that upsample; of the
             last update, between neighbouring frames.
+        matching: of the classification of the true position among all pixels of the other frame
+            (:func:`train.tasks.droid.matching.matching_loss`), nats; of no update; 0: none. DROID-SLAM has it not.
         decay: factor of the weight from each update to the one before it.
         target_limit: cap of the error of one pixel's target; beyond the reach of the correlation there is nothing to
             learn.
@@ -44,6 +46,7 @@ class LossConfig:
     target: float = 0.4
     residual: float = 0.01
     upsampled: float = 0.4
+    matching: float = 0.0
     decay: float = 0.9
     target_limit: float = 8.0
     flow_limit: float = 32.0

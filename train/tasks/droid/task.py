@@ -15,6 +15,7 @@ from dvo.models.droid import DroidVO, neighbour_edges
 from dvo.nets.droid import preset
 from train.data.augment import Augmentation, augment, random_source
 from train.data.clips import Renderings
+from train.tasks.droid.matching import matching_loss
 from train.tasks.droid.objective import LossConfig, measures, objective, true_positions, truth_of
 from train.tasks.task import Batch, StepContext, StepLoss, Task
 
@@ -100,11 +101,16 @@ class DroidTask(Task):
         known = min(self.known, frames)
         given = truth.poses_cw[:, :known]
         start = torch.cat([given, given[:, -1:].expand(-1, frames - known, -1)], 1)
+        features, (ii, jj) = net.encode(batch["images"]), self.edges(frames, context.step)
         states = net.unroll(
-            batch["images"], batch["intrinsics"], *self.edges(frames, context.step), updates=self.updates,
-            poses_cw=start, fixed=known, mode=mode,
+            batch["images"], batch["intrinsics"], ii, jj, updates=self.updates, poses_cw=start, fixed=known, mode=mode,
+            features=features,
         )  # fmt: skip
         loss, found = objective(states, truth, self.loss, mode, known)
+        if self.loss.matching:
+            exact = true_positions(truth.inverse_depth, truth.poses_cw, truth.intrinsics, ii, jj, self.loss.margin)
+            matching = self.loss.matching * matching_loss(features.matching, ii, jj, *exact)
+            loss, found = loss + matching, found | {"loss_matching": matching.detach()}
         return StepLoss(loss, found, {name: found.pop(name) for name in ("target", "flow")})
 
     @torch.no_grad()

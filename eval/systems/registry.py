@@ -5,7 +5,8 @@ command line it is chosen by
 
 - a name of the registry: the classical baselines and the peers below, and those that other packages announce under the
   entry-point group ``dvo.systems``;
-- ``dvo-NAME``, the learned odometry with weights NAME of the package, or ``dvo:FILE`` with a weights file;
+- ``dvo-NAME``, the learned odometry with weights NAME of the package (NAME alone will do where no system has it), or
+  ``dvo:FILE`` with a weights file;
 - ``package.module:Class``, a class that can be imported;
 - ``FILE.py:Class``, a class in a file (:mod:`eval.systems.plugin`).
 
@@ -142,11 +143,19 @@ def _find(name: str, weights: str | None) -> System:
         return _learned(weights) if weights else _learned(name.removeprefix("dvo-"), name)
     if is_target(name):
         return _announced(name, name)
+    if _ships(name):
+        return _find(f"dvo-{name}", weights)
     raise DvoError(
         f"no system '{name}'",
         field="--systems",
         remedy=f"choose from {', '.join(SYSTEMS)}, dvo-NAME, dvo:FILE, package.module:Class, FILE.py:Class",
     )
+
+
+def _ships(name: str) -> bool:
+    from dvo.models.weights import list_weights
+
+    return name in {info.name for info in list_weights()}
 
 
 def _learned(weights: str, name: str | None = None) -> System:

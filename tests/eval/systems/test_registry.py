@@ -112,6 +112,14 @@ def test_weights_from_a_file_are_named_by_it(tmp_path):
     assert find_system("klt-pnp", file).name == "klt-pnp"
 
 
+def test_shipped_weights_need_no_prefix():
+    assert find_system("small") == find_system("dvo-small")
+    assert find_system("small+patches=48").name == "dvo-small+patches=48"
+    assert find_system("null").target != find_system("dvo-small").target
+    with pytest.raises(DvoError, match="no system 'smal'"):
+        find_system("smal")
+
+
 def test_a_class_of_another_package_needs_no_registration(job):
     assert find_system("no_such_package.slam:Slam").missing() == (
         "no module no_such_package.slam; install it, or set PYTHONPATH"

@@ -13,6 +13,7 @@ from dvo.errors import DvoError
 from dvo.models.deepvo import TRANSLATION_UNIT, chain, true_steps
 from dvo.synth.sequence import make_sequence
 from train.data.augment import Augmentation
+from train.data.turns import Turns, turn_cameras
 from train.engine.build import make_program
 from train.engine.checkpoint import read_state
 from train.tasks.deepvo.objective import LossConfig, step_errors
@@ -58,7 +59,8 @@ def test_the_loss_is_the_published_one():
 
 
 def test_the_same_seed_gives_the_same_bytes_and_resuming_those_of_not_having_stopped(tmp_path, runs):
-    options = {"both_ways": True, "augmentation": Augmentation(colour=0.0, zoom=0.0, exposure=1.0)}
+    changes = {"augmentation": Augmentation(colour=0.0, zoom=0.0, exposure=1.0), "turns": Turns(probability=1.0)}
+    options = {"both_ways": True} | changes
     for name in "abc":
         (tmp_path / name).mkdir()
     whole, losses = runs.fit(tmp_path / "a", 4, program(**options))
@@ -131,6 +133,17 @@ def test_both_ways_is_the_mean_over_the_clips_and_their_reversals(runs):
     one, both = program(), program(both_ways=True)
     apart = [one.task.compute_loss(one.context, clips).loss for clips in (batch, reverse)]
     torch.testing.assert_close(both.task.compute_loss(both.context, batch).loss, sum(apart) / 2)
+
+
+def test_turned_cameras_have_the_motion_of_turned_cameras(runs):
+    """Images and poses of the loss are those of the turned clips, in both directions."""
+    batch = runs.batch(0, 2)
+    turned = turn_cameras(batch, Turns(probability=1.0), 4, 0)
+    plain, made = (program(seed=4, both_ways=True, **more) for more in ({}, {"turns": {"probability": 1.0}}))
+    found = made.task.compute_loss(made.context, batch)
+    expected = plain.task.compute_loss(plain.context, turned)
+    torch.testing.assert_close(found.loss, expected.loss)
+    assert found.measures["rotation_deg"] != plain.task.compute_loss(plain.context, batch).measures["rotation_deg"]
 
 
 def test_measures_of_a_held_out_clip(runs):

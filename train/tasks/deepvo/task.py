@@ -15,6 +15,7 @@ from dvo.nets.sizes import named_preset
 from dvo.settings import check_seed, shown
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
+from train.data.turns import Turns, turn_cameras
 from train.tasks.deepvo.objective import LossConfig, step_errors
 from train.tasks.task import Batch, StepContext, StepLoss, Task
 
@@ -23,7 +24,7 @@ class DeepVOTask(Task):
     """Trains a preset of the pose-regression network on clips.
 
     The translations keep the unit of the clips, see :mod:`dvo.models.deepvo`; the depth of a clip is not used beyond
-    that, nor are its intrinsics.
+    that, and its intrinsics serve the random changes of the clips alone.
 
     Args:
         model: name of the preset.
@@ -33,6 +34,8 @@ class DeepVOTask(Task):
         loss: weights of the terms.
         augmentation: random changes of the clips, None for none. A change of the field of view (``zoom``) is one of the
             camera, which the network does not know.
+        turns: random turns of the cameras of the clips, None for none. Clips show few rotations, and a network that
+            sees the same ones again and again remembers them; these are others at every step.
 
     Raises:
         DvoError: no such preset, or another argument out of range.
@@ -47,6 +50,7 @@ class DeepVOTask(Task):
         both_ways: bool = False,
         loss: LossConfig | None = None,
         augmentation: Augmentation | None = None,
+        turns: Turns | None = None,
     ) -> None:
         named_preset(DeepVO.presets, model, "model")
         check_seed(seed)
@@ -54,7 +58,7 @@ class DeepVOTask(Task):
             raise DvoError(f"must be true or false, got {shown(both_ways)}", field="both_ways", remedy="give a bool")
         self.model, self.seed, self.both_ways = model, seed, both_ways
         self.loss = loss or LossConfig()
-        self.augmentation = augmentation
+        self.augmentation, self.turns = augmentation, turns
 
     def network(self) -> nn.Module:
         """New network of the preset."""
@@ -70,13 +74,17 @@ class DeepVOTask(Task):
 
         Args:
             context: state of the engine.
-            batch: ``images (B, N, 3, H, W)``, ``poses_cw (B, N, 7)``.
+            batch: ``images (B, N, 3, H, W)``, ``poses_cw (B, N, 7)``; ``depth (B, N, H, W)`` for the augmentation,
+                ``intrinsics (B, N, 4)`` for augmentation and turns.
 
         Returns:
             The loss, with its two terms and the measures of :meth:`errors`.
         """
         if self.augmentation is not None:
             batch = augment(batch, self.augmentation, self.seed, context.step)
+        if self.turns is not None:  # of what the loss uses; turning the depth would take time
+            used = {name: batch[name] for name in ("images", "poses_cw", "intrinsics")}
+            batch = turn_cameras(used, self.turns, self.seed, context.step)
         images, poses_cw = batch["images"], batch["poses_cw"]
         if self.both_ways:
             images, poses_cw = (torch.cat([clips, clips.flip(1)]) for clips in (images, poses_cw))

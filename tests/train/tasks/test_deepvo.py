@@ -18,6 +18,7 @@ from train.engine.build import make_program
 from train.engine.checkpoint import read_state
 from train.tasks.deepvo.objective import LossConfig, step_errors
 from train.tasks.deepvo.task import DeepVOTask
+from train.tasks.task import StepContext
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -180,3 +181,21 @@ def test_weights_of_the_loss_out_of_range_are_named(name):
     for value in (-1.0, float("nan"), "1"):
         with pytest.raises(DvoError, match=name):
             LossConfig(**{name: value})
+
+
+def test_copies_of_a_clip_are_turned_otherwise(runs):
+    """Two copies of a clip count as the two clips that the same draws make of a batch with the clip twice."""
+    batch = runs.batch(0, 1, sizes=[(48, 64)])
+    turns = Turns(probability=1.0)
+    copied, plain = program(seed=4, turns=turns, copies=2), program(seed=4, turns=turns)
+    twice = {name: value.repeat_interleave(2, 0) for name, value in batch.items()}
+    found = copied.task.compute_loss(StepContext(plain.net, 3, {}), batch)
+    torch.testing.assert_close(found.loss, plain.task.compute_loss(StepContext(plain.net, 3, {}), twice).loss)
+    turned = turn_cameras({k: twice[k] for k in ("images", "poses_cw", "intrinsics")}, turns, 4, 3)
+    assert not torch.equal(turned["poses_cw"][0], turned["poses_cw"][1])
+
+
+@pytest.mark.parametrize("change", [{"copies": 0}, {"copies": True}, {"copies": 2}])
+def test_numbers_of_copies_out_of_range_are_named(change):
+    with pytest.raises(DvoError, match="copies"):
+        DeepVOTask(turns=None if change["copies"] == 2 else Turns(), **change)

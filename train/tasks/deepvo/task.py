@@ -36,6 +36,8 @@ class DeepVOTask(Task):
             camera, which the network does not know.
         turns: random turns of the cameras of the clips, None for none. Clips show few rotations, and a network that
             sees the same ones again and again remembers them; these are others at every step.
+        copies: of each clip in a step, each turned by a draw of its own; rendering a clip takes longer than learning
+            from it.
 
     Raises:
         DvoError: no such preset, or another argument out of range.
@@ -51,14 +53,19 @@ class DeepVOTask(Task):
         loss: LossConfig | None = None,
         augmentation: Augmentation | None = None,
         turns: Turns | None = None,
+        copies: int = 1,
     ) -> None:
         named_preset(DeepVO.presets, model, "model")
         check_seed(seed)
         if not isinstance(both_ways, bool):
             raise DvoError(f"must be true or false, got {shown(both_ways)}", field="both_ways", remedy="give a bool")
+        if not isinstance(copies, int) or isinstance(copies, bool) or not 1 <= copies <= 64:
+            raise DvoError(f"no number of copies: {shown(copies)}", field="copies", remedy="give a number from 1 to 64")
+        if copies > 1 and turns is None:
+            raise DvoError("copies without turns would be equal", field="copies", remedy="give turns, or one copy")
         self.model, self.seed, self.both_ways = model, seed, both_ways
         self.loss = loss or LossConfig()
-        self.augmentation, self.turns = augmentation, turns
+        self.augmentation, self.turns, self.copies = augmentation, turns, copies
 
     def network(self) -> nn.Module:
         """New network of the preset."""
@@ -83,7 +90,9 @@ class DeepVOTask(Task):
         if self.augmentation is not None:
             batch = augment(batch, self.augmentation, self.seed, context.step)
         if self.turns is not None:  # of what the loss uses; turning the depth would take time
-            used = {name: batch[name] for name in ("images", "poses_cw", "intrinsics")}
+            used = {
+                name: batch[name].repeat_interleave(self.copies, 0) for name in ("images", "poses_cw", "intrinsics")
+            }
             batch = turn_cameras(used, self.turns, self.seed, context.step)
         images, poses_cw = batch["images"], batch["poses_cw"]
         if self.both_ways:

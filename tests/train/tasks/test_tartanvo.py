@@ -234,6 +234,17 @@ def test_virtual_pairs_train_the_pose_network_alone(runs):
     assert shown["virtual_rotation_deg"] > 0 and "virtual_rotation_ratio" in whole.measures
 
 
+def test_the_first_steps_may_train_the_pose_network_alone(runs):
+    part = program(virtual=VirtualMotions(pairs=6), matching_from=5)
+    batch = runs.batch(0, 1, sizes=[(48, 64)])
+    early = part.task.compute_loss(StepContext(part.net, 4, {}), batch)
+    torch.testing.assert_close(early.loss, part.task._virtual_loss(part.net, batch, 4)[0])
+    late = part.task.compute_loss(StepContext(part.net, 5, {}), batch)
+    assert "loss_flow" in late.measures and "loss_flow" not in early.measures
+    with pytest.raises(DvoError, match="matching_from"):
+        TartanVOTask(matching_from=5)
+
+
 @pytest.mark.parametrize("change", [{"pairs": -1}, {"rotation": (0.2, 0.1)}, {"noise": (0.0, 1.0)}, {"focal": (1, 99)}])
 def test_virtual_motions_out_of_range_are_named(change):
     with pytest.raises(DvoError, match=next(iter(change))):

@@ -38,6 +38,8 @@ class TartanVOTask(Task):
         loss: weights of the terms, and the form of the translation loss.
         augmentation: random changes of the clips, None for none.
         virtual: further pairs for the pose network, whose flow follows from the depth maps of the batch; None: none.
+        matching_from: step up to which the virtual pairs alone count: the pose network learns from many more pairs in
+            the same time than beside the matching network, and ``data.batch_size: 1`` gives depth maps enough.
         true_flow_until: step up to which the pose network reads the true flow where it is known, as in the first part
             of TartanVO's training; from then on it reads the estimate, and its loss reaches the matching network.
 
@@ -55,17 +57,21 @@ class TartanVOTask(Task):
         augmentation: Augmentation | None = None,
         true_flow_until: int = 0,
         virtual: VirtualMotions | None = None,
+        matching_from: int = 0,
     ) -> None:
         preset(model)
         check_seed(seed)
-        whole = isinstance(true_flow_until, int) and not isinstance(true_flow_until, bool)
-        if not (whole and true_flow_until >= 0):
-            message = f"no number of steps: {shown(true_flow_until)}"
-            raise DvoError(message, field="true_flow_until", remedy="give a whole number, 0 for none")
+        for name, steps in (("true_flow_until", true_flow_until), ("matching_from", matching_from)):
+            whole = isinstance(steps, int) and not isinstance(steps, bool)
+            if not (whole and steps >= 0):
+                message = f"no number of steps: {shown(steps)}"
+                raise DvoError(message, field=name, remedy="give a whole number, 0 for none")
+        if matching_from and not (virtual and virtual.pairs):
+            raise DvoError("there are no virtual pairs", field="matching_from", remedy="give virtual, or leave it at 0")
         self.model, self.seed = model, seed
         self.loss = loss or LossConfig()
         self.augmentation, self.virtual = augmentation, virtual
-        self.true_flow_until = true_flow_until
+        self.true_flow_until, self.matching_from = true_flow_until, matching_from
 
     def network(self) -> nn.Module:
         """New network of the preset."""
@@ -81,6 +87,10 @@ class TartanVOTask(Task):
         if self.augmentation is not None:
             batch = augment(batch, self.augmentation, self.seed, context.step)
         net = cast(TartanVO, context.net)
+        if context.step < self.matching_from:
+            loss, found = self._virtual_loss(net, batch, context.step)
+            shown = {name: found[f"virtual_{name}"] for name in ("direction_deg", "rotation_deg")}
+            return StepLoss(loss, found, shown)
         truth = truth_of(batch, net.STRIDE, self.loss.margin)
         motion = self._motion(net, batch, truth if context.step < self.true_flow_until else None)
         loss, found = objective(motion, truth, self.loss)

@@ -296,9 +296,9 @@ class Archive:
 
         Args:
             identifier: of the keyframe.
-            measured: ``(M, 2)`` see :class:`ArchivedKeyframe`.
+            measured: ``(M, 2)`` see :class:`ArchivedKeyframe`; copied.
         """
-        self._change(identifier, measured=measured)
+        self._change(identifier, measured=self._storage["patches"].keep(measured))
         self._shrink()
 
     def _shrink(self) -> None:
@@ -321,9 +321,11 @@ class Archive:
             None if array is None else features(array) for array in (keyframe.matching, keyframe.context, keyframe.jpeg)
         )
         centres, depth, colors = map(patches, (keyframe.centres, keyframe.inverse_depth, keyframe.colors))
+        measured = None if keyframe.measured is None else patches(keyframe.measured)
         return replace(
-            keyframe, centres=centres, inverse_depth=depth, colors=colors, matching=matching, context=context, jpeg=jpeg
-        )
+            keyframe, centres=centres, inverse_depth=depth, colors=colors, matching=matching, context=context,
+            jpeg=jpeg, measured=measured,
+        )  # fmt: skip
 
     def _change(self, identifier: int, **fields: object) -> None:
         before = self._keyframes[identifier]

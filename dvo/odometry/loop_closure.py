@@ -1,4 +1,4 @@
-"""Loop closure of a tracker: when to search, what a loop changes, and what is told about it.
+"""Loop closure of a tracker: times of searches, confirmation of loops, corrections, and their entries in run.json.
 
 A confirmed loop adds its measurements to the archive, where the final adjustment finds them, and corrects the poses of
 all keyframes of its world by a pose graph in Sim(3) (Strasdat, Montiel and Davison, "Scale drift-aware large scale
@@ -34,7 +34,7 @@ from dvo.odometry import loop_correction
 from dvo.odometry.background import Background, Task
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.loop_window import GroupMatcher
-from dvo.odometry.loops import Loop, LoopFinder
+from dvo.odometry.loops import Loop, LoopFinder, median_inverse_depth
 from dvo.odometry.place_descriptors import shipped_descriptor
 
 # A loop whose correction is smaller (in the same units) leaves the poses to the final adjustment.
@@ -253,10 +253,13 @@ class LoopCloser:
         return loop.joins or not self._is_within(loop, _SMALL)
 
     def _is_within(self, loop: Loop, limits: tuple[float, float, float]) -> bool:
-        """Return True if a loop agrees with the poses: translation in median depths, rotation in rad, log scale."""
+        """Return True if a loop agrees with the poses: translation in median depths, rotation in rad, log scale.
+
+        A loop of a keyframe whose patches were released meanwhile does not: its nan is within no limit.
+        """
         old, new = sim3.from_se3(self.graph.poses_cw(np.array([loop.old, loop.new])))
         error = sim3.compose(loop.measurement, sim3.inverse(sim3.compose(new, sim3.inverse(old))))
-        far = float(error[:3].norm()) * float(np.median(self.graph.archive[loop.new].inverse_depth))
+        far = float(error[:3].norm()) * median_inverse_depth(self.graph.archive[loop.new])
         parts = far, float(so3.log(error[3:7]).norm()), abs(float(error[7].log()))
         return all(part <= limit for part, limit in zip(parts, limits, strict=True))
 

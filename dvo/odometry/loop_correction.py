@@ -17,7 +17,7 @@ from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
 from dvo.geometry import se3, sim3
 from dvo.graph.correction import apply_similarities, move_window, similarity_between
 from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.odometry.loops import Loop
+from dvo.odometry.loops import Loop, median_inverse_depth
 
 # Standard deviations of the edges of the pose graph: translation in median depths, rotation in rad, log scale.
 _STEP = (0.01, 0.002, 0.01)
@@ -67,16 +67,19 @@ def members(graph: KeyframeGraph, kept: Sequence[int], loop: Loop) -> np.ndarray
 def prepare(graph: KeyframeGraph, kept: Sequence[int], loops: Sequence[Loop], loop: Loop) -> Correction:
     """Pose graph of the worlds of a loop.
 
+    Errors are weighted relative to the depth of the scene. Keyframes whose patches were released, which do not tell it,
+    take that of the nearest keyframe with patches.
+
     Args:
         graph: holds the keyframes.
         kept: identifiers of the kept keyframes, increasing.
         loops: confirmed ones, those of other worlds included.
         loop: the last of them. If it joins two worlds, the later one is moved into the earlier to start from.
     """
-    archive, identifiers = graph.archive, members(graph, kept, loop)
+    identifiers = members(graph, kept, loop)
     poses_cw = graph.poses_cw(identifiers)
     segments = np.array([graph.segment_of(int(k)) for k in identifiers])
-    depth = torch.tensor([1.0 / float(np.median(archive[int(k)].inverse_depth)) for k in identifiers]).double()
+    depth = torch.from_numpy(_depths(graph, identifiers, segments))
     ii = torch.from_numpy(np.flatnonzero(segments[1:] == segments[:-1]))
     jj = ii + 1
     steps = sim3.from_se3(poses_cw)
@@ -127,6 +130,20 @@ def held_keyframes(graph: KeyframeGraph, identifiers: np.ndarray) -> np.ndarray:
     """Mask ``(N,)`` of the keyframes of the map, in the world that stays; none without a map."""
     worlds = np.array([graph.world_of(graph.segment_of(int(k))) for k in identifiers])
     return (identifiers < graph.recording.keyframe) & (worlds == worlds.min())
+
+
+def _depths(graph: KeyframeGraph, identifiers: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    """Median depth ``(N,)`` at keyframes, that of the nearest one of the segment for those without patches.
+
+    A segment without any patches has the depth of the nearest keyframe of another one, and 1 if no patches are left.
+    """
+    depth = 1.0 / np.array([median_inverse_depth(graph.archive[int(k)]) for k in identifiers])
+    known = np.flatnonzero(np.isfinite(depth))
+    for row in np.flatnonzero(~np.isfinite(depth)):
+        own = known[segments[known] == segments[row]]
+        near = own if len(own) else known
+        depth[row] = depth[near[np.abs(near - row).argmin()]] if len(near) else 1.0
+    return depth
 
 
 def _carried(graph: KeyframeGraph, identifiers: np.ndarray, found: Tensor, now: np.ndarray) -> Tensor:

@@ -8,6 +8,7 @@ in time, gives the same correction.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3, sim3, so3
-from dvo.graph.archive import ArchivedEdges
+from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.places import PlaceIndex
 from dvo.odometry.loop_candidates import Candidate, by_likeness, by_proximity
@@ -187,14 +188,14 @@ class LoopFinder:
             first, second: loops, with the poses of the graph as they were when these were found.
 
         Returns:
-            True if they do, within the options.
+            True if they do, within the options; False if the patches of the keyframe were released meanwhile.
         """
         o, middle = self.options, self.graph.poses_cw(np.array([second.new]))[0]
         a, b = (self._moved(loop, middle) for loop in (first, second))
         difference = sim3.compose(a, sim3.inverse(b))
         scale = float(difference[7])
         angle = float(so3.log(difference[3:7]).norm().rad2deg())
-        depth = 1.0 / float(np.median(self.graph.archive[second.new].inverse_depth))
+        depth = 1.0 / median_inverse_depth(self.graph.archive[second.new])
         far = float(difference[:3].norm()) / depth
         return max(scale, 1 / scale) - 1 <= o.scale and angle <= o.rotation and far <= o.translation
 
@@ -244,6 +245,15 @@ class LoopFinder:
         yield from by_likeness(graph, self.places, self.descriptor, new, earlier, options)
         here = earlier[worlds == graph.world_of(graph.segment_of(new))]
         yield from by_proximity(graph, new, sim3.from_se3(pose_cw), here, options)
+
+
+def median_inverse_depth(keyframe: ArchivedKeyframe) -> float:
+    """Median inverse depth of the patches of a keyframe, in inverse units of its segment; nan once they are released.
+
+    Args:
+        keyframe: archived.
+    """
+    return float(np.median(keyframe.inverse_depth)) if len(keyframe.inverse_depth) else math.nan
 
 
 def _loop(candidate: Candidate, old: Group, new: Group, match: Match, joins: bool) -> Loop:

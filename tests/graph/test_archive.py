@@ -50,6 +50,19 @@ def test_memory_stays_within_the_bound_and_is_counted_exactly(sizes, bound):
     assert all(k.pose_cw[0] == k.identifier for k in archive)
 
 
+def test_arrays_are_copied():
+    given_ = replace(keyframe(0), measured=np.ones((M, 2), np.float32))
+    archive, later = Archive(), np.full((M, 2), 2, np.float32)
+    archive.add(given_)
+    for array in (given_.measured, given_.inverse_depth, given_.matching, given_.jpeg):
+        array[...] = 9
+    kept = archive[0]
+    assert (kept.measured == 1).all() and (kept.inverse_depth == 1).all() and not kept.matching.any()
+    archive.set_measured(0, later)
+    later[...] = 9
+    assert (archive[0].measured == 2).all() and not kept.jpeg.any()
+
+
 def test_features_go_first_then_edges_then_patches_oldest_first():
     one = keyframe(0)
     both = one.feature_bytes + one.patch_bytes

@@ -12,6 +12,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.metrics import evaluate
+from dvo.odometry import loop_correction
 from dvo.odometry.loop_closure import Correcting, LoopCloser, Searching
 from dvo.odometry.loop_options import LoopOptions
 from dvo.synth.sequence import make_sequence
@@ -129,6 +130,41 @@ def test_a_correction_at_the_end_moves_keyframes_that_were_not_looked_at(saved):
         now = se3.relative(*graph.poses_cw(np.array([last, k])))
         wanted = torch.cat([step[:3] / scale, step[3:]])
         assert torch.allclose(now, wanted, atol=1e-6)
+
+
+def released(graph, identifiers):
+    """Release the patches of keyframes, as the archive does beyond its bound."""
+    for identifier in identifiers:
+        empty = {"centres": np.zeros((0, 2), np.float32), "colors": np.zeros((0, 3), np.uint8)}
+        graph.archive._change(identifier, inverse_depth=np.zeros(0, np.float32), **empty)
+
+
+@pytest.mark.filterwarnings("error")
+def test_keyframes_without_patches_are_corrected_with_the_others(saved):
+    """The oldest patches were released while a search ran: the pose graph takes the depth of the nearest patches."""
+    loaded = dvo.load_map(saved["correcting"][0])
+    graph, kept, loops = loaded.graph, loaded.loops.finder.kept, loaded.loops.loops
+    plain = loop_correction.prepare(graph, kept, loops, loops[-1])
+    depths = {k: float(np.median(graph.archive[k].inverse_depth)) for k in kept}
+    released(graph, kept[:3])
+    found = loop_correction.prepare(graph, kept, loops, loops[-1])
+    ratio = (found.weight / plain.weight)[:, 0]  # of translations: inverse squares of the depths
+    for row, end in enumerate(found.jj.tolist()):
+        expected = (depths[kept[3]] / depths[kept[end]]) ** 2 if end < 3 else 1.0
+        assert float(ratio[row]) == pytest.approx(expected, rel=1e-9)
+    assert sum(end < 3 for end in found.jj.tolist()) == 2 and torch.equal(found.weight[:, 3:], plain.weight[:, 3:])
+    assert torch.isfinite(found.solve()).all() and (found.solve() - plain.solve()).norm(dim=1).max() < 0.05
+    released(graph, kept[3:])
+    assert torch.isfinite(loop_correction.prepare(graph, kept, loops, loops[-1]).solve()).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_loop_of_a_keyframe_whose_patches_were_released_counts_for_nothing(saved):
+    loaded = dvo.load_map(saved["correcting"][0])
+    loops, loop = loaded.loops, loaded.loops.loops[-1]
+    assert loops.finder.agree(loop, loop) and loops._is_within(loop, (1e6, 4.0, 1e6))
+    released(loaded.graph, [loop.new])
+    assert not loops.finder.agree(loop, loop) and not loops._is_within(loop, (1e6, 4.0, 1e6))
 
 
 def test_an_interruption_while_a_frame_waits_leaves_the_work(saved, monkeypatch):

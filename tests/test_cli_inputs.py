@@ -68,7 +68,8 @@ def test_extrinsics(given, images, tmp_path, capsys, monkeypatch, scale):
     said = errors(capsys.readouterr().err)
     assert sum("lever arm of 1.5 m" in line for line in said) == (scale is None)
     assert ("scale of the trajectory is not known" in (out / "trajectory_base.txt").read_text()) == (scale is None)
-    assert summary(out)["extrinsics"] == str(tmp_path / "rig.txt")
+    assert sum("lever arm of 1.5 m" in warning for warning in summary(out)["warnings"]) == (scale is None)
+    assert summary(out)["extrinsics"] == str(tmp_path / "rig.txt") and summary(out)["finished"]
     assert main(arguments(images, out)) == 0
     assert not (out / "trajectory_base.txt").exists()
 
@@ -79,6 +80,17 @@ def test_extrinsics_that_are_none_end_before_tracking(given, images, tmp_path, c
     assert main(arguments(images, tmp_path / "out", "--extrinsics", str(tmp_path / "rig.txt"))) == 2
     (line,) = errors(capsys.readouterr().err)
     assert "quaternion has the length 3" in line and not odometry.frames and not (tmp_path / "out").exists()
+
+
+def test_extrinsics_beside_the_source(given, images, tmp_path, capsys):
+    """A relative path is looked up from the working directory, then from the folder of the source."""
+    given()
+    (images.parent / "rig.txt").write_text("0 0 0  0 0 0 1\n")
+    assert main(arguments(images, tmp_path / "out", "--extrinsics", "../rig.txt")) == 0
+    assert len(read_tum(tmp_path / "out" / "trajectory_base.txt")) == 20
+    assert main(arguments(images, tmp_path / "other", "--extrinsics", "rig.txt")) == 2
+    (line,) = errors(capsys.readouterr().err)
+    assert "rig.txt: extrinsics: no such file. Give an existing file to --extrinsics" in line
 
 
 def test_a_mask(given, images, tmp_path):

@@ -26,6 +26,8 @@ def test_a_failure_costs_nothing_of_the_run(method, given, image_folder, tmp_pat
     warnings = [line for line in capsys.readouterr().err.splitlines() if "out of order" in line]
     assert len(warnings) == 1 and "--overlay ended by RuntimeError" in warnings[0]
     assert summary(out)["finished"] and summary(out)["frames"]["tracked"] == 20
+    told = [warning for warning in summary(out)["warnings"] if "out of order" in warning]
+    assert len(told) == 1 and told[0] in warnings[0]
     assert (out / "export" / "tum").is_dir()
 
 

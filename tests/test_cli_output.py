@@ -1,4 +1,4 @@
-"""What a run leaves behind after failures of the system, and with several segments."""
+"""Files and output of a run after failures of the system, and with several segments."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -232,6 +233,16 @@ def test_breaks_as_text():
         describe_breaks(ends)
         == "2 breaks: until 0.50 s noise (15 frames); from 7.00 s to the end black image (3 frames)"
     )
+
+
+def test_a_short_clip_ends_as_tracked(given, image_folder, tmp_path, capsys):
+    """Poses that only ``finish`` gives: the last state of the progress bar is the outcome."""
+    odometry = given()
+    track = odometry.track
+    odometry.track = lambda frame: replace(track(frame), pose_wc=None, status=Status.INITIALISING)
+    assert main(arguments(image_folder, tmp_path / "out")) == 0
+    shown = capsys.readouterr().err.splitlines()[-1]
+    assert "20/20" in shown and "20 tracked" in shown and "initialising" not in shown
 
 
 def test_status_as_text():

@@ -13,6 +13,7 @@ from dvo.commands.console import warn
 from dvo.commands.observers import GuardedObserver
 from dvo.data.extrinsics import base_trajectory, read_extrinsics
 from dvo.data.frame import Frame
+from dvo.data.opening import locate
 from dvo.data.output import replaced
 from dvo.data.trajectory import tum_row
 from dvo.odometry.observer import Observer
@@ -29,10 +30,14 @@ class BaseFrame:
     Args:
         T_base_camera: ``(7,)`` camera to base, metres.
         folder: of the results.
+
+    Attributes:
+        warnings: sentences that were printed.
     """
 
     def __init__(self, T_base_camera: np.ndarray, folder: Path) -> None:
         self.T_base_camera, self.folder = T_base_camera, folder
+        self.warnings: list[str] = []
 
     def begin(self, odometry: Odometry) -> None:
         """See :class:`dvo.odometry.observer.Observer`."""
@@ -49,6 +54,7 @@ class BaseFrame:
                 f"the lever arm of {lever:.3g} m is in metres, but the scale of the trajectory is not known: positions "
                 f"in {BASE} are right only if one unit of the trajectory is a metre (rotations are right)"
             )
+            self.warnings.append(doubt)
             warn(doubt)
         rows = zip(trajectory.timestamps, trajectory.poses_wc, strict=True)
         with replaced(self.folder / BASE) as part, part.open("w", encoding="utf-8", newline="\n") as file:
@@ -59,19 +65,21 @@ class BaseFrame:
         """See :class:`dvo.odometry.observer.Observer`."""
 
 
-def base_observers(arguments: argparse.Namespace, folder: Path) -> list[Observer]:
+def base_observers(arguments: argparse.Namespace, folder: Path, source: Path) -> list[Observer]:
     """Observer of ``--extrinsics``, if it is given.
 
     Args:
         arguments: of the command line.
         folder: of the results.
+        source: file or folder that is tracked, beside which the file of the extrinsics is looked up too.
 
     Raises:
         DvoError: extrinsics that cannot be read, or are not rigid.
     """
     if arguments.extrinsics is None:
         return []
-    return [GuardedObserver(BaseFrame(read_extrinsics(arguments.extrinsics), folder), "--extrinsics")]
+    file = locate(arguments.extrinsics, source, "extrinsics")
+    return [GuardedObserver(BaseFrame(read_extrinsics(file), folder), "--extrinsics")]
 
 
 def is_metric(info: Mapping[str, Any]) -> bool:

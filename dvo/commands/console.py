@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from dvo.commands import Terminated
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
-from dvo.odometry.protocol import Estimate, Status
+from dvo.odometry.protocol import Estimate, Result, Status
 
 _COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red"}
 
@@ -192,6 +192,16 @@ class TrackingProgress:
             fields["status"] = f"[{_COLOURS[estimate.status]}]{describe_status(estimate)}"
         with contextlib.suppress(OSError):
             self._progress.update(self._task, advance=1, **fields)
+
+    def finish(self, result: Result) -> None:
+        """Show the outcome in place of the state of the last frame: ``finish`` gives poses to earlier frames too.
+
+        Args:
+            result: of the odometry.
+        """
+        tracked = result.frames_tracked
+        with contextlib.suppress(OSError):
+            self._progress.update(self._task, status=f"[{'green' if tracked else 'red'}]{tracked} tracked")
 
 
 def describe_status(estimate: Estimate) -> str:

@@ -26,6 +26,12 @@ class GuardedObserver:
 
     def __init__(self, observer: Observer, option: str) -> None:
         self._observer, self._option, self._failed = observer, option, False
+        self._warnings: list[str] = []
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences that were printed so far, by the observer (its attribute ``warnings``) and at its failure."""
+        return [*getattr(self._observer, "warnings", ()), *self._warnings]
 
     def begin(self, odometry: Odometry) -> None:
         """See :class:`dvo.odometry.observer.Observer`."""
@@ -56,7 +62,9 @@ class GuardedObserver:
             yield
         except Exception as error:
             if not self._failed:
-                warn(f"{self._option} ended by {type(error).__name__}: {error}; the run goes on without it")
+                problem = f"{self._option} ended by {type(error).__name__}: {error}; the run goes on without it"
+                self._warnings.append(problem)
+                warn(problem)
             self._failed = True
 
 

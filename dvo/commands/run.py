@@ -109,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     seed_everything(arguments.seed)
     folders = results.results_folder(arguments.out, source.name)  # checked before the weights load
     with folders as folder, open_observers(arguments, source.name) as observers:
-        observers += base_observers(arguments, folder)
+        observers += base_observers(arguments, folder, source.path)
         observers += scale_observers(arguments, folder)
         odometry = load_odometry(arguments, device)
         check_formats(arguments.export, odometry)
@@ -252,6 +252,8 @@ def _track(
         _write(folder, done, scores, clip, facts, writer, pages)
         for observer in observers:
             observer.finish(done)
+        results.add_warnings(folder, [text for observer in observers for text in getattr(observer, "warnings", ())])
+        progress.finish(done.result)
     for warning in new_warnings:
         warn(warning)
     print_report(folder, done, scores)

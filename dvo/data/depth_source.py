@@ -15,6 +15,7 @@ from dvo.data.calibration import Calibration, read_calibration
 from dvo.data.depth import read_depth
 from dvo.data.files import listed_files
 from dvo.data.images import list_images
+from dvo.data.opening import locate
 from dvo.data.recording import ImageRecording, Log, RawFrame
 from dvo.data.sensors import Finder, NearestInTime, SameNumbers
 from dvo.data.source import Source
@@ -44,7 +45,8 @@ def with_depth(
     Args:
         source: opened with :func:`dvo.open`; not changed.
         depth: folder of 16-bit PNG files (or other files of :func:`dvo.data.depth.read_depth`), or a list of ``time
-            file`` rows such as ``depth.txt`` of TUM RGB-D; None for the depth that the data set has itself.
+            file`` rows such as ``depth.txt`` of TUM RGB-D; None for the depth that the data set has itself. Relative
+            paths are looked up from the working directory, then from the source's folder.
         scale: units of a metre in integers; None for that of the data set, of a list 5000, of a folder 1000.
         calib: camera of the depth images, without distortion, whose centre and axes are taken for those of the camera;
             None for registered ones.
@@ -63,7 +65,9 @@ def with_depth(
         raise DvoError(f"is {scale}", field="--depth-scale", remedy="give the units of a metre, such as 1000")
     found, recording = copy.copy(source), source.recording
     if calib is not None:
-        found.depth_calibration = calib if isinstance(calib, Calibration) else read_calibration(Path(calib))
+        if not isinstance(calib, Calibration):
+            calib = read_calibration(locate(calib, source.path, "depth-calib"))
+        found.depth_calibration = calib
     if not isinstance(recording, ImageRecording):
         found.recording = _with_files(source, depth, scale or MILLIMETRES)
         return found
@@ -73,7 +77,7 @@ def with_depth(
         raise DvoError("the source has no depth of its own", file=source.path, field=_FIELD, remedy=remedy)
     sensors = replace(own, depth_scale=scale or own.depth_scale)
     if depth is not None:
-        path = _existing(depth)
+        path = locate(depth, source.path, "depth")
         finder = _listed_finder(path, recording) if path.is_file() else _finder(path, recording)
         sensors = replace(own, depth=finder, depth_scale=scale or (DEPTH_SCALE if path.is_file() else MILLIMETRES))
     changed = copy.copy(recording)
@@ -122,13 +126,6 @@ class _InOrder:
         return self.files.get(image)
 
 
-def _existing(depth: Path | str) -> Path:
-    path = Path(depth)
-    if not path.exists():
-        raise DvoError("no such file or folder", file=path, field=_FIELD, remedy="give a folder of depth images")
-    return path
-
-
 def _files(folder: Path) -> list[Path]:
     files = list_images(folder) or sorted(file for file in folder.iterdir() if file.suffix in _ARRAYS)
     if not files:
@@ -138,12 +135,13 @@ def _files(folder: Path) -> list[Path]:
 
 def _with_files(source: Source, depth: Path | str | None, scale: float) -> DepthRecording:
     """Recording of a video with the files of a folder, as many as it has frames."""
-    if depth is None or not _existing(depth).is_dir():
+    folder = None if depth is None else locate(depth, source.path, "depth")
+    if folder is None or not folder.is_dir():
         remedy = "give --depth FOLDER, with a depth image for each frame"
         raise DvoError("a video has no depth of its own, nor the times of a list", field=_FIELD, remedy=remedy)
-    files, count = _files(Path(depth)), source.recording.frame_count
+    files, count = _files(folder), source.recording.frame_count
     if count is not None and count != len(files):
-        raise _mismatch(Path(depth), len(files), f"{count} frames")
+        raise _mismatch(folder, len(files), f"{count} frames")
     return DepthRecording(source.recording, files, scale)
 
 

@@ -47,24 +47,27 @@ def read_extrinsics(file: Path | str) -> np.ndarray:
     return pose_of_numbers(values, path)
 
 
-def pose_of_numbers(values: np.ndarray, file: object | None = None) -> np.ndarray:
+def pose_of_numbers(values: Any, file: object | None = None) -> np.ndarray:
     """Pose of the numbers of a rigid transformation.
 
     Args:
-        values: ``(4, 4)`` or ``(16,)`` matrix, or ``(7,)`` ``tx ty tz qx qy qz qw``.
+        values: ``(4, 4)`` or ``(16,)`` matrix, or ``(7,)`` ``tx ty tz qx qy qz qw``, as an array or lists.
         file: for messages.
 
     Returns:
         ``(7,)`` float64 pose, its quaternion of length one.
 
     Raises:
-        DvoError: see :func:`read_extrinsics`.
+        DvoError: no numbers; otherwise see :func:`read_extrinsics`.
 
     Example:
         >>> pose_of_numbers(np.eye(4)).tolist()
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
     """
-    numbers = np.asarray(values, dtype=np.float64).ravel()
+    try:
+        numbers = np.array(values, dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):  # text, rows of several lengths
+        raise DvoError("no table of numbers", file=file, field="T_base_camera", remedy=_REMEDY) from None
     if len(numbers) not in (7, 16):
         raise DvoError(f"{len(numbers)} numbers", file=file, field="T_base_camera", remedy=_REMEDY)
     if not (np.abs(numbers) <= MAX_NUMBER).all():  # NaN fails too
@@ -108,7 +111,7 @@ def base_trajectory(trajectory: Trajectory, T_base_camera: np.ndarray) -> Trajec
         Trajectory of the same times, base to first base.
 
     Raises:
-        DvoError: extrinsics that are not rigid.
+        DvoError: extrinsics that are no numbers, or not rigid. :func:`read_extrinsics` reads a file.
 
     Example:
         >>> turn = np.array([[0.0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 1, 0, 0]])  # about the y axis of the camera
@@ -124,7 +127,7 @@ def base_trajectory(trajectory: Trajectory, T_base_camera: np.ndarray) -> Trajec
     return Trajectory(trajectory.timestamps, moved)
 
 
-def _of_table(table: Any, file: Path) -> np.ndarray:
+def _of_table(table: Any, file: Path) -> Any:
     value = table
     if isinstance(table, dict):
         key = next((key for key in KEYS if key in table), None)
@@ -133,15 +136,10 @@ def _of_table(table: Any, file: Path) -> np.ndarray:
             message = f"neither {' nor '.join(KEYS)} in it, but {found}"
             raise DvoError(message, file=file, field="T_base_camera", remedy=_REMEDY)
         value = table[key]
-    if isinstance(value, dict):
-        value = value.get("data")
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise DvoError("no table of numbers", file=file, field="T_base_camera", remedy=_REMEDY) from None
+    return value.get("data") if isinstance(value, dict) else value
 
 
-def _of_text(file: Path) -> np.ndarray:
+def _of_text(file: Path) -> list[float]:
     numbers: list[float] = []
     for line, fields in read_rows(file, _REMEDY, "extrinsics"):
         try:
@@ -150,4 +148,4 @@ def _of_text(file: Path) -> np.ndarray:
             raise DvoError("no numbers", file=file, field=f"line {line}", remedy=_REMEDY) from None
         if len(numbers) > 16:
             break
-    return np.array(numbers)
+    return numbers

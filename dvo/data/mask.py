@@ -93,7 +93,7 @@ class Masks:
             DvoError: no such mask, or one of another size than the image.
         """
         if len(self.files) > 1 and index >= len(self.files):
-            message = f"{len(self.files)} masks, but an image {index}"
+            message = f"{len(self.files)} masks, none for the image {index}"
             raise DvoError(message, file=self.files[0].parent, field="mask", remedy="give a mask for every image")
         return self._read(self.files[index if len(self.files) > 1 else 0], undistorter)
 

@@ -44,19 +44,25 @@ def locate(given: Path | str, source: Path, field: str) -> Path:
 
     Args:
         given: by the user.
-        source: file or folder that is opened.
+        source: file or folder that is opened; the name of a stream, which has no folder.
         field: name of the option.
+
+    Returns:
+        The file; of a mask or of depth images, possibly a folder.
 
     Raises:
         DvoError: no such file.
     """
     path = Path(given)
     base = source if source.is_dir() else source.parent
+    may_be_folder, is_calibration = field in ("mask", "depth"), field in ("calib", "depth-calib")
     for option in (path, base / path):
-        found = is_calibration_file(option) if field == "calib" else is_file(option)
-        if found or (field == "mask" and option.is_dir()):
+        if is_calibration_file(option) if is_calibration else is_file(option):
             return option
-    raise DvoError("no such file", file=path, field=field, remedy=f"give an existing file to --{field}")
+        if may_be_folder and option.is_dir():
+            return option
+    kind = "file or folder" if may_be_folder else "file"
+    raise DvoError(f"no such {kind}", file=path, field=field, remedy=f"give an existing {kind} to --{field}")
 
 
 def first_frame(recording: Recording) -> RawFrame:

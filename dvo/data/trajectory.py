@@ -83,13 +83,13 @@ def tum_row(values: Iterable[float]) -> str:
         values: timestamp in seconds and camera-to-world pose, ``timestamp tx ty tz qx qy qz qw``.
 
     Returns:
-        The values with nine decimals, and the end of the line.
+        The values with nine decimals, zero without a sign, and the end of the line.
 
     Example:
         >>> tum_row([0.5, 1, 2, 3, 0, 0, 0, 1])[:23]
         '0.500000000 1.000000000'
     """
-    return " ".join(f"{value:.9f}" for value in values) + "\n"
+    return " ".join(f"{value:z.9f}" for value in values) + "\n"
 
 
 def read_tum(path: Path | str) -> Trajectory:
@@ -244,4 +244,4 @@ def write_kitti_poses(path: Path | str, poses_wc: np.ndarray) -> None:
     rows = pose_matrices(poses_wc)[:, :3].reshape(len(poses_wc), 12)
     with open(path, "w", encoding="utf-8") as file:
         for row in rows:
-            file.write(" ".join(f"{value:.9e}" for value in row) + "\n")
+            file.write(" ".join(f"{value:z.9e}" for value in row) + "\n")

@@ -57,5 +57,5 @@ def write_euroc_trajectory(trajectory: Trajectory, folder: Path) -> None:
     for time, (x, y, z, qx, qy, qz, qw) in zip(
         trajectory.timestamps.tolist(), trajectory.poses_wc.tolist(), strict=True
     ):
-        lines.append(f"{round(time * 1e9)}," + ",".join(f"{value:.9f}" for value in (x, y, z, qw, qx, qy, qz)) + "\n")
+        lines.append(f"{round(time * 1e9)}," + ",".join(f"{value:z.9f}" for value in (x, y, z, qw, qx, qy, qz)) + "\n")
     (folder / "trajectory.csv").write_text("".join(lines), encoding="ascii", newline="\n")

@@ -213,6 +213,25 @@ def write_summary(folder: Path, values: dict[str, Any]) -> None:
         part.write_text(text + "\n", encoding="utf-8")
 
 
+def add_warnings(folder: Path, warnings: Sequence[str]) -> None:
+    """Add to the warnings in run.json what was found after it was written.
+
+    Args:
+        folder: of the results.
+        warnings: sentences; nothing is written for none.
+
+    Raises:
+        DvoError: the file cannot be read or written.
+    """
+    if not warnings:
+        return
+    try:
+        values = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
+        write_summary(folder, {**values, "warnings": [*values["warnings"], *warnings]})
+    except OSError as error:
+        raise write_error(folder / SUMMARY, error) from error
+
+
 def summary(run: Run, segment_facts: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
     """Measured part of run.json: counts, segments, breaks, speed, memory, versions, warnings, the odometry's metadata.
 

@@ -33,6 +33,19 @@ def test_by_the_numbers_in_the_names_in_any_unit(make):
     assert depths(source) == [None] * 3  # as it was
 
 
+def test_paths_beside_the_source(make):
+    """Looked up from the working directory, then from the folder of the source, as those of the other options."""
+    source = images(make)
+    depth_image(make, "seq/d/1.png", 1, 1000)
+    make.calib("seq/depth.txt")
+    found = with_depth(source, "../d", calib="../depth.txt")
+    assert depths(found) == [1, None, None] and found.depth_calibration is not None
+    for given in ({"depth": "d"}, {"calib": "depth.txt"}):
+        with pytest.raises(DvoError, match="no such file") as caught:
+            with_depth(source, **given)
+        assert caught.value.field == {"depth": "depth", "calib": "depth-calib"}[next(iter(given))]
+
+
 def test_in_order_where_there_are_as_many(make):
     source = images(make, ("a.png", "b.png", "c.png"))
     for k, name in enumerate("xyz"):

@@ -77,3 +77,10 @@ def test_malformed_files(tmp_path, name, text, message):
 def test_a_rounded_matrix_becomes_a_rotation():
     pose = pose_of_numbers(MATRIX.round(4))
     assert abs(np.linalg.norm(pose[3:]) - 1) < 1e-12 and np.allclose(pose_matrices(pose), MATRIX, atol=2e-4)
+
+
+@pytest.mark.parametrize("values", ["rig.txt", [[1, 2], [3]], {"T_BS": 1}, [None] * 7])
+def test_extrinsics_that_are_no_numbers(values):
+    trajectory = Trajectory(np.zeros(1), POSE[None])
+    with pytest.raises(DvoError, match="T_base_camera: (no table of numbers|a number that is not finite)"):
+        base_trajectory(trajectory, values)

@@ -97,6 +97,18 @@ def test_kitti_and_tum_files_round_trip(tmp_path):
     assert same(again.poses_wc, poses, 1e-7)
 
 
+def test_zero_is_written_without_a_sign(tmp_path):
+    """Rounding to the digits of the file included."""
+    pose = np.array([[-0.0, -1e-12, -1e-9, -0.0, 0.0, -0.0, 1.0]])
+    write_tum(tmp_path / "t.txt", Trajectory(np.zeros(1), pose))
+    written = "0.000000000 0.000000000 0.000000000 -0.000000001 0.000000000 0.000000000 0.000000000 1.000000000"
+    assert (tmp_path / "t.txt").read_text().splitlines()[1] == written
+    write_kitti_poses(tmp_path / "k.txt", np.array([[-0.0, -0.0, -0.5, 0, 0, 0, 1]]))
+    numbers = (tmp_path / "k.txt").read_text().split()
+    assert numbers[3::4] == ["0.000000000e+00", "0.000000000e+00", "-5.000000000e-01"]
+    assert "-0.000000000e+00" not in numbers
+
+
 @pytest.mark.parametrize("text", ["", "1 2 3\n", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "a b c d e f g h i j k l\n"])
 def test_malformed_kitti_poses(make, text):
     with pytest.raises(DvoError, match="KITTI row|no poses"):

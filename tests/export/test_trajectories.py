@@ -51,7 +51,7 @@ def test_every_format_gives_the_poses_back(values, start):
 
 def test_the_rows_as_text(tmp_path):
     half = np.sqrt(0.5)
-    given_ = Trajectory(np.array([0.1, 1.25]), np.array([[1, 2, 3, 0, 0, 0, 1], [4, 5, 6, 0, 0, half, half]]))
+    given_ = Trajectory(np.array([0.1, 1.25]), np.array([[1, 2, 3, -0.0, 0, 0, 1], [4, 5, 6, 0, 0, half, half]]))
     write_kitti_trajectory(given_, tmp_path)
     write_euroc_trajectory(given_, tmp_path)
     matrix = np.loadtxt(tmp_path / "poses.txt")
@@ -59,7 +59,7 @@ def test_the_rows_as_text(tmp_path):
     assert (tmp_path / "times.txt").read_text() == "0.100000000\n1.250000000\n"
     header, first, second = (tmp_path / "trajectory.csv").read_text().splitlines()
     assert header == "#timestamp [ns], p_x, p_y, p_z, q_w, q_x, q_y, q_z"
-    assert first.startswith("100000000,1.000000000,2.000000000,3.000000000,1.000000000,0.0")
+    assert first.startswith("100000000,1.000000000,2.000000000,3.000000000,1.000000000,0.000000000,")
     assert second.split(",")[0] == "1250000000" and float(second.split(",")[4]) == pytest.approx(half)
 
 

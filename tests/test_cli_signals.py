@@ -1,4 +1,4 @@
-"""What a run leaves behind when it is killed, terminated or interrupted."""
+"""Files of a run when it is killed, terminated or interrupted."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ print(json.dumps(codes))
 
 
 def test_kill_loses_no_tracked_frame(image_folder, tmp_path, repository):
-    """What had been recorded when the process was killed is there; no frame is missing, so no second is. SIGTERM, the
-    last of the signals, ends with all results."""
+    """Rows that had been recorded when the process was killed are there; no frame is missing, so no second is. SIGTERM,
+    the last of the signals, ends with all results."""
     (tmp_path / "program.py").write_text(PROGRAM)
     draw = random.Random(0)
     signals = [(draw.randrange(2, 18), signal.SIGKILL) for _ in range(5)] + [(3, signal.SIGTERM)]

@@ -24,7 +24,7 @@ def draw(formula: str, *, block: bool) -> str:
         block: on lines of its own, otherwise within the text.
 
     Returns:
-        SVG in the colour of the text, with the LaTeX as its name for readers of screens.
+        SVG in the colour of the text, with the LaTeX as its name for screen readers.
 
     Raises:
         ValueError: a command that the converter does not know, which it would show as it is written.

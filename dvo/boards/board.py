@@ -83,7 +83,7 @@ class Checkerboard:
         _check_sizes(self.columns, self.rows, self.square, 3, "board")
 
     def __str__(self) -> str:
-        """Name for people."""
+        """Name for messages."""
         return f"{self.columns}x{self.rows} checkerboard"
 
     @cached_property
@@ -197,7 +197,7 @@ class CharucoBoard:
             raise DvoError(message, field="dictionary", remedy="give the dictionary of the board, such as 5X5_100")
 
     def __str__(self) -> str:
-        """Name for people."""
+        """Name for messages."""
         return f"{self.columns}x{self.rows} ChArUco board ({self.dictionary})"
 
     @cached_property

@@ -68,7 +68,7 @@ class BoardOptions:
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """Camera, and what it was found from.
+    """Camera, with the views that it was found from.
 
     Attributes:
         board: its name.
@@ -111,7 +111,7 @@ class BoardCalibration:
         return dict(zip(names, pairs, strict=True))
 
     def __str__(self) -> str:
-        """Summary for people, a few lines."""
+        """Summary of a few lines."""
         tilts = self.solution.tilts
         used = f"{len(self.views)} views of a {self.board} ({self.found} found in {self.examined} frames"
         lines = [

@@ -29,7 +29,7 @@ def decode_message(message: Any, name: str) -> np.ndarray | None:
         ``(H, W, 3)`` uint8 RGB, 16 bit divided by 257; None if the data is damaged or too short.
 
     Raises:
-        DvoError: an encoding that is no image for people (depth in float, say), or too large an image.
+        DvoError: an encoding without brightness or colours, such as depth in float, or too large an image.
     """
     if not hasattr(message, "encoding"):
         image = decode_bytes(np.asarray(message.data).tobytes(), name)

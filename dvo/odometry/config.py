@@ -78,6 +78,7 @@ class TrackerConfig:
         loops: close loops, and join segments that show the same place (:mod:`dvo.odometry.loop_closure`).
         real_time: never wait in ``track`` for a search for loops or a correction by one. Results are then taken when
             they are there, which depends on the load of the machine: the same frames need not give the same bytes.
+            ``save`` and ``finish`` wait.
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
         sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
             are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). It scales covariances

@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 def save_map(file: str | Path, odometry: PatchOdometry) -> None:
     """Write a tracker with its graph to a map file, between two frames or after the last one.
 
+    The result of a search for loops or a correction in progress is waited for, also in real time
+    (:attr:`dvo.odometry.config.TrackerConfig.real_time`); it takes effect at its frame, after this.
+
     Args:
         file: to write; replaced as a whole.
         odometry: the tracker, which is not changed.

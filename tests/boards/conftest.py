@@ -104,7 +104,7 @@ class Scene:
 
 
 class Boards:
-    """What tests use, in one place."""
+    """Renderings and boards for tests."""
 
     Scene, RADTAN, FISHEYE, WIDTH, HEIGHT = Scene, RADTAN, FISHEYE, WIDTH, HEIGHT
     checkerboard, charuco = staticmethod(checkerboard), staticmethod(charuco)

@@ -96,7 +96,7 @@ def test_any_memory_layout_and_tensors():
 
 
 def test_views_are_tracked_as_their_copies(fake_odometry):
-    """Not contiguous frames reach an odometry as contiguous arrays of the same pixels."""
+    """Frames that are not contiguous reach an odometry as contiguous arrays of the same pixels."""
     whole = np.random.default_rng(0).integers(0, 256, (6, 48, 128, 3), dtype=np.uint8)
     views = [Frame(i, 0.1 * i, image[:, ::2][::-1], CAMERA) for i, image in enumerate(whole)]
     odometry = fake_odometry()

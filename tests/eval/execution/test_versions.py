@@ -66,7 +66,7 @@ def test_code_of_a_file_and_of_a_package(tmp_path, monkeypatch):
 
 
 def test_networks_and_readers_of_other_packages_are_followed(tmp_path, monkeypatch):
-    """What weights may name counts for the learned systems, not for the classical ones; readers count for the data."""
+    """Code that weights may name counts for learned systems, not for classical ones; readers count for the data."""
     (tmp_path / "brought_along.py").write_text("import brought_further\n")
     (tmp_path / "brought_further.py").write_text("VALUE = 1\n")
     monkeypatch.syspath_prepend(tmp_path)

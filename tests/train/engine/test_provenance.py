@@ -1,4 +1,4 @@
-"""What weights were trained on: counted, kept in states, told by model cards."""
+"""Training data of weights: counted, kept in states, told by model cards."""
 
 import json
 

@@ -145,7 +145,7 @@ def test_every_map_is_a_segment():
 
 
 def test_only_the_last_map_follows_its_keyframes(tmp_path):
-    """What ORB-SLAM3 says of its keyframes at the end is in the world of its last map."""
+    """Keyframes that ORB-SLAM3 gives at the end are in the world of its last map."""
 
     class Slam:
         def save_keyframe_trajectory_tum(self, file: str) -> None:

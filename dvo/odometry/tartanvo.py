@@ -23,6 +23,7 @@ from dvo.geometry import se3
 from dvo.models.tartanvo import TartanVO
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.config import with_changes
+from dvo.odometry.epipolar_refinement import refine_motion
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
@@ -54,6 +55,8 @@ class TwoFrameConfig:
     Attributes:
         pixels: largest number of pixels of the working image; the aspect is kept (0: full resolution).
         scale: see :data:`ScaleRule`.
+        refine: improve the motion of the pose network by the epipolar residuals of the flow
+            (:func:`dvo.odometry.epipolar_refinement.refine_motion`); TartanVO does not.
         longest: limit of the length of a step, in median depths, with ``scale="parallax"``.
         join_share: share of the pixels that flow there and back must bring home for a frame after an interruption
             (frames without content, or a gap in time) to go on in the segment before it; otherwise it begins the next
@@ -72,6 +75,7 @@ class TwoFrameConfig:
 
     pixels: int = 320 * 240
     scale: ScaleRule = "parallax"
+    refine: bool = False
     longest: float = 2.0
     join_share: float = 0.3
     max_gap: float = 4.5
@@ -131,6 +135,7 @@ class _View:
 
     features: list[Tensor]
     pose_wc: Tensor  # (7,) float64
+    motion: Tensor | None = None  # (7,) of the frame in the coordinates of the one before it, without a length
 
 
 class TartanOdometry:
@@ -296,13 +301,19 @@ class TartanOdometry:
                 return self._stand(timestamp, features, start, 1.0)
         self._alone = None
         pose_ab = se3.normalise(motion.poses_ab()[0].double().cpu())
+        if self.config.refine:
+            starts = [pose_ab] if view.motion is None else [pose_ab, view.motion]
+            pose_ab = refine_motion(torch.from_numpy(flow), starts, torch.from_numpy(intrinsics) / self.model.STRIDE)
+        direction = pose_ab.clone()
         parallax = parallax_of(flow, pose_ab.numpy(), intrinsics / self.model.STRIDE)
         if self.config.scale == "parallax":
             pose_ab[:3] *= parallax.step(self.config.longest)
         pose_wc = se3.normalise(se3.compose(view.pose_wc, pose_ab))
-        return self._stand(timestamp, features, pose_wc, parallax.agreement())
+        return self._stand(timestamp, features, pose_wc, parallax.agreement(), direction)
 
-    def _stand(self, timestamp: float, features: list[Tensor], pose_wc: Tensor, confidence: float) -> Estimate:
+    def _stand(
+        self, timestamp: float, features: list[Tensor], pose_wc: Tensor, confidence: float, motion: Tensor | None = None
+    ) -> Estimate:
         """Keep a frame as the one that the next motion starts from."""
-        self._view = _View(features, pose_wc)
+        self._view = _View(features, pose_wc, motion)
         return Estimate(timestamp, pose_wc.numpy().copy(), Status.TRACKING, confidence, self._segment)

@@ -1,0 +1,236 @@
+"""Refinement of the motion between two views by the epipolar residuals of the flow between them.
+
+Robust least squares over the rotation and the direction of the translation, with Sampson distances (Hartley and
+Zisserman, "Multiple View Geometry in Computer Vision", section 11.4.3; Tron and Daniilidis, "On the quotient
+representation for the essential manifold", CVPR 2014, for the parameters). No depth is needed: a flow lies on the
+epipolar line of its pixel, wherever on it.
+
+Rotations and sideways translations of a flat scene look alike, and a camera that only turns has no epipolar lines. So
+the flow that the rotation leaves over counts too, with a small weight: of motions that explain the flow as well, the
+one with the least parallax is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from dvo.geometry import so3
+from dvo.settings import check_settings
+
+_RANGES = {
+    "iterations": (1, 1000), "points": (10, 2**24), "scale": (1e-6, 1e6), "parallax": (0, 1e3), "damping": (0, 1e3),
+}  # fmt: skip
+_SETTLED = 1e-5  # relative decrease of the cost below which the steps end
+_COARSE_TO_FINE = (3.0, 1.0)  # factors of the scale: a wide one first, whose cost has fewer minima
+_STRONGEST = 10.0  # damping beyond which no step helps
+_EPSILON = 1e-12
+_LEAST_AHEAD = 0.1  # cosine of the largest angle from the axis at which a turned ray counts
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """Settings of :func:`refine_motion`.
+
+    Attributes:
+        iterations: steps at each of two scales, from each start.
+        scale: distance at which a residual counts half, feature pixels (Cauchy).
+        points: largest number of pixels that count; of a larger map, every second, third, ... row and column.
+        parallax: weight of the flow that the rotation leaves over, beside distances from epipolar lines.
+        damping: least one; added to the diagonal of the normal equations, relative to it.
+
+    Raises:
+        DvoError: a value of another type or out of range.
+    """
+
+    iterations: int = 10
+    points: int = 2000
+    scale: float = 0.2
+    parallax: float = 0.003
+    damping: float = 1e-6
+
+    def __post_init__(self) -> None:
+        check_settings(self, _RANGES)
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Both ends of each flow on the planes ``z = 1``, float64."""
+
+    start: Tensor  # (M, 3) of camera a
+    end: Tensor  # (M, 3) of camera b
+    focal: float
+
+
+def refine_motion(
+    flow: Tensor, starts: Sequence[Tensor], intrinsics: Tensor, options: RefinementOptions | None = None
+) -> Tensor:
+    """Refine the motion between two views.
+
+    Args:
+        flow: ``(2, h, w)`` from image ``a`` to image ``b``, pixels of the map.
+        starts: poses ``T_ab`` ``(7,)`` of camera ``b`` in the coordinates of camera ``a`` to begin from; the lengths of
+            their translations do not count.
+        intrinsics: ``(4,)`` ``fx fy cx cy``, pixels of the map.
+        options: settings; None for the defaults.
+
+    Returns:
+        The pose of least cost that was found from any of the starts, ``(7,)`` float64 with a translation of length one
+        that moves most points in front of the camera; the first start where the flow says nothing.
+
+    Example:
+        >>> pose_ab = refine_motion(flow, [motion.poses_ab()[0]], intrinsics / model.STRIDE)
+    """
+    options = options or RefinementOptions()
+    rays = _rays(flow.double(), intrinsics.double(), options.points)
+    found: list[tuple[float, Tensor, Tensor]] = []
+    for start in starts:
+        rotation, direction = so3.normalise(start[3:].double()), _unit(start[:3].double())
+        for factor in _COARSE_TO_FINE:
+            rotation, direction = _descend(rays, rotation, direction, replace(options, scale=factor * options.scale))
+        cost = _cost(rays, rotation, direction, options)
+        found.append((cost, rotation, direction))
+    _, rotation, direction = min(found, key=lambda item: item[0])
+    return torch.cat([_forwards(rays, rotation, direction), rotation])
+
+
+def _descend(rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions) -> tuple[Tensor, Tensor]:
+    """Levenberg-Marquardt steps until the cost settles."""
+    cost, damping = _cost(rays, rotation, direction, options), options.damping
+    for _ in range(options.iterations):
+        next_rotation, next_direction = _step(rays, rotation, direction, options, damping)
+        next_cost = _cost(rays, next_rotation, next_direction, options)
+        if next_cost < cost:
+            settled = next_cost > cost * (1 - _SETTLED)
+            rotation, direction, cost = next_rotation, next_direction, next_cost
+            damping = max(options.damping, 0.1 * damping)
+            if settled:
+                break
+        elif damping > _STRONGEST:
+            break
+        else:
+            damping = max(1e-3, 10 * damping)
+    return rotation, direction
+
+
+def epipolar_residuals(
+    start: Tensor, end: Tensor, rotation: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sampson distances, and the flow that the rotation leaves over.
+
+    Args:
+        start, end: ``(M, 3)`` rays with ``z = 1`` of the two cameras.
+        rotation: ``(4,)`` of camera ``b`` in the coordinates of camera ``a``.
+        direction: ``(3,)`` of the translation, of length one.
+
+    Returns:
+        Distances ``(M,)`` and ``(M, 2)`` remaining flow, on the plane ``z = 1``; and ``(M,)`` bool, rays that the
+        rotation leaves in front of the camera.
+    """
+    turned = so3.rotate(rotation, end)
+    ahead = turned[:, 2] > _LEAST_AHEAD
+    epipolar = torch.linalg.cross(turned, direction.expand_as(turned))
+    error = (start * epipolar).sum(-1)
+    of_end = so3.rotate(so3.conjugate(rotation), torch.linalg.cross(direction.expand_as(start), start))
+    spread = (epipolar[:, :2].square().sum(-1) + of_end[:, :2].square().sum(-1)).clamp(min=_EPSILON).sqrt()
+    left = turned[:, :2] / turned[:, 2:].clamp(min=_LEAST_AHEAD) - start[:, :2]
+    return error / spread, left, ahead
+
+
+def _rays(flow: Tensor, intrinsics: Tensor, points: int) -> _Rays:
+    _, h, w = flow.shape
+    every = max(1, math.ceil(math.sqrt(h * w / points)))
+    fx, fy, cx, cy = intrinsics.tolist()
+    y, x = torch.meshgrid(
+        torch.arange(h, dtype=flow.dtype, device=flow.device), torch.arange(w, dtype=flow.dtype, device=flow.device),
+        indexing="ij",
+    )  # fmt: skip
+    one = torch.ones_like(x)
+    start = torch.stack([(x - cx) / fx, (y - cy) / fy, one], -1)[::every, ::every].flatten(0, 1)
+    end = torch.stack([(x + flow[0] - cx) / fx, (y + flow[1] - cy) / fy, one], -1)[::every, ::every].flatten(0, 1)
+    counts = torch.isfinite(end).all(-1)
+    return _Rays(start[counts], end[counts], (fx + fy) / 2)
+
+
+def _cost(rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions) -> float:
+    """Sum of the Cauchy costs of both kinds of residuals."""
+    distance, left, ahead = epipolar_residuals(rays.start, rays.end, rotation, direction)
+    scaled = (distance * (rays.focal / options.scale)).square()
+    parallax = left.square().sum(-1) * (rays.focal * options.parallax / options.scale) ** 2
+    return float(torch.where(ahead, scaled.log1p() + parallax.log1p(), 100.0).sum())
+
+
+def _step(
+    rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions, damping: float
+) -> tuple[Tensor, Tensor]:
+    """One Gauss-Newton step over a rotation vector on the left of the rotation and two angles of the direction."""
+    start, turned = rays.start, so3.rotate(rotation, rays.end)
+    distance, left, ahead = epipolar_residuals(rays.start, rays.end, rotation, direction)
+    basis, axes = _tangents(direction), torch.eye(3, dtype=start.dtype, device=start.device)
+    back = so3.conjugate(rotation)
+    plane = torch.linalg.cross(direction.expand_as(start), start)
+    epipolar = torch.linalg.cross(turned, direction.expand_as(turned))
+    of_end = so3.rotate(back, plane)
+    spread = (epipolar[:, :2].square().sum(-1) + of_end[:, :2].square().sum(-1)).clamp(min=_EPSILON).sqrt()
+    # Derivatives of both normals, (5, M, 3), for R <- exp(w) R and for the direction.
+    turns = torch.linalg.cross(axes[:, None].expand(-1, len(turned), -1), turned.expand(3, -1, -1))
+    by_epipolar = torch.cat(
+        [torch.linalg.cross(turns, direction.expand_as(turns)),
+         torch.linalg.cross(turned.expand(2, -1, -1), basis[:, None].expand(-1, len(turned), -1))]
+    )  # fmt: skip
+    by_end = torch.cat(
+        [torch.linalg.cross(plane.expand(3, -1, -1), axes[:, None].expand(-1, len(plane), -1)),
+         torch.linalg.cross(basis[:, None].expand(-1, len(start), -1), start.expand(2, -1, -1))]
+    )  # fmt: skip
+    by_end = so3.rotate(back, by_end)
+    by_spread = (by_epipolar[..., :2] * epipolar[:, :2]).sum(-1) + (by_end[..., :2] * of_end[:, :2]).sum(-1)
+    by_error = (by_epipolar * start).sum(-1)
+    pixels = rays.focal / options.scale
+    jacobian = ((by_error - distance / spread * by_spread) / spread).mT * pixels
+    residual = distance * pixels
+    weight = ahead / (1 + residual.square())
+    hessian = (jacobian * weight[:, None]).mT @ jacobian
+    gradient = (jacobian * weight[:, None]).mT @ residual
+    if options.parallax:
+        factor = rays.focal * options.parallax / options.scale
+        x, y, z = turned.unbind(-1)
+        z = z.clamp(min=_LEAST_AHEAD)
+        u, v, zero = x / z, y / z, torch.zeros_like(x)
+        # The projection of b + w x b, and no change by the direction of the translation.
+        rows = torch.stack(
+            [torch.stack([-u * y / z, (z + u * x) / z, -y / z, zero, zero], -1),
+             torch.stack([-(z + v * y) / z, v * x / z, x / z, zero, zero], -1)], 1,
+        )  # fmt: skip
+        share = (ahead / (1 + left.square().sum(-1) * factor**2))[:, None, None] * factor**2
+        hessian = hessian + torch.einsum("mki,mkj->ij", rows * share, rows)
+        gradient = gradient + torch.einsum("mki,mk->i", rows * share, left)
+    diagonal = hessian.diagonal()
+    hessian = hessian + torch.diag(damping * diagonal + _EPSILON * (1 + diagonal.max()))
+    change = -torch.linalg.solve(hessian, gradient)
+    return so3.normalise(so3.multiply(so3.exp(change[:3]), rotation)), _unit(direction + change[3:] @ basis)
+
+
+def _forwards(rays: _Rays, rotation: Tensor, direction: Tensor) -> Tensor:
+    """Direction with the sign for which most of the parallax belongs to points in front of the cameras."""
+    _, left, ahead = epipolar_residuals(rays.start, rays.end, rotation, direction)
+    there = left + rays.start[:, :2]
+    along = there * direction[2] - direction[:2]
+    votes = torch.where(ahead, (left * along).sum(-1).sign() * along.norm(dim=-1), 0.0).sum()
+    return direction if votes >= 0 else -direction
+
+
+def _tangents(direction: Tensor) -> Tensor:
+    """Two unit vectors ``(2, 3)`` perpendicular to a direction and to each other."""
+    axis = torch.zeros_like(direction)
+    axis[direction.abs().argmin()] = 1.0
+    first = _unit(torch.linalg.cross(direction, axis))
+    return torch.stack([first, torch.linalg.cross(direction, first)])
+
+
+def _unit(vector: Tensor) -> Tensor:
+    length = vector.norm()
+    return vector / length if length > _EPSILON else torch.tensor([0.0, 0.0, 1.0]).to(vector)

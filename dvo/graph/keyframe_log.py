@@ -34,6 +34,16 @@ class FrameRecord:
     segment: int = 0
     reason: str = ""
 
+    def place(self, anchor: int, segment: int, reason: str = "") -> None:
+        """Give the frame the pose of a keyframe.
+
+        Args:
+            anchor: the keyframe.
+            segment: its segment.
+            reason: cause of a break before the frame.
+        """
+        self.anchor, self.lost, self.segment, self.reason = anchor, False, segment, reason
+
     def follow(self, other: FrameRecord) -> None:
         """Take the pose and the state of another frame.
 

@@ -79,6 +79,8 @@ class TrackerConfig:
         real_time: never wait in ``track`` for a search for loops or a correction by one. Results are then taken when
             they are there, which depends on the load of the machine: the same frames need not give the same bytes.
             ``save`` and ``finish`` wait.
+        adjust_after_loop: bundle adjustment of all archived keyframes after each correction by a loop, beside tracking
+            (:mod:`dvo.odometry.graph_adjustment`).
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
         sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
             are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). It scales covariances
@@ -137,6 +139,7 @@ class TrackerConfig:
     estimate_readout: bool = True
     loops: bool = True
     real_time: bool = False
+    adjust_after_loop: bool = False
     robust: float = 0.3
     sigma: float = SIGMA
     covariance_scale: float = 2.0

@@ -103,6 +103,7 @@ def adjust_segment(
     segment: int,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
     shutter: Shutter | None = None,
+    since: int = 0,
 ) -> int:
     """Solve for the archived keyframes and inverse depths of a segment, in place.
 
@@ -112,6 +113,7 @@ def adjust_segment(
         segment: its number.
         options: kernels, iterations and size of the blocks.
         shutter: timing of the rows; None, or a readout time of 0, for a global shutter.
+        since: identifier; keyframes before it stay.
 
     Returns:
         Number of keyframes with patches, dropped ones included. Those whose measurements have been released to save
@@ -137,6 +139,8 @@ def adjust_segment(
         return 0
     held = min(map_size + int(linked.argmax()) + options.overlap, len(identifiers) - 1)
     held = held if not linked[0] else max(map_size, 1)
+    later = int(np.searchsorted(identifiers, since))
+    held = max(held, min(later, len(identifiers) - 1))
     start = solved = held
     block = options.loop_block if graph.loops else options.block
     change = _Change(old[held - 1], old[held - 1], 1.0)
@@ -147,7 +151,7 @@ def adjust_segment(
     while solved < len(identifiers):
         end = min(max(start + block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
-        whole = start == held and not map_size
+        whole = start == held and not (map_size or later)
         part = graph.problem(True, segment, 0 if whole else int(identifiers[start]), int(identifiers[end - 1]))
         rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))
         fixed, new = rows < start, rows >= solved

@@ -10,6 +10,9 @@ bit on the CPU. In real time they are taken when they are there, and ``track`` n
 
 In a map (a graph with keyframes of earlier recordings) only keyframes of the last recording search. Those of the map
 stay where they are; what joins their world is moved.
+
+After a correction, if it is asked for, and on request, a global bundle adjustment follows in the same thread and in the
+same way (:mod:`dvo.odometry.graph_adjustment`).
 """
 
 from __future__ import annotations
@@ -31,17 +34,22 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.places import PlaceIndex
 from dvo.models.patch_vo import PatchVO
 from dvo.odometry import loop_correction
+from dvo.odometry.adjuster import Adjuster, Adjusting
 from dvo.odometry.background import Background, Task
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.graph_adjustment import AdjustmentRecord
 from dvo.odometry.loop_window import GroupMatcher
 from dvo.odometry.loops import Loop, LoopFinder, median_inverse_depth
 from dvo.odometry.place_descriptors import shipped_descriptor
+from dvo.odometry.tracker_state import TrackerState
 
 # A loop whose correction is smaller (in the same units) leaves the poses to the final adjustment.
 _SMALL = (0.01, 0.003, 0.01)
 
 
-def loop_closer(model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device) -> LoopCloser:
+def loop_closer(
+    model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device, state: TrackerState
+) -> LoopCloser:
     """Loop closure of a tracker.
 
     Args:
@@ -49,11 +57,14 @@ def loop_closer(model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, dev
         config: of the tracker.
         graph: of the tracker.
         device: of the computation.
+        state: of the tracker.
     """
     described = shipped_descriptor(model.config.feature_channels)
     places = PlaceIndex(1 if described is None else described.dimensions)
     finder = LoopFinder(graph, GroupMatcher(model, config, device), places, described)
-    return LoopCloser(graph, finder, config.loops and not model.config.fine_channels, config.real_time)
+    enabled = config.loops and not model.config.fine_channels
+    adjuster = Adjuster(graph, state, config.adjustment, config.adjust_after_loop)
+    return LoopCloser(graph, finder, enabled, config.real_time, adjuster)
 
 
 @dataclass
@@ -93,6 +104,7 @@ class LoopCloser:
         finder: of loops.
         enabled: search for loops; otherwise nothing is kept or found.
         real_time: take results as soon as they are there, instead of waiting for them at a fixed frame.
+        adjuster: of global adjustments; None for no adjustments.
 
     Attributes:
         loops: confirmed loops, in the order of their discovery.
@@ -100,19 +112,20 @@ class LoopCloser:
         wait: kept keyframes until the next search.
         pending: loop that has not been confirmed yet.
         searches: since then.
-        work: search or correction in progress.
+        work: search, correction or adjustment in progress.
     """
 
     graph: KeyframeGraph
     finder: LoopFinder
     enabled: bool = True
     real_time: bool = False
+    adjuster: Adjuster | None = None
     loops: list[Loop] = field(default_factory=list)
     corrections: int = 0
     wait: int = 0
     pending: Loop | None = None
     searches: int = 0
-    work: Searching | Correcting | None = None
+    work: Searching | Correcting | Adjusting | None = None
     _background: Background = field(default_factory=Background)
 
     def see(self, identifier: int, image: np.ndarray, maps: Tensor) -> None:
@@ -131,7 +144,7 @@ class LoopCloser:
             True if poses were corrected.
         """
         if not self.enabled:
-            return False
+            return self._drain() if at_once else self._collect(False)
         corrected, at_once = False, at_once or not self.finder.options.delay
         seen = self.finder.kept[-1] if self.finder.kept else -1
         for frame in self.graph.archive.kept_after(seen):
@@ -139,6 +152,31 @@ class LoopCloser:
                 self._visit(frame)
                 corrected |= at_once and self._drain()
         return self._drain() | corrected if at_once else self._collect(False)
+
+    def adjust(self, segments: Collection[int], wait: bool) -> list[AdjustmentRecord]:
+        """Adjust the worlds of the recording: now, with the bounds of the final adjustment, or beside tracking.
+
+        Args:
+            segments: those that are initialised.
+            wait: for the work in progress and the adjustments; otherwise these are begun one after the other.
+
+        Returns:
+            What was done; nothing yet if it is not waited for.
+        """
+        if self.adjuster is None:
+            return []
+        if wait:
+            self._drain()
+        own = (segment for segment in segments if segment >= self.graph.recording.segment)
+        worlds, before = sorted({self.graph.world_of(segment) for segment in own}), len(self.adjuster.records)
+        if not wait:
+            self.adjuster.want(worlds)
+            self._adjust_next()
+            return []
+        for world in worlds:
+            self.work = self.adjuster.begin(self._background, world, "request", 0, None)
+            self._drain()
+        return self.adjuster.records[before:]
 
     def _drain(self) -> bool:
         """Wait for the work in progress, and what follows from it; True if poses were corrected."""
@@ -157,6 +195,8 @@ class LoopCloser:
         Returns:
             True if poses were corrected.
         """
+        if self.adjuster is not None:
+            self.adjuster.end()
         corrected = self.advance(segments, at_once=True)
         loops = self._own_loops()
         if not loops:
@@ -182,8 +222,9 @@ class LoopCloser:
 
         In a map also ``localised``: the loop by which the recording was recognised in it, None if it was not.
         """
+        adjusted = {} if self.adjuster is None else self.adjuster.information()
         if not self.enabled:
-            return {}
+            return adjusted
         loops, begun = self._own_loops(), self.graph.recording.keyframe
         entries: list[dict[str, Any]] = [
             {
@@ -193,7 +234,7 @@ class LoopCloser:
             for loop in loops
         ]  # fmt: skip
         found = {"loops": sorted(entries, key=lambda loop: loop["from"]), "loop_corrections": self.corrections}
-        return found | ({"localised": next((e for e in entries if e["in_map"]), None)} if begun else {})
+        return found | adjusted | ({"localised": next((e for e in entries if e["in_map"]), None)} if begun else {})
 
     def _own_loops(self) -> list[Loop]:
         """Confirmed loops of the last recording."""
@@ -227,9 +268,22 @@ class LoopCloser:
         self.work = None
         if isinstance(work, Searching):
             self._found(work.task.result())
+            self._adjust_next()
             return False
+        if isinstance(work, Adjusting):
+            assert self.adjuster is not None
+            unit = self.adjuster.take(work)
+            self.rescale(unit)
+            self._adjust_next()
+            return bool(unit)
         self._apply(work.identifiers, work.task.result())
+        self._adjust_next(self.graph.world_of(self.graph.segment_of(self.loops[-1].new)))
         return True
+
+    def _adjust_next(self, corrected: int | None = None) -> None:
+        """Begin the next global adjustment unless there is other work: of a world that was corrected, or is wanted."""
+        if self.adjuster is not None and self.work is None:
+            self.work = self.adjuster.begin_next(self._background, self.finder.options, corrected)
 
     def _found(self, loop: Loop | None) -> None:
         """Take the outcome of a search."""
@@ -292,7 +346,5 @@ class LoopCloser:
             unit: scale of the similarity of each keyframe (:func:`dvo.graph.correction.apply_similarities`); those that
                 are not named keep theirs.
         """
-        for row, loop in enumerate(self.loops):
-            old, new = unit.get(loop.old, 1.0), unit.get(loop.new, 1.0)
-            t, q, scale = loop.measurement[:3] / new, loop.measurement[3:7], loop.measurement[7:] * old / new
-            self.loops[row] = replace(loop, measurement=torch.cat([t, q, scale]))
+        self.loops[:] = [loop.in_units(unit) for loop in self.loops]
+        self.pending = None if self.pending is None else self.pending.in_units(unit)

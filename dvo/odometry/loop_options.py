@@ -29,6 +29,10 @@ class LoopOptions:
         patience: searches after a loop within which a second one has to confirm it.
         translation, rotation, scale: largest differences of the corrections of two loops that confirm each other, in
             median depths, degrees, and as a ratio less one.
+        adjust_delay: as ``delay``, of a global adjustment (:mod:`dvo.odometry.graph_adjustment`).
+        adjust_iterations: steps of a global adjustment beside tracking with each of its kernels, at most.
+        adjust_frames, adjust_edges: newest keyframes of a world, and measurements between them, that it solves for, at
+            most; those before are held.
 
     Raises:
         DvoError: a value of another type or out of range.
@@ -38,7 +42,8 @@ class LoopOptions:
         "seconds": (0, 1e6), "every": (1, 10**4), "neighbours": (0, 8), "likeness": (-1, 1), "overlap": (0, 1),
         "retrieved": (0, 100), "near": (0, 100), "apart": (0, 10**4), "delay": (0, 10**4),
         "hopeful": (0, 1), "inliers": (0, 1), "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180),
-        "scale": (0, 10),
+        "scale": (0, 10), "adjust_delay": (0, 10**4), "adjust_iterations": (1, 1000), "adjust_frames": (3, 10**6),
+        "adjust_edges": (1, 10**9),
     }  # fmt: skip
 
     seconds: float = 10.0
@@ -57,6 +62,10 @@ class LoopOptions:
     translation: float = 0.2
     rotation: float = 3.0
     scale: float = 0.1
+    adjust_delay: int = 40
+    adjust_iterations: int = 5
+    adjust_frames: int = 600
+    adjust_edges: int = 300_000
 
     def __post_init__(self) -> None:
         check_settings(self, self.RANGES)

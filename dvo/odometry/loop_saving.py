@@ -13,6 +13,7 @@ from dvo.errors import DvoError
 from dvo.graph.archive import ArchivedEdges
 from dvo.graph.map_file import MapReader
 from dvo.graph.places import PlaceIndex
+from dvo.odometry.adjuster_saving import AdjusterTable, adjuster_arrays, adjuster_table, restore_adjuster
 from dvo.odometry.background import Task
 from dvo.odometry.loop_closure import Correcting, LoopCloser, Searching
 from dvo.odometry.loop_correction import members
@@ -48,6 +49,7 @@ class LoopsTable:
         searching: frames until the result of the search in progress is taken; 0 if there is none.
         found: that result.
         correcting: frames until the correction in progress is made; 0 if there is none.
+        adjuster: global adjustments; None if there are none.
     """
 
     loops: tuple[LoopTable, ...]
@@ -58,6 +60,7 @@ class LoopsTable:
     searching: int = 0
     found: LoopTable | None = None
     correcting: int = 0
+    adjuster: AdjusterTable | None = None
 
     RANGES: ClassVar[dict[str, tuple[float, float]]] = {
         "corrections": (0, _LAST), "wait": (-_LAST, _LAST), "searches": (0, _LAST), "searching": (0, _LAST),
@@ -80,9 +83,9 @@ def loops_table(closer: LoopCloser) -> dict[str, Any]:
     left = max(closer.work.left, 1) if closer.work is not None else 0
     searching, correcting = (left if isinstance(closer.work, kind) else 0 for kind in (Searching, Correcting))
     loops = tuple(map(_table, closer.loops))
-    return asdict(
-        LoopsTable(loops, pending, closer.corrections, closer.wait, closer.searches, searching, found, correcting)
-    )
+    counts = closer.corrections, closer.wait, closer.searches
+    table = LoopsTable(loops, pending, *counts, searching, found, correcting, adjuster_table(closer))
+    return asdict(table)
 
 
 def loops_arrays(closer: LoopCloser) -> dict[str, np.ndarray]:
@@ -99,7 +102,7 @@ def loops_arrays(closer: LoopCloser) -> dict[str, np.ndarray]:
     if isinstance(closer.work, Correcting):
         arrays["correction/keyframes"] = closer.work.identifiers
         arrays["correction/similarities"] = closer.work.task.result().numpy()
-    return arrays
+    return arrays | adjuster_arrays(closer)
 
 
 def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[int]) -> None:
@@ -135,6 +138,10 @@ def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[in
     closer.loops[:] = loops
     if table.searching:
         closer.work = Searching(Task.finished(found), table.searching)
+    if table.adjuster is not None:
+        busy = table.searching or table.correcting
+        source.require(not (busy and table.adjuster.left), "adjusting beside other work", "loops: adjuster")
+        restore_adjuster(source, closer, table.adjuster)
     if not closer.enabled:
         return
     kept = (frame.identifier for frame in archive if frame.anchor is None)

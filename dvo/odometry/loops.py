@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -55,6 +55,16 @@ class Loop:
     count: int
     edges: ArchivedEdges | None
     joins: bool = False
+
+    def in_units(self, unit: Mapping[int, float]) -> Loop:
+        """Loop in new units of its keyframes.
+
+        Args:
+            unit: new ones in old ones, by keyframe; those that are not named keep theirs.
+        """
+        old, new = unit.get(self.old, 1.0), unit.get(self.new, 1.0)
+        t, q, scale = self.measurement[:3] / new, self.measurement[3:7], self.measurement[7:] * old / new
+        return replace(self, measurement=torch.cat([t, q, scale]))
 
 
 @dataclass(frozen=True)

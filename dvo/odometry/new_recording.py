@@ -54,7 +54,7 @@ def new_recording(
     )  # fmt: skip
     _take_over(found.graph, old.graph)
     found.state.keyframes, found.state.adjustable = old.state.keyframes, list(old.state.adjustable)
-    found.loops = loop_closer(found.model, config, found.graph, found.device)
+    found.loops = loop_closer(found.model, config, found.graph, found.device, found.state)
     found.loops.loops[:] = old.loops.loops
     finder = found.loops.finder
     finder.kept[:] = _kept(old)

@@ -26,6 +26,7 @@ from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
 from dvo.nets.patchifier import patch_coordinates
+from dvo.odometry.adjusting import adjust
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
 from dvo.odometry.finishing import finish_segments
@@ -97,7 +98,7 @@ class PatchOdometry:
         self.correlation = WindowCorrelation(self.window, c, self.device)
         align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
         self.step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final", config.kernel)
-        self.loops = loop_closer(self.model, config, self.graph, self.device)
+        self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
 
     @property
     def window(self) -> Window:
@@ -195,6 +196,8 @@ class PatchOdometry:
         """
         save_map(file, self)
 
+    adjust = adjust
+
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
         begun, keyframes = self.graph.recording, self.graph.log.poses
         info = {
@@ -222,7 +225,7 @@ class PatchOdometry:
             self.graph.discard(len(window) - 1)  # so that the next frames are joined with those before it
             state.waiting.append(view)
             return self._lose(record, NO_MATCH)
-        self._place(record, keyframe.identifier, state.joining if state.skipped else "")
+        record.place(keyframe.identifier, self.graph.segment, state.joining if state.skipped else "")
         state.joining, state.skipped = "", False
         state.waiting.clear()
         state.tracked += 1
@@ -241,9 +244,9 @@ class PatchOdometry:
                 # Too little motion to initialise: until the final adjustment it shares the pose of the last keyframe.
                 self.step.store(revision)
                 self.graph.drop(len(window) - 1, still=True)
-                self._place(record, keyframe.identifier)
+                record.place(keyframe.identifier, self.graph.segment)
                 return self._estimate(record, None, Status.INITIALISING)
-        self._place(record, keyframe.identifier)
+        record.place(keyframe.identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
             enough = initialise_related(self.graph, self.step, config)
             state.initialised = enough and newest_evidence(self.step).supports(config)
@@ -261,9 +264,6 @@ class PatchOdometry:
             state.waiting[-1].records.append(record)
         state.last = state.last[0], replace(state.last[1], timestamp=record.timestamp, recovered=False)
         return state.last[1]
-
-    def _place(self, record: FrameRecord, anchor: int, reason: str = "") -> None:
-        record.anchor, record.lost, record.segment, record.reason = anchor, False, self.graph.segment, reason
 
     def _lose(self, record: FrameRecord, reason: str) -> Estimate:
         """Mark a frame as lost; the next frame of an initialised segment has to be joined across it."""

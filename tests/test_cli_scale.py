@@ -1,6 +1,7 @@
 """Metric scale on the command line: sources, settings, and what is printed and written."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -20,13 +21,23 @@ def test_options_become_the_setting_of_the_odometry():
     assert scale_settings(parsed()) == {}
     assert scale_settings(parsed("--height", "1.6")) == {"scale": {"height": 1.6}}
     assert scale_settings(parsed("--depth", "d")) == scale_settings(parsed("--depth")) == {"scale": {"depth": True}}
+    assert scale_settings(parsed("--right", "r")) == scale_settings(parsed("--right")) == {"scale": {"stereo": True}}
     found = scale_settings(parsed("--distance", "0", "2", "1.5", "--distance", "1", "3", "2"))
     assert found == {"scale": {"distances": [[0.0, 2.0, 1.5], [1.0, 3.0, 2.0]]}}
     config = dvo.TrackerConfig(**found)
     assert config.scale.distances[1] == (1.0, 3.0, 2.0)
 
 
-@pytest.mark.parametrize("options", [("--height", "1", "--depth", "d"), ("--height", "-1"), ("--distance", "0", "1")])
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--height", "1", "--depth", "d"),
+        ("--right", "--depth"),
+        ("--baseline", "0"),
+        ("--height", "-1"),
+        ("--distance", "0", "1"),
+    ],
+)
 def test_options_that_exclude_each_other_or_are_no_lengths(options, capsys):
     with pytest.raises(SystemExit):
         parsed(*options)
@@ -82,6 +93,26 @@ def test_a_run_with_depth_is_in_metres(clip, tmp_path, capsys):
     assert (out / "cloud.ply").stat().st_size > 1000
 
 
+def test_a_run_with_right_images_is_in_metres(clip, tmp_path, capsys):
+    """The right camera 0.1 m beside the left one sees what that one sees two frames later."""
+    names = sorted(file.name for file in (clip / "rgb").iterdir())
+    (clip / "right").mkdir()
+    for name, later in zip(names[:-2], names[2:], strict=True):
+        shutil.copy(clip / "rgb" / later, clip / "right" / name)
+    out = tmp_path / "out"
+    options = ["--out", str(out), *SETTINGS, "--right", "right"]
+    assert main(["run", str(clip), *options]) == 2
+    assert "--baseline: is not known" in capsys.readouterr().err
+    assert main(["run", str(clip), *options, "--baseline", "0.1"]) == 0
+    printed = capsys.readouterr().out
+    assert "poses and map are in metres, from stereo images" in printed and "after SE(3) alignment" in printed
+    facts = json.loads((out / "run.json").read_text())
+    assert facts["info"]["scale"]["source"] == "stereo" and facts["metrics"]["alignment"] == "se3"
+    moved = np.loadtxt(out / "trajectory.txt")[[0, -1], 1:4]
+    assert np.linalg.norm(moved[1] - moved[0]) == pytest.approx(0.75, rel=0.02)
+    assert not (out / "cloud.ply").exists()
+
+
 def test_a_run_with_a_distance_is_in_metres_and_one_that_is_not_covered_is_told(clip, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["run", str(clip), "--out", str(out), *SETTINGS, "--distance", "0.2", "1.2", "0.5"]) == 0
@@ -100,6 +131,9 @@ def test_a_run_with_a_distance_is_in_metres_and_one_that_is_not_covered_is_told(
         (("--depth", "nothing"), "no such file or folder"),
         (("--depth-scale", "1000"), "no depth images"),
         (("--tsdf",), "no depth images"),
+        (("--baseline", "0.1"), "no right images"),
+        (("--right",), "no right images of its own"),
+        (("--right", "nothing", "--baseline", "0.1"), "no such file or folder"),
         (("--weights", "nothing", "--height", "1"), "nothing"),
     ],
 )

@@ -16,7 +16,8 @@ from dvo.odometry.session import Run
 
 _SHOWN = 5  # breaks and segments that are printed one by one
 _SCALES = {
-    "depth": "depth images", "height": "the height of the camera", "distance": "known distances", "map": "the map",
+    "depth": "depth images", "stereo": "stereo images",
+    "height": "the height of the camera", "distance": "known distances", "map": "the map",
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Metric scale in ``dvo run``: depth of the source, settings of the odometry, and fused cloud."""
+"""Metric scale in ``dvo run``: depth or right images of the source, settings of the odometry, and fused cloud."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from dvo.commands.observers import GuardedObserver
 from dvo.data.depth_source import with_depth
+from dvo.data.right_source import with_right
 from dvo.data.source import Source
 from dvo.errors import DvoError
 from dvo.odometry import results
@@ -16,18 +17,20 @@ from dvo.odometry.observer import Observer
 
 
 def scaled_source(source: Source, arguments: argparse.Namespace) -> Source:
-    """Give a source the depth of ``--depth``.
+    """Give a source the depth of ``--depth``, or the right images of ``--right``.
 
     Args:
         source: newly opened.
         arguments: of the command line.
 
     Returns:
-        The source, with depth if it was asked for.
+        The source, with depth or right images if they were asked for.
 
     Raises:
-        DvoError: no such depth, or options of a depth that is not asked for.
+        DvoError: no such images, or options of images that are not asked for.
     """
+    if arguments.right is None and arguments.baseline is not None:
+        raise DvoError("there are no right images", field="--baseline", remedy="give --right too")
     if arguments.depth is None:
         given = {
             "--depth-scale": arguments.depth_scale,
@@ -37,6 +40,8 @@ def scaled_source(source: Source, arguments: argparse.Namespace) -> Source:
         for name, value in given.items():
             if value:
                 raise DvoError("there are no depth images", field=name, remedy="give --depth too")
+        if arguments.right is not None:
+            return with_right(source, arguments.right or None, arguments.baseline)
         return source
     return with_depth(source, arguments.depth or None, arguments.depth_scale, arguments.depth_calib)
 
@@ -53,6 +58,8 @@ def scale_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     given = vars(arguments)
     if given.get("depth") is not None:
         return {"scale": {"depth": True}}
+    if given.get("right") is not None:
+        return {"scale": {"stereo": True}}
     if given.get("height") is not None:
         return {"scale": {"height": given["height"]}}
     return {"scale": {"distances": given["distance"]}} if given.get("distance") else {}

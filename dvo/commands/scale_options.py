@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-OWN = ""  # value of --depth without a path: the depth of the data set itself
+OWN = ""  # value of --depth and --right without a path: those of the data set itself
 
 
 def add_scale_options(parser: argparse.ArgumentParser) -> None:
@@ -13,7 +13,8 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
     Args:
         parser: of the command.
     """
-    group = parser.add_argument_group("metric scale", "poses and map in metres; one of --depth, --height, --distance")
+    about = "poses and map in metres; one of --depth, --right, --height, --distance"
+    group = parser.add_argument_group("metric scale", about)
     source = group.add_mutually_exclusive_group()
     source.add_argument(
         "--depth",
@@ -21,6 +22,13 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
         const=OWN,
         metavar="PATH",
         help="depth images: a folder of 16-bit PNG files, or a list as depth.txt (default: those of the data set)",
+    )
+    source.add_argument(
+        "--right",
+        nargs="?",
+        const=OWN,
+        metavar="PATH",
+        help="right images of a stereo pair: a folder, a list, a second video (default: those of the data set)",
     )
     source.add_argument("--height", type=_metres, metavar="METRES", help="of the camera over the ground")
     source.add_argument(
@@ -30,6 +38,12 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar=("T0", "T1", "METRES"),
         help="straight distance between the camera at two times, seconds; repeatable",
+    )
+    group.add_argument(
+        "--baseline",
+        type=_metres,
+        metavar="METRES",
+        help="distance of the cameras of a stereo pair (default: that of the data set)",
     )
     group.add_argument(
         "--depth-scale",

@@ -13,13 +13,14 @@ from dvo.data.files import listed_files
 from dvo.data.folder import camera_images
 from dvo.data.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-from dvo.data.sensors import NearestInTime, Sensors
+from dvo.data.sensors import NearestInTime, SameName, Sensors, rectified
 from dvo.data.sequence import find_calibration
 from dvo.data.stamps import choose_times, read_times, times_from_names
 from dvo.data.trajectory import Trajectory, interpolate, read_tum
 
 # The colour cameras as published with the benchmark (file_formats page); freiburg3 is delivered undistorted.
 DEPTH_SCALE = 5000.0  # units of a metre
+RIGHT = "right"  # folder of right images, which the benchmark has not, where the calibration states a baseline
 CALIBRATIONS = {
     "1": Calibration(517.3, 516.5, 318.6, 255.3, "radtan", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633), 640, 480),
     "2": Calibration(520.9, 521.0, 325.1, 249.7, "radtan", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172), 640, 480),
@@ -93,11 +94,15 @@ def open_tum(path: Path, request: Request) -> Recording:
 
 
 def _sensors(path: Path, images: list[Path], stamps: np.ndarray | None, calibration: Calibration | None) -> Sensors:
+    right, rig = None, None
+    if calibration is not None and calibration.baseline and (path / RIGHT).is_dir():
+        right, rig = SameName(path / RIGHT), rectified(calibration, calibration.baseline)
     if stamps is None or not ((path / "depth.txt").is_file() or (path / "depth").is_dir()):
-        return Sensors()
+        return Sensors(right=right, stereo=rig)
     times = dict(zip(images, stamps.tolist(), strict=True))
     scale = (calibration.depth_scale if calibration else None) or DEPTH_SCALE
-    return Sensors(depth=NearestInTime(times, partial(_depth_images, path)), depth_scale=scale)
+    depth = NearestInTime(times, partial(_depth_images, path))
+    return Sensors(depth=depth, depth_scale=scale, right=right, stereo=rig)
 
 
 def _depth_images(path: Path) -> tuple[list[Path], np.ndarray]:

@@ -73,7 +73,7 @@ def settle_scale(
         elif options.source != "none" and world >= begun:
             known[world] = observe(graph, world, own, options)
             if known[world].found:
-                if options.source != "depth":
+                if not options.measures:
                     units = rescale(graph, world, known[world].factor)
                     if loops is not None:
                         loops.rescale(units)
@@ -106,7 +106,7 @@ def observe(graph: KeyframeGraph, world: int, segments: Sequence[int], options: 
     Returns:
         The scale, or why it was not found.
     """
-    if options.source == "depth":
+    if options.measures:
         return scale_of_depths(graph.members(world))
     if options.source == "height":
         kept = [frame for frame in graph.members(world) if frame.anchor is None]

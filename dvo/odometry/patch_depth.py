@@ -1,4 +1,4 @@
-"""Depth of patches from the depth image of their frame.
+"""Depth of patches from the depth image of their frame (:mod:`dvo.odometry.stereo_depth`: from its right image).
 
 The depth of a patch is the median over a neighbourhood of its centre. Where the neighbourhood crosses the edge of a
 body, or few of its pixels are known, the patch has none: which of the two surfaces its features lie on is not known.
@@ -13,9 +13,12 @@ import torch
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
+from dvo.models.patch_vo import PatchVO
+from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.front_end import Observation
 from dvo.odometry.scale_options import ScaleOptions
+from dvo.odometry.stereo_depth import measure_stereo
 
 _REACH = 1.5  # from the centre to the border of the neighbourhood, pixels of the working image
 _KNOWN = 0.5  # least share of known pixels in it
@@ -23,20 +26,24 @@ _STEP = 0.06  # relative difference of the first and the last decile of its dept
 _NEAREST = 0.2  # metres; bundle adjustment leaves out points that are nearer (dvo.ba.layer)
 
 
-def measure_depth(seen: Observation, frame: Frame, options: ScaleOptions) -> Observation:
+def measure_depth(model: PatchVO, seen: Observation, frame: Frame, config: TrackerConfig) -> Observation:
     """Measure the depths of the patches of a frame, if that is wanted.
 
     Args:
+        model: the network, which measures in right images.
         seen: the patches.
-        frame: of the same image; its depth is read if it is used.
-        options: use and noise of the depth.
+        frame: of the same image; its depth or right image is read if it is used.
+        config: of the tracker, whose ``scale`` says what is used.
 
     Returns:
         The observation with ``measured``, of zeros for a frame without depth; unchanged without the option.
 
     Raises:
-        DvoError: a depth that is not an image of the size of the frame.
+        DvoError: a depth or a right image that is not an image of the size of the frame.
     """
+    options = config.scale
+    if options.stereo:
+        return measure_stereo(model, seen, frame, config)
     if not options.depth:
         return seen
     height, width = seen.image.shape[:2]

@@ -240,7 +240,7 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
         shape = n, size[0] // c.STRIDE, size[1] // c.STRIDE
         visible = torch.from_numpy(source.array("waiting/visible", np.uint8, shape, 0, 1) > 0).to(odometry.device)
     measured = None
-    if odometry.config.scale.depth:
+    if odometry.config.scale.measures:
         values = source.array("waiting/measured", np.float32, (n, odometry.config.patches, 2), 0, 1e12)
         measured = torch.from_numpy(values).to(odometry.device)
     for k, view in enumerate(table.waiting):

@@ -8,13 +8,14 @@ from typing import Literal
 from dvo.errors import DvoError
 from dvo.settings import check_settings
 
-ScaleSource = Literal["none", "depth", "height", "distance"]
+ScaleSource = Literal["none", "depth", "stereo", "height", "distance"]
 """Observation that lengths in metres come from; ``none``: trajectories are up to scale."""
 
 _RANGES = {
     "depth_error": (1e-4, 1),
     "depth_base": (0, 1),
     "depth_quadratic": (0, 1),
+    "stereo_error": (1e-4, 10),
     "height": (0, 1e6),
     "tilt": (1, 80),
 }
@@ -32,6 +33,8 @@ class ScaleOptions:
         depth_base, depth_quadratic: ``a`` and ``b`` of the noise of the depth camera, whose standard deviation is ``a +
             b (Z - 0.4)^2`` metres at depth ``Z``. The defaults are those of a Kinect (Nguyen, Izadi and Lovell,
             "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012, axial noise).
+        stereo: use the right images of ``Frame.right`` in the same way (:mod:`dvo.odometry.stereo_depth`).
+        stereo_error: standard deviation of a disparity, feature pixels (a quarter of those of the working image).
         height: of the camera over the ground, metres; 0 if it is not known (:mod:`dvo.odometry.ground_plane`).
         tilt: largest angle between the vertical of the image and that of the ground, degrees, for ``height``.
         distances: ``(from, to, metres)``: straight distance between the camera centres at two times, seconds.
@@ -48,23 +51,30 @@ class ScaleOptions:
     depth_error: float = 0.05
     depth_base: float = 0.0012
     depth_quadratic: float = 0.0019
+    stereo: bool = False
+    stereo_error: float = 0.03
     height: float = 0.0
     tilt: float = 30.0
     distances: tuple[tuple[float, float, float], ...] = ()
 
     def __post_init__(self) -> None:
         check_settings(self, _RANGES)
-        if self.depth + (self.height > 0) + bool(self.distances) > 1:
+        if self.depth + self.stereo + (self.height > 0) + bool(self.distances) > 1:
             message = "the scale is to come from several sources"
-            raise DvoError(message, field="scale", remedy="give one of depth, height and distances")
+            raise DvoError(message, field="scale", remedy="give one of depth, stereo, height and distances")
         for first, last, metres in self.distances:
             if not (first < last and 0 < metres < 1e7):
                 message = f"no distance: {metres:g} m from {first:g} s to {last:g} s"
                 raise DvoError(message, field="distances", remedy="give T0 before T1, and a distance above 0")
 
     @property
+    def measures(self) -> bool:
+        """True if depths of patches are measured, and take part in every bundle adjustment."""
+        return self.depth or self.stereo
+
+    @property
     def source(self) -> ScaleSource:
         """Observation that the scale comes from."""
-        if self.depth:
-            return "depth"
+        if self.measures:
+            return "depth" if self.depth else "stereo"
         return "height" if self.height > 0 else "distance" if self.distances else "none"

@@ -143,7 +143,7 @@ class PatchOdometry:
             if gap and state.initialised and not state.joining:
                 state.joining, state.skipped = str(gap), not gap.frozen
             seen = observe(self.model, image, camera, self.select, self.device, mask=mask)
-            seen = measure_depth(seen, frame, self.config.scale)
+            seen = measure_depth(self.model, seen, frame, self.config)
             state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
             estimate = self._take(View([record], seen))
             if len(state.waiting) >= self.config.patience:

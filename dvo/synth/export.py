@@ -120,20 +120,23 @@ def export_sequence(
     return [*sequence.warnings, *notes]
 
 
-def write_calibration(camera: Camera, out: Path) -> None:
-    """Write ``calib.txt``, or ``calib.yaml`` for what only that can state: a fisheye model, a rolling shutter.
+def write_calibration(camera: Camera, out: Path, baseline: float = 0.0) -> None:
+    """Write ``calib.txt``, or ``calib.yaml`` for what only that can state: a fisheye model, a rolling shutter, a
+    stereo pair.
 
     Args:
         camera: of the images.
         out: the folder.
+        baseline: metres to the right camera of a rectified pair with the same intrinsics, 0 without one.
 
     Raises:
         OSError: it cannot be written.
     """
-    if camera.model == "fisheye" or camera.readout > 0:
+    if camera.model == "fisheye" or camera.readout > 0 or baseline > 0:
         rows = {name: f"{value:.9f}" for name, value in zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True)}
         rows |= {"width": str(camera.width), "height": str(camera.height), "model": camera.model}
         rows |= {"coefficients": str(list(camera.coefficients)), "readout": f"{camera.readout:.9f}"}
+        rows |= {"baseline": f"{baseline:.9f}"} if baseline > 0 else {}
         text = "\n".join(f"{name}: {value}" for name, value in rows.items())
         (out / "calib.yaml").write_text(text + "\n", encoding="utf-8")
         return

@@ -16,7 +16,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dvo.data.trajectory import write_tum
+from dvo.data.tum import RIGHT
 from dvo.errors import DvoError
 
 RECORD = "sequence.json"
@@ -55,7 +58,8 @@ def rendered_folder(name: str, options: dict[str, Any]) -> Path:
 
     Args:
         name: of the sequence.
-        options: of :func:`dvo.synth.make_sequence`, and ``version``; with ``depth``, depth images are written too.
+        options: of :func:`dvo.synth.make_sequence`, and ``version``; with ``depth``, depth images are written too, with
+            ``baseline`` the images of a right camera at that many metres.
 
     Raises:
         DvoError: options that cannot be rendered, or a folder that cannot be written.
@@ -79,30 +83,38 @@ def rendered_folder(name: str, options: dict[str, Any]) -> Path:
     return folder
 
 
-def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
+def _write_image(file: Path, image: np.ndarray) -> None:
     import cv2  # imported here, like rendering: the evaluation of recordings needs neither
 
+    file.parent.mkdir(exist_ok=True)
+    if not cv2.imwrite(str(file), image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise OSError(f"cannot write {file.name}")
+
+
+def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
     from dvo.synth.export import write_calibration, write_depth
     from dvo.synth.sequence import make_sequence
 
     begin, clock = time.perf_counter(), time.process_time()
-    chosen = {key: value for key, value in options.items() if key not in ("version", "depth")}
+    chosen = {key: value for key, value in options.items() if key not in ("version", "depth", "baseline")}
     try:
         sequence = make_sequence(**chosen)
     except TypeError as error:
         raise DvoError(f"options that cannot be rendered ({error})", field=name, remedy="fix the suite") from error
-    (folder / "rgb").mkdir()
+    baseline = float(options.get("baseline", 0))
+    right = sequence.stereo(baseline) if baseline else None
     rows = ["# timestamp filename"]
     for frame in sequence:
         file = f"rgb/{frame.timestamp:.6f}.png"
-        if not cv2.imwrite(str(folder / file), frame.image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise OSError(f"cannot write {file}")
+        _write_image(folder / file, frame.image)
+        if right is not None:
+            _write_image(folder / RIGHT / Path(file).name, right.frame(frame.index).image)
         rows.append(f"{frame.timestamp:.9f} {file}")
         if options.get("depth"):
             write_depth(folder, f"{frame.timestamp:.6f}", sequence.rendering(frame.index).depth[0].cpu().numpy())
     (folder / "rgb.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
     write_tum(folder / "groundtruth.txt", sequence.groundtruth)
-    write_calibration(sequence.camera, folder)
+    write_calibration(sequence.camera, folder, baseline)
     facts = {
         "name": name, "options": options, "scene": sequence.name, "frames": len(sequence),
         "path_m": round(sequence.groundtruth.path_length, 4), "seconds": round(time.perf_counter() - begin, 2),

@@ -125,6 +125,17 @@ def test_readers_give_back_what_was_rendered(cache: Path) -> None:
     assert open_sequence(again, NOWHERE, 1)[0].path == source.path
 
 
+def test_the_right_camera_of_a_stereo_pair_is_written_and_read(cache: Path) -> None:
+    options = {**OPTIONS, "frames": 2, "baseline": 0.12}
+    source, _ = open_sequence(Sequence("pair", rendered=tuple(options.items())), NOWHERE, 1)
+    right = make_sequence(**{k: v for k, v in OPTIONS.items() if k != "version"} | {"frames": 2}).stereo(0.12)
+    for k, frame in enumerate(source):
+        assert frame.right is not None and frame.right.baseline == pytest.approx(0.12)
+        assert np.array_equal(frame.right.image, right.frame(k).image)
+        assert not np.array_equal(frame.right.image, frame.image)
+    assert len(read_suites("stereo")[0].sequences) == 3
+
+
 def test_every_frame_of_a_rolling_shutter_has_its_readout(cache: Path) -> None:
     options = {**OPTIONS, "rolling_shutter": 0.5}
     source, _ = open_sequence(Sequence("one", rendered=tuple(options.items())), NOWHERE, 1)

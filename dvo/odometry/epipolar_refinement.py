@@ -47,8 +47,8 @@ class RefinementOptions:
         DvoError: a value of another type or out of range.
     """
 
-    iterations: int = 10
-    points: int = 2000
+    iterations: int = 6
+    points: int = 800
     scale: float = 0.2
     parallax: float = 0.003
     damping: float = 1e-6
@@ -80,7 +80,8 @@ def refine_motion(
 
     Returns:
         The pose of least cost that was found from any of the starts, ``(7,)`` float64 with a translation of length one
-        that moves most points in front of the camera; the first start where the flow says nothing.
+        to the same side as that of the first start, since the residuals do not tell a motion from its opposite; the
+        first start where the flow says nothing.
 
     Example:
         >>> pose_ab = refine_motion(flow, [motion.poses_ab()[0]], intrinsics / model.STRIDE)
@@ -95,7 +96,7 @@ def refine_motion(
         cost = _cost(rays, rotation, direction, options)
         found.append((cost, rotation, direction))
     _, rotation, direction = min(found, key=lambda item: item[0])
-    return torch.cat([_forwards(rays, rotation, direction), rotation])
+    return torch.cat([-direction if direction @ starts[0][:3].double() < 0 else direction, rotation])
 
 
 def _descend(rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions) -> tuple[Tensor, Tensor]:
@@ -212,15 +213,6 @@ def _step(
     hessian = hessian + torch.diag(damping * diagonal + _EPSILON * (1 + diagonal.max()))
     change = -torch.linalg.solve(hessian, gradient)
     return so3.normalise(so3.multiply(so3.exp(change[:3]), rotation)), _unit(direction + change[3:] @ basis)
-
-
-def _forwards(rays: _Rays, rotation: Tensor, direction: Tensor) -> Tensor:
-    """Direction with the sign for which most of the parallax belongs to points in front of the cameras."""
-    _, left, ahead = epipolar_residuals(rays.start, rays.end, rotation, direction)
-    there = left + rays.start[:, :2]
-    along = there * direction[2] - direction[:2]
-    votes = torch.where(ahead, (left * along).sum(-1).sign() * along.norm(dim=-1), 0.0).sum()
-    return direction if votes >= 0 else -direction
 
 
 def _tangents(direction: Tensor) -> Tensor:

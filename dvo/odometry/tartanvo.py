@@ -86,6 +86,7 @@ class TwoFrameConfig:
 
 
 NETWORK_DEFAULTS: dict[str, TwoFrameConfig] = {
+    "small": TwoFrameConfig(refine=True),  # its pose network has 0.4 of the 15 million parameters of the published one
     "full": TwoFrameConfig(pixels=640 * 480),  # it was trained on 640x448
 }
 """Settings of a preset of the network; others have those of :class:`TwoFrameConfig`."""

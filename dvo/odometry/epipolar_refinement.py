@@ -26,7 +26,7 @@ _RANGES = {
     "iterations": (1, 1000), "points": (10, 2**24), "scale": (1e-6, 1e6), "parallax": (0, 1e3), "damping": (0, 1e3),
 }  # fmt: skip
 _SETTLED = 1e-5  # relative decrease of the cost below which the steps end
-_COARSE_TO_FINE = (3.0, 1.0)  # factors of the scale: a wide one first, whose cost has fewer minima
+_COARSE = 3.0  # factor of the scale at first: a wide one, whose cost has fewer minima
 _STRONGEST = 10.0  # damping beyond which no step helps
 _EPSILON = 1e-12
 _LEAST_AHEAD = 0.1  # cosine of the largest angle from the axis at which a turned ray counts
@@ -37,7 +37,7 @@ class RefinementOptions:
     """Settings of :func:`refine_motion`.
 
     Attributes:
-        iterations: steps at each of two scales, from each start.
+        iterations: steps from each start at three times the scale, and at the scale from the best of what they find.
         scale: distance at which a residual counts half, feature pixels (Cauchy).
         points: largest number of pixels that count; of a larger map, every second, third, ... row and column.
         parallax: weight of the flow that the rotation leaves over, beside distances from epipolar lines.
@@ -79,28 +79,29 @@ def refine_motion(
         options: settings; None for the defaults.
 
     Returns:
-        The pose of least cost that was found from any of the starts, ``(7,)`` float64 with a translation of length one
-        to the same side as that of the first start, since the residuals do not tell a motion from its opposite; the
-        first start where the flow says nothing.
+        The pose found from the start that led to the least cost at the wider scale, ``(7,)`` float64; the translation
+        is of length one and to the same side as that of the first start, since the residuals do not tell a motion from
+        its opposite. The first start where the flow says nothing.
 
     Example:
         >>> pose_ab = refine_motion(flow, [motion.poses_ab()[0]], intrinsics / model.STRIDE)
     """
     options = options or RefinementOptions()
     rays = _rays(flow.double(), intrinsics.double(), options.points)
-    found: list[tuple[float, Tensor, Tensor]] = []
+    coarse = replace(options, scale=_COARSE * options.scale)
+    found = []
     for start in starts:
         rotation, direction = so3.normalise(start[3:].double()), _unit(start[:3].double())
-        for factor in _COARSE_TO_FINE:
-            rotation, direction = _descend(rays, rotation, direction, replace(options, scale=factor * options.scale))
-        cost = _cost(rays, rotation, direction, options)
-        found.append((cost, rotation, direction))
+        found.append(_descend(rays, rotation, direction, coarse))
     _, rotation, direction = min(found, key=lambda item: item[0])
+    _, rotation, direction = _descend(rays, rotation, direction, options)
     return torch.cat([-direction if direction @ starts[0][:3].double() < 0 else direction, rotation])
 
 
-def _descend(rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions) -> tuple[Tensor, Tensor]:
-    """Levenberg-Marquardt steps until the cost settles."""
+def _descend(
+    rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions
+) -> tuple[float, Tensor, Tensor]:
+    """Levenberg-Marquardt steps until the cost settles; gives cost, rotation and direction."""
     cost, damping = _cost(rays, rotation, direction, options), options.damping
     for _ in range(options.iterations):
         next_rotation, next_direction = _step(rays, rotation, direction, options, damping)
@@ -115,7 +116,7 @@ def _descend(rays: _Rays, rotation: Tensor, direction: Tensor, options: Refineme
             break
         else:
             damping = max(1e-3, 10 * damping)
-    return rotation, direction
+    return cost, rotation, direction
 
 
 def epipolar_residuals(
@@ -132,11 +133,12 @@ def epipolar_residuals(
         Distances ``(M,)`` and ``(M, 2)`` remaining flow, on the plane ``z = 1``; and ``(M,)`` bool, rays that the
         rotation leaves in front of the camera.
     """
-    turned = so3.rotate(rotation, end)
+    matrix, skew = so3.matrix(rotation), so3.hat(direction)
+    turned = end @ matrix.mT
     ahead = turned[:, 2] > _LEAST_AHEAD
-    epipolar = torch.linalg.cross(turned, direction.expand_as(turned))
+    epipolar = turned @ skew  # b x d
     error = (start * epipolar).sum(-1)
-    of_end = so3.rotate(so3.conjugate(rotation), torch.linalg.cross(direction.expand_as(start), start))
+    of_end = start @ (-skew @ matrix)  # R^T (d x a)
     spread = (epipolar[:, :2].square().sum(-1) + of_end[:, :2].square().sum(-1)).clamp(min=_EPSILON).sqrt()
     left = turned[:, :2] / turned[:, 2:].clamp(min=_LEAST_AHEAD) - start[:, :2]
     return error / spread, left, ahead
@@ -169,29 +171,20 @@ def _step(
     rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions, damping: float
 ) -> tuple[Tensor, Tensor]:
     """One Gauss-Newton step over a rotation vector on the left of the rotation and two angles of the direction."""
-    start, turned = rays.start, so3.rotate(rotation, rays.end)
-    distance, left, ahead = epipolar_residuals(rays.start, rays.end, rotation, direction)
-    basis, axes = _tangents(direction), torch.eye(3, dtype=start.dtype, device=start.device)
-    back = so3.conjugate(rotation)
-    plane = torch.linalg.cross(direction.expand_as(start), start)
-    epipolar = torch.linalg.cross(turned, direction.expand_as(turned))
-    of_end = so3.rotate(back, plane)
+    start, matrix, skew = rays.start, so3.matrix(rotation), so3.hat(direction)
+    turned = rays.end @ matrix.mT
+    distance, left, ahead = epipolar_residuals(start, rays.end, rotation, direction)
+    basis = _tangents(direction)
+    epipolar, of_end = turned @ skew, start @ (-skew @ matrix)
     spread = (epipolar[:, :2].square().sum(-1) + of_end[:, :2].square().sum(-1)).clamp(min=_EPSILON).sqrt()
-    # Derivatives of both normals, (5, M, 3), for R <- exp(w) R and for the direction.
-    turns = torch.linalg.cross(axes[:, None].expand(-1, len(turned), -1), turned.expand(3, -1, -1))
-    by_epipolar = torch.cat(
-        [torch.linalg.cross(turns, direction.expand_as(turns)),
-         torch.linalg.cross(turned.expand(2, -1, -1), basis[:, None].expand(-1, len(turned), -1))]
-    )  # fmt: skip
-    by_end = torch.cat(
-        [torch.linalg.cross(plane.expand(3, -1, -1), axes[:, None].expand(-1, len(plane), -1)),
-         torch.linalg.cross(basis[:, None].expand(-1, len(start), -1), start.expand(2, -1, -1))]
-    )  # fmt: skip
-    by_end = so3.rotate(back, by_end)
-    by_spread = (by_epipolar[..., :2] * epipolar[:, :2]).sum(-1) + (by_end[..., :2] * of_end[:, :2]).sum(-1)
-    by_error = (by_epipolar * start).sum(-1)
+    # Derivatives of both normals, (M, 5, 3), for R <- exp(w) R and for the direction: products with constant vectors.
+    axes, sides = so3.hat(torch.eye(3).to(start)), so3.hat(basis)
+    by_epipolar = (turned @ torch.cat([*(-axes @ skew), *sides], 1)).unflatten(1, (5, 3))
+    by_end = (start @ torch.cat([*(-skew @ axes @ matrix), *(-sides @ matrix)], 1)).unflatten(1, (5, 3))
+    by_spread = (by_epipolar[..., :2] * epipolar[:, None, :2]).sum(-1) + (by_end[..., :2] * of_end[:, None, :2]).sum(-1)
+    by_error = (by_epipolar * start[:, None]).sum(-1)
     pixels = rays.focal / options.scale
-    jacobian = ((by_error - distance / spread * by_spread) / spread).mT * pixels
+    jacobian = (by_error - distance[:, None] / spread[:, None] * by_spread) / spread[:, None] * pixels
     residual = distance * pixels
     weight = ahead / (1 + residual.square())
     hessian = (jacobian * weight[:, None]).mT @ jacobian

@@ -52,7 +52,8 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
 
     Args:
         settings: instance of a dataclass; fields of type int, float, bool, str and ``Literal`` of texts are checked.
-        ranges: smallest and largest valid value by field, both inclusive; other fields are not bounded.
+        ranges: smallest and largest valid value by field, both inclusive; other fields are not bounded. A field of type
+            ``tuple[float, float]`` with an entry holds a range, the lower limit first, within these two.
 
     Raises:
         DvoError: a value of another type, not finite, out of range or unknown, with the name of the field.
@@ -75,7 +76,12 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
             raise DvoError(f"unknown: {shown(value)}", field=item.name, remedy=remedy)
         if item.name in ranges:
             low, high = ranges[item.name]
-            if not low <= value <= high:
+            if kind == tuple[float, float]:
+                numbers = isinstance(value, (tuple, list)) and all(type(x) in (int, float) for x in value)
+                if not numbers or len(value) != 2 or not low <= value[0] <= value[1] <= high:
+                    remedy = f"give [low, high], from {low:g} to {high:g}"
+                    raise DvoError(f"no range: {shown(value)}", field=item.name, remedy=remedy)
+            elif not low <= value <= high:
                 limits = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
                 raise DvoError(f"out of range: {shown(value)}", field=item.name, remedy=f"give a number {limits}")
 

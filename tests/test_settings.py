@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import dvo
 from dvo.errors import DvoError
 from dvo.odometry.config import TrackerConfig
-from dvo.settings import from_table, parse_settings, read_settings
+from dvo.settings import check_settings, from_table, parse_settings, read_settings
 
 
 @pytest.mark.parametrize(
@@ -118,3 +118,18 @@ def test_a_table_with_a_wrong_entry(entry, message):
     with pytest.raises(DvoError, match=message) as error:
         from_table(Whole, full, FILE)
     assert str(error.value).startswith("whole.yaml: ") and error.value.remedy and len(str(error.value)) < 250
+
+
+@pytest.mark.parametrize("value", [(0.2, 0.1), (0.0, 0.5), (0.5, 2.0), (0.5,), "wide", None, (True, 1.0), ("a", "b")])
+def test_a_range_out_of_its_limits_is_named(value):
+    @dataclass(frozen=True)
+    class Span:
+        reach: tuple[float, float] = (0.1, 0.5)
+
+        def __post_init__(self) -> None:
+            check_settings(self, {"reach": (0.1, 1.0)})
+
+    Span([0.1, 1.0])
+    with pytest.raises(DvoError, match="no range") as caught:
+        Span(value)
+    assert caught.value.field == "reach"

@@ -133,15 +133,17 @@ def epipolar_residuals(
         Distances ``(M,)`` and ``(M, 2)`` remaining flow, on the plane ``z = 1``; and ``(M,)`` bool, rays that the
         rotation leaves in front of the camera.
     """
-    matrix, skew = so3.matrix(rotation), so3.hat(direction)
-    turned = end @ matrix.mT
-    ahead = turned[:, 2] > _LEAST_AHEAD
-    epipolar = turned @ skew  # b x d
-    error = (start * epipolar).sum(-1)
-    of_end = start @ (-skew @ matrix)  # R^T (d x a)
-    spread = (epipolar[:, :2].square().sum(-1) + of_end[:, :2].square().sum(-1)).clamp(min=_EPSILON).sqrt()
+    turned, epipolar, _, spread = _normals(start, end, so3.matrix(rotation), so3.hat(direction))
     left = turned[:, :2] / turned[:, 2:].clamp(min=_LEAST_AHEAD) - start[:, :2]
-    return error / spread, left, ahead
+    return (start * epipolar).sum(-1) / spread, left, turned[:, 2] > _LEAST_AHEAD
+
+
+def _normals(start: Tensor, end: Tensor, matrix: Tensor, skew: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Turned rays ``b = R q``, normals ``b x d`` and ``R^T (d x a)`` of the epipolar planes, divisor of distances."""
+    turned = end @ matrix.mT
+    epipolar, of_end = turned @ skew, start @ (-skew @ matrix)
+    spread = (epipolar[:, :2].square().sum(-1) + of_end[:, :2].square().sum(-1)).clamp(min=_EPSILON).sqrt()
+    return turned, epipolar, of_end, spread
 
 
 def _rays(flow: Tensor, intrinsics: Tensor, points: int) -> _Rays:
@@ -172,11 +174,9 @@ def _step(
 ) -> tuple[Tensor, Tensor]:
     """One Gauss-Newton step over a rotation vector on the left of the rotation and two angles of the direction."""
     start, matrix, skew = rays.start, so3.matrix(rotation), so3.hat(direction)
-    turned = rays.end @ matrix.mT
-    distance, left, ahead = epipolar_residuals(start, rays.end, rotation, direction)
+    turned, epipolar, of_end, spread = _normals(start, rays.end, matrix, skew)
+    distance, ahead = (start * epipolar).sum(-1) / spread, turned[:, 2] > _LEAST_AHEAD
     basis = _tangents(direction)
-    epipolar, of_end = turned @ skew, start @ (-skew @ matrix)
-    spread = (epipolar[:, :2].square().sum(-1) + of_end[:, :2].square().sum(-1)).clamp(min=_EPSILON).sqrt()
     # Derivatives of both normals, (M, 5, 3), for R <- exp(w) R and for the direction: products with constant vectors.
     axes, sides = so3.hat(torch.eye(3).to(start)), so3.hat(basis)
     by_epipolar = (turned @ torch.cat([*(-axes @ skew), *sides], 1)).unflatten(1, (5, 3))
@@ -194,6 +194,7 @@ def _step(
         x, y, z = turned.unbind(-1)
         z = z.clamp(min=_LEAST_AHEAD)
         u, v, zero = x / z, y / z, torch.zeros_like(x)
+        left = torch.stack([u, v], -1) - start[:, :2]
         # The projection of b + w x b, and no change by the direction of the translation.
         rows = torch.stack(
             [torch.stack([-u * y / z, (z + u * x) / z, -y / z, zero, zero], -1),
@@ -204,7 +205,7 @@ def _step(
         gradient = gradient + torch.einsum("mki,mk->i", rows * share, left)
     diagonal = hessian.diagonal()
     hessian = hessian + torch.diag(damping * diagonal + _EPSILON * (1 + diagonal.max()))
-    change = -torch.linalg.solve(hessian, gradient)
+    change = -torch.linalg.solve_ex(hessian, gradient)[0]  # what overflowed ends in a cost that is refused
     return so3.normalise(so3.multiply(so3.exp(change[:3]), rotation)), _unit(direction + change[3:] @ basis)
 
 

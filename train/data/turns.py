@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.geometry.precision import full_precision
-from dvo.settings import check_settings, shown
+from dvo.settings import check_settings
 from train.data.augment import random_source
 
 SALT = 0x70A2
@@ -53,13 +52,8 @@ class Turns:
     zoom: float = 1.15
 
     def __post_init__(self) -> None:
-        check_settings(self, {"probability": (0, 1), "limit": (0, 30), "zoom": (1, 2)})
-        for name, least, most in (("degrees", 1e-3, 30.0), ("smoothness", 0.0, 1.0)):
-            value = getattr(self, name)
-            numbers = isinstance(value, (tuple, list)) and all(type(x) in (int, float) for x in value)
-            if not numbers or len(value) != 2 or not least <= value[0] <= value[1] <= most:
-                remedy = f"give [low, high], from {least:g} to {most:g}"
-                raise DvoError(f"no range: {shown(value)}", field=name, remedy=remedy)
+        ranges = {"probability": (0, 1), "degrees": (1e-3, 30), "smoothness": (0, 1), "limit": (0, 30), "zoom": (1, 2)}
+        check_settings(self, ranges)
 
 
 def turn_cameras(batch: dict[str, Tensor], settings: Turns, seed: int, step: int) -> dict[str, Tensor]:

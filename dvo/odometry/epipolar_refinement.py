@@ -63,11 +63,17 @@ class _Rays:
 
     start: Tensor  # (M, 3) of camera a
     end: Tensor  # (M, 3) of camera b
+    weights: Tensor  # (M,)
     focal: float
 
 
 def refine_motion(
-    flow: Tensor, starts: Sequence[Tensor], intrinsics: Tensor, options: RefinementOptions | None = None
+    flow: Tensor,
+    starts: Sequence[Tensor],
+    intrinsics: Tensor,
+    options: RefinementOptions | None = None,
+    *,
+    weights: Tensor | None = None,
 ) -> Tensor:
     """Refine the motion between two views.
 
@@ -77,6 +83,8 @@ def refine_motion(
             their translations do not count.
         intrinsics: ``(4,)`` ``fx fy cx cy``, pixels of the map.
         options: settings; None for the defaults.
+        weights: ``(h, w)`` of the pixels, such as :func:`dvo.odometry.flow_reliability.flow_weights`; None for equal
+            ones.
 
     Returns:
         The pose found from the start that led to the least cost at the wider scale, ``(7,)`` float64; the translation
@@ -87,7 +95,7 @@ def refine_motion(
         >>> pose_ab = refine_motion(flow, [motion.poses_ab()[0]], intrinsics / model.STRIDE)
     """
     options = options or RefinementOptions()
-    rays = _rays(flow.double(), intrinsics.double(), options.points)
+    rays = _rays(flow.double(), intrinsics.double(), options.points, weights)
     coarse = replace(options, scale=_COARSE * options.scale)
     found = []
     for start in starts:
@@ -146,7 +154,7 @@ def _normals(start: Tensor, end: Tensor, matrix: Tensor, skew: Tensor) -> tuple[
     return turned, epipolar, of_end, spread
 
 
-def _rays(flow: Tensor, intrinsics: Tensor, points: int) -> _Rays:
+def _rays(flow: Tensor, intrinsics: Tensor, points: int, weights: Tensor | None = None) -> _Rays:
     _, h, w = flow.shape
     every = max(1, math.ceil(math.sqrt(h * w / points)))
     fx, fy, cx, cy = intrinsics.tolist()
@@ -158,15 +166,16 @@ def _rays(flow: Tensor, intrinsics: Tensor, points: int) -> _Rays:
     start = torch.stack([(x - cx) / fx, (y - cy) / fy, one], -1)[::every, ::every].flatten(0, 1)
     end = torch.stack([(x + flow[0] - cx) / fx, (y + flow[1] - cy) / fy, one], -1)[::every, ::every].flatten(0, 1)
     counts = torch.isfinite(end).all(-1)
-    return _Rays(start[counts], end[counts], (fx + fy) / 2)
+    weights = torch.ones_like(x) if weights is None else weights.to(x)
+    return _Rays(start[counts], end[counts], weights[::every, ::every].flatten()[counts], (fx + fy) / 2)
 
 
 def _cost(rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions) -> float:
-    """Sum of the Cauchy costs of both kinds of residuals."""
+    """Weighted sum of the Cauchy costs of both kinds of residuals."""
     distance, left, ahead = epipolar_residuals(rays.start, rays.end, rotation, direction)
     scaled = (distance * (rays.focal / options.scale)).square()
     parallax = left.square().sum(-1) * (rays.focal * options.parallax / options.scale) ** 2
-    return float(torch.where(ahead, scaled.log1p() + parallax.log1p(), 100.0).sum())
+    return float((rays.weights * torch.where(ahead, scaled.log1p() + parallax.log1p(), 100.0)).sum())
 
 
 def _step(
@@ -186,7 +195,8 @@ def _step(
     pixels = rays.focal / options.scale
     jacobian = (by_error - distance[:, None] / spread[:, None] * by_spread) / spread[:, None] * pixels
     residual = distance * pixels
-    weight = ahead / (1 + residual.square())
+    counted = rays.weights * ahead
+    weight = counted / (1 + residual.square())
     hessian = (jacobian * weight[:, None]).mT @ jacobian
     gradient = (jacobian * weight[:, None]).mT @ residual
     if options.parallax:
@@ -200,7 +210,7 @@ def _step(
             [torch.stack([-u * y / z, (z + u * x) / z, -y / z, zero, zero], -1),
              torch.stack([-(z + v * y) / z, v * x / z, x / z, zero, zero], -1)], 1,
         )  # fmt: skip
-        share = (ahead / (1 + left.square().sum(-1) * factor**2))[:, None, None] * factor**2
+        share = (counted / (1 + left.square().sum(-1) * factor**2))[:, None, None] * factor**2
         hessian = hessian + torch.einsum("mki,mkj->ij", rows * share, rows)
         gradient = gradient + torch.einsum("mki,mk->i", rows * share, left)
     diagonal = hessian.diagonal()

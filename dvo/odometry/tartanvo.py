@@ -25,6 +25,7 @@ from dvo.models.weights import LoadedWeights
 from dvo.odometry.config import with_changes
 from dvo.odometry.epipolar_refinement import refine_motion
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
+from dvo.odometry.flow_reliability import flow_weights
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.reset import start_again
@@ -56,7 +57,8 @@ class TwoFrameConfig:
         pixels: largest number of pixels of the working image; the aspect is kept (0: full resolution).
         scale: see :data:`ScaleRule`.
         refine: improve the motion of the pose network by the epipolar residuals of the flow
-            (:func:`dvo.odometry.epipolar_refinement.refine_motion`); TartanVO does not.
+            (:func:`dvo.odometry.epipolar_refinement.refine_motion`), weighted by
+            :func:`dvo.odometry.flow_reliability.flow_weights`; TartanVO does not.
         longest: limit of the length of a step, in median depths, with ``scale="parallax"``.
         join_share: share of the pixels that flow there and back must bring home for a frame after an interruption
             (frames without content, or a gap in time) to go on in the segment before it; otherwise it begins the next
@@ -135,6 +137,7 @@ class _View:
     """Last frame with content."""
 
     features: list[Tensor]
+    image: np.ndarray
     pose_wc: Tensor  # (7,) float64
     motion: Tensor | None = None  # (7,) of the frame in the coordinates of the one before it, without a length
 
@@ -290,7 +293,7 @@ class TartanOdometry:
         start = se3.identity(dtype=torch.float64)
         self._alone = len(self._estimates)
         if view is None:
-            return self._stand(timestamp, features, start, 1.0)
+            return self._stand(timestamp, (features, image), start, 1.0)
         camera = torch.as_tensor(intrinsics, dtype=torch.float32, device=self.device)[None]
         motion = self.model.between(view.features, features, camera)
         flow = motion.flows.flow[0].cpu().numpy()
@@ -299,22 +302,29 @@ class TartanOdometry:
             if returning_share(flow, back) < self.config.join_share:
                 self._segment += 1
                 self._reasons.setdefault(timestamp, UNRELATED)
-                return self._stand(timestamp, features, start, 1.0)
+                return self._stand(timestamp, (features, image), start, 1.0)
         self._alone = None
         pose_ab = se3.normalise(motion.poses_ab()[0].double().cpu())
         if self.config.refine:
             starts = [pose_ab] if view.motion is None else [pose_ab, view.motion]
-            pose_ab = refine_motion(torch.from_numpy(flow), starts, torch.from_numpy(intrinsics) / self.model.STRIDE)
+            weights = torch.from_numpy(flow_weights(view.image, image, flow))
+            camera_ab = torch.from_numpy(intrinsics) / self.model.STRIDE
+            pose_ab = refine_motion(torch.from_numpy(flow), starts, camera_ab, weights=weights)
         direction = pose_ab.clone()
         parallax = parallax_of(flow, pose_ab.numpy(), intrinsics / self.model.STRIDE)
         if self.config.scale == "parallax":
             pose_ab[:3] *= parallax.step(self.config.longest)
         pose_wc = se3.normalise(se3.compose(view.pose_wc, pose_ab))
-        return self._stand(timestamp, features, pose_wc, parallax.agreement(), direction)
+        return self._stand(timestamp, (features, image), pose_wc, parallax.agreement(), direction)
 
     def _stand(
-        self, timestamp: float, features: list[Tensor], pose_wc: Tensor, confidence: float, motion: Tensor | None = None
+        self,
+        timestamp: float,
+        shown: tuple[list[Tensor], np.ndarray],
+        pose_wc: Tensor,
+        confidence: float,
+        motion: Tensor | None = None,
     ) -> Estimate:
         """Keep a frame as the one that the next motion starts from."""
-        self._view = _View(features, pose_wc, motion)
+        self._view = _View(*shown, pose_wc, motion)
         return Estimate(timestamp, pose_wc.numpy().copy(), Status.TRACKING, confidence, self._segment)

@@ -107,6 +107,37 @@ def test_steps_use_the_derivatives_of_the_cost():
     torch.testing.assert_close(moved, wanted, atol=1e-6, rtol=1e-4)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_flows_of_no_weight_do_not_count(seed):
+    """A large part of the flow is wrong in the same way, which no robust cost finds out."""
+    flow, true = views(seed)
+    flow[:, :, 16:] = views(seed + 100, turn=0.1)[0][:, :, 16:]
+    weights = torch.ones(30, 40)
+    weights[:, 16:] = 0
+    options, start = RefinementOptions(iterations=30, parallax=0.0), near(true, seed)
+    weighted, equal = (errors(refine_motion(flow, [start], CAMERA, options, weights=w), true) for w in (weights, None))
+    assert max(weighted) < 0.2 and equal[1] > 1
+    cut = flow.clone()
+    cut[:, :, 16:] = torch.nan  # pixels that are not finite are left out
+    without = refine_motion(cut, [start], CAMERA, options)
+    torch.testing.assert_close(refine_motion(flow, [start], CAMERA, options, weights=weights), without)
+
+
+def test_a_weight_of_two_counts_a_pixel_twice():
+    flow, true = views(7, outliers=0.2)
+    options, start = RefinementOptions(points=300), near(true, 7)  # every second row and column
+    twice = torch.ones(30, 40)
+    twice[::4] = 2
+    rays = _rays(flow, CAMERA, 300, twice)
+    again = torch.cat([torch.arange(300), torch.arange(300)[rays.weights == 2]])
+    plain = type(rays)(rays.start[again], rays.end[again], torch.ones(len(again)).double(), rays.focal)
+    direction = torch.nn.functional.normalize(start[:3], dim=0)
+    assert len(again) == 460 and (rays.weights == 2).sum() == 160
+    assert _cost(rays, start[3:], direction, options) == pytest.approx(_cost(plain, start[3:], direction, options))
+    for found, wanted in zip(*(_step(r, start[3:], direction, options, 0.0) for r in (rays, plain)), strict=True):
+        torch.testing.assert_close(found, wanted)
+
+
 def test_residuals_are_distances_from_epipolar_lines():
     """To first order: the length of the least move of both ends that puts them on one epipolar plane."""
     flow, true = views(5)

@@ -8,6 +8,7 @@ Poses are ``T_cw`` (world to camera); coordinates are feature pixels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from dvo.ba.dense import dense_bundle_adjust, dense_patches, dense_plan, pixel_grid
 from dvo.ba.edges import EdgePlan
+from dvo.ba.kernels import Kernel
 from dvo.ba.options import BADamping, BAOptions
 from dvo.geometry.projection import Reprojection, reproject
 from dvo.nets.dense_update import DenseUpdate
@@ -181,6 +183,7 @@ class DenseOptions:
         iterations: Gauss-Newton iterations.
         damping: of bundle adjustment, besides that of the network.
         held: further measurements.
+        kernel: robust kernel of the residuals; its width is in feature pixels, for a measurement of full confidence.
         check: indices and weights, see :class:`dvo.ba.options.BAOptions`.
     """
 
@@ -189,6 +192,7 @@ class DenseOptions:
     iterations: int = 2
     damping: BADamping = DAMPING
     held: HeldEdges | None = None
+    kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
     check: bool | None = False
 
 
@@ -253,9 +257,10 @@ def _adjust(state: DenseState, damping: Tensor | None, options: DenseOptions) ->
         confidence = torch.cat((held.confidence, confidence), 1)
         plan = dense_plan(ii, jj, state.frames, h * w)
     motion_only = options.mode == "motion"
+    kernel = replace(options.kernel, width=options.kernel.width * math.sqrt(WEIGHT))
     settings = BAOptions(
         fixed=options.fixed, iterations=options.iterations, damping=options.damping, motion_only=motion_only,
-        bounds=(float(w), float(h)), check=options.check,
+        bounds=(float(w), float(h)), kernel=kernel, check=options.check,
     )  # fmt: skip
     return dense_bundle_adjust(
         state.poses_cw, state.inverse_depth, state.intrinsics, targets, WEIGHT * confidence, ii, jj, settings,

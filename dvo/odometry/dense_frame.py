@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dvo.ba.kernels import Kernel
 from dvo.geometry import se3
 from dvo.models.dense_step import DenseMode, DenseOptions, DenseState, VolumeLookup, dense_step, frame_graph
 from dvo.models.droid import DroidVO
@@ -35,6 +36,7 @@ def place_frame(
     pose_cw: Tensor,
     updates: int,
     mode: DenseMode = "motion",
+    kernel: Kernel = Kernel(),  # noqa: B008 (frozen)
 ) -> Placed:
     """Estimate the pose of a frame, or its flow alone.
 
@@ -46,6 +48,7 @@ def place_frame(
         pose_cw: ``(7,)`` to start from.
         updates: number of steps.
         mode: ``motion``, or ``flow`` where depths are not known yet.
+        kernel: robust kernel of the residuals, see :class:`dvo.models.dense_step.DenseOptions`.
 
     Returns:
         Pose and evidence.
@@ -64,7 +67,7 @@ def place_frame(
         torch.stack([a.hidden for a in anchors])[None],
     )
     lookup = VolumeLookup([PairVolume(a.matching, matching, config.pyramid, config.radius) for a in anchors])
-    options = DenseOptions(mode, fixed=[True] * count + [False])
+    options = DenseOptions(mode, fixed=[True] * count + [False], kernel=kernel)
     for _ in range(updates):
         state = dense_step(model, state, lookup, options)
     return Placed(state.poses_cw[0, -1], agreement(state))

@@ -10,10 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.kernels import Kernel
 from dvo.geometry import se3
 from dvo.graph.keyframe_log import KeyframeLog
 from dvo.models.droid import DroidVO, damping_of
 from dvo.odometry.dense_frame import place_frame
+from dvo.odometry.dense_restart import better_solution
 from dvo.odometry.dense_window import Agreement, DenseWindow, Keyframe
 from dvo.odometry.depth_maps import StoredDepth
 from dvo.odometry.droid_config import DenseConfig
@@ -109,6 +111,8 @@ class DenseMapper:
             found = self._solve(1, config.initial_updates, cold=True)
             self._add_proximity(1)
             found = self._solve(1, config.initial_updates) or found
+            if config.restart and better_solution(self.window, lambda: self._solve(1, 2 * config.initial_updates)):
+                found = self._solve(1, 1)
             if found is None or not self.supports(found):
                 return False
         self.ready = True
@@ -129,10 +133,11 @@ class DenseMapper:
         return found.confidence >= self.config.lost_confidence and found.inliers >= least
 
     def _solve(self, fixed: int, updates: int, cold: bool = False) -> Agreement | None:
-        found = None
+        found, config = None, self.config
         for update in range(updates):
             damping = damping_of(update if cold else updates + 10)
-            found = self.window.update(fixed, damping)
+            kernel = Kernel() if cold else config.kernel  # far from the solution, no residual is an outlier
+            found = self.window.update(fixed, damping, kernel)
             self.confidence = found.confidence
         return found
 
@@ -202,8 +207,9 @@ class DenseMapper:
             if view.matching is not None and len(keyframes) > 1:
                 anchors = [before, after] if last > first else [before]
                 placed = place_frame(
-                    self.model, anchors, view.matching, view.intrinsics, pose, self.config.frame_updates
-                )
+                    self.model, anchors, view.matching, view.intrinsics, pose, self.config.frame_updates,
+                    kernel=self.config.kernel,
+                )  # fmt: skip
                 pose = placed.pose_cw if self.supports(placed.found) else pose
             self.log.place(number, before.number, pose.double().cpu().numpy())
 

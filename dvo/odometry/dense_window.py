@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.dense import pixel_grid
+from dvo.ba.kernels import Kernel
 from dvo.ba.options import BADamping
 from dvo.models.dense_step import DAMPING, DenseOptions, DenseState, HeldEdges, VolumeLookup, dense_step, frame_graph
 from dvo.models.droid import DroidVO
@@ -207,12 +208,13 @@ class DenseWindow:
             torch.stack([frame.intrinsics for frame in frames]),
         )
 
-    def update(self, fixed: int, damping: BADamping = DAMPING) -> Agreement:
+    def update(self, fixed: int, damping: BADamping = DAMPING, kernel: Kernel = Kernel()) -> Agreement:  # noqa: B008
         """Revise all edges once and adjust poses and depths to them and to the held ones.
 
         Args:
             fixed: number of leading keyframes whose poses stay.
             damping: of bundle adjustment.
+            kernel: robust kernel of the residuals, see :class:`dvo.models.dense_step.DenseOptions`.
 
         Returns:
             Agreement of all edges.
@@ -236,7 +238,9 @@ class DenseWindow:
             held = HeldEdges(held_ii.to(poses.device), held_jj.to(poses.device), positions, confidence)
         state = replace(state, targets=torch.stack(targets)[None])
         lookup = VolumeLookup([edge.volume for edge in self.edges if edge.volume is not None])
-        state = dense_step(self.model, state, lookup, DenseOptions(fixed=fixed, damping=damping, held=held))
+        state = dense_step(
+            self.model, state, lookup, DenseOptions(fixed=fixed, damping=damping, held=held, kernel=kernel)
+        )
         self._take(state)
         return agreement(state)
 

@@ -292,7 +292,9 @@ class DroidOdometry:
         start = predicted_pose(before, self._recent[-1], view.timestamp, config.motion_damping)
         anchors = mapper.window.keyframes[:-3:-1]
         assert view.matching is not None
-        placed = place_frame(self.model, anchors, view.matching, view.intrinsics, start, config.frame_updates)
+        placed = place_frame(
+            self.model, anchors, view.matching, view.intrinsics, start, config.frame_updates, kernel=config.kernel
+        )
         found = placed.found
         if not mapper.supports(found, joining=bool(self._interrupted)):
             return self._fail(view)

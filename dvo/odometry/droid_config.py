@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 from dvo.settings import check_settings
 
@@ -23,6 +24,7 @@ _RANGES = {
     "max_age": (1, 10_000),
     "initial_updates": (1, 100),
     "updates": (1, 100),
+    "robust": (0, 1e4),
     "frame_updates": (1, 100),
     "translation_share": (0, 1),
     "motion_damping": (0, 1),
@@ -55,6 +57,9 @@ class DenseConfig:
         max_held: held edges that stay in bundle adjustment.
         max_age: updates after which an edge is held.
         initial_updates: updates of the initialisation, before and again after proximity edges are added.
+        restart: solve the first keyframes from other motions as well, and keep the better solution
+            (:func:`dvo.odometry.dense_restart.better_solution`); DROID-SLAM does not.
+        robust: width of the Cauchy kernel of bundle adjustment, feature pixels; 0 for no kernel, as in DROID-SLAM.
         updates: updates for each keyframe.
         frame_updates: updates of the pose of each frame, by two edges from the newest keyframes.
         translation_share: share of the flow of the translation alone in the distance of frames.
@@ -88,6 +93,8 @@ class DenseConfig:
     max_held: int = 48
     max_age: int = 16
     initial_updates: int = 6
+    restart: bool = True
+    robust: float = 1.0
     updates: int = 3
     frame_updates: int = 3
     translation_share: float = 0.7
@@ -109,6 +116,11 @@ class DenseConfig:
                 f"{self.warm_up} keyframes do not fit into the window of {self.window}", field="warm_up",
                 remedy="give a larger window, or fewer keyframes",
             )  # fmt: skip
+
+    @property
+    def kernel(self) -> Kernel:
+        """Robust kernel of bundle adjustment."""
+        return Kernel("cauchy", self.robust) if self.robust > 0 else Kernel()
 
 
 PRESETS: dict[str, dict[str, Any]] = {

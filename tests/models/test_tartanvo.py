@@ -125,4 +125,6 @@ def test_each_pass_corrects_the_rotation_of_the_one_before():
     assert len(passes) == 4 and errors[0] == pytest.approx(float(true.norm()) / 2, rel=0.1)
     for before, after in pairwise(errors):
         assert after == pytest.approx(before / 2, rel=0.1)
-    assert torch.equal(model.motion(flow, intrinsics)[1], passes[-1][1])
+    torch.testing.assert_close(
+        model.motion(flow, intrinsics)[1], passes[-1][1]
+    )  # LAPACK may round the last bit otherwise

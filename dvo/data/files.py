@@ -35,6 +35,18 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def is_folder(path: Path) -> bool:
+    """True for a folder, or a link to one; False for what cannot be looked up.
+
+    Args:
+        path: any.
+    """
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def lookups(path: Path) -> Iterator[None]:
     """Turn errors of the file system into one :class:`DvoError`.

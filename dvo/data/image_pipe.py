@@ -7,9 +7,11 @@ the segments of a JPEG (so that a thumbnail inside it is not taken for an image)
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import select
+import stat
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -26,22 +28,37 @@ _INTERVAL = 0.25  # seconds between two looks whether somebody has stopped the s
 _REMEDY = "write JPEG or PNG images one after the other, as ffmpeg -f image2pipe -c:v mjpeg - does"
 
 
-def pipe_reader(file: Any, stopped: Callable[[], bool]) -> Callable[[], bytes]:
+def pipe_reader(file: Any, stopped: Callable[[], bool], name: str = "pipe") -> Callable[[], bytes]:
     """Function that reads what has arrived.
 
+    A pipe is read by its descriptor, any other file by its own methods: what these decompress (``gzip``), decode
+    (chunks of HTTP) or have in a buffer is not what its descriptor gives.
+
     Args:
-        file: binary file; nothing of it has been read yet.
+        file: binary file; nothing of it has been read yet if it is a pipe.
         stopped: whether to end although the pipe is open.
+        name: of the stream, for messages.
 
     Returns:
-        Function that waits for bytes and returns them; none at the end.
+        Function that waits for bytes and returns them; none at the end. It raises a :class:`DvoError` where the file
+        cannot be read: a damaged ``gzip``, a connection that breaks, a file that is not binary.
     """
-    try:
-        descriptor = file.fileno()
-    except (OSError, AttributeError):  # a file in memory
-        return lambda: b"" if stopped() else file.read(_CHUNK)
+    descriptor = _pipe_descriptor(file)
+    take = getattr(file, "read1", file.read)  # what has arrived; read waits for all bytes
 
     def read() -> bytes:
+        if stopped():
+            return b""
+        if descriptor is None:
+            try:
+                data = take(_CHUNK)
+            except Exception as error:  # EOFError, zlib.error, HTTPException and others of the file's own kind
+                reason = " ".join(str(error).split())[:200] or type(error).__name__
+                raise DvoError(f"cannot be read ({reason})", file=name, remedy="check the stream") from error
+            if not isinstance(data, bytes):
+                message = f"reading gives {type(data).__name__}, not bytes"
+                raise DvoError(message, file=name, remedy="give a binary file that waits for its data")
+            return data
         # The descriptor, not the file: a thread that waits inside of sys.stdin would abort the end of the interpreter.
         while os.name != "nt" and not stopped():
             if select.select([descriptor], [], [], _INTERVAL)[0]:
@@ -49,6 +66,15 @@ def pipe_reader(file: Any, stopped: Callable[[], bool]) -> Callable[[], bytes]:
         return b"" if stopped() else os.read(descriptor, _CHUNK)
 
     return read
+
+
+def _pipe_descriptor(file: Any) -> int | None:
+    """Descriptor of a file of the system that may make its reader wait; None for every other one."""
+    raw = file.raw if isinstance(file, io.BufferedReader) else file
+    if not isinstance(raw, io.FileIO):
+        return None
+    descriptor = raw.fileno()
+    return None if stat.S_ISREG(os.fstat(descriptor).st_mode) else descriptor
 
 
 def split_images(read: Callable[[], bytes], name: str) -> Iterator[bytes]:

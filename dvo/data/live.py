@@ -124,6 +124,17 @@ class LiveFrames(Generic[T]):
         problem = "ends without an image" if in_time else f"no image within {timeout:g} s"
         raise DvoError(problem, file=self.name, remedy="check that the camera or the stream is on")
 
+    def skip(self, item: T) -> None:
+        """Take an element that :meth:`peek` has shown out of the queue, unless it has been dropped since.
+
+        Args:
+            item: the same object.
+        """
+        with self._changed:
+            if self._waiting and self._waiting[0] is item:
+                self._waiting.popleft()
+                self._changed.notify_all()
+
     def __iter__(self) -> Iterator[T]:
         """Elements in order of arrival.
 
@@ -200,11 +211,11 @@ class LiveFrames(Generic[T]):
             for item in self._frames:
                 if not self._put(item):
                     break
-        except Exception as caught:  # whatever it is, the consumer gets it
-            error = caught
-        finally:
             if isinstance(self._frames, GeneratorType):
                 self._frames.close()
+        except Exception as caught:  # whatever it is, also of the generator's end, the consumer gets it
+            error = caught
+        finally:
             with self._changed:
                 self._error, self._ended = error, True
                 self._changed.notify_all()

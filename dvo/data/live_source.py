@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import sys
 import threading
@@ -34,6 +35,11 @@ class Timed(Protocol):
     """Element of a stream of images."""
 
     @property
+    def index(self) -> int:
+        """Number of the image, dropped ones counted."""
+        ...
+
+    @property
     def timestamp(self) -> float:
         """Seconds."""
         ...
@@ -44,6 +50,7 @@ T = TypeVar("T", bound=Timed)
 QUEUE = 2
 """Frames that wait by default: one while another is tracked, and one that arrives in the meantime."""
 _FIRST = 15.0  # seconds to wait for the first image of a camera or an address
+_DAMAGED = 30  # images that may be damaged before the first good one: a stream that is joined in its midst
 
 
 class LiveRecording(Generic[T]):
@@ -70,26 +77,41 @@ class LiveRecording(Generic[T]):
         self.name = re.sub(r"[^A-Za-z0-9._-]+", "-", re.sub(r"^\w+://", "", live.name)).strip("-.") or "stream"
 
     def first(self, timeout: float | None) -> RawFrame:
-        """Wait for an image, which stays in the stream.
+        """Wait for an image that decodes, which stays in the stream; those before it are skipped, with a warning.
 
         Args:
             timeout: seconds; None for any time.
 
         Raises:
-            DvoError: none in time, or one that does not decode.
+            DvoError: none in time, or too many that do not decode.
         """
-        found = self.decode(self.live.peek(timeout))
-        if found is None:
-            raise DvoError("the first image does not decode", file=self.live.name, remedy="check the stream")
-        return found
+        end = None if timeout is None else time.monotonic() + timeout
+        for damaged in range(_DAMAGED):
+            try:
+                item = self.live.peek(None if end is None else max(end - time.monotonic(), 0.0))
+            except DvoError as error:
+                raise (self._damaged(damaged, error) if damaged else error) from None
+            found = self.decode(item)
+            if found is not None:
+                if damaged:
+                    what = "image was" if damaged == 1 else f"{damaged} images were"
+                    self.warnings.append(f"the first {what} skipped: not to be decoded")
+                return found
+            self.live.skip(item)
+        raise self._damaged(_DAMAGED)
+
+    def _damaged(self, count: int, then: DvoError | None = None) -> DvoError:
+        what = "image does not decode" if count == 1 else f"{count} images do not decode"
+        after = "" if then is None else f", and then: {then.message}"
+        return DvoError(f"the first {what}{after}", file=self.live.name, remedy="check the stream")
 
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; the stride counts frames that were not dropped."""
         numbered = enumerate(self.live)
-        for number, item in self.interval.select(numbered, lambda item: item[1].timestamp, stride, self.live.name):
+        for _, item in self.interval.select(numbered, lambda item: item[1].timestamp, stride, self.live.name):
             raw = self.decode(item)
             if raw is None:
-                log.unreadable.append(f"image {number}")
+                log.unreadable.append(f"image {item.index}")
             else:
                 yield raw
         dropped = self.live.counts.dropped
@@ -260,9 +282,12 @@ class _Encoded:
 
 
 def _of_pipe(file: Any, fps: float | None, queue: int | None, stopped: threading.Event) -> LiveRecording[_Encoded]:
-    name = "standard input" if file == STANDARD_INPUT else str(getattr(file, "name", "pipe"))
+    given = getattr(file, "name", None)  # a number, if it was opened by a descriptor
+    name = "standard input" if file == STANDARD_INPUT else given if isinstance(given, str) and given else "pipe"
     if file == STANDARD_INPUT:
         file = getattr(sys.stdin, "buffer", None)  # a service may have no standard input
+    if isinstance(file, io.TextIOWrapper):
+        file = file.buffer
     if file is None or getattr(file, "closed", False):
         raise DvoError("is closed", file=name, remedy="pipe images into it: ffmpeg ... -f image2pipe - | dvo run -")
     if not hasattr(file, "read"):
@@ -273,7 +298,7 @@ def _of_pipe(file: Any, fps: float | None, queue: int | None, stopped: threading
 
     def images() -> Iterator[_Encoded]:
         clock = StreamClock()
-        for index, data in enumerate(split_images(pipe_reader(file, stopped.is_set), name)):
+        for index, data in enumerate(split_images(pipe_reader(file, stopped.is_set, name), name)):
             yield _Encoded(index, clock(time.monotonic()) if fps is None else index / fps, data)
 
     times = "arrival" if fps is None else "fps"

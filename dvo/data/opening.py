@@ -7,7 +7,7 @@ from numbers import Integral
 from pathlib import Path
 
 from dvo.data.colmap_cameras import is_calibration_file
-from dvo.data.files import is_file
+from dvo.data.files import is_file, is_folder
 from dvo.data.recording import Log, RawFrame, Recording
 from dvo.errors import DvoError
 
@@ -54,12 +54,12 @@ def locate(given: Path | str, source: Path, field: str) -> Path:
         DvoError: no such file.
     """
     path = Path(given)
-    base = source if source.is_dir() else source.parent
+    base = source if is_folder(source) else source.parent
     may_be_folder, is_calibration = field in ("mask", "depth", "right"), field in ("calib", "depth-calib")
     for option in (path, base / path):
         if is_calibration_file(option) if is_calibration else is_file(option):
             return option
-        if may_be_folder and option.is_dir():
+        if may_be_folder and is_folder(option):
             return option
     kind = "file or folder" if may_be_folder else "file"
     raise DvoError(f"no such {kind}", file=path, field=field, remedy=f"give an existing {kind} to --{field}")

@@ -78,9 +78,8 @@ class Log:
         found = list(self.notes)
         if self.unreadable:
             count = len(self.unreadable)
-            found.insert(
-                0, f"{count} image{'s' * (count > 1)} could not be read and were skipped: {_few(self.unreadable)}"
-            )
+            what = "1 image could not be read and was" if count == 1 else f"{count} images could not be read and were"
+            found.insert(0, f"{what} skipped: {_few(self.unreadable)}")
         if self.without:
             count = len(self.without)
             found.append(f"{count} depth or right image{'s' * (count > 1)} could not be read: {_few(self.without)}")

@@ -49,14 +49,14 @@ def split_topic(source: Path | str, topic: str | None) -> tuple[Path, str | None
         topic: given apart.
 
     Raises:
-        DvoError: a topic for what is no bag.
+        DvoError: a topic for what is no bag, or a path that cannot be looked up.
     """
     path, (file, mark, name) = Path(source), str(source).partition(":/")
-    if mark and "://" not in str(source):
-        with lookups(path):
-            if not path.exists() and Path(file).exists():
-                path, topic = Path(file), f"/{name}"
-    if topic is not None and path.exists() and not matches(path):
+    with lookups(path):
+        if mark and "://" not in str(source) and not path.exists() and Path(file).exists():
+            path, topic = Path(file), f"/{name}"
+        is_no_bag = topic is not None and path.exists() and not matches(path)
+    if is_no_bag:
         raise DvoError("only bags have topics", file=path, field="topic", remedy="leave it out")
     return path, topic
 
@@ -93,7 +93,7 @@ def _choose_topic(path: Path, topics: dict[str, Any], asked: str | None) -> str:
     if asked is not None:
         asked = f"/{asked.lstrip('/')}"
         if asked not in found:
-            message = f"{asked} is no topic of images; those are: {listed}"
+            message = f"{asked[:80]} is no topic of images; those are: {listed}"
             raise DvoError(message, file=path, field="topic", remedy="give one of them")
         return asked
     if not found:

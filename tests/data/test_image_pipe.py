@@ -1,6 +1,8 @@
+import gzip
 import io
 import os
 import threading
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -90,3 +92,27 @@ def test_pipes_and_files_in_memory():
         assert (read(), read()) == (b"abc", b"")
     memory = pipe_reader(io.BytesIO(b"abc"), lambda: False)
     assert (memory(), memory()) == (b"abc", b"")
+
+
+def test_what_a_file_decompresses_is_read(tmp_path):
+    """The descriptor of a gzip file gives compressed bytes, that of a buffered file not what is in its buffer."""
+    data = bytes(range(256)) * 1000
+    with gzip.open(tmp_path / "a.gz", "wb") as file:
+        file.write(data)
+    (tmp_path / "a").write_bytes(data)
+    for name, opened in {"a.gz": gzip.open, "a": open}.items():
+        with opened(tmp_path / name, "rb") as file:
+            assert file.read(5) == data[:5]
+            read = pipe_reader(file, lambda: False)
+            assert b"".join(iter(read, b"")) == data[5:]
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path):
+    cut = gzip.compress(bytes(10**4))[:-4]
+    read = pipe_reader(gzip.GzipFile(fileobj=io.BytesIO(cut)), lambda: False, "clip.gz")
+    with pytest.raises(DvoError, match=r"clip.gz: cannot be read \(Compressed file ended"):
+        list(iter(read, b""))
+    with pytest.raises(DvoError, match="pipe: reading gives str, not bytes"):
+        pipe_reader(io.StringIO("abc"), lambda: False)()
+    with pytest.raises(DvoError, match="NoneType, not bytes.*waits"):
+        pipe_reader(SimpleNamespace(read=lambda count: None), lambda: False)()

@@ -160,3 +160,32 @@ def test_a_session_takes_live_frames(fake_odometry):
     pairs = ((0.1 * i, frame(i).image) for i in range(12))
     done = dvo.run(fake_odometry(), stream(LiveFrames(pairs, drop=False), CAMERA))
     assert np.allclose(done.result.trajectory.timestamps, 0.1 * np.arange(12))
+
+
+def test_an_element_that_was_looked_at_is_skipped():
+    live = LiveFrames(iter("abc"), drop=False, queue=1)
+    first = live.peek(LIMIT)
+    live.skip(first)
+    until(lambda: live.peek(LIMIT) == "b")
+    live.skip(first)  # it has gone: nothing happens
+    assert list(live) == ["b", "c"]
+
+
+def test_an_error_at_the_end_of_a_generator_reaches_the_consumer():
+    class Frames:
+        def __init__(self, error):
+            self.error = error
+
+        def __call__(self):
+            try:
+                yield from range(3)
+            finally:
+                raise self.error
+
+    live = LiveFrames(Frames(OSError("the camera has gone"))(), drop=False)
+    with pytest.raises(OSError, match="has gone"):
+        list(live)
+    live = LiveFrames(Frames(OSError("at its release"))(), drop=False, queue=1)
+    assert next(iter(live)) == 0
+    live.close()  # closing the generator raises in its thread
+    assert live._ended and gone("dvo stream stream")

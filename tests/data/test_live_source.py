@@ -1,11 +1,13 @@
 """Cameras (a fake one), addresses (a server on this machine) and pipes as sources."""
 
+import gzip
 import http.server
 import io
 import math
 import os
 import threading
 import time
+import urllib.request
 from functools import partial
 
 import cv2
@@ -228,6 +230,65 @@ def test_a_pipe_without_a_rate_is_live(make):
         while not source.recording.live._ended:
             time.sleep(0.001)
         assert [frame.index for frame in source] == [4, 5] and source.times == "arrival"
+
+
+def test_a_compressed_file(make):
+    data = gzip.compress(b"".join(jpegs(make)))
+    source = open_stream(gzip.GzipFile(fileobj=io.BytesIO(data)), calib=make.calib(), fps=20)
+    assert [frame.index for frame in source] == list(range(6))
+    with gzip.open(make.root / "clip.gz", "wb") as file:
+        file.write(b"".join(jpegs(make)))
+    with gzip.open(make.root / "clip.gz", "rb") as file:  # it has a descriptor, that of the compressed file
+        assert len(list(open_stream(file, calib=make.calib(), fps=20))) == 6
+
+
+def test_the_response_of_a_server(server, make):
+    """Its header has been read into a buffer, together with the first images."""
+    address = server.replace("user:secret@", "")
+    with urllib.request.urlopen(f"{address}/camera", timeout=20) as response:
+        found = list(open_stream(response, calib=make.calib(), queue=0))
+    assert [frame.index for frame in found] == list(range(7))
+
+
+def test_a_process_in_text_mode(make):
+    out, into = os.pipe()
+    with os.fdopen(into, "wb") as writer:
+        writer.write(b"".join(jpegs(make)))
+    with os.fdopen(out, "r") as file:
+        source = open_stream(file, calib=make.calib(), fps=20)
+        assert source.recording.live.name == "pipe" and len(list(source)) == 6
+
+
+DAMAGED = b"\xff\xd8\xff\xd9"
+
+
+def test_damaged_images_at_the_beginning_are_skipped(make):
+    for count, said in ((1, "the first image was skipped"), (5, "the first 5 images were skipped")):
+        data = DAMAGED * count + b"".join(jpegs(make))
+        source = open_stream(io.BytesIO(data), calib=make.calib(), fps=20)
+        assert len(source.warnings) == 1 and said in source.warnings[0]
+        frames = list(source)
+        assert [frame.index for frame in frames] == list(range(count, count + 6)), "numbers are those of the stream"
+        assert frames[0].timestamp == pytest.approx(count / 20) and source.counts.received == 6
+    with pytest.raises(DvoError, match="the first 30 images do not decode"):
+        open_stream(io.BytesIO(DAMAGED * 50 + jpegs(make)[0]), calib=make.calib(), fps=20)
+    with pytest.raises(DvoError, match="the first 2 images do not decode, and then: ends without an image"):
+        open_stream(io.BytesIO(DAMAGED * 2), calib=make.calib())
+
+
+def test_a_damaged_image_is_named_by_its_number(make):
+    """Where others were dropped, its place among those that were processed is not its number."""
+    images = jpegs(make)
+    out, into = os.pipe()
+    with os.fdopen(out, "rb") as file:
+        with os.fdopen(into, "wb", buffering=0) as writer:
+            writer.write(images[0])
+            source = open_stream(file, calib=make.calib())
+            writer.write(b"".join([*images[1:4], DAMAGED, images[5]]))
+        while not source.recording.live._ended:
+            time.sleep(0.001)
+        assert [frame.index for frame in source] == [5], "of a live stream the newest two are kept"
+    assert source.warnings[0] == "1 image could not be read and was skipped: image 4"
 
 
 def test_pipes_that_hold_nothing(make):

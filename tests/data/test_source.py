@@ -1,10 +1,15 @@
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import dvo
 from dvo.data import Calibration, open_source, write_kitti_poses
+from dvo.data.depth_source import with_depth
+from dvo.data.files import is_folder
+from dvo.data.right_source import with_right
 from dvo.errors import DvoError
 
 
@@ -60,6 +65,27 @@ def test_missing_option_files(make, option):
     with pytest.raises(DvoError, match="no such file") as caught:
         open_source(folder, **options)
     assert caught.value.field == option
+
+
+LONG = "x" * 3000  # longer than the name of a file may be
+
+
+def test_names_that_are_too_long(make):
+    folder, calib = make.images("clip", ["0.png"]), make.calib()
+    for options in ({}, {"topic": "/camera/image_raw"}):
+        with pytest.raises(DvoError, match="cannot be read"):
+            dvo.open(LONG, calib=calib, **options)
+    with pytest.raises(DvoError, match="no such file or folder"):
+        dvo.open(f"none.bag:/{LONG}", calib=calib)
+    for field in ("calib", "mask"):
+        with pytest.raises(DvoError, match=f"{field}: no such file"):
+            dvo.open(folder, **{"calib": calib, "fps": 10, field: LONG})
+    for function, field in ((with_right, "right"), (with_depth, "depth")):
+        with pytest.raises(DvoError, match=f"{field}: no such file"):
+            function(dvo.open(folder, calib=calib, fps=10), LONG)
+    with pytest.raises(DvoError, match="only bags have topics"):
+        dvo.open(folder, calib=calib, topic=LONG)
+    assert not is_folder(Path(LONG)) and not is_folder(folder / "0.png") and is_folder(folder)
 
 
 def test_options_are_found_from_the_working_directory_then_from_the_source(make, monkeypatch):

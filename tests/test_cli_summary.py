@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -136,6 +137,48 @@ def test_a_page_that_cannot_be_drawn_costs_no_other_file(image_folder, tmp_path,
     assert "ValueError: a wrong number" in capsys.readouterr().err
     facts = summary(tmp_path / "out")
     assert not facts["finished"] and facts["frames"]["tracked"] == 20 and (tmp_path / "out" / "map.ply").is_file()
+
+
+def test_all_warnings_of_a_run_are_on_its_page(image_folder, tmp_path, given, monkeypatch, capsys):
+    """Those of reading, of observers that end after the page was written, and of files that could not be."""
+    (image_folder / "0007.png").write_bytes(b"no image")
+    (tmp_path / "base.txt").write_text("1.5 0 0 0 0 0 1\n")
+    given()
+    more = ["--extrinsics", str(tmp_path / "base.txt")]
+    assert main(arguments(image_folder, tmp_path / "out", *more)) == 0
+    warnings, text = summary(tmp_path / "out")["warnings"], (tmp_path / "out" / "summary.html").read_text()
+    assert ["0007.png" in warnings[0], "lever arm" in warnings[1], len(warnings)] == [True, True, 2]
+    assert re.findall('<p class="notice">(.*?)</p>', text) == [escape(warning) for warning in warnings]
+
+    def fail(*_, **__):
+        raise ValueError("a wrong number")
+
+    monkeypatch.setattr("dvo.commands.run.draw", fail)
+    assert main(arguments(image_folder, tmp_path / "out", *more)) == 2
+    warnings, text = summary(tmp_path / "out")["warnings"], (tmp_path / "out" / "summary.html").read_text()
+    assert "trajectory.png: ValueError: a wrong number" in warnings[1] and escape(warnings[1]) in text
+
+
+def test_the_page_of_a_metric_run(run, image_folder, tmp_path):
+    """Units and alignment are told as they are; another ground truth replaces the errors of each segment."""
+    out = run(new_segment=(8,))
+    facts = summary(out)
+    old = [part["ate_rmse"] for part in facts["segments"]]
+    known = [{"segment": number, "source": "depth", "deviation": None} for number in range(2)]
+    facts["info"]["scale"] = {"source": "depth", "segments": known}
+    (out / "run.json").write_text(json.dumps(facts))
+    (out / "frames.csv").unlink()
+    assert main(["summary", str(out)]) == 0
+    assert [world["unit"] for world in data_of(out / "summary.html")["worlds"]] == ["m", "m"]
+    truth = read_tum(image_folder.parent / "truth.txt")
+    truth.poses_wc[:, :3] *= 2
+    write_tum(tmp_path / "other.txt", truth)
+    assert main(["summary", str(out), "--groundtruth", str(tmp_path / "other.txt")]) == 0
+    text = (out / "summary.html").read_text()
+    shown = re.search(r"<h2>Segments</h2>.*?</table>", text, re.DOTALL)[0]
+    assert "ATE after SE(3)" in text and str(tmp_path / "other.txt") in text
+    cells = [float(cell) for cell in re.findall(r"<td>([0-9.e-]+)</td>", shown)]
+    assert max(old) < 1e-6 and max(cells[3::5][:2]) > 0.01, "a segment of half the size, in metres"
 
 
 def test_a_run_without_a_pose(given, image_folder, tmp_path):

@@ -48,7 +48,8 @@ def figures(facts: dict[str, Any], rows: Sequence[FrameRow]) -> list[tuple[str, 
     frames, info, metrics = (facts.get(name) or {} for name in ("frames", "info", "metrics"))
     found = [("tracked frames", f"{frames.get('tracked', '?')} of {frames.get('read', '?')}")]
     if metrics.get("ate_rmse") is not None:
-        found.append(("ATE after Sim(3)", f"{metrics['ate_rmse']:.3g} m"))
+        group = "SE(3)" if metrics.get("alignment") == "se3" else "Sim(3)"
+        found.append((f"ATE after {group}", f"{metrics['ate_rmse']:.3g} m"))
         if metrics.get("ate_percent") is not None:
             found.append(("ATE / path length", f"{metrics['ate_percent']:.2f} %"))
     if metrics.get("rpe_rot_deg") is not None:

@@ -25,7 +25,7 @@ from dvo.commands.picture import draw
 from dvo.commands.report import Scores, headline, print_report, score
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
 from dvo.commands.streams import print_counts, stream_facts, stream_settings
-from dvo.commands.summary import page_writers
+from dvo.commands.summary import Pages
 from dvo.data.capture import shown
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
@@ -248,11 +248,11 @@ def _track(
         done = replace(done, warnings=(*done.warnings, *recorder.warnings))
         scores = score(done, clip.groundtruth)
         writer = None if save_map is None else partial(_save, odometry, save_map)
-        pages = partial(page_writers, clip.name, table=table, odometry=odometry, groundtruth=clip.groundtruth)
+        pages = Pages(clip.name, done, table, odometry, clip.groundtruth)
         _write(folder, done, scores, clip, facts, writer, pages)
         for observer in observers:
             observer.finish(done)
-        results.add_warnings(folder, [text for observer in observers for text in getattr(observer, "warnings", ())])
+        pages.add_warnings(folder, [text for observer in observers for text in getattr(observer, "warnings", ())])
         progress.finish(done.result)
     for warning in new_warnings:
         warn(warning)
@@ -289,7 +289,7 @@ def _write(
     clip: Clip,
     facts: dict[str, Any],
     save_map: Callable[[], dict[str, Any]] | None,
-    pages: Callable[..., dict[str, Callable[[Path], None]]],
+    pages: Pages,
 ) -> None:
     """Replace the files of the recorder with the final ones, and write the map file, which run.json names."""
     facts = {**facts, "map_file": None, "metrics": None if scores.longest is None else asdict(scores.longest)}
@@ -305,9 +305,15 @@ def _write(
         )
 
     try:
-        more = pages(run=done, scores=scores, facts=facts)
         results.write_results(
-            folder, done, facts, draw=picture, more=more, segment_facts=scores.segment_facts, also=save_map
+            folder,
+            done,
+            facts,
+            draw=picture,
+            more={results.FRAMES: pages.frames},
+            page=pages.page,
+            segment_facts=scores.segment_facts,
+            also=save_map,
         )
     except KeyboardInterrupt:
         aborted = replace(done, interrupted=True, warnings=(*done.warnings, _ABORTED))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from dvo.commands import OK
 from dvo.commands.console import say
 from dvo.commands.page_tables import figures, headline_of, tables
 from dvo.commands.picture import world_root
-from dvo.commands.report import Scores
+from dvo.commands.report import score
 from dvo.data.output import replaced
 from dvo.data.trajectory import Trajectory, read_tum
-from dvo.metrics import MINIMUM_MATCHES, associate, evaluate, fit_alignment, stands_still, transform
+from dvo.metrics import MINIMUM_MATCHES, associate, fit_alignment, stands_still, transform
 from dvo.odometry import results
 from dvo.odometry.files import write_error
 from dvo.odometry.frame_table import FrameRow, FrameTable, keyframe_times, write_frames
@@ -44,7 +45,7 @@ def summary(arguments: argparse.Namespace) -> int:
     folder = Path(arguments.source)
     stored = read_results(folder)
     if arguments.groundtruth is not None:
-        stored = _with_truth(stored, read_tum(arguments.groundtruth))
+        stored = _with_truth(stored, Path(arguments.groundtruth))
     out = folder / results.PAGE if arguments.out is None else Path(arguments.out)
     try:
         with replaced(out) as part:
@@ -56,48 +57,77 @@ def summary(arguments: argparse.Namespace) -> int:
     return OK
 
 
-def _with_truth(stored: Stored, groundtruth: Trajectory) -> Stored:
+def _with_truth(stored: Stored, file: Path) -> Stored:
     """Results compared with another ground truth."""
+    groundtruth = read_tum(file)
     truth = true_positions(np.array([row.timestamp for row in stored.rows]), groundtruth)
     rows = [row.at(position) for row, position in zip(stored.rows, truth, strict=True)]
-    metrics = evaluate(stored.result.trajectory, groundtruth, align="se3" if stored.result.metric else "sim3")
-    facts = {**stored.facts, "metrics": asdict(metrics)}
+    scores = score(Run(stored.result, len(rows), False), groundtruth)
+    segments = stored.facts["segments"]
+    if scores.segments:
+        segments = [{**part, **errors} for part, errors in zip(segments, scores.segment_facts, strict=True)]
+    metrics = None if scores.longest is None else asdict(scores.longest)
+    facts = {**stored.facts, "groundtruth": str(file), "metrics": metrics, "segments": segments}
     return Stored(stored.result, rows, facts)
 
 
-def page_writers(
-    name: str,
-    run: Run,
-    scores: Scores,
-    facts: dict[str, Any],
-    table: FrameTable,
-    odometry: Odometry,
-    groundtruth: Trajectory | None,
-) -> dict[str, Callable[[Path], None]]:
+@dataclass(frozen=True)
+class Pages:
     """Writers of frames.csv and summary.html at the end of a run.
 
-    Args:
+    Attributes:
         name: of the clip.
         run: record of the session.
-        scores: its errors.
-        facts: metadata of the caller, the first entries of run.json.
         table: record of the estimates.
         odometry: that has tracked the clip.
         groundtruth: camera to world, metres; None if there is none.
-
-    Returns:
-        Functions that write a file, by its name.
     """
 
-    def rows() -> list[FrameRow]:
-        truth = None if groundtruth is None else true_positions(table.timestamps, groundtruth)
-        return table.rows(run, keyframe_times(odometry, run.result), truth)
+    name: str
+    run: Run
+    table: FrameTable
+    odometry: Odometry
+    groundtruth: Trajectory | None
 
-    def page(path: Path) -> None:
-        values = results.jsonable({**facts, **results.summary(run, scores.segment_facts)})
-        write_page(path, run_page(name, run.result, rows(), values))
+    def frames(self, path: Path) -> None:
+        """Write frames.csv."""
+        write_frames(path, self._rows())
 
-    return {results.FRAMES: lambda path: write_frames(path, rows()), results.PAGE: page}
+    def page(self, path: Path, values: dict[str, Any]) -> None:
+        """Write summary.html.
+
+        Args:
+            path: file to write.
+            values: content of run.json.
+        """
+        write_page(path, run_page(self.name, self.run.result, self._rows(), values))
+
+    def add_warnings(self, folder: Path, warnings: Sequence[str]) -> None:
+        """Add to the warnings in run.json and summary.html what was found after they were written.
+
+        Args:
+            folder: of the results.
+            warnings: sentences; nothing is written for none.
+
+        Raises:
+            DvoError: a file cannot be read or written.
+        """
+        if not warnings:
+            return
+        file = folder / results.SUMMARY
+        try:
+            values = json.loads(file.read_text(encoding="utf-8"))
+            values["warnings"] += warnings
+            results.write_summary(folder, values)
+            file = folder / results.PAGE
+            with replaced(file) as part:
+                self.page(part, values)
+        except OSError as error:
+            raise write_error(file, error) from error
+
+    def _rows(self) -> list[FrameRow]:
+        truth = None if self.groundtruth is None else true_positions(self.table.timestamps, self.groundtruth)
+        return self.table.rows(self.run, keyframe_times(self.odometry, self.run.result), truth)
 
 
 def true_positions(times: np.ndarray, groundtruth: Trajectory) -> np.ndarray:
@@ -213,7 +243,7 @@ def _own_worlds(result: Result, shown: set[int], facts: dict[str, Any]) -> list[
             continue
         tracks = tuple(TrackLine(result.segments[k].trajectory, k) for k in members)
         name = f"segment{'s' * (len(members) > 1)} {', '.join(map(str, members))}"
-        world = World(name, tracks, loops=_loop_positions(tracks, facts))
+        world = World(name, tracks, all(map(result.is_metric, members)), loops=_loop_positions(tracks, facts))
         mapped = root == main and result.longest not in shown
         worlds.append(replace(world, points=result.map.points, colors=result.map.colors) if mapped else world)
     return worlds

@@ -143,6 +143,7 @@ def write_results(
     *,
     draw: Callable[[Path], None] | None = None,
     more: Mapping[str, Callable[[Path], None]] | None = None,
+    page: Callable[[Path, dict[str, Any]], None] | None = None,
     segment_facts: Sequence[dict[str, Any]] = (),
     also: Callable[[], dict[str, Any]] | None = None,
 ) -> None:
@@ -157,6 +158,7 @@ def write_results(
         facts: metadata of the caller (source, seed, device, config, metrics), the first entries of run.json.
         draw: writes the plot to the file that it is given.
         more: writers of further files, by name (one of :data:`FILES`).
+        page: writes summary.html from the content of run.json, after the other files.
         segment_facts: further entries for each segment in run.json.
         also: writes a further file after these, anywhere, and returns entries for run.json about it.
 
@@ -172,30 +174,38 @@ def write_results(
     if draw is not None:
         writers[PICTURE] = draw
     writers |= more or {}
-    failures: list[DvoError] = []
-    for name, write in writers.items():
-        try:
-            with replaced(folder / name) as part:
-                write(part)
-        except OSError as error:
-            failures.append(write_error(folder / name, error))
-        except Exception as error:
-            if name not in VIEWS:
-                raise
-            failures.append(DvoError(f"{type(error).__name__}: {error}", file=folder / name, remedy="report this"))
+    failures = [found for name, write in writers.items() if (found := _failure(folder / name, write))]
     if also is not None:
         try:
             facts = {**facts, **also()}
         except DvoError as error:
             failures.append(error)
+    warned = replace(run, warnings=(*run.warnings, *map(str, failures)))
+    values = jsonable({**facts, **summary(warned, segment_facts), "finished": not failures})
+    if page is not None and (found := _failure(folder / PAGE, lambda path: page(path, values))):
+        failures.append(found)
+        values |= {"warnings": [*values["warnings"], str(found)], "finished": False}
     try:
         remove_files(folder, keep={*FILES, *writers})
-        warned = replace(run, warnings=(*run.warnings, *map(str, failures)))
-        write_summary(folder, {**facts, **summary(warned, segment_facts), "finished": not failures})
+        write_summary(folder, values)
     except OSError as error:
         failures.append(write_error(folder / SUMMARY, error))
     if failures:
         raise failures[0]
+
+
+def _failure(file: Path, write: Callable[[Path], None]) -> DvoError | None:
+    """Write a file; of what went wrong, the error."""
+    try:
+        with replaced(file) as part:
+            write(part)
+    except OSError as error:
+        return write_error(file, error)
+    except Exception as error:
+        if file.name not in VIEWS:
+            raise
+        return DvoError(f"{type(error).__name__}: {error}", file=file, remedy="report this")
+    return None
 
 
 def write_summary(folder: Path, values: dict[str, Any]) -> None:
@@ -211,25 +221,6 @@ def write_summary(folder: Path, values: dict[str, Any]) -> None:
     text = json.dumps(jsonable(values), indent=2, allow_nan=False)
     with replaced(folder / SUMMARY) as part:
         part.write_text(text + "\n", encoding="utf-8")
-
-
-def add_warnings(folder: Path, warnings: Sequence[str]) -> None:
-    """Add to the warnings in run.json what was found after it was written.
-
-    Args:
-        folder: of the results.
-        warnings: sentences; nothing is written for none.
-
-    Raises:
-        DvoError: the file cannot be read or written.
-    """
-    if not warnings:
-        return
-    try:
-        values = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
-        write_summary(folder, {**values, "warnings": [*values["warnings"], *warnings]})
-    except OSError as error:
-        raise write_error(folder / SUMMARY, error) from error
 
 
 def summary(run: Run, segment_facts: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:

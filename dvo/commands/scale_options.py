@@ -43,7 +43,7 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
         "--baseline",
         type=_metres,
         metavar="METRES",
-        help="distance of the cameras of a stereo pair (default: that of the data set)",
+        help="distance of the cameras of a stereo pair (default: that of the calibration file or the data set)",
     )
     group.add_argument(
         "--depth-scale",

@@ -132,11 +132,12 @@ def read_calibration(path: Path | str) -> Calibration:
     Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` (radial-tangential) separated by blanks or commas, ``#`` comments;
     the same by name, ``fx=525 fy=525 cx=320 cy=240``; or a 3x3 matrix K on three lines. YAML: ``fx, fy, cx, cy`` with
     optional ``width, height, model: none|radtan|fisheye, coefficients``; EuRoC ``sensor.yaml``; Kalibr camchain (its
-    ``cam0``); ROS camera_info and OpenCV's ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state
-    ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is
-    ``fx`` times it) too; and ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global
-    one, if it is left out; Kalibr's ``line_delay`` is not read). COLMAP's ``cameras.txt`` and ``cameras.bin``, with
-    ``:ID`` after the name if there are several cameras, see :mod:`dvo.data.colmap_cameras`.
+    ``cam0``); KITTI's ``calib.txt``, if all its cameras have the same intrinsics; ROS camera_info and OpenCV's
+    ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``)
+    and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too; and ``readout``, the
+    seconds from the first to the last row of a rolling shutter (0, a global one, if it is left out; Kalibr's
+    ``line_delay`` is not read). COLMAP's ``cameras.txt`` and ``cameras.bin``, with ``:ID`` after the name if there are
+    several cameras, see :mod:`dvo.data.colmap_cameras`.
 
     Args:
         path: text, YAML or COLMAP file.
@@ -176,11 +177,9 @@ def _from_text(text: str, path: Path) -> Calibration:
         if not fields:
             continue
         if fields[0].rstrip(":").upper() in ("P0", "P1", "P2", "P3", "P_RECT_00", "P_RECT_02"):
-            raise DvoError(
-                "this is KITTI's calibration of four cameras",
-                file=path,
-                remedy="open the KITTI sequence folder itself, or write the fx fy cx cy of one camera into a file",
-            )
+            from dvo.data.stereo_calibration import kitti_calibration
+
+            return kitti_calibration(path)
         try:
             rows.append([float(field) for field in fields])
         except ValueError:

@@ -126,8 +126,18 @@ def read_inertial(path: Path, T_camera_imu: np.ndarray | None = None) -> Inertia
     return InertialSamples(nanoseconds / 1e9, table[:, :3], table[:, 3:], T_camera_imu)
 
 
-def _rig(mav: Path) -> StereoRig | None:
-    """Calibration of ``cam1``; None if one of the cameras has no extrinsics."""
+def read_rig(mav: Path) -> StereoRig | None:
+    """Right camera ``cam1`` of a stereo pair, not rectified.
+
+    Args:
+        mav: folder with ``cam0/sensor.yaml`` and ``cam1/sensor.yaml``.
+
+    Returns:
+        None if one of the cameras has no extrinsics.
+
+    Raises:
+        DvoError: a malformed file.
+    """
     body_left, body_right = (read_extrinsics(mav / name / "sensor.yaml") for name in ("cam0", "cam1"))
     if body_left is None or body_right is None:
         return None
@@ -150,7 +160,7 @@ def _sensors(mav: Path, request: Request) -> Sensors:
     inertial = partial(_inertial, mav) if has_inertial else None
     if not (mav / "cam1" / "data").is_dir():
         return Sensors(inertial=inertial)
-    return Sensors(right=SameName(mav / "cam1" / "data"), stereo=partial(_rig, mav), inertial=inertial)
+    return Sensors(right=SameName(mav / "cam1" / "data"), stereo=partial(read_rig, mav), inertial=inertial)
 
 
 def _groundtruth(mav: Path, timestamps: np.ndarray, warnings: list[str]) -> Trajectory | None:

@@ -109,7 +109,7 @@ def open_kitti(path: Path, request: Request) -> Recording:
     if camera not in projections:
         raise DvoError("no such row", file=sequence / "calib.txt", field=camera, remedy="use KITTI's calib.txt")
     projection = projections[camera]
-    calibration = _calibration(projection, sequence / "calib.txt")
+    calibration = projection_calibration(projection, sequence / "calib.txt")
     times = _times(sequence, folder, images, request, warnings)
 
     groundtruth = None
@@ -128,7 +128,13 @@ def open_kitti(path: Path, request: Request) -> Recording:
     )  # fmt: skip
 
 
-def _calibration(projection: np.ndarray, file: Path) -> Calibration:
+def projection_calibration(projection: np.ndarray, file: Path) -> Calibration:
+    """Calibration of a rectified camera.
+
+    Args:
+        projection: ``(3, 4)``, see :func:`read_projections`.
+        file: that it comes from.
+    """
     fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return Calibration(fx, fy, cx, cy, file=file)
 
@@ -145,13 +151,19 @@ def _sensors(sequence: Path, folder: Path, projections: dict[str, np.ndarray]) -
     if name is None or not (sequence / name).is_dir() or f"P{name[-1]}" not in projections:
         return Sensors()
     left, right = projections[f"P{folder.resolve().name[-1]}"], projections[f"P{name[-1]}"]
-    return Sensors(right=SameName(sequence / name), stereo=partial(_rig, left, right, sequence / "calib.txt"))
+    return Sensors(right=SameName(sequence / name), stereo=partial(projection_rig, left, right, sequence / "calib.txt"))
 
 
-def _rig(left: np.ndarray, right: np.ndarray, file: Path) -> StereoRig:
+def projection_rig(left: np.ndarray, right: np.ndarray, file: Path) -> StereoRig:
+    """Right camera of two rectified cameras, which are parallel.
+
+    Args:
+        left, right: ``(3, 4)`` projections, see :func:`read_projections`.
+        file: that they come from.
+    """
     T_left_right = _pose_in_camera_0(right)
     T_left_right[:3] -= _pose_in_camera_0(left)[:3]
-    return StereoRig(_calibration(right, file), T_left_right)
+    return StereoRig(projection_calibration(right, file), T_left_right)
 
 
 def _times(sequence: Path, folder: Path, images: list[Path], request: Request, warnings: list[str]) -> np.ndarray:

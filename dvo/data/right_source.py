@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,7 +21,10 @@ from dvo.data.registry import find_reader
 from dvo.data.sensors import Finder, StereoRig, rectified
 from dvo.data.sequence import RIGHT_OF
 from dvo.data.source import Source
+from dvo.data.stereo_calibration import right_camera
 from dvo.errors import DvoError
+
+T = TypeVar("T")
 
 _KIND = CompanionKind("right images", "--right", "images")
 _VIDEOS = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
@@ -30,8 +33,9 @@ _VIDEOS = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".
 def with_right(source: Source, right: Path | str | None = None, baseline: float | None = None) -> Source:
     """Give the frames of a source the right images of a stereo pair.
 
-    The right images of a data set have its calibration of the right camera. Others are those of a rectified pair: both
-    cameras have the calibration of the source and parallel axes. They belong to the images as depth images do
+    The right camera is that of the calibration file (:func:`dvo.data.stereo_calibration.right_camera`) or of the data
+    set. Where neither states one, and with ``baseline``, the pair is taken for a rectified one: both cameras have the
+    calibration of the source and parallel axes. Right images belong to the images as depth images do
     (:func:`dvo.data.companions.companions_of_images`).
 
     Args:
@@ -39,7 +43,7 @@ def with_right(source: Source, right: Path | str | None = None, baseline: float 
         right: folder of images, a list of ``time file`` rows, or of a video another one with the same frames; looked up
             beside the source too. None for those of the data set, or a folder with the usual name beside its images
             (``image_1`` of ``image_0``).
-        baseline: metres from the left to the right camera; None for that of the data set's calibration.
+        baseline: metres from the left to the right camera; None for that of the calibration.
 
     Returns:
         A source with the same frames, whose ``right`` is read when it is first wanted.
@@ -63,13 +67,12 @@ def with_right(source: Source, right: Path | str | None = None, baseline: float 
     if isinstance(recording, ImageRecording):
         own = recording.sensors
         finder = own.right if path is None else companions_of_images(path, recording, _KIND)
-        stereo = own.stereo if path is None and baseline is None else None
         finder = finder or _beside(source, recording)
-        sensors = replace(own, right=finder, stereo=stereo or _parallel(source, baseline))
+        sensors = replace(own, right=finder, stereo=_rig(source, baseline))
         found.recording = copy.copy(recording)
         found.recording.sensors = sensors
         return found
-    rig = _parallel(source, baseline)
+    rig = _rig(source, baseline)
     if path is not None and path.suffix.lower() in _VIDEOS and path.is_file():
         found.recording = PairedRecording(recording, find_reader(path, None).open(path, Request()), rig)
     else:
@@ -125,17 +128,30 @@ def _beside(source: Source, recording: ImageRecording) -> Finder:
     return companions_of_images(folder.parent / name, recording, _KIND)
 
 
-def _parallel(source: Source, baseline: float | None) -> Callable[[], StereoRig]:
-    """Loader of the right camera of a rectified pair with the calibration of the source."""
-    known = source.recording.calibration
-    baseline = baseline or (known.baseline if known is not None else None)
+def _rig(source: Source, baseline: float | None) -> Callable[[], StereoRig]:
+    """Loader of the right camera: by the baseline, the calibration of the user, the data set, its calibration file."""
+    given, own = source.calibration, source.recording.calibration
     if baseline is None:
-        remedy = "give the distance of the two cameras in metres, such as --baseline 0.12"
-        raise DvoError("is not known from a calibration", file=source.path, field="--baseline", remedy=remedy)
+        name = source.recording.images[0].parent.name if isinstance(source.recording, ImageRecording) else ""
+        found = None if given is None or given is own else right_camera(given, name)
+        if found is None and source.recording.stereo is not None:
+            found = source.recording.stereo()
+        if found is None and own is not None:
+            found = right_camera(own, name)
+        if found is not None:
+            return partial(_same, found)
+        baseline = next((known.baseline for known in (given, own) if known is not None and known.baseline), None)
+    if baseline is None:
+        remedy = (
+            "give the distance of the two cameras in metres, such as --baseline 0.12, or a --calib FILE that states it "
+            "(KITTI's calib.txt, EuRoC's cam0/sensor.yaml, a camchain of Kalibr, or a YAML with baseline)"
+        )
+        file = (given.file if given is not None else None) or source.path
+        raise DvoError("is not known from a calibration", file=file, field="--baseline", remedy=remedy)
     camera = source.recorded_camera
     fx, fy, cx, cy = camera.intrinsics.tolist()
-    own = Calibration(fx, fy, cx, cy, camera.model, camera.coefficients, camera.width, camera.height)
-    return rectified(own, baseline)
+    calibration = Calibration(fx, fy, cx, cy, camera.model, camera.coefficients, camera.width, camera.height)
+    return rectified(calibration, baseline)
 
 
 def _with_file(raw: RawFrame, file: Path, log: Log) -> RawFrame:
@@ -150,5 +166,5 @@ def _read(file: Path, log: Log) -> np.ndarray | None:
     return image
 
 
-def _same(image: np.ndarray) -> np.ndarray:
-    return image
+def _same(found: T) -> T:
+    return found

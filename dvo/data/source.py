@@ -44,6 +44,7 @@ class Source:
         path: file or folder that was opened.
         camera: the camera of every frame (without distortion if frames are undistorted).
         recorded_camera: the camera as calibrated, distortion included.
+        calibration: of the recorded images, as read; None for a stream.
         masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
         depth_calibration: of depth images that are not registered to the images; None for others.
@@ -75,6 +76,7 @@ class Source:
         count = expected_frames(recording)
         self.frame_count: int | None = None if count is None else -(-count // stride)
         self._doubts = doubts
+        self.calibration: Calibration | None = None
         self.guess: FocalGuess | None = None
         self.masks: Masks | None = None
         self.depth_calibration: Calibration | None = None
@@ -91,7 +93,7 @@ class Source:
         """
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
         found = Source(self.recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
-        found.masks = self.masks
+        found.calibration, found.masks = calibration, self.masks
         found.depth_calibration = self.depth_calibration
         return found
 
@@ -320,8 +322,7 @@ def open_source(
         truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
     try:
         found = Source(recording, camera, truth, stride, undistort, doubts)
-        found.guess = guessed
-        found.masks = masks
+        found.calibration, found.guess, found.masks = calibration, guessed, masks
         return found
     except DvoError as error:  # the lens model does not know its file
         raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None

@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+import dvo
 from dvo.graph.map_file import open_map_file, write_map_file
 from dvo.graph.serialisation import load_graph, save_graph
 from dvo.odometry.scale_options import ScaleOptions
 from tests.archived_walk import archived_walk
 from tests.odometry.test_saving import SMALL, check_cuts, network, saved
+from tests.odometry.test_stereo_depth import clip
 from tests.odometry.test_tracker import frames, tracker
 
 WITH_DEPTH = replace(SMALL, scale=ScaleOptions(depth=True))
@@ -30,6 +32,19 @@ def test_going_on_from_a_file_with_measured_depths(tmp_path):
     assert result.metric and result.info["scale"]["source"] == "depth"
     whole = load_graph(tmp_path / "12.dvo")
     assert all(frame.measured is not None for frame in whole.archive)
+
+
+def test_going_on_from_a_file_with_right_images(tmp_path):
+    """Before the initialisation, and after keyframes with depths from right images have left the window."""
+
+    def new():
+        settings = {"removal": 5, "lifetime": 4, "patches": 12, "initial_frames": 4, "keyframe_motion": 0.5}
+        return dvo.load("small", pixels=160 * 120, scale={"stereo": True}, estimate_readout=False, **settings)
+
+    _, result = check_cuts(new, clip(14), (3, 11), tmp_path)
+    assert result.metric and result.info["scale"]["source"] == "stereo"
+    whole = load_graph(tmp_path / "11.dvo")
+    assert whole.archive and any((frame.measured[:, 1] > 0).any() for frame in whole.archive)
 
 
 def test_a_graph_in_metres_says_so_and_keeps_its_depths(tmp_path):

@@ -103,6 +103,21 @@ class Lazy(Generic[T]):
         instance.__dict__[self._key] = value
 
 
+class LazyNumber(Lazy[float]):
+    """:class:`Lazy` field of a number, whose default is not None.
+
+    Args:
+        default: value of an instance that is given none.
+    """
+
+    def __init__(self, default: float) -> None:
+        self._default = default
+
+    def __get__(self, instance: Any, owner: type | None = None) -> float:
+        found = super().__get__(instance, owner)
+        return self._default if found is None else found
+
+
 @dataclass(frozen=True)
 class Frame:
     """One image with its time and camera, and what other sensors measured at that time.

@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from dvo.data.frame import Frame
+from dvo.data.frame import Frame, Lazy, LazyNumber
 from dvo.data.trajectory import Trajectory
 
 
@@ -51,27 +51,36 @@ class Estimate:
             measurements do not determine it, and from odometries that have none.
         reference: timestamp of the reference, seconds: the oldest keyframe of the window that a measurement still
             reaches; None without one.
+
+    ``confidence``, ``covariance`` and ``reference`` may be functions, which are called when the value is first read.
     """
 
     timestamp: float
     pose_wc: np.ndarray | None
     status: Status
-    confidence: float = 0.0
+    confidence: LazyNumber = LazyNumber(0.0)  # noqa: RUF009 (a descriptor)
     segment: int = 0
     reason: str = ""
     recovered: bool = False
-    covariance: np.ndarray | None = None
-    reference: float | None = None
+    covariance: Lazy[np.ndarray] = Lazy()  # noqa: RUF009
+    reference: Lazy[float] = Lazy()  # noqa: RUF009
 
     @property
     def position_sigma(self) -> float | None:
         """Standard deviation of the position relative to the reference, units of the segment: root of the trace."""
-        return None if self.covariance is None else float(np.sqrt(np.trace(self.covariance[:3, :3])))
+        covariance = self.covariance
+        return None if covariance is None else float(np.sqrt(np.trace(covariance[:3, :3])))
 
     @property
     def rotation_sigma(self) -> float | None:
         """Standard deviation of the rotation relative to the reference, degrees: root of the trace."""
-        return None if self.covariance is None else float(np.rad2deg(np.sqrt(np.trace(self.covariance[3:, 3:]))))
+        covariance = self.covariance
+        return None if covariance is None else float(np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]))))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for pickling and copying: values in place of functions that would give them."""
+        _ = self.confidence, self.covariance, self.reference
+        return self.__dict__
 
 
 @dataclass(frozen=True)

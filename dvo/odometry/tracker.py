@@ -43,7 +43,7 @@ from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
 from dvo.odometry.tracker_state import TrackerState
-from dvo.odometry.uncertainty import UNKNOWN, newest_uncertainty
+from dvo.odometry.uncertainty import UNKNOWN, later_uncertainty
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
@@ -342,7 +342,7 @@ class PatchOdometry:
         graph, reason = self.graph, record.reason if status is Status.LOST else ""
         recovered = pose_wc is not None and self.state.enter(graph.segment, graph.world_of(graph.segment))
         segment = graph.segment - graph.recording.segment
-        sure = UNKNOWN if pose_wc is None else newest_uncertainty(self.step, self.config)
+        sure = UNKNOWN if pose_wc is None else later_uncertainty(self.step, self.config, self.state.unread)
         return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
                         sure.covariance, sure.reference)  # fmt: skip
 

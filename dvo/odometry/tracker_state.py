@@ -11,6 +11,8 @@ from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View
 from dvo.odometry.protocol import Estimate
 from dvo.odometry.rolling_shutter import Shutter
+from dvo.odometry.uncertainty import Uncertainty
+from dvo.odometry.window_measurements import Waiting
 
 
 @dataclass
@@ -32,6 +34,7 @@ class TrackerState:
         world: that of the last pose of the segment (:meth:`KeyframeGraph.world_of`); -1 before its first one.
         shutter: timing of the rows of the last frame.
         info: metadata for run.json.
+        unread: uncertainties of estimates that nobody has read yet; not written, as they change nothing.
     """
 
     generator: torch.Generator
@@ -48,6 +51,7 @@ class TrackerState:
     world: int = -1
     shutter: Shutter = Shutter(0.0, 1.0)
     info: dict[str, object] = field(default_factory=dict)
+    unread: Waiting[Uncertainty] = field(default_factory=Waiting)
 
     def begin_segment(self) -> None:
         """Forget the segment that has been closed."""

@@ -16,7 +16,9 @@ from dvo.ba.layer import BAOptions, make_problem
 from dvo.ba.reference import dense_rows
 from dvo.geometry import se3
 from dvo.odometry import tracker as tracker_module
+from dvo.odometry import uncertainty, window_measurements
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.depth_factor import SIGMA, depth_factors
 from dvo.odometry.protocol import Estimate, Status
 from dvo.odometry.uncertainty import (
     UNKNOWN,
@@ -25,6 +27,7 @@ from dvo.odometry.uncertainty import (
     newest_uncertainty,
     window_gauge,
 )
+from dvo.odometry.window_measurements import Later, Waiting
 from dvo.synth.sequence import make_sequence
 
 FAST = {"pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "initial_updates": 6, "restart": False}
@@ -72,21 +75,26 @@ def test_every_pose_has_a_covariance_and_nothing_else_has(tracked):
     assert estimates[-2].reference in [frame.timestamp for frame in odometry.window.frames]
 
 
+def information(step, factors=()):
+    """Dense information matrix of the poses after the reference and all depths, float64, and the rows of the poses."""
+    window, gauge = step.window, window_gauge(step.window)
+    options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, kernel=step.kernel)
+    tensors = window.poses_cw, window.patches, window.intrinsics, window.targets, window.confidence
+    edges = window.ii, window.jj, window.kk
+    problem = make_problem(*(x[None].double() for x in tensors), *edges, options, factors=factors, grouped=False)
+    state, (_, w, jac_p, jac_l) = problem.state, dense_rows(problem)
+    jacobian = torch.cat((jac_p, jac_l), -1)[0]
+    hessian = jacobian.T @ (w[0, :, None] * jacobian)
+    hessian += torch.diag(torch.cat((torch.full((state.size,), 1e-6), torch.full((jac_l.shape[-1],), 1e-4))))
+    return hessian, state.rows(POSES, torch.arange(len(window)))
+
+
 def test_it_is_the_marginal_of_the_whole_information_matrix(tracked):
     """The dense inverse, bordered with the gauge, in place of the eliminated depths."""
     _, step, estimates = tracked
     window, gauge = step.window, window_gauge(step.window)
-    options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, kernel=step.kernel)
-    tensors = window.poses_cw, window.patches, window.intrinsics, window.targets, window.confidence
-    problem = make_problem(
-        *(x[None].double() for x in tensors), window.ii, window.jj, window.kk, options, grouped=False
-    )
-    state, constraint = problem.state, size_gradient(window.poses_cw[None].double(), gauge.reference, gauge.members)
-    _, w, jac_p, jac_l = dense_rows(problem)
-    jacobian = torch.cat((jac_p, jac_l), -1)[0]
-    hessian = jacobian.T @ (w[0, :, None] * jacobian)
-    hessian += torch.diag(torch.cat((torch.full((state.size,), 1e-6), torch.full((jac_l.shape[-1],), 1e-4))))
-    rows = state.rows(POSES, torch.arange(len(window)))
+    constraint = size_gradient(window.poses_cw[None].double(), gauge.reference, gauge.members)
+    hessian, rows = information(step)
     column = torch.zeros(len(hessian), 1, dtype=torch.float64)
     for member in gauge.members:
         column[rows[member], 0] = constraint[0, member]
@@ -96,6 +104,75 @@ def test_it_is_the_marginal_of_the_whole_information_matrix(tracked):
     plain = config.sigma**2 * config.covariance_scale * inverse[rows[-1]][:, rows[-1]].numpy()
     scale = np.sqrt(np.outer(plain.diagonal(), plain.diagonal()))
     np.testing.assert_allclose(estimates[-2].covariance / scale, plain / scale, atol=2e-3)
+
+
+def with_depths(step, share, error, scale=1.0):
+    """The step with measured depths of a share of the patches, of a relative standard deviation, times a scale."""
+    window, g = copied(step).window, torch.Generator().manual_seed(0)
+    m = window.per_frame
+    depth = window.patches[:, 2, 0, 0].unflatten(0, (-1, m))
+    value = depth / scale * (1 + error * torch.randn(depth.shape, generator=g))
+    weight = torch.where(torch.rand(depth.shape, generator=g) < share, (SIGMA / (error * value)) ** 2, 0.0)
+    measured = torch.stack((value * (weight > 0), weight), -1)
+    window.frames = [replace(frame, measured=x) for frame, x in zip(window.frames, measured, strict=True)]
+    return SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
+
+
+@pytest.mark.parametrize(("share", "error"), [(0.8, 0.05), (0.1, 0.3)])
+def test_measured_depths_are_in_it(tracked, share, error):
+    """Information of the priors, their robust kernel included, in the inverse of the dense matrix; no scale is held."""
+    step = with_depths(tracked[1], share, error, scale=1.1)
+    hessian, rows = information(step, depth_factors(step.window.measured.double()))
+    config = TrackerConfig()
+    inverse = torch.linalg.inv(hessian)[rows[-1]][:, rows[-1]].numpy()
+    plain = config.sigma**2 * config.covariance_scale * inverse
+    found = newest_uncertainty(step, config)
+    scale = np.sqrt(np.outer(plain.diagonal(), plain.diagonal()))
+    np.testing.assert_allclose(found.covariance / scale, plain / scale, atol=1e-6)
+    without = newest_uncertainty(tracked[1], config)
+    tight = newest_uncertainty(with_depths(tracked[1], 1.0, 1e-4), config)
+    sizes = [np.trace(x.covariance[:3, :3]) for x in (tight, found)]
+    assert sizes[0] < sizes[1], "better depths, a surer scale"
+    assert np.trace(tight.covariance[3:, 3:]) < np.trace(without.covariance[3:, 3:])
+    assert tight.reference == without.reference and 0 < found.confidence <= tight.confidence
+
+
+def test_depths_that_are_not_measured_change_no_byte(tracked):
+    found = newest_uncertainty(with_depths(tracked[1], 0.0, 0.05), TrackerConfig())
+    plain = newest_uncertainty(tracked[1], TrackerConfig())
+    assert found.covariance.tobytes() == plain.covariance.tobytes() and found.confidence == plain.confidence
+
+
+def test_it_is_computed_when_it_is_read_with_the_same_bytes(tracked, monkeypatch):
+    """After tracking went on, and whether or not others were read; nothing is computed for what nobody reads."""
+    calls, marginal = [], uncertainty._marginal
+    monkeypatch.setattr(uncertainty, "_marginal", lambda *given: calls.append(1) or marginal(*given))
+    odometry = dvo.load("small", **FAST)
+    estimates = [odometry.track(frame) for frame in walk()]
+    odometry.finish()
+    assert not calls
+    known = [e for e in tracked[2] if e.pose_wc is not None]
+    late = [e for e in estimates if e.pose_wc is not None]
+    assert len(known) == len(late) <= window_measurements.MOST_WAITING
+    for before, after in reversed(list(zip(known, late, strict=True))):
+        again = pickle.loads(pickle.dumps(after))
+        for found in (after, again, replace(after, recovered=True)):
+            assert found.covariance.tobytes() == before.covariance.tobytes()
+            assert (found.confidence, found.reference) == (before.confidence, before.reference)
+    assert len(calls) == len(late), "once each"
+
+
+def test_estimates_that_are_kept_hold_few_windows(monkeypatch):
+    monkeypatch.setattr(window_measurements, "MOST_WAITING", 3)
+    waiting, made = Waiting(), []
+    kept = [Later(lambda k=k: made.append(k) or k) for k in range(5)]
+    for value in kept:
+        waiting.add(value)
+    assert made == [0, 1] and [value.waits for value in kept] == [False, False, True, True, True]
+    for k in range(5, 9):
+        waiting.add(Later(lambda k=k: made.append(k)))  # nobody holds it
+    assert made == [0, 1, 2, 3, 4], "what is gone is not computed"
+    assert [value() for value in kept] == [0, 1, 2, 3, 4] == made
 
 
 def test_scale_and_world_do_not_matter(tracked):
@@ -132,7 +209,7 @@ def test_the_gauge_leaves_out_frames_without_measurements(tracked):
 
 
 def test_no_pose_depends_on_it(tracked, monkeypatch):
-    monkeypatch.setattr(tracker_module, "newest_uncertainty", lambda step, config: UNKNOWN)
+    monkeypatch.setattr(tracker_module, "later_uncertainty", lambda step, config, waiting: UNKNOWN)
     odometry = dvo.load("small", **FAST)
     for frame, estimate in zip(walk(), tracked[2], strict=False):
         found = odometry.track(frame)

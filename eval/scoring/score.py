@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,9 @@ def score_all(out: Path, manifest: Manifest) -> list[Row]:
 def score_run(out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory | None) -> Row:
     """One run of an evaluation as a row.
 
+    An error while it is scored, for instance of the renderer that gives the truth about loops, makes this run a failed
+    one, and costs no other.
+
     Args:
         out: folder of the evaluation.
         manifest: of the evaluation.
@@ -148,7 +152,12 @@ def score_run(out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory |
         prediction, segments = read_prediction(folder), read_segments(folder)
     else:
         prediction, segments = Prediction("not run", "the evaluation was stopped before"), ()
-    return score(prediction, segments, groundtruth, system=run.system, suite=suite, sequence=sequence, seed=run.seed)
+    row = partial(score, system=run.system, suite=suite, sequence=sequence, seed=run.seed)
+    try:
+        return row(prediction, segments, groundtruth)
+    except Exception as error:
+        message = f"scoring ended by {type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        return row(replace(prediction, status="failed", reason=message), (), None)
 
 
 def score(

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from dvo.data.trajectory import read_tum
+from eval.execution.plan import read_manifest
 from eval.execution.predict import predict_here, read_segments
+from eval.scoring import score as score_module
 from eval.scoring.score import COLUMNS, Row, made_up_share, score
 
 REQUIRED_COLUMNS = [
@@ -41,6 +43,28 @@ def test_every_run_is_a_row(rows):
     assert by_name["null"].rotation_error_ratio == pytest.approx(1) and by_name["null"].ate_percent > 1
     assert np.isnan(by_name["bad"].ate_rmse) and by_name["absent"].reason == "needs a thing"
     assert by_name["bad"].auc == 0 and np.isnan(by_name["absent"].auc)
+
+
+def test_an_error_while_a_run_is_scored_costs_no_other(rows, plan, monkeypatch):
+    """The truth about loops of a rendered sequence comes from a renderer, which may fail."""
+    calls, judge = [], score_module.loop_errors
+
+    def broken(*given):
+        calls.append(given)
+        if len(calls) == 2:
+            raise RuntimeError("no memory\nfor the scene")
+        return judge(*given)
+
+    monkeypatch.setattr(score_module, "loop_errors", broken)
+    again = score_module.score_all(plan.out, read_manifest(plan.out))
+    assert len(calls) > 2
+    second = [row for row in rows if row.status in ("ok", "lost")][1]
+    for before, after in zip(rows, again, strict=True):
+        if before is second:
+            assert (after.status, after.reason) == ("failed", "scoring ended by RuntimeError: no memory for the scene")
+            assert (after.frames, after.auc) == (before.frames, 0) and np.isnan(after.ate_rmse) and after.failed
+        else:
+            assert repr(after) == repr(before)
 
 
 def test_columns():

@@ -205,16 +205,18 @@ def calibrate(
         clip = islice(_readable(frames if kept is None else copy(kept)), limit)
         seen = _track(odometry, clip, focal, wanted, options.interval, on_frame)
         profile, count = _profile(odometry)
-        deviation = math.hypot(options.inflation * profile.minimum.deviation, options.floor)
-        reason = _doubt(profile, deviation, focal, guess, options)
+        asked = [*walk, (math.log(focal), profile.minimum.value)]
+        slope = _slope(asked)
+        step = profile.minimum.value / slope
+        deviation = math.hypot(options.inflation * profile.minimum.deviation / slope, options.floor)
+        reason = _doubt(profile, deviation, focal * math.exp(step), guess, options)
         is_last = number + 1 == options.rounds
         if reason:
             if seen < wanted or wanted > options.frames or is_last:
                 break
             focal, wanted, walk = guess.focal, 2 * wanted, []
             continue
-        walk.append((math.log(focal), profile.minimum.value))
-        step = _step(walk)
+        walk = asked
         focal *= math.exp(step)
         if abs(step) > options.settled:  # the last round may end without having settled
             deviation = math.hypot(deviation, step)
@@ -236,23 +238,23 @@ def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:
             raise
 
 
-def _step(walk: list[tuple[float, float]]) -> float:
-    """Step to the focal length at which the measurements ask for no further one, in logarithms.
+def _slope(walk: list[tuple[float, float]]) -> float:
+    """Share of the way to the focal length at which the measurements ask for no further step, that they ask for.
 
     Measurements lean towards the focal length that they were tracked with, so that a step that they ask for is too
-    short. The secant through the last two rounds tells by how much.
+    short; so is the deviation of the focal length that they tell. The secant through the last two rounds tells by how
+    much.
 
     Args:
         walk: logarithm of the focal length of each round, and the step that its measurements ask for.
 
     Returns:
-        The last step, lengthened 2.5 times at most.
+        Divisor of the last step and its deviation, 0.4 to 1.
     """
     (at, step) = walk[-1]
     if len(walk) == 1 or at == walk[-2][0]:
-        return step
-    slope = (walk[-2][1] - step) / (at - walk[-2][0])
-    return step / min(max(slope, 0.4), 1.0)
+        return 1.0
+    return min(max((walk[-2][1] - step) / (at - walk[-2][0]), 0.4), 1.0)
 
 
 def _track(
@@ -299,12 +301,11 @@ def _profile(odometry: Odometry) -> tuple[FocalProfile, int]:
 def _doubt(
     profile: FocalProfile, deviation: float, focal: float, guess: FocalGuess, options: CalibrationOptions
 ) -> str:
-    """Reason for not believing a minimum; empty for one that is believed."""
+    """Reason for not believing the focal length of a minimum, after the step; empty for one that is believed."""
     if not np.isfinite(deviation) and profile.contrast == 0 and profile.minimum.gain == 0:
         return "too few frames could be tracked"
     if not (deviation <= options.max_deviation and profile.contrast >= options.min_contrast):  # nan fails too
         return "the motion does not tell: the measurements fit a wide range of focal lengths"
-    found = math.log(focal / guess.focal) + profile.minimum.value
-    if abs(found) > 4 * guess.deviation / guess.focal:
-        return f"the measurements fit {math.exp(found) * guess.focal:.0f} px best, which is hardly possible"
+    if not abs(math.log(focal / guess.focal)) <= 4 * guess.deviation / guess.focal:
+        return f"the measurements fit {focal:.0f} px best, which is hardly possible"
     return ""

@@ -1,5 +1,6 @@
 """Calibration of a camera from its images: ``dvo.calibrate``."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,10 @@ import dvo
 from dvo.data import read_calibration
 from dvo.data.focal_guess import FocalGuess, guess_from_angle
 from dvo.errors import DvoError
-from dvo.odometry.calibrate import CalibrationOptions, SelfCalibration, _step, calibrate
+from dvo.odometry import calibrate as calibrate_module
+from dvo.odometry.calibrate import CalibrationOptions, SelfCalibration, _slope, calibrate
+from dvo.odometry.focal_length import FocalProfile
+from dvo.odometry.self_calibration import Minimum
 from dvo.synth.sequence import make_sequence
 
 
@@ -54,8 +58,49 @@ def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(lean, rounds
     at, walk = 0.4, []
     for _ in range(rounds):
         walk.append((at, -(1 - lean) * at))
-        at += _step(walk)
+        at += walk[-1][1] / _slope(walk)
     assert at == pytest.approx(0, abs=1e-9)
+
+
+@pytest.fixture
+def leaning(clip, monkeypatch):
+    """Calibration by measurements that ask for a share of the way to 200 px, the logarithm known to 1 %."""
+
+    def find(share, guess, **options):
+        tracked = []
+
+        def track(odometry, frames, focal, *rest):
+            tracked.append(focal)
+            return 60
+
+        def profile(odometry):
+            step = share * math.log(200 / tracked[-1])
+            return FocalProfile(Minimum(step, 0.01, 0.5), 0.5), 60
+
+        monkeypatch.setattr(calibrate_module, "_track", track)
+        monkeypatch.setattr(calibrate_module, "_profile", profile)
+        monkeypatch.setattr(calibrate_module, "load", lambda *_, **__: None)
+        return calibrate(clip[:1], guess, options=CalibrationOptions(frames=30, **options)), tracked
+
+    return find
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_the_deviation_is_lengthened_with_the_step(leaning, share):
+    found, tracked = leaning(share, FocalGuess(160.0, 40.0, "prior", 192, 144), floor=0.0)
+    assert found.found and found.focal == pytest.approx(200, rel=1e-6) and len(tracked) == (2 if share == 1 else 3)
+    assert found.deviation == pytest.approx(3 * 0.01 / share * 200, rel=1e-6)
+    believed, _ = leaning(share, FocalGuess(160.0, 40.0, "prior", 192, 144), floor=0.0, max_deviation=0.05)
+    assert believed.found == (share == 1)
+
+
+def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):
+    """Half of the way lies in the range of the guess, the whole of it does not."""
+    narrow = FocalGuess(160.0, 160 * 0.05, "exif", 192, 144)  # 131 to 195 px
+    found, _ = leaning(0.5, narrow)
+    assert not found.found and (found.focal, found.deviation) == (160.0, narrow.deviation)
+    assert "fit 200 px best, which is hardly possible" in found.reason
+    assert leaning(0.5, replace(narrow, deviation=160 * 0.06))[0].focal == pytest.approx(200, rel=1e-6)
 
 
 def test_ignored_pixels_are_not_measured(clip):

@@ -230,6 +230,9 @@ def write_mesh(
         posed: views with their poses ``(7,)`` camera to world.
         cell: side of a voxel, metres; the function is truncated at four of them.
         farthest: depth beyond which pixels are left out, metres.
+
+    Raises:
+        DvoError: Open3D has not written the file, for instance because there is no surface.
     """
     kind = open3d.pipelines.integration
     volume = kind.ScalableTSDFVolume(cell, 4 * cell, kind.TSDFVolumeColorType.RGB8)
@@ -244,4 +247,6 @@ def write_mesh(
         volume.integrate(image, camera, np.linalg.inv(pose_matrices(pose_wc)))
     mesh = volume.extract_triangle_mesh()
     with replaced(file) as part:
-        open3d.io.write_triangle_mesh(str(part), mesh)
+        if not open3d.io.write_triangle_mesh(str(part), mesh):
+            remedy = "check the depth images and their scale; the fused cloud is written without it"
+            raise DvoError("Open3D has written no mesh", file=file, field="--tsdf", remedy=remedy)

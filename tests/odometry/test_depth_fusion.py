@@ -2,6 +2,8 @@
 
 import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,3 +89,75 @@ def test_a_mesh_needs_open3d(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(DvoError, match=r"dvo\[tsdf\]"):
         DepthCloud(tmp_path / "cloud.ply", tmp_path / "mesh.ply")
+
+
+class FakeOpen3D:
+    """Stand-in for the parts of Open3D that are used, by the names and arguments of its documentation (0.18).
+
+    Open3D itself has not been run by this test.
+    """
+
+    class TSDFVolumeColorType:
+        RGB8 = "RGB8"
+
+    def __init__(self, writes=True):
+        self.views, self.writes = [], writes
+        self.pipelines = SimpleNamespace(integration=self)
+        self.geometry = SimpleNamespace(Image=np.asarray, RGBDImage=self)
+        self.camera, self.io = self, self
+
+    def ScalableTSDFVolume(self, voxel_length, sdf_trunc, color_type):
+        self.volume = voxel_length, sdf_trunc, color_type
+        return self
+
+    def create_from_color_and_depth(self, color, depth, depth_scale, depth_trunc, convert_rgb_to_intensity):
+        assert color.dtype == np.uint8 and depth.dtype == np.float32 and color.shape == (*depth.shape, 3)
+        assert color.flags.c_contiguous and depth.flags.c_contiguous and np.isfinite(depth).all()
+        assert (depth_scale, convert_rgb_to_intensity) == (1.0, False)
+        return color, depth, depth_trunc
+
+    def PinholeCameraIntrinsic(self, width, height, fx, fy, cx, cy):
+        return width, height, fx, fy, cx, cy
+
+    def integrate(self, image, intrinsic, extrinsic):
+        self.views.append((image, intrinsic, extrinsic))
+
+    def extract_triangle_mesh(self):
+        return "mesh"
+
+    def write_triangle_mesh(self, filename, mesh):
+        assert filename.endswith(".ply"), "the extension tells Open3D the format"
+        if self.writes:
+            Path(filename).write_text(mesh)
+        return self.writes
+
+
+def test_what_is_passed_to_open3d(tmp_path, monkeypatch):
+    fake = FakeOpen3D()
+    monkeypatch.setitem(sys.modules, "open3d", fake)
+    cloud = DepthCloud(tmp_path / "cloud.ply", tmp_path / "mesh.ply")
+    cloud.begin(object())
+    depth = np.full((240, 320), 2.0)
+    depth[:40] = np.nan
+    for k in range(3):
+        cloud.update(frame(k, depth), Estimate(0.1 * k, None, Status.LOST))
+    run = run_of(3)
+    run.result.trajectory.poses_wc[2, :3] = 0.5, 0.2, -0.1
+    cloud.finish(run)
+    assert (tmp_path / "mesh.ply").read_text() == "mesh" and (tmp_path / "cloud.ply").is_file()
+    assert fake.volume == (pytest.approx(0.02), pytest.approx(0.08), "RGB8") and len(fake.views) == 3
+    (color, seen, farthest), camera, extrinsic = fake.views[2]
+    assert seen.shape == (120, 160) and (seen[:19] == 0).all() and (seen[21:] == 2).all()
+    assert (color == [200, 100, 50]).all() and farthest == pytest.approx(6.0)
+    assert camera == (160, 120, 100.0, 100.0, 79.25, 59.25), "of every other pixel, from the second one on"
+    np.testing.assert_allclose(extrinsic, [[1, 0, 0, -0.5], [0, 1, 0, -0.2], [0, 0, 1, 0.1], [0, 0, 0, 1]], atol=1e-12)
+
+
+def test_a_mesh_that_open3d_does_not_write_is_told(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", FakeOpen3D(writes=False))
+    cloud = DepthCloud(tmp_path / "cloud.ply", tmp_path / "mesh.ply")
+    cloud.begin(object())
+    cloud.update(frame(0, np.full((240, 320), 2.0)), Estimate(0.0, None, Status.LOST))
+    with pytest.raises(DvoError, match="mesh.ply: --tsdf: Open3D has written no mesh"):
+        cloud.finish(run_of(1))
+    assert [file.name for file in tmp_path.iterdir()] == ["cloud.ply"]

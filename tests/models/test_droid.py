@@ -6,9 +6,17 @@ import pytest
 import torch
 
 import dvo
+from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
 from dvo.geometry import se3
-from dvo.models.dense_step import DenseOptions, DenseState, HeldEdges, VolumeLookup, dense_step, frame_graph
+from dvo.models.dense_step import (
+    DenseOptions,
+    DenseState,
+    HeldEdges,
+    VolumeLookup,
+    dense_step,
+    frame_graph,
+)
 from dvo.models.droid import DroidVO, damping_of, neighbour_edges
 from dvo.models.registry import network_class
 from dvo.models.weights import import_checkpoint, load_weights, save_weights
@@ -176,6 +184,20 @@ def test_held_edges_count_in_bundle_adjustment(model):
         held = HeldEdges(state.graph.ii[:1], state.graph.jj[:1], there, torch.ones_like(there))
         pulled = dense_step(model, state, lookup, DenseOptions(held=held))
     assert torch.equal(plain.targets, pulled.targets) and not torch.equal(plain.poses_cw, pulled.poses_cw)
+
+
+def test_a_robust_kernel_takes_the_influence_of_far_measurements(model):
+    with torch.no_grad():
+        state, lookup = start_of(model, images(1, 3, 3, 48, 64), camera(3))
+        there = state.reprojected().coords[:, :1] + 3.0
+        held = HeldEdges(state.graph.ii[:1], state.graph.jj[:1], there, torch.ones_like(there))
+        (plain, wide, robust), alone = (
+            [dense_step(model, state, lookup, DenseOptions(iterations=1, held=pull, kernel=kernel)).poses_cw
+             for kernel in (Kernel(), Kernel("cauchy", 1e4), Kernel("cauchy", 0.3))]
+            for pull in (held, None)
+        )  # fmt: skip
+    torch.testing.assert_close(wide, plain, atol=1e-6, rtol=1e-4)
+    assert (robust - alone[2]).norm() < 0.3 * (plain - alone[0]).norm()
 
 
 def test_weights_files_name_the_network(model, tmp_path):

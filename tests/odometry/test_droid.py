@@ -132,6 +132,30 @@ def test_true_flow_gives_the_true_trajectory_and_depth(clip, knowing):
     assert len(done.map.points) == sum(int(found.reliable.sum()) for found in done.depth) == len(done.map.colors)
 
 
+def test_a_moving_body_does_not_pull_the_camera(clip, monkeypatch):
+    volume = true_volume(clip)
+
+    class Moving(volume):
+        """A tenth of the map shows a body that swings by up to 3 feature pixels."""
+
+        def __call__(self, coords):
+            found = super().__call__(coords)
+            h, w = coords.shape[:2]
+            (x, y), (u, v) = ((3 * np.sin(1.7 * number), 3 * np.cos(2.3 * number)) for number in self.pair)
+            found[:2, : h // 3, : w // 3] += torch.tensor([[[u - x]], [[v - y]]])
+            return found
+
+    for module in (dense_window, dense_frame):
+        monkeypatch.setattr(module, "PairVolume", Moving)
+    truth, errors = se3.inverse(clip.poses_cw.double()).numpy(), []
+    for robust in (1.0, 0.0):
+        done = run(DroidOdometry(Knowing(clip), replace(CONFIG, robust=robust)), frames_of(clip)).result
+        times = done.trajectory.timestamps
+        rows = [round(time * 10) for time in times]
+        errors.append(evaluate(done.trajectory, Trajectory(times, truth[rows])).ate_percent)
+    assert errors[0] < 0.5 * errors[1] and errors[1] > 2
+
+
 def test_another_scene_is_lost_and_then_begins_a_segment(clip, knowing):
     odometry = DroidOdometry(knowing, replace(CONFIG, patience=3))
     first = frames_of(clip)[:14]

@@ -243,8 +243,7 @@ class LoopCloser:
     def _visit(self, frame: ArchivedKeyframe) -> None:
         """Take a kept keyframe into the list, and begin to search for a loop if it is time to."""
         kept, options = self.finder.kept, self.finder.options
-        self.finder.keep(frame.identifier)
-        self.wait -= 1
+        self.wait -= self.finder.keep(frame.identifier)
         own = len(kept) > 2 * options.neighbours and kept[-1 - 2 * options.neighbours] >= self.graph.recording.keyframe
         if self.wait > 0 or not own or self.work is not None:
             return

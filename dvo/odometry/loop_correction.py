@@ -21,7 +21,8 @@ from dvo.odometry.loops import Loop, median_inverse_depth
 
 # Standard deviations of the edges of the pose graph: translation in median depths, rotation in rad, log scale.
 _STEP = (0.01, 0.002, 0.01)
-_LOOP = (0.01, 0.002, 0.01)
+_LOOP = (0.01, 0.002, 0.01)  # of a loop with the share _SURE of inliers or more; larger with fewer
+_SURE = 0.5
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ def prepare(graph: KeyframeGraph, kept: Sequence[int], loops: Sequence[Loop], lo
     inside = [other for other in loops if other.old in position and other.new in position]
     old = torch.tensor([position[other.old] for other in inside])
     new = torch.tensor([position[other.new] for other in inside])
-    deviation = torch.tensor([_STEP] * len(ii) + [_LOOP] * len(inside)).double()
+    doubt = [(_SURE / min(max(other.inliers, 0.01), _SURE)) ** 2 for other in inside]
+    deviation = torch.tensor([_STEP] * len(ii) + [tuple(d * x for x in _LOOP) for d in doubt]).double()
     ends = torch.cat([jj, new])
     shape = deviation[:, [0, 0, 0, 1, 1, 1, 2]].clone()
     shape[:, :3] *= depth[ends, None]

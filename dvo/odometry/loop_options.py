@@ -15,15 +15,21 @@ class LoopOptions:
     Attributes:
         seconds: smallest time between the two visits of a place in a segment.
         every: kept keyframes between two searches.
+        pace: seconds between two kept keyframes above which the later one counts as several towards the next search.
         neighbours: keyframes before and after each of the two that are matched along.
         likeness: smallest similarity of the descriptors of a candidate by retrieval, in [-1, 1].
-        retrieved: candidates by retrieval that are verified, at most.
+        retrieved: candidates by retrieval, at most.
         apart: identifiers of two such candidates differ by more than this.
         overlap: smallest share of the patches in view of a candidate by proximity.
-        near: candidates by proximity that are verified, at most; ``seconds`` apart.
+        near: candidates by proximity, at most; ``seconds`` apart.
+        guessed: least number of patches that agree on the pose of a candidate
+            (:func:`dvo.odometry.loop_guess.order_pairs`).
+        matched: candidates that are verified by the network, at most.
         updates: updates of the network before a candidate with fewer than ``hopeful`` inliers is refused, further ones
             before one with fewer than ``inliers`` is, and further ones of a loop.
-        hopeful, inliers: shares of inliers.
+        hopeful, inliers: shares of inliers among all patches of both visits.
+        inliers_in_view: least share of inliers of a loop among the patches that its poses put into view of the other
+            visit.
         delay: frames between the beginning of a search, or of a correction, and the frame that takes its result, so
             that tracking goes on meanwhile.
         patience: searches after a loop within which a second one has to confirm it.
@@ -39,24 +45,29 @@ class LoopOptions:
     """
 
     RANGES: ClassVar[dict[str, Range]] = {
-        "seconds": (0, 1e6), "every": (1, 10**4), "neighbours": (0, 8), "likeness": (-1, 1), "overlap": (0, 1),
-        "retrieved": (0, 100), "near": (0, 100), "apart": (0, 10**4), "delay": (0, 10**4),
-        "hopeful": (0, 1), "inliers": (0, 1), "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180),
+        "seconds": (0, 1e6), "every": (1, 10**4), "pace": (1e-3, 1e6), "neighbours": (0, 8), "likeness": (-1, 1),
+        "retrieved": (0, 100), "apart": (0, 10**4), "overlap": (0, 1), "near": (0, 100), "guessed": (0, 10**4),
+        "matched": (0, 100), "hopeful": (0, 1), "inliers": (0, 1), "inliers_in_view": (0, 1), "delay": (0, 10**4),
+        "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180),
         "scale": (0, 10), "adjust_delay": (0, 10**4), "adjust_iterations": (1, 1000), "adjust_frames": (3, 10**6),
         "adjust_edges": (1, 10**9),
     }  # fmt: skip
 
     seconds: float = 10.0
     every: int = 6
+    pace: float = 0.5
     neighbours: int = 1
     likeness: float = 0.3
-    retrieved: int = 2
-    apart: int = 20
-    overlap: float = 0.5
+    retrieved: int = 8
+    apart: int = 6
+    overlap: float = 0.3
     near: int = 2
+    guessed: int = 8
+    matched: int = 3
     updates: tuple[int, int, int] = (2, 2, 8)
     hopeful: float = 0.03
-    inliers: float = 0.4
+    inliers: float = 0.12
+    inliers_in_view: float = 0.2
     delay: int = 8
     patience: int = 4
     translation: float = 0.2

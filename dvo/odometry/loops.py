@@ -1,17 +1,19 @@
 """Search for loops: keyframes that show a place again that an earlier keyframe has seen.
 
-Candidates come from the present poses (proximity) and from the likeness of the images (retrieval). A candidate is
-verified by the network (:mod:`dvo.odometry.loop_window`): in a joint window of both keyframes and their neighbours, a
-share of the patches must be found where bundle adjustment reprojects them. A loop counts when a second one, close to it
-in time, gives the same correction.
+Candidates come from the present poses (proximity) and from the likeness of the images (retrieval). They are ordered by
+the number of patches that agree on a pose (:mod:`dvo.odometry.loop_guess`), and the first few are verified by the
+network (:mod:`dvo.odometry.loop_window`), starting from that pose: in a joint window of both keyframes and their
+neighbours, a share of the patches must be found where bundle adjustment reprojects them. A loop counts when a second
+one, close to it in time, gives the same correction.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 import torch
@@ -22,6 +24,7 @@ from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.places import PlaceIndex
 from dvo.odometry.loop_candidates import Candidate, by_likeness, by_proximity
+from dvo.odometry.loop_guess import Pair, order_pairs
 from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.loop_window import Group, GroupMatcher, Match
 from dvo.odometry.place_descriptors import PlaceDescriptor
@@ -73,12 +76,13 @@ class Search:
 
     Attributes:
         new: identifier of the keyframe.
-        pairs: candidates with the keyframes of both groups, the poses ``(n, 7)`` to start from, and whether the two are
-            of different worlds.
+        pairs: candidates.
+        predicted: number of the first of them, whose poses follow from a loop that waits for its confirmation.
     """
 
     new: int
-    pairs: tuple[tuple[Candidate, Group, Group, Tensor, bool], ...]
+    pairs: tuple[Pair, ...]
+    predicted: int = 0
 
 
 @dataclass
@@ -129,16 +133,22 @@ class LoopFinder:
         """
         self._recent[identifier] = descriptor
 
-    def keep(self, identifier: int) -> None:
+    def keep(self, identifier: int) -> int:
         """Take a keyframe that was archived and not dropped into the list and the index.
 
         Args:
             identifier: of the keyframe, larger than those before.
+
+        Returns:
+            Number of keyframes that it counts for towards the next search: more than one long after the one before it.
         """
+        archive, before = self.graph.archive, self.kept[-1] if self.kept else identifier
+        elapsed = archive[identifier].timestamp - archive[before].timestamp
         self.kept.append(identifier)
         if identifier in self._recent:
             self.places.add(identifier, self._recent[identifier])
         self._recent = {other: row for other, row in self._recent.items() if other > identifier}
+        return max(1, int(elapsed / self.options.pace))
 
     def find(self, new: int, pending: Loop | None = None) -> Loop | None:
         """Look for an earlier visit of the place of a keyframe.
@@ -162,17 +172,19 @@ class LoopFinder:
             The candidates, the most likely first, possibly none.
         """
         group, graph = self._group(new), self.graph
-        pairs = []
-        for candidate in [] if group is None else self._candidates(new, pending):
+        if group is None:
+            return Search(new, ())
+        poses_cw, pairs, predicted = graph.poses_cw(np.array(group)), [], 0
+        moved = se3.relative(poses_cw[group.index(new)].expand(len(group), 7), poses_cw)
+        for candidate, known in self._candidates(new, pending):
             old = self._group(candidate.old)
-            if group is None or old is None:
+            if old is None:
                 continue
-            poses_cw, at = graph.poses_cw(np.array([*old, *group])), len(old) + group.index(new)
-            moved = se3.relative(poses_cw[at].expand(len(group), 7), poses_cw[len(old) :])
-            start = torch.cat([poses_cw[: len(old)], se3.compose(moved, candidate.pose_cw.expand(len(group), 7))])
             joins = graph.world_of(graph.segment_of(candidate.old)) != graph.world_of(graph.segment_of(new))
-            pairs.append((candidate, self._frames(old), self._frames(group), start, joins))
-        return Search(new, tuple(pairs))
+            old_cw = graph.poses_cw(np.array(old))
+            pairs.append(Pair(candidate, self._frames(old), self._frames(group), old_cw, moved, joins))
+            predicted += known
+        return Search(new, tuple(pairs), predicted)
 
     def verify(self, search: Search) -> Loop | None:
         """Match the candidates of a search until one is verified. Nothing of the graph is read or changed.
@@ -185,11 +197,19 @@ class LoopFinder:
         """
         o = self.options
         decisions = tuple(zip(o.updates, (o.hopeful, o.inliers, o.inliers), strict=True))
-        for candidate, old, new, start, joins in search.pairs:
-            match = self.matcher.match(old, new, start, decisions)
-            if match is not None:
-                return _loop(candidate, old, new, match, joins)
+        ahead, others = search.pairs[: search.predicted], search.pairs[search.predicted :]
+        for pair in chain(ahead, self._promising(others)):
+            match = self.matcher.match(pair.old, pair.new, pair.start, decisions)
+            if match is not None and match.inliers_in_view >= o.inliers_in_view:
+                return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
         return None
+
+    def _promising(self, pairs: Sequence[Pair]) -> Iterator[Pair]:
+        """Pairs to match, the most promising first, with the poses to start from."""
+        maps = self.matcher.maps.maps(pairs[0].later) if pairs else None
+        if maps is not None:
+            o = self.options
+            yield from order_pairs(maps, pairs, o.guessed, o.matched)
 
     def agree(self, first: Loop, second: Loop) -> bool:
         """Find out if two loops ask for the same correction.
@@ -242,8 +262,8 @@ class LoopFinder:
                 earlier.append(identifier)
         return np.array(earlier, dtype=np.int64)
 
-    def _candidates(self, new: int, pending: Loop | None) -> Iterator[Candidate]:
-        """Candidates, the most likely first."""
+    def _candidates(self, new: int, pending: Loop | None) -> Iterator[tuple[Candidate, bool]]:
+        """Candidates, and whether the loop that waits for its confirmation predicts them; these come first."""
         earlier, graph, options = self._earlier(new), self.graph, self.options
         if not len(earlier):
             return
@@ -251,10 +271,16 @@ class LoopFinder:
         pose_cw = graph.poses_cw(np.array([new]))[0]
         if pending is not None:
             there = earlier[worlds == graph.world_of(graph.segment_of(pending.old))]
-            yield from by_proximity(graph, new, self._moved(pending, pose_cw), there, replace(options, near=1))
-        yield from by_likeness(graph, self.places, self.descriptor, new, earlier, options)
-        here = earlier[worlds == graph.world_of(graph.segment_of(new))]
-        yield from by_proximity(graph, new, sim3.from_se3(pose_cw), here, options)
+            predicted = replace(options, near=1)
+            for candidate in by_proximity(graph, new, self._moved(pending, pose_cw), there, predicted):
+                yield candidate, True
+        here, seen = earlier[worlds == graph.world_of(graph.segment_of(new))], set()
+        for candidate in by_proximity(graph, new, sim3.from_se3(pose_cw), here, options):
+            seen.add(candidate.old)
+            yield candidate, False
+        for candidate in by_likeness(graph, self.places, self.descriptor, new, earlier, options):
+            if candidate.old not in seen:
+                yield candidate, False
 
 
 def median_inverse_depth(keyframe: ArchivedKeyframe) -> float:

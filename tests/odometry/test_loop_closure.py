@@ -1,5 +1,6 @@
 """Loops of a walk there and back, with the shipped weights."""
 
+import math
 import threading
 from dataclasses import replace
 
@@ -69,6 +70,67 @@ def test_loops_are_found_where_the_way_is_repeated(film, closed):
             float(so3.angle(true[3:])), abs=0.02
         )
     assert evaluate(result.trajectory, film[1]).ate_percent < 0.5
+
+
+def turned_away(finder):
+    """Search of a repeated view, with a candidate whose pose to start from is turned by 30 degrees."""
+    old, new = finder.kept[1], finder.kept[-2]
+    search = finder.prepare(new)
+    kept = next(pair for pair in search.pairs if pair.candidate.new == new)
+    group = finder._group(old)
+    poses_cw = finder.graph.poses_cw(np.array(group))
+    turn = se3.exp(torch.tensor([0, 0, 0, 0, math.radians(30), 0], dtype=torch.float64))
+    start = se3.compose(turn, poses_cw[group.index(old)])
+    candidate = replace(kept.candidate, old=old, kind="retrieval", pose_cw=start)
+    pair = replace(kept, candidate=candidate, old=finder._frames(group), old_cw=poses_cw)
+    return replace(search, pairs=(pair,), predicted=0)
+
+
+def test_a_place_is_recognised_from_a_wrong_start(closed):
+    """The network alone does not find the way from a view that is 30 degrees off; the guessed pose is near enough."""
+    finder = closed[0].loops.finder
+    search = turned_away(finder)
+    (pair,) = search.pairs
+    decisions = ((2, 0.0), (2, OPTIONS.inliers), (8, OPTIONS.inliers))
+    with torch.inference_mode():
+        assert finder.matcher.match(pair.old, pair.new, pair.start, decisions) is None
+        loop = finder.verify(search)
+        assert loop is not None and loop.inliers > 2 * OPTIONS.inliers
+        assert finder._moved(loop, finder.graph.poses_cw(np.array([loop.new]))[0])[3:7].abs()[3] > 0.99
+        predicted = replace(search, predicted=1)  # is matched from where it is predicted, without a guess
+        assert finder.verify(predicted) is None
+
+
+def test_patches_in_view_have_to_be_found(closed, monkeypatch):
+    finder = closed[0].loops.finder
+    search = turned_away(finder)
+    with torch.inference_mode():
+        match = finder.matcher.match
+        shares = []
+
+        def listen(*arguments):
+            shares.append(match(*arguments))
+            return shares[-1]
+
+        monkeypatch.setattr(finder.matcher, "match", listen)
+        assert finder.verify(search) is not None
+        (found,) = shares
+        assert found.inliers <= found.inliers_in_view < 1.0
+        monkeypatch.setattr(finder, "options", replace(finder.options, inliers_in_view=found.inliers_in_view + 0.01))
+        assert finder.verify(search) is None
+
+
+def test_a_keyframe_long_after_the_one_before_counts_more(closed):
+    finder = closed[0].loops.finder
+    times = np.array([finder.graph.archive[k].timestamp for k in finder.kept])
+
+    def counts(pace):
+        fresh = replace(finder, kept=[], options=replace(OPTIONS, pace=pace))
+        return [fresh.keep(k) for k in finder.kept]
+
+    assert counts(1e6) == [1] * len(times)
+    found = counts(0.125)
+    assert found == [1, *np.maximum(1, np.floor(np.diff(times) / 0.125)).astype(int).tolist()] and max(found) > 1
 
 
 @pytest.fixture(scope="module")

@@ -173,7 +173,7 @@ class Archive:
         # Identifiers in the order of archiving: those with features or an image, and those with patches.
         self._with_features: deque[int] = deque()
         self._with_patches: deque[int] = deque()
-        self._storage = {kind: ArrayStorage() for kind in ("features", "edges", "patches")}  # released in this order
+        self._storage = {kind: ArrayStorage() for kind in ("features", "edges", "patches", "poses")}  # poses stay
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -287,9 +287,8 @@ class Archive:
         """
         keyframe = self._keyframes[identifier]
         depth = keyframe.inverse_depth if inverse_depth is None else np.asarray(inverse_depth, np.float32)
-        self._keyframes[identifier] = replace(
-            keyframe, pose_cw=np.asarray(pose_cw, np.float64), anchor=anchor, inverse_depth=depth
-        )
+        pose_cw = np.asarray(pose_cw, np.float64)
+        self._keyframes[identifier] = replace(keyframe, pose_cw=pose_cw, anchor=anchor, inverse_depth=depth)
 
     def set_measured(self, identifier: int, measured: np.ndarray) -> None:
         """Give a keyframe measured depths.
@@ -321,10 +320,11 @@ class Archive:
             None if array is None else features(array) for array in (keyframe.matching, keyframe.context, keyframe.jpeg)
         )
         centres, depth, colors = map(patches, (keyframe.centres, keyframe.inverse_depth, keyframe.colors))
+        intrinsics, pose_cw = map(self._storage["poses"].keep, (keyframe.intrinsics, keyframe.pose_cw))
         measured = None if keyframe.measured is None else patches(keyframe.measured)
         return replace(
-            keyframe, centres=centres, inverse_depth=depth, colors=colors, matching=matching, context=context,
-            jpeg=jpeg, measured=measured,
+            keyframe, intrinsics=intrinsics, pose_cw=pose_cw, centres=centres, inverse_depth=depth, colors=colors,
+            matching=matching, context=context, jpeg=jpeg, measured=measured,
         )  # fmt: skip
 
     def _change(self, identifier: int, **fields: object) -> None:

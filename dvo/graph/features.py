@@ -32,6 +32,10 @@ class FeatureCache:
     def __len__(self) -> int:
         return len(self._maps)
 
+    def clear(self) -> None:
+        """Release all maps."""
+        self._maps.clear()
+
     def maps(self, keyframe: ArchivedKeyframe) -> Tensor | None:
         """Feature maps of a keyframe, from the cache or computed.
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dvo.geometry import se3
 from dvo.graph.archive import Archive, ArchiveConfig, ArchivedEdges, ArchivedKeyframe, encode_jpeg
+from dvo.graph.heap import release_free_memory
 from dvo.graph.keyframe_log import KeyframeLog
 from dvo.graph.problem import GraphProblem, graph_problem
 from dvo.graph.recordings import Recording
@@ -24,6 +25,7 @@ from dvo.graph.window import Keyframe, Window
 NEAR = 0.05
 """Points whose inverse depth is below this fraction of their keyframe's median are left out of the map, because their
 depth is uncertain."""
+_TIDY = 64  # frames that have left the window, after which free memory of the heap is released
 
 
 class KeyframeGraph:
@@ -178,7 +180,8 @@ class KeyframeGraph:
         anchor = window.frames[position - 1].identifier
         self._archive_edges(window.touching(position))
         self._archive_keyframe(position, relative, anchor)
-        self.log.reanchor(window.remove(position).identifier, anchor, relative)
+        identifier = window.remove(position).identifier
+        self.log.reanchor(identifier, anchor, self.archive[identifier].pose_cw)
 
     def archive_oldest(self) -> None:
         """Move the oldest keyframe of the window to the archive."""
@@ -186,8 +189,8 @@ class KeyframeGraph:
         pose_cw = window.poses_cw[0].double().cpu().numpy()
         self._archive_edges(window.touching(0))
         self._archive_keyframe(0, pose_cw, None)
-        self.log.set_pose(window.frames[0].identifier, pose_cw)
-        window.remove(0)
+        identifier = window.remove(0).identifier
+        self.log.set_pose(identifier, self.archive[identifier].pose_cw)
 
     def discard(self, position: int) -> Keyframe:
         """Remove a frame from the window, and its measurements, without archiving them.
@@ -301,7 +304,7 @@ class KeyframeGraph:
 
     def _archive_edges(self, mask: Tensor) -> None:
         """Archive the edges where ``mask (E,)`` is True, without those that have not been updated yet."""
-        window = self.window
+        window, m = self.window, self.window.per_frame
         chosen = mask & (window.weights > 0).any(-1)
         if not chosen.any():
             return
@@ -309,7 +312,6 @@ class KeyframeGraph:
             self._finalise(chosen.nonzero()[:, 0])
         identifiers = np.array([frame.identifier for frame in window.frames], dtype=np.int32)
         kk, jj = window.kk[chosen].cpu().numpy(), window.jj[chosen].cpu().numpy()
-        m = window.per_frame
         self.archive.add_edges(
             ArchivedEdges(
                 source=identifiers[kk // m],
@@ -344,3 +346,5 @@ class KeyframeGraph:
                 measured=None if frame.measured is None else frame.measured.float().cpu().numpy(),
             )
         )
+        if len(self.archive) % _TIDY == 0:
+            release_free_memory()

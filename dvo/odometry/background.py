@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Generic, TypeVar
 
 import torch
 
 T = TypeVar("T")
+
+_NICE = 5  # added to that of the process: a third of the processor time of tracking where they compete
 
 
 class Task(Generic[T]):
@@ -46,7 +52,8 @@ class Background:
     """Thread that does one piece of work after the other, without gradients.
 
     What the work reads must not change meanwhile. The thread is started with the first work, and ends with the process
-    or when nothing refers to it any more.
+    or when nothing refers to it any more. It computes without further threads, which would take the cores that tracking
+    waits for, and on Linux with lower priority.
     """
 
     def __init__(self) -> None:
@@ -59,8 +66,21 @@ class Background:
             work: called in the thread.
         """
         if self._executor is None:
+            count = torch.get_num_threads()
             self._executor = ThreadPoolExecutor(1, "dvo-background")
+            self._executor.submit(_give_way).result()
+            torch.set_num_threads(count)  # of other threads that begin later
         return Task(self._executor.submit(_without_gradients, work))
+
+
+def _give_way() -> None:
+    """Leave the cores to other threads, as far as the calling thread is concerned."""
+    torch.get_num_threads()  # the first call in a thread sets the number of the process
+    torch.set_num_threads(1)
+    if sys.platform.startswith("linux"):  # elsewhere a priority is that of the whole process
+        thread = threading.get_native_id()
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _NICE)
 
 
 def _without_gradients(work: Callable[[], T]) -> T:

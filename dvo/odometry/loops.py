@@ -198,11 +198,14 @@ class LoopFinder:
         o = self.options
         decisions = tuple(zip(o.updates, (o.hopeful, o.inliers, o.inliers), strict=True))
         ahead, others = search.pairs[: search.predicted], search.pairs[search.predicted :]
-        for pair in chain(ahead, self._promising(others)):
-            match = self.matcher.match(pair.old, pair.new, pair.start, decisions)
-            if match is not None and match.inliers_in_view >= o.inliers_in_view:
-                return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
-        return None
+        try:
+            for pair in chain(ahead, self._promising(others)):
+                match = self.matcher.match(pair.old, pair.new, pair.start, decisions)
+                if match is not None and match.inliers_in_view >= o.inliers_in_view:
+                    return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
+            return None
+        finally:
+            self.matcher.maps.clear()  # the next search is about other keyframes
 
     def _promising(self, pairs: Sequence[Pair]) -> Iterator[Pair]:
         """Pairs to match, the most promising first, with the poses to start from."""

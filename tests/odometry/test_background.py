@@ -1,5 +1,7 @@
 """Work beside tracking."""
 
+import os
+import sys
 import threading
 
 import pytest
@@ -41,3 +43,23 @@ def test_an_error_of_the_work_is_that_of_the_result():
 def test_a_finished_task_has_its_result():
     task = Task.finished(3)
     assert task.done and task.result() == 3
+
+
+def test_the_thread_gives_way_to_tracking():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        background = Background()
+        assert background.start(torch.get_num_threads).result() == 1
+        assert torch.get_num_threads() == 3
+        later = []
+        thread = threading.Thread(target=lambda: later.append(torch.get_num_threads()))
+        thread.start()
+        thread.join()
+        assert later == [3] and background.start(torch.get_num_threads).result() == 1
+    finally:
+        torch.set_num_threads(before)
+    if sys.platform.startswith("linux"):
+        own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        there = background.start(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id())).result()
+        assert there == min(own + 5, 19)

@@ -30,6 +30,8 @@ DARK = 2.0
 """Seconds without a view, in the middle of a sequence."""
 WARM = 0.25
 """Share of the frames after which the growth of memory is watched."""
+SPANS = 12
+"""Spans of equal length that a run is divided in to find the growth of memory."""
 BLACK = 1
 """Variant of the dark images: black with noise, see :func:`image_without_view`."""
 
@@ -81,8 +83,8 @@ class Run:
         found, false, revisit_s, recall: loops, see :class:`eval.scoring.loops.LoopErrors`.
         p95_ms, fps: time of ``track``, frames in a second.
         archive_kb: kilobytes of the archive at the end, a kept keyframe.
-        resident_kb: growth of the resident memory of the process from a quarter of the frames to the last one, over the
-            keyframes of that time (of all keyframes in proportion), kilobytes.
+        resident_kb: growth of the resident memory of the process for each keyframe, kilobytes, see
+            :meth:`Watched.growth_kb`.
     """
 
     key: list[Any] = field(default_factory=list)
@@ -116,18 +118,23 @@ class Watched:
 
     Attributes:
         resident: bytes after every frame.
+        keyframes: keyframes that were kept by then; none of an odometry without a graph.
         archive_kb: see :class:`Run`.
     """
 
     def __init__(self, inner: Odometry) -> None:
         self.inner, self.name = inner, inner.name
         self.resident: list[int] = []
+        self.keyframes: list[int] = []
         self.archive_kb = math.nan
 
     def track(self, frame: Frame) -> Estimate:
         """Track a frame."""
         estimate = self.inner.track(frame)
         self.resident.append(resident_bytes())
+        log = getattr(getattr(self.inner, "graph", None), "log", None)
+        if log is not None:
+            self.keyframes.append(log.keyframes)
         return estimate
 
     def finish(self) -> Result:
@@ -139,14 +146,25 @@ class Watched:
         return self.inner.finish()
 
     def growth_kb(self, keyframes: int) -> float:
-        """Growth of the resident memory, see :class:`Run`.
+        """Growth of the resident memory of the process for each keyframe.
+
+        Memory that is in use for a while (by a search for loops, for instance) comes and goes: of each of the
+        :data:`SPANS` spans of the run the frame after which it was least counts. The growth is the slope of the
+        straight line through these, without those of the first quarter, when caches fill.
 
         Args:
-            keyframes: of the whole run.
+            keyframes: of the whole run, spread evenly over it if the odometry does not tell when they were kept.
+
+        Returns:
+            Kilobytes; nan for a run without enough frames or keyframes.
         """
-        begin = int(WARM * len(self.resident))
-        count = keyframes * (1 - begin / max(len(self.resident), 1))
-        return (self.resident[-1] - self.resident[begin]) / 1000 / count if count >= 1 else math.nan
+        if len(self.resident) < SPANS:
+            return math.nan
+        resident = np.array(self.resident) / 1000
+        kept = np.array(self.keyframes, float) if self.keyframes else np.linspace(0, keyframes, len(resident))
+        spans = np.array_split(np.arange(len(resident)), SPANS)[int(WARM * SPANS) :]
+        least = [int(span[resident[span].argmin()]) for span in spans]
+        return float(np.polyfit(kept[least], resident[least], 1)[0]) if np.ptp(kept[least]) >= 1 else math.nan
 
 
 class Fed:
@@ -237,6 +255,9 @@ def joined_world(
 
 
 def resident_bytes() -> int:
-    """Resident memory of this process; 0 where the system does not tell."""
+    """Resident memory of this process without pages of files, which the system drops at will; 0 if it is not told."""
     status = Path("/proc/self/statm")
-    return int(status.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if status.is_file() else 0
+    if not status.is_file():
+        return 0
+    _, resident, of_files = (int(pages) for pages in status.read_text().split()[:3])
+    return (resident - of_files) * os.sysconf("SC_PAGE_SIZE")

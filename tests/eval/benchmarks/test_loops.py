@@ -14,9 +14,10 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.graph.storage import ArrayStorage
 from dvo.odometry.protocol import Segment
 from eval.benchmarks.loops.__main__ import blackout_sequences, check_out, line, read_runs, run_all
-from eval.benchmarks.loops.runs import Fed, Run, Task, carry_out, joined_world
+from eval.benchmarks.loops.runs import Fed, Run, Task, Watched, carry_out, joined_world, resident_bytes
 from eval.benchmarks.loops.tables import blackout_table, revisit_table
 from eval.scoring.blackout import without_view
 from eval.suites.suite import Sequence
@@ -79,6 +80,38 @@ def test_darkness_is_in_its_span_and_shows_nothing() -> None:
     assert [without_view(frame.image) for frame in fed if 2.5 < frame.timestamp < 5.5] == [True] * 3
     assert all(one is other for one, other in zip(fed[:3], frames[:3], strict=True)) and len(fed) == 8
     assert len(list(Fed(frames, None, None, seed=0))) == 9
+
+
+class Untold:
+    """Odometry of which nothing is known but its name."""
+
+    name = "untold"
+
+
+def test_growth_is_that_of_what_stays() -> None:
+    watched, frames = Watched(Untold()), np.arange(1200)  # type: ignore[arg-type]
+    searching = 60_000_000 * ((frames > 800) & (frames % 30 < 8))  # memory of searches, which begin late
+    filling = 1e8 * np.minimum(frames / 200, 1)
+    watched.resident = (5e8 + filling + searching + 20_000.0 * frames).astype(int).tolist()
+    assert watched.growth_kb(240) == pytest.approx(20 * 1200 / 240, rel=0.01)
+    watched.keyframes = np.minimum(frames, 900).tolist()
+    watched.resident = (5e8 + searching + 70_000.0 * np.minimum(frames, 900)).astype(int).tolist()
+    assert watched.growth_kb(7) == pytest.approx(70, rel=0.01)
+    watched.keyframes = [3] * len(frames)
+    assert math.isnan(watched.growth_kb(7))
+    watched.resident = watched.resident[:5]
+    assert math.isnan(watched.growth_kb(7))
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").is_file(), reason="needs Linux")
+def test_pages_of_files_are_not_counted(tmp_path: Path) -> None:
+    file, size = tmp_path / "data", 2**24
+    file.write_bytes(bytes(size))
+    before = resident_bytes()
+    mapped = np.memmap(file, np.uint8, "r")
+    assert int(mapped.sum()) == 0 and resident_bytes() < before + size / 2
+    held = ArrayStorage().keep(np.ones(size, np.uint8))  # in a mapping of its own: the heap may have room
+    assert resident_bytes() > before + size / 2 and held.all()
 
 
 def track(begin: int, end: int, shift: float = 0.0) -> Trajectory:

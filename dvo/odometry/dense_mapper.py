@@ -135,6 +135,8 @@ class DenseMapper:
     def _solve(self, fixed: int, updates: int, cold: bool = False) -> Agreement | None:
         found, config = None, self.config
         for update in range(updates):
+            if not self.window.edges:  # all are held after ``max_age`` updates
+                break
             damping = damping_of(update if cold else updates + 10)
             kernel = Kernel() if cold else config.kernel  # far from the solution, no residual is an outlier
             found = self.window.update(fixed, damping, kernel)

@@ -72,11 +72,10 @@ def better_solution(
     Returns:
         True if the other solution was taken.
     """
-    edges = [edge for edge in (*window.edges, *window.held) if edge.positions is not None]
     other = _other_poses(window) if len(window) > 2 else None
     if other is None:
         return False
-    problem = _Problem(window, edges, options)
+    problem = _Problem(window, options)
     present = problem.solve(problem.poses(), problem.depths())
     flat = torch.ones_like(problem.depths())
     depths = problem.solve(other, flat, move_poses=False).patches[:, 2, 0, 0]
@@ -90,7 +89,7 @@ def better_solution(
         edge.hidden, edge.positions, edge.confidence, edge.age = edge.source.hidden, None, None, 0
     window.held = []
     measure()
-    problem = _Problem(window, window.edges, options)
+    problem = _Problem(window, options)
     after = problem.relative_cost(problem.solve(problem.poses(), problem.depths()))
     if after < options.margin * before and _turned(first, problem.poses()) > _OTHER:
         return True
@@ -102,13 +101,13 @@ class _Problem:
     """Bundle adjustment of some pixels of the keyframes, in double precision on the CPU.
 
     Args:
-        window: the keyframes.
-        edges: with measurements.
+        window: the keyframes, with measurements.
         options: kernel.
     """
 
-    def __init__(self, window: DenseWindow, edges: list[FrameEdge], options: DenseRestartOptions) -> None:
+    def __init__(self, window: DenseWindow, options: DenseRestartOptions) -> None:
         self.frames, self.options = window.keyframes, options
+        edges = [edge for edge in (*window.edges, *window.held) if edge.positions is not None]
         place = {id(frame): k for k, frame in enumerate(self.frames)}
         self.size = self.frames[0].inverse_depth.shape
         self.rows, self.columns = torch.meshgrid(*(_chosen(length) for length in self.size), indexing="ij")

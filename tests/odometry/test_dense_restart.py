@@ -78,7 +78,7 @@ def wrong_window(truth):
     window = window_at(*truth)
     measure(window, *truth)
     other = _other_poses(window)
-    problem = _Problem(window, window.edges, DenseRestartOptions(iterations=60))
+    problem = _Problem(window, DenseRestartOptions(iterations=60))
     depths = problem.solve(other, torch.ones_like(problem.depths()), move_poses=False).patches[:, 2, 0, 0]
     problem.take(problem.solve(other, depths))
     return window
@@ -97,7 +97,7 @@ def test_the_wrong_motion_of_a_plane_is_left(truth):
 
     assert better_solution(window, again, DenseRestartOptions(iterations=60, promising=1e6))
     assert taken == [[(None, 0, True)] * len(window.edges)]  # the network measures anew
-    problem = _Problem(window, window.edges, DenseRestartOptions(iterations=60))
+    problem = _Problem(window, DenseRestartOptions(iterations=60))
     problem.take(problem.solve(problem.poses(), problem.depths()))
     assert turns(window, truth[0]).max() < 0.2
 

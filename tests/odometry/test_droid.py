@@ -156,6 +156,14 @@ def test_a_moving_body_does_not_pull_the_camera(clip, monkeypatch):
     assert errors[0] < 0.5 * errors[1] and errors[1] > 2
 
 
+def test_more_updates_than_an_edge_lives_for(clip, knowing):
+    settings = replace(CONFIG, initial_updates=6, updates=8, max_age=4)
+    done = run(DroidOdometry(knowing, settings), frames_of(clip)).result
+    truth = se3.inverse(clip.poses_cw.double()).numpy()
+    assert len(done.trajectory) == len(clip.images)
+    assert evaluate(done.trajectory, Trajectory(done.trajectory.timestamps, truth)).ate_percent < 2
+
+
 def test_another_scene_is_lost_and_then_begins_a_segment(clip, knowing):
     odometry = DroidOdometry(knowing, replace(CONFIG, patience=3))
     first = frames_of(clip)[:14]

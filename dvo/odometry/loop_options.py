@@ -66,7 +66,7 @@ class LoopOptions:
     matched: int = 3
     updates: tuple[int, int, int] = (2, 2, 8)
     hopeful: float = 0.03
-    inliers: float = 0.12
+    inliers: float = 0.4
     inliers_in_view: float = 0.2
     delay: int = 8
     patience: int = 4

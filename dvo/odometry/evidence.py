@@ -250,30 +250,10 @@ def related_share(step: WindowStep, among: Tensor) -> float:
     return _inliers(step, edges) if bool(edges.any()) else 0.0
 
 
-def patches_in_view(step: WindowStep) -> Tensor:
-    """Edges whose patch is reprojected into the image of the frame that they lead to.
-
-    Args:
-        step: of the model on a window.
-
-    Returns:
-        ``(E,)`` bool.
-    """
-    places, before = _reprojected(step, slice(None))
-    (x, y), (width, height) = places.unbind(-1), step.bounds
-    return before & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-
-
-def _reprojected(step: WindowStep, edges: Tensor | slice) -> tuple[Tensor, Tensor]:
-    """Places ``(e, 2)`` of the centres of patches, feature pixels, and whether they are before the camera ``(e,)``."""
+def _inliers(step: WindowStep, edges: Tensor) -> float:
     w = step.window
     seen = reproject(w.poses_cw[None], w.patches[None], w.intrinsics[None], w.ii[edges], w.jj[edges], w.kk[edges])
     centre = seen.coords.shape[2] // 2
-    return seen.coords[0, :, centre, centre], seen.valid[0, :, centre, centre]
-
-
-def _inliers(step: WindowStep, edges: Tensor) -> float:
-    w = step.window
-    residual = (w.targets[edges] - _reprojected(step, edges)[0]).norm(dim=-1)
+    residual = (w.targets[edges] - seen.coords[0, :, centre, centre]).norm(dim=-1)
     found = (w.confidence[edges].mean(dim=-1) > CONFIDENT) & (residual < AGREEMENT)
     return float(found.float().mean())

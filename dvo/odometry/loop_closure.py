@@ -38,8 +38,9 @@ from dvo.odometry.adjuster import Adjuster, Adjusting
 from dvo.odometry.background import Background, Task
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.graph_adjustment import AdjustmentRecord
+from dvo.odometry.loop_check import median_inverse_depth
 from dvo.odometry.loop_window import GroupMatcher
-from dvo.odometry.loops import Loop, LoopFinder, median_inverse_depth
+from dvo.odometry.loops import Loop, LoopFinder
 from dvo.odometry.place_descriptors import shipped_descriptor
 from dvo.odometry.tracker_state import TrackerState
 

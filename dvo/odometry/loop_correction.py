@@ -17,7 +17,8 @@ from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
 from dvo.geometry import se3, sim3
 from dvo.graph.correction import apply_similarities, move_window, similarity_between
 from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.odometry.loops import Loop, median_inverse_depth
+from dvo.odometry.loop_check import median_inverse_depth
+from dvo.odometry.loops import Loop
 
 # Standard deviations of the edges of the pose graph: translation in median depths, rotation in rad, log scale.
 _STEP = (0.01, 0.002, 0.01)

@@ -51,24 +51,27 @@ def guess_pose(
     Args:
         maps: ``(1, 1, C, h, w)`` matching features of the keyframe.
         intrinsics: ``(4,)`` fx fy cx cy of its feature map.
-        frames: ``n`` earlier keyframes, with patches and their features.
+        frames: ``n`` earlier keyframes; those without features of their patches are left out.
         poses_cw: ``(n, 7)`` their poses ``T_cw``.
 
     Returns:
         The pose with the most inliers; None if there are too few clear matches for any.
     """
-    patches = [torch.from_numpy(frame.matching) for frame in frames if frame.matching is not None]
+    patches, points = [], []
+    for frame, pose in zip(frames, poses_cw, strict=True):
+        if frame.matching is not None:
+            patches.append(torch.from_numpy(frame.matching))
+            points.append(se3.act(se3.inverse(pose), _points(frame)))
+    if not patches:
+        return None
     places, lead = find_patches(maps, torch.cat(patches))
-    worlds = torch.cat(
-        [se3.act(se3.inverse(pose), _points(frame)) for pose, frame in zip(poses_cw, frames, strict=True)]
-    )
     clear = (lead > _LEAD).cpu().numpy()
     if clear.sum() < _SAMPLE:
         return None
     fx, fy, cx, cy = intrinsics.astype(float).tolist()
     camera = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     found, turn, shift, inliers = cv2.solvePnPRansac(
-        worlds.numpy()[clear], places.double().cpu().numpy()[clear], camera, None,
+        torch.cat(points).numpy()[clear], places.double().cpu().numpy()[clear], camera, None,
         iterationsCount=_TRIALS, reprojectionError=_REACH, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     if not found or inliers is None or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
@@ -86,7 +89,7 @@ class Pair:
         old, new: both with their neighbours.
         old_cw: ``(n, 7)`` poses ``T_cw`` of ``old``.
         moved: ``(m, 7)`` transforms from the camera of the later keyframe to those of ``new``.
-        joins: the two are of different worlds.
+        present_cw: ``(7,)`` pose ``T_cw`` of the later keyframe by the present poses; None if it is of another world.
     """
 
     candidate: Candidate
@@ -94,7 +97,12 @@ class Pair:
     new: Group
     old_cw: Tensor
     moved: Tensor
-    joins: bool
+    present_cw: Tensor | None
+
+    @property
+    def joins(self) -> bool:
+        """The two are of different worlds."""
+        return self.present_cw is None
 
     @property
     def later(self) -> ArchivedKeyframe:

@@ -26,15 +26,16 @@ class LoopOptions:
             (:func:`dvo.odometry.loop_guess.order_pairs`).
         matched: candidates that are verified by the network, at most.
         updates: updates of the network before a candidate with fewer than ``hopeful`` inliers is refused, further ones
-            before one with fewer than ``inliers`` is, and further ones of a loop.
-        hopeful, inliers: shares of inliers among all patches of both visits.
-        inliers_in_view: least share of inliers of a loop among the patches that its poses put into view of the other
-            visit.
+            before one with fewer than ``weak_inliers`` is, and further ones of a loop.
+        hopeful: share of inliers among all patches of both visits.
+        inliers: the same, with which a match is a loop.
+        weak_inliers: the same, with which it is one if the pose agrees with the present one as closely as two loops
+            that confirm each other (:mod:`dvo.odometry.loop_check`).
         delay: frames between the beginning of a search, or of a correction, and the frame that takes its result, so
             that tracking goes on meanwhile.
         patience: searches after a loop within which a second one has to confirm it.
         translation, rotation, scale: largest differences of the corrections of two loops that confirm each other, in
-            median depths, degrees, and as a ratio less one.
+            median depths, degrees, and as a ratio less one; largest corrections of a loop with few inliers.
         adjust_delay: as ``delay``, of a global adjustment (:mod:`dvo.odometry.graph_adjustment`).
         adjust_iterations: steps of a global adjustment beside tracking with each of its kernels, at most.
         adjust_frames, adjust_edges: newest keyframes of a world, and measurements between them, that it solves for, at
@@ -47,7 +48,7 @@ class LoopOptions:
     RANGES: ClassVar[dict[str, Range]] = {
         "seconds": (0, 1e6), "every": (1, 10**4), "pace": (1e-3, 1e6), "neighbours": (0, 8), "likeness": (-1, 1),
         "retrieved": (0, 100), "apart": (0, 10**4), "overlap": (0, 1), "near": (0, 100), "guessed": (0, 10**4),
-        "matched": (0, 100), "hopeful": (0, 1), "inliers": (0, 1), "inliers_in_view": (0, 1), "delay": (0, 10**4),
+        "matched": (0, 100), "hopeful": (0, 1), "inliers": (0, 1), "weak_inliers": (0, 1), "delay": (0, 10**4),
         "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180),
         "scale": (0, 10), "adjust_delay": (0, 10**4), "adjust_iterations": (1, 1000), "adjust_frames": (3, 10**6),
         "adjust_edges": (1, 10**9),
@@ -67,7 +68,7 @@ class LoopOptions:
     updates: tuple[int, int, int] = (2, 2, 8)
     hopeful: float = 0.03
     inliers: float = 0.4
-    inliers_in_view: float = 0.2
+    weak_inliers: float = 0.12
     delay: int = 8
     patience: int = 4
     translation: float = 0.2

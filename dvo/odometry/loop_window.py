@@ -24,7 +24,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.evidence import patches_in_view, related_share
+from dvo.odometry.evidence import related_share
 from dvo.odometry.front_end import encode_image
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
@@ -42,14 +42,12 @@ class Match:
 
     Attributes:
         inliers: share of the edges between the groups whose measurement is confident and agrees with bundle adjustment.
-        inliers_in_view: the same among the edges whose patch is reprojected into the image.
         poses_cw: ``(n, 7)`` float64 ``T_cw`` of the older and the newer group, in the world and the scale of the older.
         scale: of the lengths of the newer group, after over before.
         edges: measurements between the groups, aligned to a fraction of a pixel where that is possible.
     """
 
     inliers: float
-    inliers_in_view: float
     poses_cw: Tensor
     scale: float
     edges: ArchivedEdges
@@ -101,14 +99,13 @@ class GroupMatcher:
             share = related_share(step, across)
             if not share >= inliers:  # NaN fails too
                 return None
-        in_view = related_share(step, across & patches_in_view(step))
         step.finalise(across.nonzero()[:, 0])
         after = window.patches[count * window.per_frame :, 2, 0, 0]
         scale = float((before / after).median())
         poses = se3.normalise(window.poses_cw.double().cpu())
         if not (np.isfinite(scale) and scale > 0 and bool(torch.isfinite(poses).all())):
             return None
-        return Match(share, in_view, poses, scale, self._edges((*old, *new), window, across))
+        return Match(share, poses, scale, self._edges((*old, *new), window, across))
 
     def _joint(self, old: Group, new: Group, poses_cw: Tensor) -> WindowStep:
         """Window of both groups with all edges but those within the older one."""

@@ -3,13 +3,12 @@
 Candidates come from the present poses (proximity) and from the likeness of the images (retrieval). They are ordered by
 the number of patches that agree on a pose (:mod:`dvo.odometry.loop_guess`), and the first few are verified by the
 network (:mod:`dvo.odometry.loop_window`), starting from that pose: in a joint window of both keyframes and their
-neighbours, a share of the patches must be found where bundle adjustment reprojects them. A loop counts when a second
-one, close to it in time, gives the same correction.
+neighbours, a share of the patches must be found where bundle adjustment reprojects them
+(:mod:`dvo.odometry.loop_check`). A loop counts when a second one, close to it in time, gives the same correction.
 """
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -20,10 +19,11 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3, sim3, so3
-from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
+from dvo.graph.archive import ArchivedEdges
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.places import PlaceIndex
 from dvo.odometry.loop_candidates import Candidate, by_likeness, by_proximity
+from dvo.odometry.loop_check import is_loop, median_inverse_depth
 from dvo.odometry.loop_guess import Pair, order_pairs
 from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.loop_window import Group, GroupMatcher, Match
@@ -181,8 +181,8 @@ class LoopFinder:
             if old is None:
                 continue
             joins = graph.world_of(graph.segment_of(candidate.old)) != graph.world_of(graph.segment_of(new))
-            old_cw = graph.poses_cw(np.array(old))
-            pairs.append(Pair(candidate, self._frames(old), self._frames(group), old_cw, moved, joins))
+            old_cw, present_cw = graph.poses_cw(np.array(old)), None if joins else poses_cw[group.index(new)]
+            pairs.append(Pair(candidate, self._frames(old), self._frames(group), old_cw, moved, present_cw))
             predicted += known
         return Search(new, tuple(pairs), predicted)
 
@@ -196,12 +196,13 @@ class LoopFinder:
             The loop; None if no candidate is one.
         """
         o = self.options
-        decisions = tuple(zip(o.updates, (o.hopeful, o.inliers, o.inliers), strict=True))
+        least = min(o.weak_inliers, o.inliers)
+        decisions = tuple(zip(o.updates, (o.hopeful, least, least), strict=True))
         ahead, others = search.pairs[: search.predicted], search.pairs[search.predicted :]
         try:
             for pair in chain(ahead, self._promising(others)):
                 match = self.matcher.match(pair.old, pair.new, pair.start, decisions)
-                if match is not None and match.inliers_in_view >= o.inliers_in_view:
+                if match is not None and is_loop(match, pair, o):
                     return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
             return None
         finally:
@@ -284,15 +285,6 @@ class LoopFinder:
         for candidate in by_likeness(graph, self.places, self.descriptor, new, earlier, options):
             if candidate.old not in seen:
                 yield candidate, False
-
-
-def median_inverse_depth(keyframe: ArchivedKeyframe) -> float:
-    """Median inverse depth of the patches of a keyframe, in inverse units of its segment; nan once they are released.
-
-    Args:
-        keyframe: archived.
-    """
-    return float(np.median(keyframe.inverse_depth)) if len(keyframe.inverse_depth) else math.nan
 
 
 def _loop(candidate: Candidate, old: Group, new: Group, match: Match, joins: bool) -> Loop:

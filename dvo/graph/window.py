@@ -194,6 +194,20 @@ class Window:
         self.poses_cw = torch.cat([self.poses_cw, pose_cw[None]])
         self.patches = torch.cat([self.patches, patches])
 
+    def insert(self, position: int, frame: Keyframe, pose_cw: Tensor, patches: Tensor) -> None:
+        """Add a keyframe before others; the positions of those increase by one, and :meth:`remove` undoes it.
+
+        Args:
+            position: of the new keyframe in the window.
+            frame, pose_cw, patches: see :meth:`append`.
+        """
+        self._edges, first = None, position * self.per_frame
+        self.kk = self.kk + self.per_frame * (self.kk >= first)
+        self.jj = self.jj + (self.jj >= position).long()
+        self.poses_cw = torch.cat([self.poses_cw[:position], pose_cw[None], self.poses_cw[position:]])
+        self.patches = torch.cat([self.patches[:first], patches, self.patches[first:]])
+        self.frames.insert(position, frame)
+
     def connect(self, kk: Tensor, jj: Tensor) -> Tensor:
         """Add edges, with zero state and confidence.
 
@@ -227,12 +241,25 @@ class Window:
         Returns:
             Slots of the new edges.
         """
-        m, n, device = self.per_frame, len(self), self.jj.device
-        first = max(0, n - 1 - lifetime)
-        old = torch.arange(first * m, (n - 1) * m, device=device)
-        slots = [self.connect(old, torch.full_like(old, n - 1))]
-        new = torch.arange((n - 1) * m, n * m, device=device)
-        targets = torch.arange(first, n if own else n - 1, device=device)
+        return self.connect_frame(len(self) - 1, lifetime, own)
+
+    def connect_frame(self, position: int, lifetime: int, own: bool) -> Tensor:
+        """Add edges from the patches of the frames around a frame to it, and from its patches to them.
+
+        Args:
+            position: of the frame in the window; it has no edges yet.
+            lifetime: number of frames on either side of it that take part.
+            own: also from its patches to itself.
+
+        Returns:
+            Slots of the new edges.
+        """
+        m, device = self.per_frame, self.jj.device
+        near = torch.arange(max(0, position - lifetime), min(len(self), position + lifetime + 1), device=device)
+        others = near[near != position]
+        old = (others[:, None] * m + torch.arange(m, device=device)).flatten()
+        slots = [self.connect(old, torch.full_like(old, position))]
+        new, targets = torch.arange(position * m, (position + 1) * m, device=device), near if own else others
         slots.append(self.connect(new.repeat_interleave(len(targets)), targets.repeat(m)))
         return torch.cat(slots)
 

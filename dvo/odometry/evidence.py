@@ -43,10 +43,10 @@ _UNLIKE = 24.0  # mean difference of two windows above which they do not show th
 
 @dataclass(frozen=True)
 class Evidence:
-    """Agreement of the measurements of the newest frame with the window.
+    """Agreement of the measurements of a frame with those before it in the window.
 
     Attributes:
-        confidence: mean confidence of the edges into the frame, in [0, 1].
+        confidence: mean confidence of the edges from these frames and its own patches into the frame, in [0, 1].
         inliers: share of the patches of earlier frames that are found in it: confident, and where bundle adjustment
             reprojects them, in [0, 1].
     """
@@ -173,16 +173,28 @@ def newest_evidence(step: WindowStep) -> Evidence:
     Returns:
         Evidence; zero for a window of one frame.
     """
+    return evidence_of(step, len(step.window) - 1)
+
+
+def evidence_of(step: WindowStep, position: int) -> Evidence:
+    """Evidence for the pose of a frame of a window, after a step; later frames do not count.
+
+    Args:
+        step: of the model on the window.
+        position: of the frame in the window.
+
+    Returns:
+        Evidence; without inliers for the first frame.
+    """
     window = step.window
-    newest = len(window) - 1
-    into = window.jj == newest
+    into = (window.jj == position) & (window.ii <= position)
     if not bool(into.any()):
         return Evidence(0.0, 0.0)
     into = measured(window, window.confidence, into)
     if not bool(into.any()):
         return Evidence(0.0, 0.0)
     confidence = float(window.confidence[into].mean())
-    earlier = into & (window.ii < newest)
+    earlier = into & (window.ii < position)
     if not bool(earlier.any()):
         return Evidence(confidence, 0.0)
     return Evidence(confidence, _inliers(step, earlier))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dvo.geometry.camera import Camera
 from dvo.graph.keyframe_log import FrameRecord
+from dvo.graph.window import Keyframe
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.masks import places_of_patches, unmasked_centres, visible_features
 from dvo.nets.patchifier import Features, cut_fine, normalise_images
@@ -67,6 +68,21 @@ class View:
 
     records: list[FrameRecord]
     seen: Observation
+
+
+def keyframe_of(view: View, identifier: int, map_slot: int) -> Keyframe:
+    """Keyframe of the window from a view.
+
+    Args:
+        view: the frame.
+        identifier, map_slot: see :class:`dvo.graph.window.Keyframe`.
+
+    Returns:
+        The keyframe.
+    """
+    s = view.seen
+    features = s.matching, s.context, s.colors, s.intrinsics, s.image, s.fine, s.visible, s.measured
+    return Keyframe(identifier, view.records[0].timestamp, map_slot, *features)
 
 
 def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Features:

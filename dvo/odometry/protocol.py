@@ -22,7 +22,7 @@ class Status(StrEnum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-    LOST = "lost"
+    LOST = "lost"  # the result may have a pose all the same (:mod:`dvo.odometry.late_join`)
 
 
 @dataclass(frozen=True)

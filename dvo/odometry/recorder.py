@@ -189,7 +189,8 @@ class Recorder:
     def _result(self) -> Result:
         """Result so far: that of the odometry if it gives one, else the rows."""
         if isinstance(self.odometry, Interim):
-            return replace(self.odometry.current(), frames_read=self._read, frames_lost=self._lost)
+            result = self.odometry.current()  # where a frame may have a row that was lost at first
+            return replace(result, frames_read=self._read, frames_lost=min(self._lost, result.frames_lost))
         segments: list[Segment] = []
         for _, rows in sorted(self._rows.items()):
             table = np.array(rows).reshape(-1, _COLUMNS)

@@ -230,6 +230,9 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
     fits = all(table.waiting) and len(set(numbers)) == len(numbers) and numbers == sorted(numbers)
     source.require(fits, "not a list of frames", "tracker: waiting")
     source.require(numbers[0] >= 0 and numbers[-1] < len(records), "frames that are not there", "tracker: waiting")
+    # Each has had an identifier, and may take it again (:mod:`dvo.odometry.late_join`).
+    room = table.keyframes - odometry.window.frames[-1].identifier > n
+    source.require(room, "more views than identifiers of keyframes", "tracker: waiting")
     images = source.array("waiting/images", np.uint8, (n, *size, 3))
     intrinsics = source.array("waiting/intrinsics", np.float64, (n, 4), -1e6, 1e6)
     centres = source.array("waiting/centres", np.int64, (n, odometry.config.patches, 2), 0, 2**20)

@@ -31,9 +31,10 @@ from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
 from dvo.odometry.finishing import finish_segments
 from dvo.odometry.frame_sequence import FrameSequence
-from dvo.odometry.front_end import View, observe
+from dvo.odometry.front_end import View, keyframe_of, observe
 from dvo.odometry.initial_pose import first_depth, first_pose
 from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise_related, leave_minimum, worth_keeping
+from dvo.odometry.late_join import join_waiting
 from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
 from dvo.odometry.patch_depth import measure_depth
@@ -109,10 +110,10 @@ class PatchOdometry:
     def track(self, frame: Frame) -> Estimate:
         """Process the next frame.
 
-        A frame whose image has no content, or whose pose its measurements do not bear out
-        (:mod:`dvo.odometry.evidence`), is lost and leaves the graph. The frames after it are joined with the window if
-        there is evidence for it; after ``config.patience`` frames with content that could not be joined, these begin
-        the next segment. A loop (:mod:`dvo.odometry.loop_closure`) moves earlier frames too, and may change the scale.
+        A frame without content, or whose pose its measurements do not bear out (:mod:`dvo.odometry.evidence`), is lost
+        and leaves the graph. Those after it are joined with the window if there is evidence for it, and may bring it
+        back (:mod:`dvo.odometry.late_join`); after ``config.patience`` frames with content that could not be joined,
+        these begin the next segment. A loop (:mod:`dvo.odometry.loop_closure`) also moves and scales earlier frames.
 
         Args:
             frame: of the same size as the first, later than the one before, without lens distortion.
@@ -227,10 +228,10 @@ class PatchOdometry:
             return self._lose(record, NO_MATCH)
         record.place(keyframe.identifier, self.graph.segment, state.joining if state.skipped else "")
         state.joining, state.skipped = "", False
-        state.waiting.clear()
         state.tracked += 1
         if config.restart:
             leave_minimum(window, state.tracked)
+        join_waiting(self.graph, self.step, state, config, record)
         self._reduce()  # may correct the window
         return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
 
@@ -305,8 +306,7 @@ class PatchOdometry:
         config, window, seen = self.config, self.window, view.seen
         slot = window.free_map_slot()
         self.step.keep_frame(slot, seen.image, seen.maps, seen.fine_maps)
-        features = seen.matching, seen.context, seen.colors, seen.intrinsics, seen.image, seen.fine, seen.visible
-        keyframe = Keyframe(self.state.keyframes, view.records[0].timestamp, slot, *features, seen.measured)
+        keyframe = keyframe_of(view, self.state.keyframes, slot)
         self.state.keyframes += 1
         self.loops.see(keyframe.identifier, seen.image, seen.maps)
         depth = first_depth(window, config, self.state.initialised, seen.measured)

@@ -36,6 +36,28 @@ def test_remove_renumbers_patches_frames_and_edges():
     assert after == expected
 
 
+def test_a_frame_in_between_is_joined_with_both_sides_and_its_removal_leaves_nothing():
+    w = window(5)
+    w.poses_cw = se3.exp(torch.arange(30.0).view(5, 6) / 10)
+    w.connect(torch.arange(10).repeat_interleave(5), torch.arange(5).repeat(10))
+    before, names = w.snapshot(), ("kk", "jj", "edge_slots", "poses_cw", "patches")
+    indices = {name: getattr(w, name) for name in names}
+    empty = torch.zeros(0)
+    new = Keyframe(9, 0.35, w.free_map_slot(), empty, empty, empty, w.frames[0].intrinsics)
+    w.insert(4, new, se3.identity(), w.patches[:2] + 1)
+    assert [f.identifier for f in w.frames] == [0, 1, 2, 3, 9, 4]
+    assert torch.equal(w.patches[8:10], before.patches[:2] + 1) and torch.equal(w.poses_cw[5], before.poses_cw[4])
+    assert torch.equal(w.ii[:50] - (w.ii[:50] == 5).long(), indices["kk"] // 2)
+    assert torch.equal(w.jj[:50] - (w.jj[:50] == 5).long(), indices["jj"])
+    assert not w.touching(4).any()
+    w.connect_frame(4, 2, True)
+    pairs = {(int(i), int(j)) for i, j in zip(w.ii[50:], w.jj[50:], strict=True)}
+    assert pairs == {(2, 4), (3, 4), (5, 4), (4, 2), (4, 3), (4, 4), (4, 5)} and len(w.kk) == 50 + 2 * 7
+    w.remove(4)
+    assert all(torch.equal(getattr(w, name), value) for name, value in indices.items())
+    assert [f.identifier for f in w.frames] == [0, 1, 2, 3, 4]
+
+
 def test_slots_are_unique_and_reused():
     w = window()
     first = w.connect(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 1]))

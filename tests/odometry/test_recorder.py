@@ -154,6 +154,13 @@ def test_the_map_is_written_for_an_odometry_that_tells_its_result_so_far(tmp_pat
     assert written["frames"]["read"] == 11, "counts are frames of the source"
 
 
+def test_a_lost_frame_that_has_a_row_in_the_result_so_far_is_not_lost(tmp_path):
+    run = Run(tmp_path, Telling(), interval=0.0)
+    run.feed(lost=True)
+    run.feed()
+    assert run.summary()["frames"] == {"read": 2, "fed": 2, "tracked": 2, "lost": 0}
+
+
 def test_segments_have_files_and_the_longest_is_the_trajectory(tmp_path):
     run = Run(tmp_path)
     for _ in range(3):

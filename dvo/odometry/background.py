@@ -14,7 +14,7 @@ import torch
 
 T = TypeVar("T")
 
-_NICE = 5  # added to that of the process: a third of the processor time of tracking where they compete
+_NICE = 19  # added to that of the process: the least processor time where it competes with tracking
 
 
 class Task(Generic[T]):

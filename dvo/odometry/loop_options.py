@@ -69,7 +69,7 @@ class LoopOptions:
     hopeful: float = 0.03
     inliers: float = 0.4
     weak_inliers: float = 0.12
-    delay: int = 24
+    delay: int = 8
     patience: int = 4
     translation: float = 0.2
     rotation: float = 3.0

@@ -1,9 +1,10 @@
 """Height of the camera over the ground, in the unit of a map: local planes of its points below the camera.
 
-Around each keyframe, the points of it and its neighbours that lie below the camera are searched for a plane whose
+Around each keyframe, the points of it and its neighbours that the camera looks down on are searched for a plane whose
 normal is the vertical of the image up to a tilt: by planes through three random points, of which the one with most
-points near it is fitted again. It is the ground if hardly any point lies below it. The estimate of a trajectory is the
-median over its keyframes: a monocular map drifts in scale, and one plane for all of it would not be flat.
+points near it is fitted again. It is the ground if hardly any point lies below it. Points near the horizon are left
+out: they are far away, so that their depth is not sure, and few of them are on the ground. The estimate of a trajectory
+is the median over its keyframes: a monocular map drifts in scale, and one plane for all of it would not be flat.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from dvo.geometry.poses import invert_poses, quaternion_to_matrix
 from dvo.graph.archive import ArchivedKeyframe
 from dvo.graph.keyframe_graph import NEAR
 
-_NEIGHBOURS = 4  # keyframes before and after whose points take part
+_NEIGHBOURS = 8  # keyframes before and after whose points take part
+_STEEP = 0.07  # least slope of the view of a point, 4 degrees below the axis of the camera
 _FEWEST = 12  # points of a plane
 _SHARE = 0.25  # of the points below the camera that a plane needs
 _BELOW = 0.1  # share of these points that may lie below it
-_NEAR_PLANE = 0.04  # distance of a point from its plane, of the height of the camera
+_NEAR_PLANE = 0.08  # distance of a point from its plane, of the height: a smooth road is measured to about a tenth
 _SAMPLES = 200
 _KEYFRAMES = 400  # that are looked at, at most
 
@@ -129,9 +131,10 @@ def _fit(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _points(frame: ArchivedKeyframe) -> np.ndarray:
-    """``(P, 3)`` points of a keyframe in its camera, without those too far away to have a sure depth."""
+    """``(P, 3)`` points of a keyframe in its camera, without those near the horizon or too far away."""
     depth = frame.inverse_depth.astype(np.float64)
-    near = depth > NEAR * np.median(depth)
     fx, fy, cx, cy = frame.intrinsics.astype(np.float64)
-    x, y = frame.centres[near].astype(np.float64).T
-    return np.column_stack([(x - cx) / fx, (y - cy) / fy, np.ones(near.sum())]) / depth[near, None]
+    x, y = frame.centres.astype(np.float64).T
+    rays = np.column_stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)])
+    used = (depth > NEAR * np.median(depth)) & (rays[:, 1] > _STEEP)
+    return rays[used] / depth[used, None]

@@ -119,6 +119,35 @@ def test_the_ground_is_found_at_any_scale_and_tilt(seed, height, tilt):
     assert found == pytest.approx(height, rel=0.03)
 
 
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 1000))
+def test_the_ground_is_found_where_it_is_smooth_and_measured_roughly(seed):
+    """Heights of the points are wrong by 6 %, those of a road on kitti00_120 by about a tenth."""
+    rng = np.random.default_rng(seed)
+    found = plane_below(floor(rng, 1.65, 2.0, count=50, others=40, noise=0.06), 30.0, rng)
+    assert found == pytest.approx(1.65, rel=0.08)
+
+
+def test_points_near_the_horizon_are_no_ground():
+    """The facades far ahead have most of the patches of a street, and lie below the camera as often as above it."""
+    graph, _ = archived_walk(unit=0.0)
+    height, frames = 0.7, list(graph.archive)
+    for frame in frames:
+        rng, centres = np.random.default_rng(frame.identifier), frame.centres.copy()
+        fx, fy, cx, cy = frame.intrinsics.astype(float)
+        centres[:, 1] = rng.integers(int(cy) + 8, 54, len(centres))
+        depth = (centres[:, 1] - cy) / fy / height
+        far = np.arange(len(centres)) % 4 > 0
+        centres[far, 1] = cy + rng.uniform(0, 0.06, far.sum()) * fy
+        depth[far] = rng.uniform(0.3, 0.5, far.sum()) * np.median(depth)
+        graph.archive.add(frame.__class__(**{**frame.__dict__, "centres": centres}))
+        level = np.array([-0.1 * frame.identifier, 0, 0, 0, 0, 0, 1.0])
+        graph.correct(frame.identifier, level, depth.astype(np.float32))
+    found = ground_height(list(graph.archive), graph.poses_cw(np.arange(len(frames))).numpy(), 30.0)
+    assert found.keyframes == found.looked_at
+    assert found.height == pytest.approx(height, rel=0.02)
+
+
 def test_no_ground_without_a_plane_or_too_steep_or_with_points_below_it():
     rng = np.random.default_rng(0)
     assert plane_below(rng.uniform(-1, 1, (100, 3)) + [0, 0, 3], 30.0, rng) is None
@@ -184,5 +213,5 @@ def test_a_solution_far_from_the_measured_depths_is_scaled_to_them():
     moved, scaled = to_measured(poses, depths, measured)
     torch.testing.assert_close(moved[:, :3], 4 * poses[:, :3])
     torch.testing.assert_close(scaled, depths / 4)
-    near = torch.tensor([[0.95, 1.0]] * 8)
+    near = torch.tensor([[0.99, 1.0]] * 8)
     assert to_measured(poses, depths, near)[0] is poses

@@ -21,12 +21,12 @@ from dvo.graph.window import Window
 
 SIGMA = 0.061
 """Standard deviation of a measurement of confidence 1 with the shipped weights, feature pixels (docs/precision.md)."""
-KERNEL = Kernel("cauchy", 3 * SIGMA)
-"""Robust kernel of measured depths: three standard deviations."""
+KERNEL = Kernel("cauchy", SIGMA)
+"""Robust kernel of measured depths: one standard deviation, as errors of depths have long tails."""
 MOST = 0.5
 """Share of the patches with a measured depth above which these decide the relief, so that it needs no other start."""
 
-_NEAR = 0.2  # logarithm of a scale that iterations reach without help
+_NEAR = 0.02  # logarithm of a scale that iterations reach without help: beyond it the kernel takes the influence away
 
 
 def depth_factors(measured: Tensor | None) -> tuple[DepthPrior, ...]:

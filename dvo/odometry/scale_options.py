@@ -27,9 +27,9 @@ class ScaleOptions:
 
     Attributes:
         depth: use ``Frame.depth``, in every bundle adjustment (:mod:`dvo.odometry.patch_depth`).
-        depth_error: standard deviation of the depth of a patch relative to it: registration, and that its features
-            follow other pixels than its centre. Edges of a patch share this error and count one by one, so that it is
-            larger than that of a single depth (docs/metric_scale.md).
+        depth_error: standard deviation of the depth of a patch relative to it, beside the noise of the camera. Edges of
+            a patch share errors and count one by one, so that parallax counts for more than it tells; a larger value
+            leaves its noise to the scale (docs/metric_scale.md).
         depth_base, depth_quadratic: ``a`` and ``b`` of the noise of the depth camera, whose standard deviation is ``a +
             b (Z - 0.4)^2`` metres at depth ``Z``. The defaults are those of a Kinect (Nguyen, Izadi and Lovell,
             "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012, axial noise).
@@ -48,11 +48,11 @@ class ScaleOptions:
     """
 
     depth: bool = False
-    depth_error: float = 0.05
+    depth_error: float = 0.005
     depth_base: float = 0.0012
     depth_quadratic: float = 0.0019
     stereo: bool = False
-    stereo_error: float = 0.03
+    stereo_error: float = 0.01
     height: float = 0.0
     tilt: float = 30.0
     distances: tuple[tuple[float, float, float], ...] = ()

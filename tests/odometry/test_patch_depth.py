@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.nets.alignment import align_patches
 from dvo.odometry.depth_factor import SIGMA
-from dvo.odometry.patch_depth import checked_depth, sample_depth, variance_of_inverse
+from dvo.odometry.patch_depth import checked_depth, followed_depth, variance_of_inverse
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.tracker import PatchOdometry
 from tests.odometry.test_tracker import SMALL, frames, tracker
@@ -17,21 +19,62 @@ from tests.odometry.test_tracker import SMALL, frames, tracker
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 
 
-def test_the_median_of_the_known_pixels_is_sampled_away_from_edges():
+def textured(height=48, width=64, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.uint8)
+
+
+def test_windows_on_two_surfaces_or_on_unknown_ones_have_no_depth():
     depth = np.full((48, 64), 2.0, np.float32)
-    depth[:, 32:] = 4.0
+    depth[:, 40:] = 4.0
     depth[10, 10] = 50.0  # a single wrong pixel
-    depth[30:34, 8:13] = np.nan
+    depth[26:48, :20] = np.nan
     depth[40, 50] = 0.0
-    positions = np.array([[10, 10], [31, 20], [50, 20], [10, 31], [50, 40], [62, 46], [100, 20]], float)
-    found = sample_depth(depth, positions, 2)
-    np.testing.assert_array_equal(found, [2, np.nan, 4, np.nan, 4, 4, np.nan])
+    centres = np.array([[10, 10], [38, 20], [50, 20], [10, 34], [50, 40], [62, 46], [100, 20]], float)
+    found = followed_depth(depth, textured(), centres)
+    np.testing.assert_allclose(found, [2, np.nan, 4, np.nan, 4, 4, np.nan])
 
 
-def test_a_slanted_surface_is_no_edge():
-    rows = np.linspace(2.0, 3.0, 48, dtype=np.float32)
-    depth = np.repeat(rows[:, None], 64, 1)
-    assert sample_depth(depth, np.array([[30.0, 20.0]]), 1)[0] == pytest.approx(rows[20])
+def test_the_depth_of_a_slanted_surface_is_that_where_the_grey_levels_change():
+    """On an even texture that of the centre; otherwise that of the pixels beside the only line of the window."""
+    inverse = np.repeat(np.linspace(0.3, 0.5, 64)[None], 48, 0)
+    even = np.indices((48, 64)).sum(0) % 2 * 100
+    centre = np.array([[30.0, 20.0]])
+    found = followed_depth((1 / inverse).astype(np.float32), np.kron(even[::2, ::2], np.ones((2, 2))), centre)
+    assert 1 / found[0] == pytest.approx(inverse[20, 30], rel=2e-3)
+    line = np.full((48, 64), 100)
+    line[:, 34] = 200
+    found = followed_depth((1 / inverse).astype(np.float32), line, centre)
+    assert 1 / found[0] == pytest.approx(inverse[20, 34], rel=2e-3)
+
+
+def waves(x, y, seed=0):
+    """Smooth texture at any place, of a third of the contrast above the 24th row."""
+    rng = np.random.default_rng(seed)
+    turns, phases = rng.uniform(0.2, 0.6, (20, 2)) * rng.choice([-1, 1], (20, 2)), rng.uniform(0, 7, 20)
+    grey = sum(np.sin(a * x + b * y + c) for (a, b), c in zip(turns, phases, strict=True))
+    return 128 + 8 * grey * np.where(y < 24, 1 / 3, 1)
+
+
+def test_the_mean_is_the_parallax_that_the_alignment_of_grey_levels_finds():
+    """Two strips of different texture move by different flows; the aligned window moves by their weighted mean."""
+    x, y = np.meshgrid(np.arange(64.0), np.arange(48.0))
+    inverse = np.where(y < 24, 0.50, 0.53)
+    images = torch.from_numpy(np.stack([waves(x, y), waves(x - 10 * (inverse - 0.5), y)]))
+    one, centre = torch.tensor([0]), torch.tensor([[30.0, 24.0]], dtype=torch.float64)
+    found = align_patches(images, one, one + 1, centre, centre, torch.eye(2, dtype=torch.float64)[None])
+    metres = followed_depth((1 / inverse).astype(np.float32), images[0].numpy(), centre.numpy())
+    assert 0.52 < 1 / metres[0] < 0.53  # the lower strip has most of the contrast
+    assert float(found.positions[0, 0] - 30) == pytest.approx(10 * (1 / metres[0] - 0.5), abs=0.02)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0, 3.0])
+def test_depth_of_another_size_belongs_to_the_same_places(scale):
+    size = int(48 * scale), int(64 * scale)
+    x = (np.arange(size[1]) + 0.5) / scale - 0.5
+    depth = np.repeat(1 / (0.3 + 0.002 * x)[None], size[0], 0).astype(np.float32)
+    centres = np.array([[8.0, 8.0], [28.0, 20.0], [40.0, 32.0]])
+    even = np.kron(np.indices((24, 32)).sum(0) % 2 * 100, np.ones((2, 2)))
+    np.testing.assert_allclose(1 / followed_depth(depth, even, centres), 0.3 + 0.002 * centres[:, 0], atol=0.0012)
 
 
 def test_the_noise_is_that_of_the_sensor_and_a_relative_one():
@@ -54,7 +97,7 @@ def test_a_depth_of_another_form_is_refused(depth):
 
 
 @pytest.mark.parametrize("size", [(96, 72), (192, 144)])
-def test_the_window_holds_the_depths_at_the_centres(size):
+def test_the_window_holds_the_depths_of_its_patches(size):
     """The working image has 96x72 pixels; depth has the size of the frame."""
     width, height = size
     config = replace(SMALL, scale=ScaleOptions(depth=True), keyframe_motion=0.0)
@@ -65,7 +108,7 @@ def test_the_window_holds_the_depths_at_the_centres(size):
     odometry.track(replace(frame, depth=depth))
     measured = odometry.window.frames[0].measured.numpy()
     centres = odometry.window.patches[:, 0, 1, 1].numpy() * 4
-    np.testing.assert_allclose(measured[:, 0], 0.3 + 0.002 * centres, atol=0.0012)
+    np.testing.assert_allclose(measured[:, 0], 0.3 + 0.002 * centres, atol=0.006)  # of a point of the window
     metres = 1 / measured[:, 0].astype(float)
     np.testing.assert_allclose(measured[:, 1], SIGMA**2 / variance_of_inverse(metres, config.scale), rtol=1e-4)
     np.testing.assert_array_equal(odometry.window.patches[:, 2, 1, 1].numpy(), measured[:, 0])

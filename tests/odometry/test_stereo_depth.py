@@ -18,7 +18,7 @@ from dvo.metrics import evaluate
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.front_end import observe
-from dvo.odometry.patch_depth import sample_depth
+from dvo.odometry.patch_depth import followed_depth
 from dvo.odometry.right_view import right_view
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.stereo_depth import match_right, sample_features, search_line
@@ -61,7 +61,7 @@ def test_depths_of_a_rendered_pair(model, mount):
     frame, depth = rendered_pair(mount)
     seen = observed(model, frame)
     found = match_right(model, seen, right_view(frame, 320, 240), TrackerConfig(scale=STEREO))
-    true = sample_depth(depth, seen.centres[0, 0].double().numpy() * 4, 1)
+    true = followed_depth(depth, seen.image.mean(2), seen.centres[0, 0].double().numpy() * 4)
     known = np.isfinite(true) & found.good.numpy()
     assert known.sum() > 0.5 * np.isfinite(true).sum()
     error = found.inverse_depth.numpy()[known] * true[known] - 1

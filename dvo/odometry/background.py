@@ -53,7 +53,7 @@ class Background:
 
     What the work reads must not change meanwhile. The thread is started with the first work, and ends with the process
     or when nothing refers to it any more. It computes without further threads, which would take the cores that tracking
-    waits for, and on Linux with lower priority.
+    waits for, and on Linux with the lowest priority.
     """
 
     def __init__(self) -> None:

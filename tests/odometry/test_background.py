@@ -60,5 +60,6 @@ def test_the_thread_gives_way_to_tracking():
     finally:
         torch.set_num_threads(before)
     if sys.platform.startswith("linux"):
+        own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
         there = background.start(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id())).result()
-        assert there == 19  # the lowest, whatever that of tracking
+        assert there == min(own + 19, 19)

@@ -15,8 +15,9 @@ from dvo.data.image_header import image_size
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices
-from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
+from dvo.graph.archive import ArchivedKeyframe
 from dvo.graph.keyframe_graph import NEAR, KeyframeGraph
+from dvo.graph.measurements import ArchivedEdges
 from dvo.nets.config import ModelConfig
 from dvo.settings import check_settings
 

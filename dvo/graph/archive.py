@@ -2,11 +2,12 @@
 
 A keyframe keeps its pose, its patches with their inverse depths (points are relative to their keyframe and move with
 it), their colours, float16 features and the working image as JPEG, from which feature maps can be computed again. An
-edge keeps its target and weight. The archive serves global bundle adjustment, loop edges, export and saving.
+edge keeps its target and weight, rounded (:mod:`dvo.graph.measurements`). The archive serves global bundle adjustment,
+loop edges, export and saving.
 
-With the ``small`` network a keyframe takes about 34 kB of features, 15 to 25 kB of JPEG and 11 kB of edges. When the
-total exceeds :attr:`ArchiveConfig.max_bytes`, features and images of the oldest keyframes are released first, then the
-oldest edges, then the oldest patches; poses (56 bytes a keyframe) stay.
+With the ``small`` network a keyframe takes about 34 kB of features and 15 to 25 kB of JPEG, and every frame between
+two of them about 3 kB of edges. When the total exceeds :attr:`ArchiveConfig.max_bytes`, features and images of the
+oldest keyframes are released first, then the oldest edges, then the oldest patches; poses (56 bytes a keyframe) stay.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dvo.errors import DvoError
+from dvo.graph.measurements import ArchivedEdges, PackedEdges, pack_edges
 from dvo.graph.storage import ArrayStorage
 
 
@@ -105,59 +107,6 @@ class ArchivedKeyframe:
         return None if decoded is None else np.ascontiguousarray(decoded[..., ::-1])
 
 
-@dataclass(frozen=True)
-class ArchivedEdges:
-    """Measurements between keyframes, one row an edge.
-
-    Attributes:
-        source: ``(E,)`` int32 identifier of the keyframe of the patch.
-        patch: ``(E,)`` int16 index of the patch in it.
-        target: ``(E,)`` int32 identifier of the keyframe in which it was measured.
-        position: ``(E, 2)`` float32 measured position of the patch centre, feature-map pixels.
-        weight: ``(E, 2)`` float16 confidence.
-    """
-
-    source: np.ndarray
-    patch: np.ndarray
-    target: np.ndarray
-    position: np.ndarray
-    weight: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the arrays."""
-        return sum(a.nbytes for a in (self.source, self.patch, self.target, self.position, self.weight))
-
-    def select(self, rows: np.ndarray) -> ArchivedEdges:
-        """Choose edges.
-
-        Args:
-            rows: ``(E,)`` bool, or indices.
-
-        Returns:
-            The chosen edges.
-        """
-        return ArchivedEdges(*(a[rows] for a in (self.source, self.patch, self.target, self.position, self.weight)))
-
-    @classmethod
-    def concatenate(cls, parts: list[ArchivedEdges]) -> ArchivedEdges:
-        """Concatenate edges.
-
-        Args:
-            parts: any number of sets of edges.
-
-        Returns:
-            All edges, in order.
-        """
-        empty = (np.zeros(0, np.int32), np.zeros(0, np.int16), np.zeros(0, np.int32),
-                 np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float16))  # fmt: skip
-        columns = zip(empty, *((p.source, p.patch, p.target, p.position, p.weight) for p in parts), strict=True)
-        return cls(*(np.concatenate(column) for column in columns))
-
-
 class Archive:
     """Keyframes by identifier, and edges in the order in which they left the window.
 
@@ -168,7 +117,7 @@ class Archive:
     def __init__(self, config: ArchiveConfig | None = None) -> None:
         self.config = config or ArchiveConfig()
         self._keyframes: dict[int, ArchivedKeyframe] = {}
-        self._edges: deque[ArchivedEdges] = deque()
+        self._edges: deque[PackedEdges] = deque()
         self._bytes = 0
         # Identifiers in the order of archiving: those with features or an image, and those with patches.
         self._with_features: deque[int] = deque()
@@ -212,7 +161,7 @@ class Archive:
         return list(self._keyframes.values())
 
     @property
-    def parts(self) -> list[ArchivedEdges]:
+    def parts(self) -> list[PackedEdges]:
         """Measurements as they were added, each released as a whole, oldest first."""
         return list(self._edges)
 
@@ -242,14 +191,20 @@ class Archive:
         """Add measurements.
 
         Args:
-            edges: the measurements, possibly none; their arrays are copied.
+            edges: the measurements, possibly none; kept as :func:`dvo.graph.measurements.pack_edges` rounds them.
         """
         if len(edges):
-            keep = self._storage["edges"].keep
-            columns = edges.source, edges.patch, edges.target, edges.position, edges.weight
-            self._edges.append(ArchivedEdges(*map(keep, columns)))
-            self._bytes += edges.nbytes
-            self._shrink()
+            self.add_part(pack_edges(edges).kept_by(self._storage["edges"].keep))
+
+    def add_part(self, part: PackedEdges) -> None:
+        """Add measurements that another archive keeps too.
+
+        Args:
+            part: one or more; not copied.
+        """
+        self._edges.append(part)
+        self._bytes += part.nbytes
+        self._shrink()
 
     def edges(self, first: int = 0, last: int | None = None) -> ArchivedEdges:
         """Measurements that are kept.
@@ -261,13 +216,13 @@ class Archive:
             The edges, oldest first.
         """
         if first <= 0 and last is None:
-            return ArchivedEdges.concatenate(list(self._edges))
+            return ArchivedEdges.concatenate([part.unpack() for part in self._edges])
         parts = []
         for part in self._edges:
-            newest = np.maximum(part.source, part.target)
-            part = part.select((newest >= first) & (newest <= (np.iinfo(np.int32).max if last is None else last)))
-            if len(part):
-                parts.append(part)
+            newest = part.newest()
+            chosen = (newest >= first) & (newest <= (np.iinfo(np.int32).max if last is None else last))
+            if chosen.any():
+                parts.append(part.unpack(chosen))
         return ArchivedEdges.concatenate(parts)
 
     def set_pose(

@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3
-from dvo.graph.archive import Archive, ArchiveConfig, ArchivedEdges, ArchivedKeyframe, encode_jpeg
+from dvo.graph.archive import Archive, ArchiveConfig, ArchivedKeyframe, encode_jpeg
 from dvo.graph.heap import release_free_memory
 from dvo.graph.keyframe_log import KeyframeLog
+from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.problem import GraphProblem, graph_problem
 from dvo.graph.recordings import Recording
 from dvo.graph.window import Keyframe, Window

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dvo.graph.archive import ArchivedEdges
 from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.measurements import ArchivedEdges
 
 
 def append_graph(graph: KeyframeGraph, other: KeyframeGraph) -> tuple[int, int]:
@@ -26,8 +26,8 @@ def append_graph(graph: KeyframeGraph, other: KeyframeGraph) -> tuple[int, int]:
     for frame in other.archive.keyframes:
         anchor = None if frame.anchor is None else frame.anchor + keyframe
         archive.add(replace(frame, identifier=frame.identifier + keyframe, anchor=anchor))
-    for edges in other.archive.parts:
-        archive.add_edges(moved_edges(edges, keyframe))
+    for part in other.archive.parts:
+        archive.add_edges(moved_edges(part.unpack(), keyframe))
     log = graph.log
     for record in other.log.frames:
         anchor = None if record.anchor is None else record.anchor + keyframe

@@ -19,11 +19,12 @@ import numpy as np
 import torch
 
 from dvo.data.image_header import MAX_PIXELS, image_size
-from dvo.graph.archive import ArchiveConfig, ArchivedEdges, ArchivedKeyframe
+from dvo.graph.archive import ArchiveConfig, ArchivedKeyframe
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.keyframe_log import FrameRecord, KeyframeLog
 from dvo.graph.map_file import MapReader, open_map_file, write_map_file
 from dvo.graph.measured_arrays import has_measured, measured_arrays, read_measured
+from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.recordings import Recording, increase
 from dvo.graph.window_arrays import read_window, window_arrays
 
@@ -222,7 +223,7 @@ def _archive_arrays(graph: KeyframeGraph) -> Arrays:
     m, p = graph.window.per_frame, graph.window.patches.shape[-1]
     patched = [frame for frame in frames if len(frame.inverse_depth)]
     described = [frame for frame in frames if frame.matching is not None and frame.context is not None]
-    edges = ArchivedEdges.concatenate(parts)
+    edges = ArchivedEdges.concatenate([part.unpack() for part in parts])
     return {
         "archive/keyframes": np.array([frame.identifier for frame in frames], np.int64),
         "archive/times": np.array([frame.timestamp for frame in frames], np.float64),

@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from dvo.graph.archive import ArchiveConfig, ArchivedEdges, ArchivedKeyframe
+from dvo.graph.archive import ArchiveConfig, ArchivedKeyframe
 from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.measurements import PackedEdges
 from dvo.graph.recordings import Recording
 
 _UNBOUNDED = 2**62  # bytes: a copy of what is within the bound of an archive
@@ -30,7 +31,7 @@ class Snapshot:
 
     per_frame: int
     keyframes: tuple[ArchivedKeyframe, ...]
-    parts: tuple[ArchivedEdges, ...]
+    parts: tuple[PackedEdges, ...]
     segment: int
     starts: tuple[tuple[int, int], ...]
     worlds: tuple[tuple[int, int], ...]
@@ -55,7 +56,7 @@ class Snapshot:
         for keyframe in self.keyframes:
             copy.archive.add(replace(keyframe, matching=None, context=None, jpeg=None))
         for part in self.parts:
-            copy.archive.add_edges(part)
+            copy.archive.add_part(part)
         copy.segment, copy.starts, copy.worlds = self.segment, list(self.starts), dict(self.worlds)
         copy.loops, copy.recordings = self.loops, list(self.recordings)
         return copy

@@ -14,7 +14,9 @@ import torch
 
 T = TypeVar("T")
 
-_NICE = 19  # added to that of the process: the least processor time where it competes with tracking
+# Added to that of the process. More than a little would starve the thread beside other busy processes, and tracking,
+# which waits for its results, with it; without privileges a priority that was lowered cannot be raised again.
+_NICE = 5
 
 
 class Task(Generic[T]):
@@ -53,7 +55,7 @@ class Background:
 
     What the work reads must not change meanwhile. The thread is started with the first work, and ends with the process
     or when nothing refers to it any more. It computes without further threads, which would take the cores that tracking
-    waits for, and on Linux with the lowest priority.
+    waits for, and on Linux with a lower priority.
     """
 
     def __init__(self) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from dvo.errors import DvoError
-from dvo.graph.archive import ArchivedEdges
 from dvo.graph.map_file import MapReader
+from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.places import PlaceIndex
 from dvo.odometry.adjuster_saving import AdjusterTable, adjuster_arrays, adjuster_table, restore_adjuster
 from dvo.odometry.background import Task

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from dvo.ba.cold_start import COLD_UPDATES, damping_at
 from dvo.geometry import se3
-from dvo.graph.archive import ArchivedEdges, ArchivedKeyframe
+from dvo.graph.archive import ArchivedKeyframe
 from dvo.graph.features import FeatureCache
+from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3, sim3, so3
-from dvo.graph.archive import ArchivedEdges
 from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.places import PlaceIndex
 from dvo.odometry.loop_candidates import Candidate, by_likeness, by_proximity
 from dvo.odometry.loop_check import is_loop, median_inverse_depth

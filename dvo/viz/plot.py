@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 INK, ACCENT, TRUTH, START, PAPER = "#22272e", "#e4572e", "#4a6fa5", "#2a9d5c", "#ffffff"
 COLOURS = (ACCENT, "#8e4ec6", "#b08900", "#00838f", "#c2185b", "#5d4037")  # of segments
 SIZE_INCHES, DPI = (7.6, 6.0), 150
+_WIDTH = 66  # letters in a line of a title
 
 
 def plan_axes(positions: np.ndarray) -> tuple[int, int]:
@@ -132,10 +134,8 @@ def _draw_alone(figure: Figure, panel: Panel, title: str, subtitle: str) -> None
     plot = figure.add_subplot()
     _draw_panel(plot, panel, SIZE_INCHES[0] / SIZE_INCHES[1])
     _add_title(plot, title, subtitle)
-    if len(panel.tracks) > 1:  # too many names for the room above the axes
-        figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9.5)
-    elif plot.get_legend_handles_labels()[0]:
-        plot.legend(loc="lower right", bbox_to_anchor=(1, 1.05), ncols=3, frameon=False, fontsize=9.5, borderaxespad=0)
+    if plot.get_legend_handles_labels()[0]:  # below the axes: above them is the title, of any length
+        figure.legend(loc="outside lower left", ncols=5, frameon=False, fontsize=9.5)
 
 
 def _draw_side_by_side(figure: Figure, panels: Sequence[Panel], title: str, subtitle: str) -> None:
@@ -147,7 +147,7 @@ def _draw_side_by_side(figure: Figure, panels: Sequence[Panel], title: str, subt
         names = [track.label for track in panel.tracks]
         handles = [line for line in plot.get_lines() if line.get_label() in names or line.get_marker() == "D"]
         plot.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
+    figure.suptitle(textwrap.fill(title, _WIDTH), x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
     note = "every panel has a world and a scale of its own; a dot marks a start"
     figure.supxlabel(f"{subtitle}\n{note}".strip(), x=0.01, ha="left", fontsize=9.5, color=INK)
 
@@ -200,6 +200,7 @@ def _decorate(plot: Axes, axes: tuple[int, int], unit: str) -> None:
 
 
 def _add_title(plot: Axes, title: str, subtitle: str) -> None:
+    title = textwrap.fill(title, _WIDTH)
     plot.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=22 if subtitle else 8)
     if subtitle:
         plot.annotate(

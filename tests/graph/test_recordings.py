@@ -51,7 +51,7 @@ def test_an_appended_graph_is_that_of_the_other_with_new_numbers():
         assert torch.equal(getattr(mine, name), getattr(alone, name)), name
     assert np.array_equal(graph.log.trajectory(1).poses_wc, other.log.trajectory().poses_wc)
     assert graph.archive.config.max_bytes == 2 * other.archive.config.max_bytes
-    assert moved_edges(other.archive.parts[0], 7).source.dtype == np.int32
+    assert moved_edges(other.archive.parts[0].unpack(), 7).source.dtype == np.int32
 
 
 def test_recordings_outlast_a_file(tmp_path):
@@ -66,7 +66,7 @@ def test_the_adjustment_holds_earlier_recordings():
     """The second walk in the world of the first, whose poses drift: only the second one is solved."""
     graph, _ = two_walks()
     graph.join(1, 0)
-    edges = moved_edges(graph.archive.parts[-1], 0)
+    edges = moved_edges(graph.archive.parts[-1].unpack(), 0)
     graph.add_loop(edges)
     before = {frame.identifier: frame.pose_cw.copy() for frame in graph.archive}
     assert adjust_segment(graph, 0) == 32

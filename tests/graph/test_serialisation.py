@@ -74,7 +74,7 @@ def test_a_read_graph_releases_and_solves_as_the_one_written(tmp_path):
     assert found.log.trajectory().poses_wc.tobytes() == graph.log.trajectory().poses_wc.tobytes()
     for one in (graph, found):  # the oldest features, edges and patches go first
         one.archive.config = replace(one.archive.config, max_bytes=4000)
-        one.archive.add_edges(one.archive.parts[0])
+        one.archive.add_part(one.archive.parts[0])
     same(graph, found)
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import dvo
 from dvo.errors import DvoError
 from dvo.geometry import se3
-from dvo.graph.archive import ArchivedEdges
+from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.recordings import Recording
 from dvo.metrics import evaluate
 from dvo.odometry.adjuster import Adjuster, Adjusting

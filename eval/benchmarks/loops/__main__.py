@@ -26,6 +26,7 @@ from dvo.errors import DvoError
 from dvo.odometry.results import jsonable
 from eval.benchmarks.loops.runs import Run, Task, carry_out
 from eval.benchmarks.loops.tables import blackout_table, revisit_table
+from eval.execution.process import die_with_parent
 from eval.suites.selection import load_suites
 from eval.suites.suite import Sequence
 
@@ -163,7 +164,7 @@ def alone(task: Task) -> Run:
         DvoError: the process ended without a result.
     """
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
+    with ProcessPoolExecutor(1, mp_context=context, initializer=die_with_parent) as pool:
         try:
             return pool.submit(carry_out, task).result()
         except BrokenProcessPool as error:

@@ -21,7 +21,8 @@ NOTE = (
     f"Sequences that show a place again: a second is a revisit if its first frame shares {100 * RIGHT:g} % of the view "
     f"(by rendered depth and poses) with that of a second at least {OLDER:g} s older. Recall: revisits with a loop "
     f"within {NEAR:g} s, of the loops with more inliers than every false one. A false loop joins frames that have no "
-    f"view in common. The setting `{SETTING}` of a system closes loops or leaves them open."
+    f"view in common. Of a system that does not tell of its loops only the errors are known. The setting `{SETTING}` "
+    "of a system closes loops or leaves them open."
 )
 
 
@@ -62,7 +63,8 @@ def loop_lines(manifest: Manifest, rows: Sequence[Row]) -> list[list[str]]:
         rows: of all its runs.
 
     Returns:
-        A line for each sequence with revisits and each system that tells of loops in it; none without such.
+        A line for each sequence with revisits and each system that tells of loops in it, or that ran without and with
+        closure; none without such.
     """
     lines = []
     for suite in manifest.suites:
@@ -73,6 +75,7 @@ def loop_lines(manifest: Manifest, rows: Sequence[Row]) -> list[list[str]]:
                     _line(sequence, pair, here)
                     for pair in loop_pairs(manifest)
                     if any(math.isfinite(row.loops) for row in here if row.system == pair[1])
+                    or set(pair) <= {row.system for row in here}
                 ]
     return lines
 

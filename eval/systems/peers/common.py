@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -17,6 +17,7 @@ from dvo.geometry.camera import Camera
 from dvo.geometry.poses import poses_from_matrices
 from dvo.geometry.undistort import Undistorter
 from dvo.odometry.protocol import Result, Segment, SparseMap
+from dvo.segment_metrics import worlds_of
 
 WIDE = 560  # smaller images are doubled: these systems expect VGA, and do not even start on 320x240
 
@@ -67,19 +68,25 @@ class Row:
     part: int
 
 
-def result(rows: list[Row], frames: int, info: dict[str, Any]) -> Result:
+def result(rows: list[Row], frames: int, info: dict[str, Any], merged: Collection[int] = ()) -> Result:
     """A result without points, one segment for each map that holds frames: each has a world and a scale of its own.
 
     Args:
         rows: frames with a pose, in order of time.
         frames: number of frames fed.
         info: for :class:`dvo.odometry.protocol.Result`.
+        merged: numbers of the maps that share a world; their segments are joined to the first of them.
     """
-    parts = dict.fromkeys(row.part for row in rows)
-    trajectories = [_trajectory([row for row in rows if row.part == part]) for part in parts]
-    segments = tuple(Segment(one, float(one.timestamps[0]), float(one.timestamps[-1])) for one in trajectories)
-    longest = max(trajectories, key=len, default=_trajectory([]))
-    return Result(longest, SparseMap(), frames, frames - len(rows), info, segments)
+    parts = list(dict.fromkeys(row.part for row in rows))
+    first = next((number for number, part in enumerate(parts) if part in merged), None)
+    segments = []
+    for number, part in enumerate(parts):
+        one = _trajectory([row for row in rows if row.part == part])
+        joined_to = first if part in merged and number != first else None
+        segments.append(Segment(one, float(one.timestamps[0]), float(one.timestamps[-1]), joined_to))
+    worlds = [[parts[number] for number in numbers] for numbers in worlds_of(segments)]
+    longest = max((_trajectory([row for row in rows if row.part in world]) for world in worlds), key=len, default=None)
+    return Result(longest or _trajectory([]), SparseMap(), frames, frames - len(rows), info, tuple(segments))
 
 
 def _trajectory(rows: list[Row]) -> Trajectory:

@@ -4,6 +4,12 @@ Its threads race: fed faster than the camera delivers, mapping starves. So frame
 say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). Poses are collected frame
 by frame; at the end the keyframes, which bundle adjustment has moved since, carry the frames around them along.
 
+It closes loops and merges maps unless it is built with ``loops=False`` (``--systems orbslam3+loops=false``), which sets
+``loopClosing: 0`` in its settings file. That turns off its recognition of places as a whole: the thread that closes
+loops also fills the database of keyframes from which a lost camera is relocalised. The binding does not tell which
+frames a loop joins, so its loops cannot be judged as right or false; ``info["map_changes"]`` has the stamps of the
+frames after which a loop, or the global adjustment that follows it, had changed the map.
+
 It ships no vocabulary. ``DVO_ORB_VOCABULARY`` names the file (``python -m eval vocabulary`` trains one),
 else the small one beside the test data is taken: figures with either are not those of the official vocabulary.
 """
@@ -63,20 +69,26 @@ def missing() -> str | None:
 class OrbSlam3:
     """See the module. Frames before its initialisation and lost ones have no row; not deterministic (threads).
 
-    A map that is begun after a loss is a segment of its own. The binding does not tell of merged maps.
+    A map that is begun after a loss is a segment of its own. The binding does not tell of merged maps: at the end the
+    last map tells by its keyframes which earlier ones it has taken in, and their segments are joined. A merge into a
+    map that was lost again later stays unknown, and its frames keep the poses that they were tracked with.
+
+    Args:
+        loops: closes loops, merges maps and relocalises; see the module.
     """
 
     name = "orbslam3"
 
-    def __init__(self) -> None:
+    def __init__(self, loops: bool = True) -> None:
         import pyorbslam3
 
-        self._package = pyorbslam3
+        self._package, self._loops = pyorbslam3, loops
         self._vocabulary = vocabulary_file()
         self._folder = tempfile.TemporaryDirectory(prefix="orbslam3-")
         self._pictures = Pictures()
         self._slam: Any = None
         self._rows: list[Row] = []
+        self._map_changes: list[float] = []
         self._frames = self._part = 0
         self._was_tracking = False
         self._begin = self._first = self._computing = 0.0
@@ -86,7 +98,7 @@ class OrbSlam3:
         if self._slam is None:
             assert self._pictures.camera is not None
             file = Path(self._folder.name) / "settings.yaml"
-            file.write_text(settings(self._pictures.camera), encoding="utf-8")
+            file.write_text(settings(self._pictures.camera, self._loops), encoding="utf-8")
             monocular = self._package.Sensor.MONOCULAR
             self._slam = self._package.Slam(str(self._vocabulary), str(file), monocular, use_viewer=False)
             self._begin, self._first = time.perf_counter(), frame.timestamp
@@ -95,6 +107,8 @@ class OrbSlam3:
         start = time.perf_counter()
         said = self._slam.track_monocular(image, frame.timestamp)
         self._computing += time.perf_counter() - start
+        if self._slam.map_changed():
+            self._map_changes.append(frame.timestamp)
         states = self._package.TrackingState
         if said.state in (states.NO_IMAGES_YET, states.NOT_INITIALIZED) and self._was_tracking:
             self._part, self._was_tracking = self._part + 1, False
@@ -108,31 +122,45 @@ class OrbSlam3:
         return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5, self._part)
 
     def finish(self) -> Result:
-        rows, moved = self._rows, 0
+        rows, keyframes, merged = self._rows, 0, frozenset[int]()
         if self._slam is not None:
             self._slam.shutdown()
-            rows, moved = self._refine(rows)
+            rows, keyframes, merged = self._refine(rows)
         self._folder.cleanup()
         info = {
             **self._pictures.facts(),
             "vocabulary": self._vocabulary.name,
             "vocabulary_words": count_words(self._vocabulary),
             "maps_started": self._part + 1,
-            "keyframes": moved,
+            "keyframes": keyframes,
+            "place_recognition": self._loops,
+            "map_changes": self._map_changes,
             "computing_fps": self._frames / self._computing if self._computing else None,
         }
-        return result(rows, self._frames, info)
+        return result(rows, self._frames, info, merged)
 
-    def _refine(self, rows: list[Row]) -> tuple[list[Row], int]:
-        """Move frames along with the last keyframe at or before each; only the last map has keyframes to offer."""
+    def _refine(self, rows: list[Row]) -> tuple[list[Row], int, frozenset[int]]:
+        """Move frames along with the last keyframe at or before each.
+
+        Only the last map has keyframes to offer. Those of earlier parts are among them if it has taken in their maps.
+
+        Returns:
+            The rows, the number of keyframes found among them, and the numbers of the parts in the world of the last
+            map.
+        """
         file = Path(self._folder.name) / "keyframes.txt"
         self._slam.save_keyframe_trajectory_tum(str(file))
-        last = [row for row in rows if row.part == self._part]
-        if not last or not file.is_file() or not file.read_text().strip():
-            return rows, 0
+        if not file.is_file() or not file.read_text().strip():
+            return rows, 0, frozenset()
         keyframes = read_tum(file)
-        moved, count = follow_keyframes(last, keyframes.timestamps, pose_matrices(keyframes.poses_wc))
-        return [row for row in rows if row.part != self._part] + moved, count
+        T_wk = pose_matrices(keyframes.poses_wc)
+        refined, total, merged = [], 0, set()
+        for part in dict.fromkeys(row.part for row in rows):
+            moved, count = follow_keyframes([row for row in rows if row.part == part], keyframes.timestamps, T_wk)
+            refined, total = refined + moved, total + count
+            if count:
+                merged.add(part)
+        return refined, total, frozenset(merged)
 
 
 def follow_keyframes(rows: list[Row], stamps: np.ndarray, T_wk: np.ndarray) -> tuple[list[Row], int]:
@@ -162,8 +190,13 @@ def follow_keyframes(rows: list[Row], stamps: np.ndarray, T_wk: np.ndarray) -> t
     ], len(corrections)
 
 
-def settings(camera: Camera) -> str:
-    """Its settings file for an undistorted camera."""
+def settings(camera: Camera, loops: bool = True) -> str:
+    """Text of its settings file.
+
+    Args:
+        camera: of the images, undistorted.
+        loops: recognises places: closes loops, merges maps, relocalises.
+    """
     lines = {
         "File.version": '"1.0"',
         "Camera.type": '"PinHole"',
@@ -181,6 +214,7 @@ def settings(camera: Camera) -> str:
         "ORBextractor.nLevels": 8,
         "ORBextractor.iniThFAST": 20,
         "ORBextractor.minThFAST": 7,
+        "loopClosing": int(loops),
         # The viewer is off, but its settings are required.
         **{f"Viewer.{name}": 0.1 for name in ("KeyFrameSize", "GraphLineWidth", "PointSize", "CameraSize")},
         **{f"Viewer.{name}": 1.0 for name in ("KeyFrameLineWidth", "CameraLineWidth", "ViewpointX", "ViewpointY")},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -20,13 +21,15 @@ SETTINGS = {
     "dvo-small+patches=48": {"weights": "small", "patches": 48},
     "keyframe": {},
     "keyframe-loops": {"loops": True},
+    "orbslam3": {},
+    "orbslam3+loops=false": {"loops": False},
 }
 
 
 def with_systems(manifest: Manifest, names: list[str]) -> Manifest:
     facts = manifest.facts["null"]
     found = {
-        name: replace(facts, label=name, identity={"target": name.split("-")[0], "settings": SETTINGS[name]})
+        name: replace(facts, label=name, identity={"target": re.split("[-+]", name)[0], "settings": SETTINGS[name]})
         for name in names
     }
     return replace(manifest, systems=tuple(names), facts=found)
@@ -38,6 +41,7 @@ def test_pairs_by_settings(plan: Plan, rows: list[Row]) -> None:
         ("dvo-small+loops=false", "dvo-small"),
         (None, "dvo-small+patches=48"),
         ("keyframe", "keyframe-loops"),
+        ("orbslam3+loops=false", "orbslam3"),
     ]
     assert loop_pairs(with_systems(manifest, ["dvo-small+loops=false"])) == [("dvo-small+loops=false", None)]
 
@@ -57,6 +61,20 @@ def test_table_of_sequences_with_revisits(plan: Plan, rows: list[Row]) -> None:
     assert loop_table(manifest, [replace(row, revisit_s=0.0) for row in (on, off)]) == ""
     two = loop_table(manifest, [on, off, replace(on, seed=1, ate_percent=2.5, loop_recall=0.8)])
     assert "2.00 [1.50–2.50]" in two and "70 [60–80]" in two
+
+
+def test_system_that_does_not_tell_of_its_loops(plan: Plan, rows: list[Row]) -> None:
+    """Its errors without and with closure stand in the table; with one of the two there is nothing to compare."""
+    manifest = with_systems(read_manifest(plan.out), list(SETTINGS))
+    null = next(row for row in rows if row.system == "null")
+    on = replace(null, system="orbslam3", ate_percent=2.5, revisit_s=34.0)
+    off = replace(on, system="orbslam3+loops=false", ate_percent=3.5)
+    assert math.isnan(on.loops) and math.isnan(on.loop_recall)
+    line = loop_table(manifest, [on, off]).splitlines()[-1]
+    assert [cell.strip() for cell in line.split("|")[1:-1]] == [
+        *("clip", "orbslam3", "3.50", "2.50", "1", "1", "–", "–", "34", "–")
+    ]
+    assert loop_table(manifest, [on]) == ""
 
 
 def test_file_and_page(plan: Plan, rows: list[Row]) -> None:

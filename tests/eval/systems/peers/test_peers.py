@@ -115,6 +115,52 @@ def test_settings_hold_the_camera(tmp_path):
     assert storage.getNode("Camera1.cy").real() == 239.5 and storage.getNode("Camera.type").string() == "PinHole"
 
 
+def test_settings_turn_the_recognition_of_places_off(tmp_path):
+    camera = Camera(500.5, 501.5, 319.5, 239.5, 640, 480)
+    for loops, expected in ((True, 1.0), (False, 0.0)):
+        file = tmp_path / f"{loops}.yaml"
+        file.write_text(orbslam3.settings(camera, loops))
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+        assert storage.getNode("loopClosing").real() == expected
+    assert orbslam3.settings(camera) == orbslam3.settings(camera, True)
+
+
+def test_orbslam3_hands_its_setting_on(monkeypatch, tmp_path):
+    """From the command line to the settings file that the package reads; frames after which its map had changed."""
+    read = []
+
+    class Slam:
+        def __init__(self, vocabulary, file, sensor, use_viewer):
+            storage = cv2.FileStorage(file, cv2.FILE_STORAGE_READ)
+            read.append(storage.getNode("loopClosing").real())
+            self._changes = iter([False, True, False])
+
+        def track_monocular(self, image, stamp):
+            return SimpleNamespace(state="OK", pose_valid=True, pose_wc=np.eye(4))
+
+        def map_changed(self):
+            return next(self._changes)
+
+        def shutdown(self):
+            pass
+
+        def save_keyframe_trajectory_tum(self, file):
+            pass
+
+    states = SimpleNamespace(NO_IMAGES_YET="none", NOT_INITIALIZED="first", OK="OK", OK_KLT="KLT")
+    package = SimpleNamespace(Slam=Slam, Sensor=SimpleNamespace(MONOCULAR=0), TrackingState=states)
+    monkeypatch.setitem(sys.modules, "pyorbslam3", package)
+    (tmp_path / "words.txt").write_text("10 6 0 0\n")
+    monkeypatch.setenv(orbslam3.VOCABULARY, str(tmp_path / "words.txt"))
+    frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
+    for name, closes in (("orbslam3", True), ("orbslam3+loops=true", True), ("orbslam3+loops=false", False)):
+        system = find_system(name).build(0, "cpu")
+        for k in range(3):
+            system.track(replace(frame, index=k, timestamp=0.001 * k))
+        info = system.finish().info
+        assert read.pop() == closes and info["place_recognition"] is closes and info["map_changes"] == [0.001]
+
+
 def test_small_pictures_are_doubled_with_their_camera():
     frame = Frame(0, 0.0, np.zeros((240, 320, 3), np.uint8), Camera(250.0, 250.0, 159.5, 119.5, 320, 240))
     pictures = Pictures()
@@ -144,19 +190,38 @@ def test_every_map_is_a_segment():
     assert len(nothing.trajectory) == 0 and nothing.segments == () and nothing.frames_lost == 9
 
 
-def test_only_the_last_map_follows_its_keyframes(tmp_path):
-    """Keyframes that ORB-SLAM3 gives at the end are in the world of its last map."""
+def test_merged_maps_share_a_world():
+    rows = [Row(float(k), np.eye(4), part) for k, part in enumerate([0, 0, 1, 1, 1, 2, 2])]
+    found = result(rows, 7, {}, merged={0, 2})
+    assert [one.joined_to for one in found.segments] == [None, None, 0]
+    assert found.trajectory.timestamps.tolist() == [0, 1, 5, 6]
+    assert [one.joined_to for one in result(rows, 7, {}, merged={2}).segments] == [None] * 3
+
+
+def refined(tmp_path: Path, keyframes: dict[float, float], parts: list[int]) -> tuple[list[Row], int, frozenset[int]]:
+    """Refine rows at 0, 1, ... seconds, all at the origin, by the keyframes of the last map: stamps and x."""
 
     class Slam:
         def save_keyframe_trajectory_tum(self, file: str) -> None:
-            write_tum(file, Trajectory(np.array([3.0]), np.array([[7.0, 0, 0, 0, 0, 0, 1]])))
+            poses_wc = np.array([[x, 0, 0, 0, 0, 0, 1] for x in keyframes.values()])
+            write_tum(file, Trajectory(np.array(list(keyframes)), poses_wc))
 
     system = object.__new__(orbslam3.OrbSlam3)
-    system._slam, system._part, system._folder = Slam(), 1, SimpleNamespace(name=str(tmp_path))
-    rows = [Row(float(k), np.eye(4), part) for k, part in enumerate([0, 0, 1, 1])]
-    moved, count = system._refine(rows)
+    system._slam, system._folder = Slam(), SimpleNamespace(name=str(tmp_path))
+    return system._refine([Row(float(k), np.eye(4), part) for k, part in enumerate(parts)])
+
+
+def test_only_the_last_map_follows_its_keyframes(tmp_path):
+    """Keyframes that ORB-SLAM3 gives at the end are in the world of its last map."""
+    moved, count, merged = refined(tmp_path, {3.0: 7.0}, [0, 0, 1, 1])
     assert count == 1 and [row.T_wc[0, 3] for row in moved] == [0, 0, 7, 7]
-    assert [row.part for row in moved] == [0, 0, 1, 1]
+    assert [row.part for row in moved] == [0, 0, 1, 1] and merged == {1}
+
+
+def test_keyframes_of_a_merged_map_move_its_frames(tmp_path):
+    moved, count, merged = refined(tmp_path, {0.0: 5.0, 4.0: 7.0}, [0, 0, 1, 1, 2])
+    assert count == 2 and [row.T_wc[0, 3] for row in moved] == [5, 5, 0, 0, 7]
+    assert [row.part for row in moved] == [0, 0, 1, 1, 2] and merged == {0, 2}
 
 
 def test_frames_follow_their_keyframes():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
@@ -68,25 +68,28 @@ class Row:
     part: int
 
 
-def result(rows: list[Row], frames: int, info: dict[str, Any], merged: Collection[int] = ()) -> Result:
+def result(rows: list[Row], frames: int, info: dict[str, Any], worlds: Mapping[int, int] | None = None) -> Result:
     """A result without points, one segment for each map that holds frames: each has a world and a scale of its own.
 
     Args:
         rows: frames with a pose, in order of time.
         frames: number of frames fed.
         info: for :class:`dvo.odometry.protocol.Result`.
-        merged: numbers of the maps that share a world; their segments are joined to the first of them.
+        worlds: number of the world of a map; maps of the same world are joined to its first one. One that is not named
+            has its own.
     """
     parts = list(dict.fromkeys(row.part for row in rows))
-    first = next((number for number, part in enumerate(parts) if part in merged), None)
+    first: dict[Any, int] = {}
     segments = []
     for number, part in enumerate(parts):
         one = _trajectory([row for row in rows if row.part == part])
-        joined_to = first if part in merged and number != first else None
+        world = (worlds or {}).get(part, ("own", part))
+        joined_to = first.get(world)
+        first.setdefault(world, number)
         segments.append(Segment(one, float(one.timestamps[0]), float(one.timestamps[-1]), joined_to))
-    worlds = [[parts[number] for number in numbers] for numbers in worlds_of(segments)]
-    longest = max((_trajectory([row for row in rows if row.part in world]) for world in worlds), key=len, default=None)
-    return Result(longest or _trajectory([]), SparseMap(), frames, frames - len(rows), info, tuple(segments))
+    joined = [{parts[number] for number in numbers} for numbers in worlds_of(segments)]
+    longest = max(([row for row in rows if row.part in world] for world in joined), key=len, default=[])
+    return Result(_trajectory(longest), SparseMap(), frames, frames - len(rows), info, tuple(segments))
 
 
 def _trajectory(rows: list[Row]) -> Trajectory:

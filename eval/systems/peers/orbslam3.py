@@ -1,8 +1,9 @@
 """ORB-SLAM3 (Campos et al. 2021), monocular, from the package ``pyorbslam3`` (GPL-3).
 
 Its threads race: fed faster than the camera delivers, mapping starves. So frames are fed no faster than their stamps
-say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). Poses are collected frame
-by frame; at the end the keyframes, which bundle adjustment has moved since, carry the frames around them along.
+say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). A machine that is busy
+with other work needs a slower pace: ``orbslam3+pace=0.5`` takes twice the time. Poses are collected frame by frame;
+when a map ends, its keyframes, which bundle adjustment has moved since, carry the frames around them along.
 
 It closes loops and merges maps unless it is built with ``loops=False`` (``--systems orbslam3+loops=false``), which sets
 ``loopClosing: 0`` in its settings file. That turns off its recognition of places as a whole: the thread that closes
@@ -19,6 +20,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.data.root import data_root
-from dvo.data.trajectory import read_tum
+from dvo.data.trajectory import Trajectory, read_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
@@ -69,25 +71,32 @@ def missing() -> str | None:
 class OrbSlam3:
     """See the module. Frames before its initialisation and lost ones have no row; not deterministic (threads).
 
-    A map that is begun after a loss is a segment of its own. The binding does not tell of merged maps: at the end the
-    last map tells by its keyframes which earlier ones it has taken in, and their segments are joined. A merge into a
-    map that was lost again later stays unknown, and its frames keep the poses that they were tracked with.
+    A map that is begun after a loss is a segment of its own. The binding does not tell of merged maps, but the
+    keyframes of a map tell which earlier ones it has taken in: they are read while it is lost and at the end, their
+    frames follow them, and the segments are joined.
 
     Args:
         loops: closes loops, merges maps and relocalises; see the module.
+        pace: seconds of the recording that are fed in a second, at most.
+
+    Raises:
+        DvoError: a pace that is not above 0.
     """
 
     name = "orbslam3"
 
-    def __init__(self, loops: bool = True) -> None:
+    def __init__(self, loops: bool = True, pace: float = 1.0) -> None:
         import pyorbslam3
 
-        self._package, self._loops = pyorbslam3, loops
+        if not pace > 0:
+            raise DvoError(f"must be above 0, got {pace}", field="pace", remedy="1 is the pace of the camera")
+        self._package, self._loops, self._pace = pyorbslam3, loops, pace
         self._vocabulary = vocabulary_file()
         self._folder = tempfile.TemporaryDirectory(prefix="orbslam3-")
         self._pictures = Pictures()
         self._slam: Any = None
         self._rows: list[Row] = []
+        self._keyframes: dict[int, Trajectory] = {}
         self._map_changes: list[float] = []
         self._frames = self._part = 0
         self._was_tracking = False
@@ -103,13 +112,17 @@ class OrbSlam3:
             self._slam = self._package.Slam(str(self._vocabulary), str(file), monocular, use_viewer=False)
             self._begin, self._first = time.perf_counter(), frame.timestamp
         self._frames += 1
-        time.sleep(max(0.0, frame.timestamp - self._first - (time.perf_counter() - self._begin)))
+        due = self._begin + (frame.timestamp - self._first) / self._pace
+        time.sleep(max(0.0, due - time.perf_counter()))
         start = time.perf_counter()
         said = self._slam.track_monocular(image, frame.timestamp)
         self._computing += time.perf_counter() - start
         if self._slam.map_changed():
             self._map_changes.append(frame.timestamp)
         states = self._package.TrackingState
+        # Giving a map up and beginning the next one is a single step, after which the old one cannot be read any more.
+        if said.state in (states.RECENTLY_LOST, states.LOST):
+            self._read_keyframes()
         if said.state in (states.NO_IMAGES_YET, states.NOT_INITIALIZED) and self._was_tracking:
             self._part, self._was_tracking = self._part + 1, False
         # While it is RECENTLY_LOST the pose is the motion model's guess.
@@ -122,10 +135,10 @@ class OrbSlam3:
         return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5, self._part)
 
     def finish(self) -> Result:
-        rows, keyframes, merged = self._rows, 0, frozenset[int]()
         if self._slam is not None:
             self._slam.shutdown()
-            rows, keyframes, merged = self._refine(rows)
+            self._read_keyframes()
+        rows, keyframes, worlds = place_maps(self._rows, list(self._keyframes.values()))
         self._folder.cleanup()
         info = {
             **self._pictures.facts(),
@@ -134,33 +147,42 @@ class OrbSlam3:
             "maps_started": self._part + 1,
             "keyframes": keyframes,
             "place_recognition": self._loops,
+            "pace": self._pace,
             "map_changes": self._map_changes,
             "computing_fps": self._frames / self._computing if self._computing else None,
         }
-        return result(rows, self._frames, info, merged)
+        return result(rows, self._frames, info, worlds)
 
-    def _refine(self, rows: list[Row]) -> tuple[list[Row], int, frozenset[int]]:
-        """Move frames along with the last keyframe at or before each.
-
-        Only the last map has keyframes to offer. Those of earlier parts are among them if it has taken in their maps.
-
-        Returns:
-            The rows, the number of keyframes found among them, and the numbers of the parts in the world of the last
-            map.
-        """
+    def _read_keyframes(self) -> None:
+        """Keep where the keyframes of the present map are."""
         file = Path(self._folder.name) / "keyframes.txt"
+        file.unlink(missing_ok=True)
         self._slam.save_keyframe_trajectory_tum(str(file))
-        if not file.is_file() or not file.read_text().strip():
-            return rows, 0, frozenset()
-        keyframes = read_tum(file)
+        if file.is_file() and file.read_text().strip():
+            self._keyframes[self._part] = read_tum(file)
+
+
+def place_maps(rows: list[Row], maps: Sequence[Trajectory]) -> tuple[list[Row], int, dict[int, int]]:
+    """Carry the frames of all maps along with their keyframes.
+
+    Args:
+        rows: frames as they were tracked, in order of time.
+        maps: keyframes of a map at its end, camera to world, in order of time. Those of frames of several parts stand
+            for a map that has taken in others; of a part that is in several maps the last one counts.
+
+    Returns:
+        The rows, the number of keyframes found among them, and for each part with keyframes the number of the map in
+        whose world it is.
+    """
+    parts = {part: [row for row in rows if row.part == part] for part in dict.fromkeys(row.part for row in rows)}
+    placed, found, worlds = dict(parts), dict.fromkeys(parts, 0), {}
+    for number, keyframes in enumerate(maps):
         T_wk = pose_matrices(keyframes.poses_wc)
-        refined, total, merged = [], 0, set()
-        for part in dict.fromkeys(row.part for row in rows):
-            moved, count = follow_keyframes([row for row in rows if row.part == part], keyframes.timestamps, T_wk)
-            refined, total = refined + moved, total + count
+        for part, mine in parts.items():
+            moved, count = follow_keyframes(mine, keyframes.timestamps, T_wk)
             if count:
-                merged.add(part)
-        return refined, total, frozenset(merged)
+                placed[part], found[part], worlds[part] = moved, count, number
+    return [row for mine in placed.values() for row in mine], sum(found.values()), worlds
 
 
 def follow_keyframes(rows: list[Row], stamps: np.ndarray, T_wk: np.ndarray) -> tuple[list[Row], int]:

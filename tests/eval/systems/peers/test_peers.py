@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,9 +16,10 @@ import numpy as np
 import pytest
 
 from dvo.data.frame import Frame
-from dvo.data.trajectory import Trajectory, write_tum
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.odometry.protocol import SparseMap
+from dvo.odometry.protocol import Result, SparseMap
 from eval.systems.peers import colmap, orbslam3, svo
 from eval.systems.peers.common import Pictures, Row, result
 from eval.systems.registry import find_system
@@ -125,18 +127,21 @@ def test_settings_turn_the_recognition_of_places_off(tmp_path):
     assert orbslam3.settings(camera) == orbslam3.settings(camera, True)
 
 
-def test_orbslam3_hands_its_setting_on(monkeypatch, tmp_path):
-    """From the command line to the settings file that the package reads; frames after which its map had changed."""
-    read = []
+@pytest.fixture
+def package(monkeypatch, tmp_path) -> list[float]:
+    """A stand-in for pyorbslam3 that is lost in its second frame and merges; the values of ``loopClosing`` it read."""
+    read: list[float] = []
 
     class Slam:
         def __init__(self, vocabulary, file, sensor, use_viewer):
             storage = cv2.FileStorage(file, cv2.FILE_STORAGE_READ)
             read.append(storage.getNode("loopClosing").real())
-            self._changes = iter([False, True, False])
+            self._told, self._reads = iter(["OK", "recent", "first", "OK"]), count()
+            self._changes = iter([False, True, False, False])
 
         def track_monocular(self, image, stamp):
-            return SimpleNamespace(state="OK", pose_valid=True, pose_wc=np.eye(4))
+            state = next(self._told)
+            return SimpleNamespace(state=state, pose_valid=state == "OK", pose_wc=np.eye(4))
 
         def map_changed(self):
             return next(self._changes)
@@ -145,20 +150,54 @@ def test_orbslam3_hands_its_setting_on(monkeypatch, tmp_path):
             pass
 
         def save_keyframe_trajectory_tum(self, file):
-            pass
+            last = next(self._reads) > 0
+            Path(file).write_text("0 5 0 0 0 0 0 1\n3 7 0 0 0 0 0 1\n" if last else "0 3 0 0 0 0 0 1\n")
 
-    states = SimpleNamespace(NO_IMAGES_YET="none", NOT_INITIALIZED="first", OK="OK", OK_KLT="KLT")
-    package = SimpleNamespace(Slam=Slam, Sensor=SimpleNamespace(MONOCULAR=0), TrackingState=states)
-    monkeypatch.setitem(sys.modules, "pyorbslam3", package)
+    named = {"NO_IMAGES_YET": "none", "NOT_INITIALIZED": "first", "RECENTLY_LOST": "recent", "LOST": "lost"}
+    states = SimpleNamespace(OK="OK", OK_KLT="KLT", **named)
+    module = SimpleNamespace(Slam=Slam, Sensor=SimpleNamespace(MONOCULAR=0), TrackingState=states)
+    monkeypatch.setitem(sys.modules, "pyorbslam3", module)
     (tmp_path / "words.txt").write_text("10 6 0 0\n")
     monkeypatch.setenv(orbslam3.VOCABULARY, str(tmp_path / "words.txt"))
+    return read
+
+
+@pytest.fixture
+def naps(monkeypatch) -> list[float]:
+    """Seconds that ORB-SLAM3 waits for its frames; the clock stands still."""
+    found: list[float] = []
+    monkeypatch.setattr(orbslam3, "time", SimpleNamespace(perf_counter=lambda: 0.0, sleep=found.append))
+    return found
+
+
+def run_orbslam3(name: str) -> Result:
     frame = Frame(0, 0.0, np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
+    system = find_system(name).build(0, "cpu")
+    for k in range(4):
+        system.track(replace(frame, index=k, timestamp=float(k)))
+    return system.finish()
+
+
+def test_orbslam3_hands_its_setting_on(package, naps):
     for name, closes in (("orbslam3", True), ("orbslam3+loops=true", True), ("orbslam3+loops=false", False)):
-        system = find_system(name).build(0, "cpu")
-        for k in range(3):
-            system.track(replace(frame, index=k, timestamp=0.001 * k))
-        info = system.finish().info
-        assert read.pop() == closes and info["place_recognition"] is closes and info["map_changes"] == [0.001]
+        info = run_orbslam3(name).info
+        assert package.pop() == closes and info["place_recognition"] is closes
+        assert info["map_changes"] == [1.0] and info["maps_started"] == 2
+
+
+def test_orbslam3_reads_its_keyframes_while_it_is_lost_and_at_the_end(package, naps):
+    """The map at the end holds a keyframe of the lost one: it has taken it in."""
+    result = run_orbslam3("orbslam3")
+    assert result.trajectory.positions[:, 0].tolist() == [5, 7] and result.info["keyframes"] == 2
+    assert [one.joined_to for one in result.segments] == [None, 0]
+
+
+def test_orbslam3_is_fed_at_its_pace(package, naps):
+    run_orbslam3("orbslam3")
+    run_orbslam3("orbslam3+pace=0.5")
+    assert naps == [0, 1, 2, 3, 0, 2, 4, 6]
+    with pytest.raises(DvoError, match=r"pace.*above 0.*got 0"):
+        find_system("orbslam3+pace=0").build(0, "cpu")
 
 
 def test_small_pictures_are_doubled_with_their_camera():
@@ -192,36 +231,32 @@ def test_every_map_is_a_segment():
 
 def test_merged_maps_share_a_world():
     rows = [Row(float(k), np.eye(4), part) for k, part in enumerate([0, 0, 1, 1, 1, 2, 2])]
-    found = result(rows, 7, {}, merged={0, 2})
+    found = result(rows, 7, {}, worlds={0: 1, 1: 0, 2: 1})
     assert [one.joined_to for one in found.segments] == [None, None, 0]
     assert found.trajectory.timestamps.tolist() == [0, 1, 5, 6]
-    assert [one.joined_to for one in result(rows, 7, {}, merged={2}).segments] == [None] * 3
+    assert [one.joined_to for one in result(rows, 7, {}, worlds={2: 0}).segments] == [None] * 3
 
 
-def refined(tmp_path: Path, keyframes: dict[float, float], parts: list[int]) -> tuple[list[Row], int, frozenset[int]]:
-    """Refine rows at 0, 1, ... seconds, all at the origin, by the keyframes of the last map: stamps and x."""
-
-    class Slam:
-        def save_keyframe_trajectory_tum(self, file: str) -> None:
-            poses_wc = np.array([[x, 0, 0, 0, 0, 0, 1] for x in keyframes.values()])
-            write_tum(file, Trajectory(np.array(list(keyframes)), poses_wc))
-
-    system = object.__new__(orbslam3.OrbSlam3)
-    system._slam, system._folder = Slam(), SimpleNamespace(name=str(tmp_path))
-    return system._refine([Row(float(k), np.eye(4), part) for k, part in enumerate(parts)])
+def placed(maps: list[dict[float, float]], parts: list[int]) -> tuple[list[float], list[int], int, dict[int, int]]:
+    """Place rows at 0, 1, ... seconds, all at the origin, by keyframes (stamp, x): x, part, keyframes and worlds."""
+    rows = [Row(float(k), np.eye(4), part) for k, part in enumerate(parts)]
+    ends = [
+        Trajectory(np.array(list(one)), np.array([[x, 0, 0, 0, 0, 0, 1] for x in one.values()], float)) for one in maps
+    ]
+    moved, count, worlds = orbslam3.place_maps(rows, ends)
+    return [row.T_wc[0, 3] for row in moved], [row.part for row in moved], count, worlds
 
 
-def test_only_the_last_map_follows_its_keyframes(tmp_path):
-    """Keyframes that ORB-SLAM3 gives at the end are in the world of its last map."""
-    moved, count, merged = refined(tmp_path, {3.0: 7.0}, [0, 0, 1, 1])
-    assert count == 1 and [row.T_wc[0, 3] for row in moved] == [0, 0, 7, 7]
-    assert [row.part for row in moved] == [0, 0, 1, 1] and merged == {1}
+def test_frames_follow_the_keyframes_of_their_own_map():
+    assert placed([{3.0: 7.0}], [0, 0, 1, 1]) == ([0, 0, 7, 7], [0, 0, 1, 1], 1, {1: 0})
+    assert placed([{1.0: 5.0}, {3.0: 7.0}], [0, 0, 1, 1]) == ([5, 5, 7, 7], [0, 0, 1, 1], 2, {0: 0, 1: 1})
+    assert placed([], [0, 0]) == ([0, 0], [0, 0], 0, {})
 
 
-def test_keyframes_of_a_merged_map_move_its_frames(tmp_path):
-    moved, count, merged = refined(tmp_path, {0.0: 5.0, 4.0: 7.0}, [0, 0, 1, 1, 2])
-    assert count == 2 and [row.T_wc[0, 3] for row in moved] == [5, 5, 0, 0, 7]
-    assert [row.part for row in moved] == [0, 0, 1, 1, 2] and merged == {0, 2}
+def test_keyframes_of_a_merged_map_move_its_frames():
+    """The last map has taken in the first one, whose keyframes had been read when it was lost."""
+    maps = [{0.0: 3.0}, {2.0: 4.0}, {0.0: 5.0, 4.0: 7.0}]
+    assert placed(maps, [0, 0, 1, 1, 2]) == ([5, 5, 4, 4, 7], [0, 0, 1, 1, 2], 3, {0: 2, 1: 1, 2: 2})
 
 
 def test_frames_follow_their_keyframes():

@@ -100,7 +100,7 @@ class OrbSlam3:
         self._map_changes: list[float] = []
         self._frames = self._part = 0
         self._was_tracking = False
-        self._begin = self._first = self._computing = 0.0
+        self._fed = self._stamp = self._computing = 0.0
 
     def track(self, frame: Frame) -> Estimate:
         image = self._pictures(frame)
@@ -110,11 +110,13 @@ class OrbSlam3:
             file.write_text(settings(self._pictures.camera, self._loops), encoding="utf-8")
             monocular = self._package.Sensor.MONOCULAR
             self._slam = self._package.Slam(str(self._vocabulary), str(file), monocular, use_viewer=False)
-            self._begin, self._first = time.perf_counter(), frame.timestamp
+            self._fed, self._stamp = time.perf_counter(), frame.timestamp
         self._frames += 1
-        due = self._begin + (frame.timestamp - self._first) / self._pace
+        # From frame to frame: after a pause of the machine nothing is made up for.
+        due = self._fed + (frame.timestamp - self._stamp) / self._pace
         time.sleep(max(0.0, due - time.perf_counter()))
-        start = time.perf_counter()
+        start = self._fed = time.perf_counter()
+        self._stamp = frame.timestamp
         said = self._slam.track_monocular(image, frame.timestamp)
         self._computing += time.perf_counter() - start
         if self._slam.map_changed():

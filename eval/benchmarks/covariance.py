@@ -2,6 +2,8 @@
 
 ``python -m eval.benchmarks.covariance [--split calibration] [--suites plain,scale] [--frames 70] [--weights small]``
 
+``python -m eval.benchmarks.covariance --scale depth [--split calibration --clips 4]``
+
 After every frame the newest pose relative to the reference of its covariance (:mod:`dvo.odometry.uncertainty`) is
 compared with the truth, whose scale is fitted to what the covariance holds fixed: the RMS distance of the keyframes in
 between from the reference. Printed are, by sequence and for all, the normalised error squared ``xi^T C^-1 xi`` for each
@@ -13,6 +15,9 @@ The split ``validation`` is that of the suites. ``calibration`` has the same opt
 ``TrackerConfig.covariance_scale`` is fitted on it: the present one times the geometric mean, over the sequences, of
 ``robust``, their median over that of a chi-square, which poses in a second solution (:mod:`dvo.ba.restart`) do not
 move.
+
+With ``--scale depth`` or ``stereo`` the tracker has the depth images or the right images of the renderings, and is in
+metres: the covariance holds no scale, and poses are compared with the truth as they are.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.data.frame import Frame, StereoView
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3
@@ -42,6 +48,14 @@ CALIBRATION = -500_000_000
 """Added to the seed of a validation sequence for one of the calibration split."""
 MEDIAN = 5.3481 / 6
 """Median of chi-square with six degrees of freedom, over six."""
+SCALES = {"none": SUITES, "depth": "rgbd", "stereo": "stereo"}
+"""Sources of the scale, and the suites that are tracked with each."""
+FARTHEST = 13.107
+"""Largest depth that a depth image of the suites can state, metres."""
+BASELINE = 0.12
+"""Of stereo pairs, metres, where the suite states none."""
+CLIP_STEP = 10
+"""Added to the seed of a sequence of the calibration split for the next one with the same options."""
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 
 
@@ -91,13 +105,14 @@ class Errors:
 _LISTS = ("joint", "rotation", "position", "displacement", "expected", "confidence")
 
 
-def pose_error(window: Window, gauge: Gauge, true_cw: Tensor) -> np.ndarray:
+def pose_error(window: Window, gauge: Gauge, true_cw: Tensor, metric: bool = False) -> np.ndarray:
     """Error of the newest pose of a window relative to the reference, under the gauge of its covariance.
 
     Args:
         window: of a tracker, right after a frame.
         gauge: of the window.
         true_cw: ``(n, 7)`` float64 true poses of its frames, world to camera.
+        metric: the window is in metres, and its scale is part of the error.
 
     Returns:
         ``(6,)`` right tangent ``[tau, phi]`` with ``T_wc_true = T_wc Exp(xi)``, in units of the segment and radians.
@@ -106,17 +121,46 @@ def pose_error(window: Window, gauge: Gauge, true_cw: Tensor) -> np.ndarray:
     poses = window.poses_cw.double().cpu(), true_cw
     found, true = (se3.relative(x[first : first + 1].expand_as(x), x) for x in poses)
     scale = (found[members, :3].square().sum() / true[members, :3].square().sum()).sqrt()
-    newest = torch.cat([scale * true[-1, :3], true[-1, 3:]])
+    newest = true[-1] if metric else torch.cat([scale * true[-1, :3], true[-1, 3:]])
     return np.asarray(se3.log(se3.compose(found[-1], se3.inverse(newest))).numpy())
 
 
-def measure(sequence: SyntheticSequence, weights: str, seed: int) -> Errors:
+def frames_of(sequence: SyntheticSequence, scale: str = "none", baseline: float = BASELINE) -> Iterator[Frame]:
+    """Frames of a sequence, with what the scale is to come from.
+
+    Args:
+        sequence: rendered.
+        scale: ``depth`` for frames with depth, ``stereo`` for frames with right images, ``none`` for neither.
+        baseline: of the stereo pairs, metres.
+
+    Returns:
+        The frames, rendered when they are asked for.
+    """
+    right = sequence.stereo(baseline) if scale == "stereo" else None
+    pose = np.array([baseline, 0, 0, 0, 0, 0, 1.0])
+    for frame in sequence:
+        if scale == "depth":
+            depth = sequence.rendering(frame.index).depth[0].cpu().numpy()
+            depth = np.where((depth > 0) & (depth <= FARTHEST), depth, np.nan).astype(np.float32)
+            yield Frame(frame.index, frame.timestamp, frame.image, frame.camera, depth=depth)
+        elif right is not None:
+            view = StereoView(right.frame(frame.index).image, right.camera, pose)
+            yield Frame(frame.index, frame.timestamp, frame.image, frame.camera, right=view)
+        else:
+            yield frame
+
+
+def measure(
+    sequence: SyntheticSequence, weights: str, seed: int, scale: str = "none", baseline: float = BASELINE
+) -> Errors:
     """Track a sequence and compare each pose with the truth.
 
     Args:
         sequence: rendered.
         weights: name or file.
         seed: of the tracker.
+        scale: source of the scale, a name in :data:`SCALES`.
+        baseline: of stereo pairs, metres.
 
     Returns:
         The errors.
@@ -124,13 +168,15 @@ def measure(sequence: SyntheticSequence, weights: str, seed: int) -> Errors:
     Raises:
         DvoError: no such weights, or those of a network without patches.
     """
-    odometry = load(weights, seed=seed, final_adjustment=False, loops=False)
+    metric = scale != "none"
+    options = {"scale": {scale: True}} if metric else {}
+    odometry = load(weights, seed=seed, final_adjustment=False, loops=False, **options)
     if not isinstance(odometry, PatchOdometry):
         raise DvoError("has no covariances", file=weights, field="--weights", remedy="give weights of a patch network")
     times, window = sequence.groundtruth.timestamps, odometry.window
     poses_cw = se3.inverse(torch.from_numpy(sequence.groundtruth.poses_wc))
     errors = Errors()
-    for frame in sequence:
+    for frame in frames_of(sequence, scale, baseline):
         estimate = odometry.track(frame)
         errors.poses += estimate.pose_wc is not None
         gauge = window_gauge(window)
@@ -139,8 +185,9 @@ def measure(sequence: SyntheticSequence, weights: str, seed: int) -> Errors:
         stamps = np.array([keyframe.timestamp for keyframe in window.frames])
         true_cw = poses_cw[np.abs(times - stamps[:, None]).argmin(1)]
         intrinsics = window.frames[-1].intrinsics.double().cpu().numpy()
-        metric = flow_metric(intrinsics, odometry.step.bounds, median_inverse_depth(window))
-        errors.add(pose_error(window, gauge, true_cw), estimate.covariance, metric, estimate.confidence)
+        pixels = flow_metric(intrinsics, odometry.step.bounds, median_inverse_depth(window))
+        xi = pose_error(window, gauge, true_cw, metric)
+        errors.add(xi, estimate.covariance, pixels, estimate.confidence)
     return errors
 
 
@@ -213,7 +260,9 @@ def main(arguments: list[str] | None = None) -> int:
         prog="python -m eval.benchmarks.covariance", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    parser.add_argument("--suites", default=SUITES, help="with commas (%(default)s)")
+    parser.add_argument("--scale", choices=tuple(SCALES), default="none", help="what it comes from (%(default)s)")
+    parser.add_argument("--suites", help=f"with commas (by --scale: {SCALES})")
+    parser.add_argument("--clips", type=int, default=1, help="of each sequence of --split calibration (%(default)s)")
     parser.add_argument("--split", choices=("calibration", "validation"), default="validation")
     parser.add_argument("--frames", type=int, default=70, help="of each sequence, from its first on (%(default)s)")
     parser.add_argument("--weights", default="small", help="name or file (%(default)s)")
@@ -221,26 +270,31 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     settle_threads()
     try:
-        _print_tables(given.suites, given.split, given.frames, given.weights, given.seed)
+        _print_tables(given)
     except DvoError as error:
         print(f"covariance: error: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def _print_tables(suites: str, split: str, frames: int, weights: str, seed: int) -> None:
+def _print_tables(given: argparse.Namespace) -> None:
     found: list[Errors] = []
     families: dict[str, list[Errors]] = {}
-    for number, entry in enumerate(rendered_sequences(suites)):
-        options = {name: value for name, value in entry.rendered or () if name != "version"}
-        options["seed"] += CALIBRATION if split == "calibration" else 0
-        sequence = make_sequence(**options)
-        errors = measure(_beginning(sequence, frames), weights, seed)
+    calibrate = given.split == "calibration"
+    entries = rendered_sequences(given.suites or SCALES[given.scale])
+    clips = [(entry, clip) for entry in entries for clip in range(given.clips if calibrate else 1)]
+    for number, (entry, clip) in enumerate(clips):
+        options = {name: value for name, value in entry.rendered or () if name not in ("version", "depth")}
+        baseline = float(options.pop("baseline", BASELINE))
+        options["seed"] += CALIBRATION + clip * CLIP_STEP if calibrate else 0
+        sequence = _beginning(make_sequence(**options), given.frames)
+        errors = measure(sequence, given.weights, given.seed, given.scale, baseline)
         found.append(errors)
         families.setdefault(options["family"], []).append(errors)
         if number == 0:
             print(HEADER)
-        print(line(entry.name.replace("validation", split), errors), flush=True)
+        name = entry.name.replace("validation", given.split)
+        print(line(f"{name} clip {clip}" if given.clips > 1 and calibrate else name, errors), flush=True)
     print(line("all", Errors.concatenate(found)))
     print(f"geometric mean of the sequences' robust NEES/6: {scale_factor(found):.2f}")
     tolerance = f"share: displacement below {TOLERANCE:g} px"

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from dvo import threads
 from dvo.threads import available_cores, process_environment, thread_rule
@@ -73,6 +74,22 @@ def test_quota_of_the_control_group(tmp_path, monkeypatch, membership, files, ex
 
 
 LOAD = "import os, dvo; dvo.load(); import torch; from dvo.threads import current_threads as now; "
+
+
+@pytest.mark.parametrize(("cores", "count", "busy", "expected"), [
+    (2, 2, True, 1), (2, 2, False, 2), (8, 4, True, 4), (4, 4, True, 3), (1, 1, True, 1), (2, 1, True, 1),
+])  # fmt: skip
+def test_a_core_is_left_to_a_busy_thread(monkeypatch, cores, count, busy, expected):
+    monkeypatch.setattr(threads, "available_cores", lambda: cores)
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        with pytest.raises(ValueError), threads.core_left(busy):
+            assert torch.get_num_threads() == expected
+            raise ValueError
+        assert torch.get_num_threads() == count
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_dvo_chooses_where_nothing_is_set():

@@ -36,6 +36,10 @@ class FeatureCache:
         """Release all maps."""
         self._maps.clear()
 
+    def has(self, keyframe: ArchivedKeyframe) -> bool:
+        """Return True if the maps of a keyframe are in the cache."""
+        return keyframe.identifier in self._maps
+
     def maps(self, keyframe: ArchivedKeyframe) -> Tensor | None:
         """Feature maps of a keyframe, from the cache or computed.
 

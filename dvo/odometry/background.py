@@ -1,11 +1,11 @@
-"""Work beside tracking, in one thread."""
+"""Work beside tracking: in one thread, or in steps of which each frame takes one."""
 
 from __future__ import annotations
 
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Generic, TypeVar
@@ -48,6 +48,81 @@ class Task(Generic[T]):
             Exception: that ended the work.
         """
         return self._outcome.result()
+
+
+class Steps(Generic[T]):
+    """Work in steps, of which each frame takes one. Frames and steps are the same whatever else the machine does.
+
+    Args:
+        generator: takes a step up to each ``yield``, and returns the result.
+    """
+
+    def __init__(self, generator: Generator[None, None, T]) -> None:
+        self._generator = generator
+        self._outcome: list[T] = []  # empty until it is known
+        self._ahead = 0
+
+    @classmethod
+    def finished(cls, result: T, left: int) -> Steps[T]:
+        """Work with a result that is known already.
+
+        Args:
+            result: of the work.
+            left: see :attr:`left`.
+        """
+
+        def empty() -> Generator[None, None, T]:
+            yield from ()
+            return result
+
+        steps = cls(empty())
+        steps.result()
+        steps._ahead = left
+        return steps
+
+    @property
+    def left(self) -> int:
+        """Calls of :meth:`step` until it returns True; the work is finished to find that out."""
+        self.result()
+        return self._ahead
+
+    def step(self) -> bool:
+        """Take a step, unless :meth:`result` has taken it.
+
+        Returns:
+            True once all have been taken.
+        """
+        if not self._outcome:
+            return self._next()
+        self._ahead = max(0, self._ahead - 1)
+        return self._ahead == 0
+
+    def result(self) -> T:
+        """Result of the work. Steps that are missing are taken, and do not count as taken by :meth:`step`."""
+        while not self._outcome:
+            self._ahead += 1
+            self._next()
+        return self._outcome[0]
+
+    def _next(self) -> bool:
+        try:
+            with torch.inference_mode():
+                next(self._generator)
+        except StopIteration as end:
+            self._outcome.append(end.value)
+        return bool(self._outcome)
+
+
+def all_steps(generator: Generator[None, None, T]) -> T:
+    """Take all steps of a work.
+
+    Args:
+        generator: see :class:`Steps`.
+
+    Returns:
+        Its result.
+    """
+    return Steps(generator).result()
 
 
 class Background:

@@ -1,7 +1,8 @@
-"""End of a sequence: final adjustment of its segments, and their scale."""
+"""End of a sequence: final adjustment of its segments, their scale, and metadata of the run."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 from dvo.graph.keyframe_graph import KeyframeGraph
@@ -32,3 +33,22 @@ def finish_segments(
         options = config.estimate_readout, config.adjustment
         info |= adjust_segments(graph, state.adjustable, state.shutter, *options)
     return info | settle_scale(graph, state.adjustable, config.scale, loops)
+
+
+def run_information(
+    graph: KeyframeGraph, state: TrackerState, config: TrackerConfig, loops: LoopCloser, seed: int
+) -> dict[str, Any]:
+    """Metadata of a recording for run.json.
+
+    Args:
+        graph: of the tracker.
+        state: of the tracker, with the entries of its parts.
+        config: of the tracker.
+        loops: of the tracker.
+        seed: of the patch centres.
+    """
+    begun, keyframes = graph.recording, graph.log.poses
+    return {
+        **state.info, **loops.information(), "keyframes": sum(k >= begun.keyframe for k in keyframes),
+        "seed": seed, "initialised": any(k >= begun.segment for k in state.adjustable), "config": asdict(config),
+    }  # fmt: skip

@@ -4,9 +4,11 @@ A confirmed loop adds its measurements to the archive, where the final adjustmen
 all keyframes of its world by a pose graph in Sim(3) (Strasdat, Montiel and Davison, "Scale drift-aware large scale
 monocular SLAM", 2010; :mod:`dvo.odometry.loop_correction`). A loop between two segments joins their worlds.
 
-Searches and pose graphs are done beside tracking, in a thread of their own. Their results are taken at a fixed frame,
-``LoopOptions.delay`` frames later, and waited for if they are not there: the same frames give the same result, bit for
-bit on the CPU. In real time they are taken when they are there, and ``track`` never waits.
+A search is done in steps, ``LoopOptions.steps`` with each frame, so that every frame takes a little longer instead of
+some much longer.
+Pose graphs are solved beside tracking, in a thread of their own; the result is taken at a fixed frame,
+``LoopOptions.delay`` frames later, and waited for if it is not there: the same frames give the same result, bit for
+bit on the CPU. In real time both are done in the thread and taken when they are there, and ``track`` never waits.
 
 In a map (a graph with keyframes of earlier recordings) only keyframes of the last recording search. Those of the map
 stay where they are; what joins their world is moved.
@@ -35,11 +37,12 @@ from dvo.graph.places import PlaceIndex
 from dvo.models.patch_vo import PatchVO
 from dvo.odometry import loop_correction
 from dvo.odometry.adjuster import Adjuster, Adjusting
-from dvo.odometry.background import Background, Task
+from dvo.odometry.background import Background, Steps, all_steps
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.graph_adjustment import AdjustmentRecord
 from dvo.odometry.loop_check import median_inverse_depth
 from dvo.odometry.loop_window import GroupMatcher
+from dvo.odometry.loop_work import Correcting, Searching, is_due
 from dvo.odometry.loops import Loop, LoopFinder
 from dvo.odometry.place_descriptors import shipped_descriptor
 from dvo.odometry.tracker_state import TrackerState
@@ -66,34 +69,6 @@ def loop_closer(
     enabled = config.loops and not model.config.fine_channels
     adjuster = Adjuster(graph, state, config.adjustment, config.adjust_after_loop)
     return LoopCloser(graph, finder, enabled, config.real_time, adjuster)
-
-
-@dataclass
-class Searching:
-    """Search in progress.
-
-    Attributes:
-        task: gives the loop, or None.
-        left: frames until its result is taken.
-    """
-
-    task: Task[Loop | None]
-    left: int
-
-
-@dataclass
-class Correcting:
-    """Correction in progress, by the last loop.
-
-    Attributes:
-        task: gives the similarities ``(N, 8)``.
-        left: frames until its result is taken.
-        identifiers: ``(N,)`` of the keyframes.
-    """
-
-    task: Task[Tensor]
-    left: int
-    identifiers: np.ndarray
 
 
 @dataclass
@@ -128,6 +103,11 @@ class LoopCloser:
     searches: int = 0
     work: Searching | Correcting | Adjusting | None = None
     _background: Background = field(default_factory=Background)
+
+    @property
+    def occupies_core(self) -> bool:
+        """A thread computes for long beside tracking; the same frames find the same, but in real time."""
+        return isinstance(self.work, Adjusting) or (self.real_time and self.work is not None)
 
     def see(self, identifier: int, image: np.ndarray, maps: Tensor) -> None:
         """Describe a new keyframe of the window; see :meth:`dvo.odometry.loops.LoopFinder.see`."""
@@ -210,9 +190,8 @@ class LoopCloser:
         rows = np.arange(first + options.neighbours, len(kept) - options.neighbours)
         step = max(1, options.every // 2)
         rows = rows[np.abs(rows[:, None] - known).min(1) >= step][::step]
-        if len(rows) > searches:
-            rows = rows[np.linspace(0, len(rows) - 1, searches).round().astype(int)]
-        for row in rows.tolist():
+        chosen = np.linspace(0, len(rows) - 1, min(searches, len(rows))).round().astype(int)
+        for row in rows[chosen].tolist():
             loop = self.finder.find(kept[row])
             if loop is not None and not loop.joins and self._is_within(loop, agreement):
                 self._accept(loop)
@@ -249,7 +228,8 @@ class LoopCloser:
         if self.wait > 0 or not own or self.work is not None:
             return
         search = self.finder.prepare(kept[-1 - options.neighbours], self.pending)
-        self.work = Searching(self._background.start(partial(self.finder.verify, search)), options.delay + 1)
+        steps = self.finder.verify(search)
+        self.work = Searching(self._background.start(partial(all_steps, steps)) if self.real_time else Steps(steps))
         self.wait = options.every
 
     def _collect(self, at_once: bool) -> bool:
@@ -257,10 +237,9 @@ class LoopCloser:
         work = self.work
         if work is None:
             return False
-        work.left -= 1
-        if not (at_once or (work.task.done if self.real_time else work.left <= 0)):
-            return False
         try:
+            if not (at_once or is_due(work, self.finder.options.steps, self.real_time)):
+                return False
             work.task.result()
         except Exception:  # but an interruption of the wait (KeyboardInterrupt) leaves the work to the next call
             self.work = None
@@ -290,8 +269,7 @@ class LoopCloser:
         options, pending, self.searches = self.finder.options, self.pending, self.searches + 1
         if loop is None:
             if pending is not None:
-                again = self.searches < options.patience
-                self.wait, self.pending = (2, pending) if again else (options.every, None)
+                self.wait, self.pending = (2, pending) if self.searches < options.patience else (options.every, None)
             return
         if self._needs_confirmation(loop):
             if pending is None or not self.finder.agree(pending, loop):

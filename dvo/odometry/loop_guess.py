@@ -9,7 +9,7 @@ although the camera is elsewhere than it was.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -27,6 +27,7 @@ _REACH = 1.5  # largest distance of an inlier from its reprojection, feature pix
 _TRIALS = 300  # of RANSAC
 _LEAD = 0.01  # least lead of the best place of a patch over the next one, in mean cosines
 _GOOD = 0.75  # share of the inliers of the best candidate above which another one is as good
+_GUESSES = 2  # poses in a step: about as long as an update of the network
 _SAMPLE = 4  # points of a trial: three for the pose, one to choose among its solutions
 
 
@@ -115,12 +116,13 @@ class Pair:
         return torch.cat([self.old_cw, se3.compose(self.moved, self.candidate.pose_cw.expand(len(self.moved), 7))])
 
 
-def order_pairs(maps: Tensor, pairs: Sequence[Pair], inliers: int, count: int) -> list[Pair]:
-    """Choose the pairs to match.
+def order_pairs(maps: Tensor, pairs: Sequence[Pair], inliers: int, count: int) -> Generator[None, None, list[Pair]]:
+    """Choose the pairs to match, in steps.
 
     Those with nearly as many inliers as the best one come first, the earliest visit before the others, since a loop
     with it corrects the most drift; then the others by inliers. Candidates by proximity for which no pose was guessed
-    follow, as the poses alone tell that they may show the same.
+    follow, as the poses alone tell that they may show the same. Of several candidates with the same neighbours, as at
+    the beginning of a segment, only the first is left.
 
     Args:
         maps: ``(1, 1, C, h, w)`` matching features of the later keyframe, which all pairs share.
@@ -133,7 +135,9 @@ def order_pairs(maps: Tensor, pairs: Sequence[Pair], inliers: int, count: int) -
     """
     found: list[tuple[int, Pair]] = []
     others = []
-    for pair in pairs:
+    for number, pair in enumerate(pairs):
+        if number % _GUESSES == 0:
+            yield
         guess = guess_pose(maps, pair.later.intrinsics, pair.old, pair.old_cw)
         if guess is not None and guess.inliers >= inliers:
             found.append((guess.inliers, replace(pair, candidate=replace(pair.candidate, pose_cw=guess.pose_cw))))
@@ -142,7 +146,9 @@ def order_pairs(maps: Tensor, pairs: Sequence[Pair], inliers: int, count: int) -
     least = _GOOD * max((number for number, _ in found), default=0)
     good = sorted((pair for number, pair in found if number >= least), key=lambda pair: pair.candidate.old)
     weak = sorted((entry for entry in found if entry[0] < least), key=lambda entry: -entry[0])
-    return [*good, *(pair for _, pair in weak), *others][:count]
+    ordered = [*good, *(pair for _, pair in weak), *others]
+    different = {tuple(frame.identifier for frame in pair.old): pair for pair in reversed(ordered)}
+    return [pair for pair in ordered if any(pair is one for one in different.values())][:count]
 
 
 def find_patches(maps: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:

@@ -31,8 +31,9 @@ class LoopOptions:
         inliers: the same, with which a match is a loop.
         weak_inliers: the same, with which it is one if the pose agrees with the present one as closely as two loops
             that confirm each other (:mod:`dvo.odometry.loop_check`).
-        delay: frames between the beginning of a search, or of a correction, and the frame that takes its result, so
-            that tracking goes on meanwhile.
+        steps: of a search that are taken with a frame, each about as long as an update of the network.
+        delay: frames between the beginning of a correction and the frame that takes its result, so that tracking goes
+            on meanwhile; 0 to do it within a frame, and searches as well.
         patience: searches after a loop within which a second one has to confirm it.
         translation, rotation, scale: largest differences of the corrections of two loops that confirm each other, in
             median depths, degrees, and as a ratio less one; largest corrections of a loop with few inliers.
@@ -49,7 +50,7 @@ class LoopOptions:
         "seconds": (0, 1e6), "every": (1, 10**4), "pace": (1e-3, 1e6), "neighbours": (0, 8), "likeness": (-1, 1),
         "retrieved": (0, 100), "apart": (0, 10**4), "overlap": (0, 1), "near": (0, 100), "guessed": (0, 10**4),
         "matched": (0, 100), "hopeful": (0, 1), "inliers": (0, 1), "weak_inliers": (0, 1), "delay": (0, 10**4),
-        "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180),
+        "steps": (1, 10**4), "patience": (1, 100), "translation": (0, 1e3), "rotation": (0, 180),
         "scale": (0, 10), "adjust_delay": (0, 10**4), "adjust_iterations": (1, 1000), "adjust_frames": (3, 10**6),
         "adjust_edges": (1, 10**9),
     }  # fmt: skip
@@ -69,6 +70,7 @@ class LoopOptions:
     hopeful: float = 0.03
     inliers: float = 0.4
     weak_inliers: float = 0.12
+    steps: int = 1
     delay: int = 8
     patience: int = 4
     translation: float = 0.2

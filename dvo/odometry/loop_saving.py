@@ -14,9 +14,10 @@ from dvo.graph.map_file import MapReader
 from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.places import PlaceIndex
 from dvo.odometry.adjuster_saving import AdjusterTable, adjuster_arrays, adjuster_table, restore_adjuster
-from dvo.odometry.background import Task
-from dvo.odometry.loop_closure import Correcting, LoopCloser, Searching
+from dvo.odometry.background import Steps, Task
+from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.loop_correction import members
+from dvo.odometry.loop_work import Correcting, Searching
 from dvo.odometry.loops import Loop
 
 _LAST = 2**31 - 1
@@ -46,7 +47,7 @@ class LoopsTable:
         loops: confirmed ones.
         pending: loop that has not been confirmed yet.
         corrections, wait, searches: see :class:`dvo.odometry.loop_closure.LoopCloser`.
-        searching: frames until the result of the search in progress is taken; 0 if there is none.
+        searching: steps of the search in progress until its result is taken; 0 if there is none.
         found: that result.
         correcting: frames until the correction in progress is made; 0 if there is none.
         adjuster: global adjustments; None if there are none.
@@ -80,8 +81,9 @@ def _found(closer: LoopCloser) -> Loop | None:
 def loops_table(closer: LoopCloser) -> dict[str, Any]:
     """JSON-able values of a :class:`LoopsTable`; waits for the work in progress."""
     pending, found = (None if loop is None else _table(loop) for loop in (closer.pending, _found(closer)))
-    left = max(closer.work.left, 1) if closer.work is not None else 0
-    searching, correcting = (left if isinstance(closer.work, kind) else 0 for kind in (Searching, Correcting))
+    work = closer.work
+    searching = (work.task.left if isinstance(work.task, Steps) else 1) if isinstance(work, Searching) else 0
+    correcting = max(work.left, 1) if isinstance(work, Correcting) else 0
     loops = tuple(map(_table, closer.loops))
     counts = closer.corrections, closer.wait, closer.searches
     table = LoopsTable(loops, pending, *counts, searching, found, correcting, adjuster_table(closer))
@@ -137,7 +139,7 @@ def restore_loops(source: MapReader, closer: LoopCloser, segments: Collection[in
         closer.pending = _with_edges(source, loops.pop(), closer, "loops")
     closer.loops[:] = loops
     if table.searching:
-        closer.work = Searching(Task.finished(found), table.searching)
+        closer.work = Searching(Steps.finished(found, table.searching))
     if table.adjuster is not None:
         busy = table.searching or table.correcting
         source.require(not (busy and table.adjuster.left), "adjusting beside other work", "loops: adjuster")

@@ -7,7 +7,7 @@ adjustment. Poses of the older group are held; those of the newer group move, an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.cold_start import COLD_UPDATES, damping_at
-from dvo.geometry import se3
+from dvo.geometry import se3, so3
 from dvo.graph.archive import ArchivedKeyframe
 from dvo.graph.features import FeatureCache
 from dvo.graph.measurements import ArchivedEdges
@@ -34,6 +34,9 @@ from dvo.odometry.window_step import WindowStep
 Group = tuple[ArchivedKeyframe, ...]
 """Keyframe with its neighbours."""
 
+# Change by an update below which further ones bring nothing: translation in median depths, rotation in rad, log scale.
+# A tenth of the standard deviations of a loop in the pose graph (:mod:`dvo.odometry.loop_correction`).
+_SETTLED = (0.001, 0.0002, 0.001)
 _MAPS = 16  # keyframes whose feature maps are kept for the next match
 
 
@@ -74,32 +77,46 @@ class GroupMatcher:
             return False
         return frame.matching.shape[1] == c.feature_channels and frame.context.shape[1] == c.hidden_channels
 
-    def match(self, old: Group, new: Group, poses_cw: Tensor, decisions: Sequence[tuple[int, float]]) -> Match | None:
-        """Match two groups.
+    def match(
+        self, old: Group, new: Group, poses_cw: Tensor, decisions: Sequence[tuple[int, float]]
+    ) -> Generator[None, None, Match | None]:
+        """Match two groups, in steps of similar length: an image is encoded, or an update is done.
 
         Args:
             old, new: keyframes; each :meth:`can_match`.
             poses_cw: ``(n, 7)`` poses ``T_cw`` of the older and the newer group to start from, in the world of the
                 older.
-            decisions: numbers of updates, each with the share of inliers below which the groups do not match.
+            decisions: numbers of updates, each with the share of inliers below which the groups do not match. Of the
+                last ones fewer are done once poses and scale stay.
 
         Returns:
             The match; None if the groups do not show the same.
         """
-        sizes = {None if maps is None else maps.shape for maps in map(self.maps.maps, (*old, *new))}
+        sizes = set()
+        for frame in (*old, *new):
+            if not self.maps.has(frame):
+                yield
+            maps = self.maps.maps(frame)
+            sizes.add(None if maps is None else maps.shape)
         if len(sizes) != 1 or None in sizes:  # an image that cannot be read, or images of two sizes
             return None
+        yield
         step = self._joint(old, new, poses_cw)
         window, count = step.window, len(old)
         across = (window.ii < count) != (window.jj < count)
-        before = window.patches[count * window.per_frame :, 2, 0, 0].clone()
+        before = _newer(window, count)[1]
         share = 0.0
-        for number, inliers in decisions:
+        for row, (number, inliers) in enumerate(decisions):
             for _ in range(number):
+                yield
+                start = _newer(window, count)
                 step(StepOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
+                if row == len(decisions) - 1 and _is_settled(start, _newer(window, count)):
+                    break
             share = related_share(step, across)
             if not share >= inliers:  # NaN fails too
                 return None
+        yield
         step.finalise(across.nonzero()[:, 0])
         after = window.patches[count * window.per_frame :, 2, 0, 0]
         scale = float((before / after).median())
@@ -144,3 +161,16 @@ class GroupMatcher:
         return ArchivedEdges(
             frames[kk // m], (kk % m).astype(np.int16), frames[jj], position, weight.astype(np.float16)
         )
+
+
+def _newer(window: Window, count: int) -> tuple[Tensor, Tensor]:
+    """Poses ``(n, 7)`` and inverse depths ``(m,)`` of the newer group; ``count`` keyframes are of the older."""
+    return window.poses_cw[count:].clone(), window.patches[count * window.per_frame :, 2, 0, 0].clone()
+
+
+def _is_settled(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> bool:
+    """Return True if an update has changed poses and scale of the newer group by next to nothing."""
+    moved = se3.relative(before[0], after[0])
+    changes = moved[:, :3].norm(dim=-1).max() * after[1].median(), so3.angle(moved[:, 3:]).max()
+    scale = (before[1] / after[1]).median().log().abs()
+    return all(float(change) <= limit for change, limit in zip((*changes, scale), _SETTLED, strict=True))

@@ -10,9 +10,8 @@ neighbours, a share of the patches must be found where bundle adjustment reproje
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from dvo.geometry import se3, sim3, so3
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.places import PlaceIndex
+from dvo.odometry.background import all_steps
 from dvo.odometry.loop_candidates import Candidate, by_likeness, by_proximity
 from dvo.odometry.loop_check import is_loop, median_inverse_depth
 from dvo.odometry.loop_guess import Pair, order_pairs
@@ -160,7 +160,7 @@ class LoopFinder:
         Returns:
             The first candidate that is verified; None if there is none.
         """
-        return self.verify(self.prepare(new, pending))
+        return all_steps(self.verify(self.prepare(new, pending)))
 
     def prepare(self, new: int, pending: Loop | None = None) -> Search:
         """Choose candidates, and gather what their verification needs.
@@ -186,8 +186,8 @@ class LoopFinder:
             predicted += known
         return Search(new, tuple(pairs), predicted)
 
-    def verify(self, search: Search) -> Loop | None:
-        """Match the candidates of a search until one is verified. Nothing of the graph is read or changed.
+    def verify(self, search: Search) -> Generator[None, None, Loop | None]:
+        """Match the candidates of a search until one is verified, in steps. Nothing of the graph is read or changed.
 
         Args:
             search: of :meth:`prepare`.
@@ -200,20 +200,23 @@ class LoopFinder:
         decisions = tuple(zip(o.updates, (o.hopeful, least, least), strict=True))
         ahead, others = search.pairs[: search.predicted], search.pairs[search.predicted :]
         try:
-            for pair in chain(ahead, self._promising(others)):
-                match = self.matcher.match(pair.old, pair.new, pair.start, decisions)
-                if match is not None and is_loop(match, pair, o):
-                    return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
+            for chosen in (_given(ahead), self._promising(others)):
+                for pair in (yield from chosen):
+                    match = yield from self.matcher.match(pair.old, pair.new, pair.start, decisions)
+                    if match is not None and is_loop(match, pair, o):
+                        return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
             return None
         finally:
             self.matcher.maps.clear()  # the next search is about other keyframes
 
-    def _promising(self, pairs: Sequence[Pair]) -> Iterator[Pair]:
+    def _promising(self, pairs: Sequence[Pair]) -> Generator[None, None, Sequence[Pair]]:
         """Pairs to match, the most promising first, with the poses to start from."""
-        maps = self.matcher.maps.maps(pairs[0].later) if pairs else None
-        if maps is not None:
-            o = self.options
-            yield from order_pairs(maps, pairs, o.guessed, o.matched)
+        if not pairs:
+            return ()
+        if not self.matcher.maps.has(pairs[0].later):
+            yield
+        maps, o = self.matcher.maps.maps(pairs[0].later), self.options
+        return () if maps is None else (yield from order_pairs(maps, pairs, o.guessed, o.matched))
 
     def agree(self, first: Loop, second: Loop) -> bool:
         """Find out if two loops ask for the same correction.
@@ -285,6 +288,12 @@ class LoopFinder:
         for candidate in by_likeness(graph, self.places, self.descriptor, new, earlier, options):
             if candidate.old not in seen:
                 yield candidate, False
+
+
+def _given(pairs: Sequence[Pair]) -> Generator[None, None, Sequence[Pair]]:
+    """Pairs as they are, without a step."""
+    yield from ()
+    return pairs
 
 
 def _loop(candidate: Candidate, old: Group, new: Group, match: Match, joins: bool) -> Loop:

@@ -7,7 +7,7 @@ keyframe. Keyframes that leave the window are archived (:mod:`dvo.graph.keyframe
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.adjusting import adjust
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
-from dvo.odometry.finishing import finish_segments
+from dvo.odometry.finishing import finish_segments, run_information
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, keyframe_of, observe
 from dvo.odometry.initial_pose import first_depth, first_pose
@@ -49,6 +49,7 @@ from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
 from dvo.odometry.working_image import masked_image
+from dvo.threads import core_left
 
 
 class PatchOdometry:
@@ -128,7 +129,12 @@ class PatchOdometry:
         """
         if self.state.finished:
             raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
-        frame, state = checked_frame(frame), self.state
+        with core_left(self.loops.occupies_core):
+            return self._track(checked_frame(frame))
+
+    def _track(self, frame: Frame) -> Estimate:
+        """Process a frame."""
+        state = self.state
         image, camera, mask = masked_image(frame, self.config.pixels)
         state.shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
         state.sequence.check(frame)
@@ -137,8 +143,7 @@ class PatchOdometry:
             state.sequence.repeat(frame.timestamp)
             return self._repeat(record)
         gap = state.sequence.tick(frame.timestamp)
-        problem = missing_content(image, mask)
-        if problem:
+        if problem := missing_content(image, mask):
             estimate = self._lose(record, problem)
         else:
             if gap and state.initialised and not state.joining:
@@ -200,12 +205,7 @@ class PatchOdometry:
     adjust = adjust
 
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
-        begun, keyframes = self.graph.recording, self.graph.log.poses
-        info = {
-            **self.state.info, **self.loops.information(), "keyframes": sum(k >= begun.keyframe for k in keyframes),
-            "seed": self.seed, "initialised": any(k >= begun.segment for k in self.state.adjustable),
-            "config": asdict(self.config),
-        }  # fmt: skip
+        info = run_information(self.graph, self.state, self.config, self.loops, self.seed)
         return result_of(self.graph, info, poses)
 
     def _take(self, view: View) -> Estimate:

@@ -20,7 +20,7 @@ SHORT = {
     "keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5, "patches": 16, "pixels": 160 * 120,
     "estimate_readout": False,
 }  # fmt: skip
-OPTIONS = LoopOptions(every=2, delay=2)
+OPTIONS = LoopOptions(every=2, steps=8, delay=2)
 
 
 def room() -> tuple[list[Frame], np.ndarray]:

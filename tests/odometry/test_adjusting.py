@@ -9,7 +9,7 @@ import pytest
 import dvo
 from dvo.metrics import evaluate
 from dvo.odometry.adjuster import Adjusting
-from dvo.odometry.loop_closure import Correcting, Searching
+from dvo.odometry.loop_work import Correcting, Searching
 from tests.odometry import test_loop_closure as closing
 
 film, OPTIONS = closing.film, closing.OPTIONS
@@ -78,7 +78,7 @@ def test_an_adjustment_on_request(film, saved):
     assert after < before
     assert loaded.track(film[0][count]).status is dvo.Status.TRACKING
     loaded.config, loaded.loops.real_time = replace(loaded.config, real_time=True), True
-    loaded.loops.work = Searching(loaded.loops._background.start(lambda: release.wait(60) and None), 1)
+    loaded.loops.work = Searching(loaded.loops._background.start(lambda: release.wait(60) and None))
     assert loaded.adjust() == () and loaded.loops.adjuster.wanted == [0]
     loaded.track(film[0][count + 1])
     assert isinstance(loaded.loops.work, Searching)

@@ -6,8 +6,47 @@ import threading
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from dvo.odometry.background import Background, Task
+from dvo.odometry.background import Background, Steps, Task, all_steps
+
+
+def counted(number, taken):
+    """Work of some steps before the result."""
+    for k in range(number):
+        taken.append(k)
+        yield
+    taken.append(torch.is_inference_mode_enabled())
+    return "done"
+
+
+@given(number=st.integers(0, 6), early=st.integers(0, 8))
+def test_steps_are_due_at_the_same_call_whether_the_result_was_taken_early_or_not(number, early):
+    taken, due = [], None
+    steps, other = Steps(counted(number, taken)), Steps(counted(number, []))
+    for call in range(number + 1):
+        if call == early:
+            assert steps.result() == "done" and len(taken) == number + 1 and steps.left == number + 1 - call
+            other = Steps.finished("done", steps.left)  # as it comes back from a file
+        elif call < early:
+            assert len(taken) == call
+        found, again = steps.step(), other.step()
+        assert found == again
+        due = call if found and due is None else due
+    assert due == number and steps.result() == other.result() == "done"
+    assert taken == [*range(number), True] and all_steps(counted(number, [])) == "done"
+
+
+def test_an_error_of_a_step_is_raised_by_it():
+    def fails():
+        yield
+        raise ValueError("no")
+
+    steps = Steps(fails())
+    assert not steps.step()
+    with pytest.raises(ValueError, match="no"):
+        steps.step()
 
 
 def test_work_is_done_in_order_in_another_thread_without_gradients():

@@ -13,16 +13,18 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.metrics import evaluate
-from dvo.odometry import loop_correction
+from dvo.odometry import loop_correction, loop_window
+from dvo.odometry.background import Steps, all_steps
 from dvo.odometry.loop_check import median_inverse_depth
-from dvo.odometry.loop_closure import Correcting, LoopCloser, Searching
+from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.loop_work import Correcting, Searching
 from dvo.synth.sequence import make_sequence
 
 THERE = 40
 SHORT = {"keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5}  # keyframes leave the window soon
-OPTIONS = LoopOptions(seconds=1.0, every=2, neighbours=1, delay=4)
-STATES = ("pending", "nothing found", "found", "correcting", "closed")
+OPTIONS = LoopOptions(seconds=1.0, every=2, neighbours=1, steps=4, delay=4)
+STATES = ("pending", "found", "correcting", "closed")
 
 
 @pytest.fixture(scope="module")
@@ -94,12 +96,31 @@ def test_a_place_is_recognised_from_a_wrong_start(closed):
     (pair,) = search.pairs
     decisions = ((2, 0.0), (2, OPTIONS.inliers), (8, OPTIONS.inliers))
     with torch.inference_mode():
-        assert finder.matcher.match(pair.old, pair.new, pair.start, decisions) is None
-        loop = finder.verify(search)
+        assert all_steps(finder.matcher.match(pair.old, pair.new, pair.start, decisions)) is None
+        loop = all_steps(finder.verify(search))
         assert loop is not None and loop.inliers > 2 * OPTIONS.inliers
         assert finder._moved(loop, finder.graph.poses_cw(np.array([loop.new]))[0])[3:7].abs()[3] > 0.99
         predicted = replace(search, predicted=1)  # is matched from where it is predicted, without a guess
-        assert finder.verify(predicted) is None
+        assert all_steps(finder.verify(predicted)) is None
+
+
+def test_a_match_ends_once_further_updates_change_nothing(closed, monkeypatch):
+    finder = closed[0].loops.finder
+    pair = next(pair for pair in finder.prepare(finder.kept[-2]).pairs if pair.candidate.kind == "proximity")
+    matches, lengths = [], []
+    for limits in (loop_window._SETTLED, (-1.0, -1.0, -1.0)):
+        monkeypatch.setattr(loop_window, "_SETTLED", limits)
+        work = finder.matcher.match(pair.old, pair.new, pair.start, ((2, 0.0), (2, 0.0), (40, 0.0)))
+        steps = Steps(work)
+        matches.append(steps.result())
+        lengths.append(steps.left)
+    quick, whole = matches
+    assert lengths[1] > 44 and lengths[0] < lengths[1] - 20
+    moved = se3.relative(quick.poses_cw, whole.poses_cw)
+    assert abs(quick.inliers - whole.inliers) < 0.05 and quick.scale == pytest.approx(whole.scale, rel=0.01)
+    assert so3.angle(moved[:, 3:]).max() < 0.002
+    depth = 1 / median_inverse_depth(pair.later)
+    assert moved[:, :3].norm(dim=1).max() < 0.01 * depth
 
 
 def test_a_match_with_few_inliers_has_to_agree_with_the_poses(closed, monkeypatch):
@@ -108,13 +129,13 @@ def test_a_match_with_few_inliers_has_to_agree_with_the_poses(closed, monkeypatc
     with torch.inference_mode():
         weak = replace(finder.options, inliers=1.0)  # no match is sure
         monkeypatch.setattr(finder, "options", weak)
-        assert finder.verify(search) is not None
+        assert all_steps(finder.verify(search)) is not None
         moved = search.pairs[0].present_cw.clone()
         moved[0] += 2 * weak.translation / median_inverse_depth(search.pairs[0].later)
         drifted = replace(search, pairs=(replace(search.pairs[0], present_cw=moved),))
-        assert finder.verify(drifted) is None
+        assert all_steps(finder.verify(drifted)) is None
         monkeypatch.setattr(finder, "options", replace(weak, inliers=0.4))
-        assert finder.verify(drifted) is not None
+        assert all_steps(finder.verify(drifted)) is not None
 
 
 def test_a_keyframe_long_after_the_one_before_counts_more(closed):
@@ -141,7 +162,6 @@ def saved(film, tmp_path_factory):
         searching = isinstance(loops.work, Searching)
         states = {
             "pending": loops.pending is not None and not searching,
-            "nothing found": searching and loops.work.task.result() is None,
             "found": searching and loops.work.task.result() is not None,
             "correcting": isinstance(loops.work, Correcting),
             "closed": bool(loops.corrections) and loops.work is None,
@@ -171,6 +191,15 @@ def test_a_sequence_goes_on_from_a_file_with_the_same_bytes(film, closed, saved,
     assert result.info["loops"] == closed[2].info["loops"]
     loaded.save(tmp_path / "done.dvo")
     assert dvo.load_map(tmp_path / "done.dvo").finish().info["loops"] == closed[2].info["loops"]
+
+
+def test_a_search_that_will_find_nothing_is_kept_in_a_file(saved, tmp_path):
+    loaded = dvo.load_map(saved["pending"][0])
+    loaded.loops.work = Searching(Steps.finished(None, 3))
+    loaded.save(tmp_path / "searching.dvo")
+    work = dvo.load_map(tmp_path / "searching.dvo").loops.work
+    assert isinstance(work, Searching) and work.task.result() is None
+    assert [work.task.step() for _ in range(3)] == [False, False, True]
 
 
 def test_a_correction_at_the_end_moves_keyframes_that_were_not_looked_at(saved):
@@ -255,11 +284,11 @@ def test_in_real_time_a_frame_does_not_wait_for_a_search(film, monkeypatch):
 
     def slow(search):
         assert release.wait(60)
-        return real(search)
+        return (yield from real(search))
 
     monkeypatch.setattr(odometry.loops.finder, "verify", slow)
     estimates = [odometry.track(frame) for frame in film[0]]
-    assert isinstance(odometry.loops.work, Searching) and odometry.loops.work.left < 0
+    assert isinstance(odometry.loops.work, Searching) and not odometry.loops.work.task.done
     assert sum(estimate.pose_wc is not None for estimate in estimates) > 60
     release.set()
     assert odometry.finish().info["loops"] is not None and odometry.loops.work is None
@@ -270,6 +299,7 @@ def test_a_search_that_fails_ends_the_frame_that_takes_its_result(film, monkeypa
     odometry.loops.finder.options = OPTIONS
 
     def broken(search):
+        yield
         raise RuntimeError("out of memory")
 
     monkeypatch.setattr(odometry.loops.finder, "verify", broken)

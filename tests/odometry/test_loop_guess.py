@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from dvo.geometry import se3, so3
 from dvo.graph.archive import ArchivedKeyframe
 from dvo.odometry import loop_guess
+from dvo.odometry.background import all_steps
 from dvo.odometry.loop_candidates import Candidate
 from dvo.odometry.loop_guess import Guess, Pair, find_patches, guess_pose, order_pairs
 
@@ -131,7 +132,7 @@ def ordered(monkeypatch, pairs, inliers, count=4):
         return None if number is None else Guess(guessed, number)
 
     monkeypatch.setattr(loop_guess, "guess_pose", guess)
-    found = order_pairs(torch.zeros(1), pairs, 10, count)
+    found = all_steps(order_pairs(torch.zeros(1), pairs, 10, count))
     for pair in found:
         assert torch.equal(pair.candidate.pose_cw, guessed) == (inliers.get(pair.candidate.old, 0) >= 10)
     return [pair.candidate.old for pair in found]
@@ -140,6 +141,11 @@ def ordered(monkeypatch, pairs, inliers, count=4):
 def test_the_earliest_of_the_good_candidates_is_matched_first(monkeypatch, pairs):
     assert ordered(monkeypatch, pairs, {40: 50, 10: 40, 70: 20, 55: 24}) == [10, 40, 55, 70]
     assert ordered(monkeypatch, pairs, {40: 50, 10: 40, 70: 20, 55: 24}, count=2) == [10, 40]
+
+
+def test_candidates_with_the_same_neighbours_are_matched_once(monkeypatch, pairs):
+    twin = replace(pairs[1], candidate=replace(pairs[1].candidate, old=11))
+    assert ordered(monkeypatch, [*pairs, twin], {40: 50, 10: 40, 70: 20, 55: 24}, count=5) == [10, 40, 55, 70]
 
 
 def test_only_candidates_by_proximity_are_matched_without_a_guess(monkeypatch, pairs):

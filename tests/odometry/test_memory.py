@@ -64,7 +64,7 @@ def test_a_keyframe_takes_less_than_its_share_of_memory():
     )
     clip, order = list(walk), [*range(THERE), *range(THERE - 2, -1, -1)]
     odometry = dvo.load("small", device="cpu", **SHORT)
-    odometry.loops.finder.options = LoopOptions(seconds=1.0, every=2, neighbours=1, delay=4)
+    odometry.loops.finder.options = LoopOptions(seconds=1.0, every=2, neighbours=1, steps=4, delay=4)
     held = {}
     for number, index in enumerate(order):
         odometry.track(replace(clip[index], timestamp=number / 15.0))

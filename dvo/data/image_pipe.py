@@ -142,7 +142,10 @@ def _png_end(buffer: _Buffer) -> int | None:
         kind = bytes(buffer.data[at + 4 : at + 8])
         if not kind.isalpha():
             raise ValueError("no chunk")
-        at += 12 + int.from_bytes(buffer.data[at : at + 4], "big")
+        length = int.from_bytes(buffer.data[at : at + 4], "big")
+        if length > MAX_BYTES:  # damaged: encoders write far smaller chunks
+            raise ValueError("no length of a chunk")
+        at += 12 + length
         if kind == b"IEND":
             return at if buffer.has(at) else None
     return None

@@ -59,13 +59,17 @@ def test_a_damaged_image_does_not_hide_the_next():
     broken = first[:2] + b"\xff\xe0" + (5).to_bytes(2, "big") + b"\0\0\0no marker"
     no_png = second[:8] + b"\0\0\0\0" + b"\0\0\0\0"
     assert list(split_images(chunks(broken + first + no_png + second, 64), "pipe")) == [first, second]
+    png = encoded(".png")
+    at = png.index(b"IDAT") - 4
+    too_long = png[:at] + (2**31).to_bytes(4, "big") + png[at + 4 :]
+    assert list(split_images(chunks(too_long + png, 2**10), "pipe")) == [png]
 
 
 def test_bounds(monkeypatch):
     endless = lambda: b"\0" * 2**16  # noqa: E731
     with pytest.raises(DvoError, match="pipe: a megabyte without a JPEG or PNG image.*image2pipe"):
         next(split_images(endless, "pipe"))
-    monkeypatch.setattr(image_pipe, "MAX_BYTES", 2**12)
+    monkeypatch.setattr(image_pipe, "MAX_BYTES", 8200)  # the first chunk of data is one of 8192
     with pytest.raises(DvoError, match="more than 0 MB"):
         next(split_images(chunks(encoded(".png"), 2**16), "pipe"))
 

@@ -6,27 +6,25 @@
 - `blackout`: walks that are dark for two seconds and then go back over the way they came, tracked with and without the
   darkness. Columns: whether the frames after the dark got the world of those before it, loops, errors and their ratio.
 
-Every run has a process of its own. With `--out FILE` each is appended as a line of JSON, and the same command goes on
-from there; the file alone gives the tables again with `--tables`.
+Every run has a process of its own. With `--alternate` both runs of a sequence are made at the same time, one frame of
+each after the other, so that other load of the machine meets both alike. With `--out FILE` each is appended as a line
+of JSON, and the same command goes on from there; the file alone gives the tables again with `--tables`.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields
 from pathlib import Path
 
 from dvo.errors import DvoError
 from dvo.odometry.results import jsonable
-from eval.benchmarks.loops.runs import Run, Task, carry_out
+from eval.benchmarks.loops.processes import Alternating, alone
+from eval.benchmarks.loops.runs import Run, Task
 from eval.benchmarks.loops.tables import blackout_table, revisit_table
-from eval.execution.process import die_with_parent
 from eval.suites.selection import load_suites
 from eval.suites.suite import Sequence
 
@@ -154,23 +152,6 @@ def _append(out: Path, run: Run) -> None:
         file.write(json.dumps(jsonable(run), allow_nan=False) + "\n")
 
 
-def alone(task: Task) -> Run:
-    """Carry out a task in a process of its own, so that its memory is its own.
-
-    Args:
-        task: to carry out.
-
-    Raises:
-        DvoError: the process ended without a result.
-    """
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context, initializer=die_with_parent) as pool:
-        try:
-            return pool.submit(carry_out, task).result()
-        except BrokenProcessPool as error:
-            raise DvoError("the run ended without a result", field=task.sequence.name, remedy="see above") from error
-
-
 def line(run: Run) -> str:
     """One line for a run.
 
@@ -199,6 +180,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="seeds of a system (%(default)s)")
     parser.add_argument("--frames", type=int, metavar="N", help="first frames of a sequence only")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--alternate", action="store_true", help="both runs of a sequence frame by frame in turns")
     parser.add_argument("--out", type=Path, metavar="FILE", help="runs as JSON lines; go on from those in it")
     parser.add_argument("--tables", action="store_true", help="the tables of FILE alone, nothing is run")
     arguments = parser.parse_args()
@@ -210,7 +192,8 @@ def main() -> None:
         else:
             if arguments.out is not None:
                 check_out(arguments.out)
-            runs = run_all(tasks(arguments), arguments.out, alone, lambda text: print(text, flush=True))
+            do = Alternating() if arguments.alternate else alone
+            runs = run_all(tasks(arguments), arguments.out, do, lambda text: print(text, flush=True))
         print("\n" + (revisit_table(runs) if arguments.mode == "revisit" else blackout_table(runs)))
     except DvoError as error:
         raise SystemExit(f"error: {error}") from error

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from multiprocessing.synchronize import Semaphore
 from pathlib import Path
 from typing import Any
 
@@ -110,11 +111,34 @@ class Run:
     resident_kb: float = math.nan
 
 
+class Turns:
+    """Alternation of two runs in two processes: one frame of each, so that the machine is the same for both.
+
+    Args:
+        own: semaphore that lets this run go on.
+        other: that of the other run.
+    """
+
+    LIMIT = 600.0  # seconds after which the other run is given up
+
+    def __init__(self, own: Semaphore, other: Semaphore) -> None:
+        self.own, self.other = own, other
+
+    def take(self) -> None:
+        """Wait for the turn of this run."""
+        self.own.acquire(timeout=self.LIMIT)
+
+    def give(self) -> None:
+        """Let the other run go on."""
+        self.other.release()
+
+
 class Watched:
     """Odometry whose resident memory is read after every frame.
 
     Args:
         inner: the odometry.
+        turns: given to the other run after every frame; None for a run by itself.
 
     Attributes:
         resident: bytes after every frame.
@@ -122,8 +146,8 @@ class Watched:
         archive_kb: see :class:`Run`.
     """
 
-    def __init__(self, inner: Odometry) -> None:
-        self.inner, self.name = inner, inner.name
+    def __init__(self, inner: Odometry, turns: Turns | None = None) -> None:
+        self.inner, self.name, self.turns = inner, inner.name, turns
         self.resident: list[int] = []
         self.keyframes: list[int] = []
         self.archive_kb = math.nan
@@ -135,6 +159,8 @@ class Watched:
         log = getattr(getattr(self.inner, "graph", None), "log", None)
         if log is not None:
             self.keyframes.append(log.keyframes)
+        if self.turns is not None:
+            self.turns.give()
         return estimate
 
     def finish(self) -> Result:
@@ -175,25 +201,41 @@ class Fed:
         count: largest number of frames; None for all.
         dark: begin and end of the dark, seconds; None for none.
         seed: of the noise in the dark.
+        turns: taken before a frame is read; None for a run by itself.
     """
 
-    def __init__(self, source: Iterable[Frame], count: int | None, dark: tuple[float, float] | None, seed: int) -> None:
-        self.source, self.count, self.dark, self.seed = source, count, dark, seed
+    def __init__(
+        self,
+        source: Iterable[Frame],
+        count: int | None,
+        dark: tuple[float, float] | None,
+        seed: int,
+        turns: Turns | None = None,
+    ) -> None:
+        self.source, self.count, self.dark, self.seed, self.turns = source, count, dark, seed, turns
 
     def __iter__(self) -> Iterator[Frame]:
-        rng = np.random.default_rng([self.seed, 7704])
-        for frame in islice(self.source, self.count):
+        rng, frames = np.random.default_rng([self.seed, 7704]), islice(self.source, self.count)
+        while True:
+            if self.turns is not None:
+                self.turns.take()
+            frame = next(frames, None)
+            if frame is None:
+                if self.turns is not None:
+                    self.turns.give()
+                return
             if self.dark is None or not self.dark[0] < frame.timestamp < self.dark[1]:
                 yield frame
             else:
                 yield replace(frame, image=image_without_view("black", BLACK, frame.image.shape, rng))
 
 
-def carry_out(task: Task) -> Run:
+def carry_out(task: Task, turns: Turns | None = None) -> Run:
     """Run a task in this process.
 
     Args:
         task: to run.
+        turns: with another run; None for a run by itself.
 
     Raises:
         DvoError: a system that is not there or has no setting ``loops``, or a sequence that cannot be rendered.
@@ -208,8 +250,8 @@ def carry_out(task: Task) -> Run:
     reason = system.missing()
     if reason:
         raise DvoError(reason, field="--systems", remedy="choose a system that is there")
-    watched = Watched(system.build(task.seed, task.device))
-    frames = Fed(source, task.frames, span if task.dark else None, task.seed)
+    watched = Watched(system.build(task.seed, task.device), turns)
+    frames = Fed(source, task.frames, span if task.dark else None, task.seed, turns)
     prediction, segments = drive(watched, frames)  # type: ignore[arg-type]  # it is only iterated
     row = score(prediction, segments, truth, system=task.system, suite=suite, sequence=task.sequence, seed=task.seed)
     lit = fed[(fed <= span[0]) | (fed >= span[1])]

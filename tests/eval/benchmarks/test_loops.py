@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +19,8 @@ from dvo.geometry.camera import Camera
 from dvo.graph.storage import ArrayStorage
 from dvo.odometry.protocol import Segment
 from eval.benchmarks.loops.__main__ import blackout_sequences, check_out, line, read_runs, run_all
-from eval.benchmarks.loops.runs import Fed, Run, Task, Watched, carry_out, joined_world, resident_bytes
+from eval.benchmarks.loops.processes import Alternating
+from eval.benchmarks.loops.runs import Fed, Run, Task, Turns, Watched, carry_out, joined_world, resident_bytes
 from eval.benchmarks.loops.tables import blackout_table, revisit_table
 from eval.scoring.blackout import without_view
 from eval.suites.suite import Sequence
@@ -70,6 +73,49 @@ def test_a_run_from_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert "1 loops, 0 false" in line(run)
     if not dark:
         assert math.isnan(carry_out(replace(task, loops=False)).found)
+
+
+def test_two_runs_take_turns_and_find_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("evo", reason="evo is in the extra 'eval'")
+    monkeypatch.setenv("DVO_CACHE", str(tmp_path))
+    (tmp_path / "line.py").write_text(SYSTEM)
+    task = Task("revisit", f"{tmp_path / 'line.py'}:Line", SEQUENCE, loops=False)
+    do = Alternating()
+    runs = [do(task), do(replace(task, loops=True))]
+    assert [run.loops for run in runs] == [False, True] and runs[1].found == 1
+    assert [run.ate_percent for run in runs] == [carry_out(replace(task, loops=on)).ate_percent for on in (False, True)]
+
+
+def test_a_frame_is_read_in_its_turn() -> None:
+    """Two alternations of the same process: each reads and tracks one frame while the other waits."""
+    events: list[tuple[int, str]] = []
+    one, two = threading.Semaphore(1), threading.Semaphore(0)
+
+    class Still:
+        name = "still"
+
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def track(self, frame: int) -> None:
+            events.append((self.number, f"track {frame}"))
+
+    def frames(number: int) -> Iterator[int]:
+        for frame in range(3):
+            events.append((number, f"read {frame}"))
+            yield frame
+
+    def go(number: int, turns: Turns) -> None:
+        watched = Watched(Still(number), turns)
+        for frame in Fed(frames(number), None, None, 0, turns):
+            watched.track(frame)
+
+    threads = [threading.Thread(target=go, args=(k, Turns(*pair))) for k, pair in enumerate([(one, two), (two, one)])]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert events == [(k, f"{what} {frame}") for frame in range(3) for k in (0, 1) for what in ("read", "track")]
 
 
 def test_darkness_is_in_its_span_and_shows_nothing() -> None:

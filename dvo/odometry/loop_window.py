@@ -37,7 +37,7 @@ Group = tuple[ArchivedKeyframe, ...]
 # Change by an update below which further ones bring nothing: translation in median depths, rotation in rad, log scale.
 # A tenth of the standard deviations of a loop in the pose graph (:mod:`dvo.odometry.loop_correction`).
 _SETTLED = (0.001, 0.0002, 0.001)
-_MAPS = 16  # keyframes whose feature maps are kept for the next match
+_MAPS = 8  # keyframes whose feature maps are kept for the next match: a search may last for many frames
 
 
 @dataclass(frozen=True)

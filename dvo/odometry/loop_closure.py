@@ -222,8 +222,12 @@ class LoopCloser:
 
     def _visit(self, frame: ArchivedKeyframe) -> None:
         """Take a kept keyframe into the list, and begin to search for a loop if it is time to."""
-        kept, options = self.finder.kept, self.finder.options
         self.wait -= self.finder.keep(frame.identifier)
+        self._search_next()
+
+    def _search_next(self) -> None:
+        """Begin the next search if it is time to, and there is no other work."""
+        kept, options = self.finder.kept, self.finder.options
         own = len(kept) > 2 * options.neighbours and kept[-1 - 2 * options.neighbours] >= self.graph.recording.keyframe
         if self.wait > 0 or not own or self.work is not None:
             return
@@ -248,6 +252,8 @@ class LoopCloser:
         if isinstance(work, Searching):
             self._found(work.task.result())
             self._adjust_next()
+            if not at_once:
+                self._search_next()  # keyframes may have been kept while the search took its time
             return False
         if isinstance(work, Adjusting):
             assert self.adjuster is not None
@@ -267,13 +273,14 @@ class LoopCloser:
     def _found(self, loop: Loop | None) -> None:
         """Take the outcome of a search."""
         options, pending, self.searches = self.finder.options, self.pending, self.searches + 1
+        soon = 2 - (options.every - self.wait)  # keyframes from the beginning of the search on
         if loop is None:
             if pending is not None:
-                self.wait, self.pending = (2, pending) if self.searches < options.patience else (options.every, None)
+                self.wait, self.pending = (soon, pending) if self.searches < options.patience else (options.every, None)
             return
         if self._needs_confirmation(loop):
             if pending is None or not self.finder.agree(pending, loop):
-                self.pending, self.searches, self.wait = loop, 0, 2
+                self.pending, self.searches, self.wait = loop, 0, soon
                 return
             self._accept(pending)
         self._accept(loop)

@@ -128,7 +128,7 @@ def core_left(busy: bool = True) -> Iterator[None]:
     """Leave a core to a busy thread of this process: torch computes with one thread less, if all cores have one.
 
     With more threads than cores those that share a core wait for each other in every parallel loop. On two cores beside
-    a search for loops, one thread tracks a frame in about half the time of two.
+    a busy thread, tracking is faster with one thread than with two.
 
     Args:
         busy: there is such a thread; nothing changes otherwise.

@@ -1,4 +1,4 @@
-"""Work beside tracking: in one thread, or in steps of which each frame takes one."""
+"""Work beside tracking: in one thread, or in steps, some of which each frame takes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Task(Generic[T]):
 
 
 class Steps(Generic[T]):
-    """Work in steps, of which each frame takes one. Frames and steps are the same whatever else the machine does.
+    """Work in steps, some of which each frame takes. Frames and steps are the same whatever else the machine does.
 
     Args:
         generator: takes a step up to each ``yield``, and returns the result.

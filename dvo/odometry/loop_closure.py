@@ -4,7 +4,7 @@ A confirmed loop adds its measurements to the archive, where the final adjustmen
 all keyframes of its world by a pose graph in Sim(3) (Strasdat, Montiel and Davison, "Scale drift-aware large scale
 monocular SLAM", 2010; :mod:`dvo.odometry.loop_correction`). A loop between two segments joins their worlds.
 
-A search is done in steps, ``LoopOptions.steps`` with each frame, so that every frame takes a little longer instead of
+A search is done in steps, ``LoopOptions.steps`` with each frame, so that more frames take a little longer instead of
 some much longer.
 Pose graphs are solved beside tracking, in a thread of their own; the result is taken at a fixed frame,
 ``LoopOptions.delay`` frames later, and waited for if it is not there: the same frames give the same result, bit for

@@ -115,6 +115,15 @@ def test_no_map_and_wrong_settings_for_it(image_folder, tmp_path, capsys):
         assert match in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
+def test_pure_odometry_on_request(monkeypatch, image_folder, tmp_path):
+    """``--no-loops`` is the setting ``loops=False``; without it the setting is left to the weights."""
+    asked = []
+    monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: asked.append(options) or FakeOdometry(curve))
+    assert main(arguments(image_folder, tmp_path / "out")) == 0
+    assert main(arguments(image_folder, tmp_path / "out", "--no-loops")) == 0
+    assert "loops" not in asked[0] and asked[1]["loops"] is False
+
+
 def test_no_map_means_none(given, image_folder, tmp_path, capsys):
     given()
     assert main(arguments(image_folder, tmp_path / "out")) == 0

@@ -188,8 +188,9 @@ class LoopCloser:
         first = bisect_left(kept, self.graph.recording.keyframe)
         known = np.array([kept.index(loop.new) for loop in loops])
         rows = np.arange(first + options.neighbours, len(kept) - options.neighbours)
-        step = max(1, options.every // 2)
-        rows = rows[np.abs(rows[:, None] - known).min(1) >= step][::step]
+        apart, counted = max(1, options.every // 2), self.finder.counted()
+        rows = rows[np.abs(counted[rows][:, None] - counted[known]).min(1) >= apart]
+        rows = rows[np.unique(counted[rows] // apart, return_index=True)[1]]  # one of each stretch of that length
         chosen = np.linspace(0, len(rows) - 1, min(searches, len(rows))).round().astype(int)
         for row in rows[chosen].tolist():
             loop = self.finder.find(kept[row])

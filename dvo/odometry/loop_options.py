@@ -70,7 +70,7 @@ class LoopOptions:
     hopeful: float = 0.03
     inliers: float = 0.4
     weak_inliers: float = 0.12
-    steps: int = 2
+    steps: int = 1
     delay: int = 8
     patience: int = 4
     translation: float = 0.2

@@ -142,13 +142,24 @@ class LoopFinder:
         Returns:
             Number of keyframes that it counts for towards the next search: more than one long after the one before it.
         """
-        archive, before = self.graph.archive, self.kept[-1] if self.kept else identifier
-        elapsed = archive[identifier].timestamp - archive[before].timestamp
         self.kept.append(identifier)
         if identifier in self._recent:
             self.places.add(identifier, self._recent[identifier])
         self._recent = {other: row for other, row in self._recent.items() if other > identifier}
-        return max(1, int(elapsed / self.options.pace))
+        return int(np.diff(self.counted(self.kept[-2:]))[-1]) if len(self.kept) > 1 else 1
+
+    def counted(self, kept: Sequence[int] | None = None) -> np.ndarray:
+        """Place of keyframes in the count that decides when to search: a long time between two counts for several.
+
+        Args:
+            kept: identifiers; None for all that are kept.
+
+        Returns:
+            ``(N,)`` increasing numbers, the first 0.
+        """
+        archive = self.graph.archive
+        times = np.array([archive[identifier].timestamp for identifier in (self.kept if kept is None else kept)])
+        return np.concatenate([[0], np.maximum(1, (np.diff(times) / self.options.pace).astype(int)).cumsum()])
 
     def find(self, new: int, pending: Loop | None = None) -> Loop | None:
         """Look for an earlier visit of the place of a keyframe.

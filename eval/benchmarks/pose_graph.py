@@ -1,7 +1,9 @@
 """Benchmark of pose graph optimisation: ``python -m eval.benchmarks.pose_graph [FILE...] [--poses 10000]``.
 
 Prints poses, edges, chi2 before and after (as defined by g2o), iterations and seconds for each g2o file, and for a
-synthetic graph of laps of a circle in Sim(3) with drifting scale.
+synthetic graph of laps of a circle in Sim(3) with drifting scale. With ``--chart log`` the error of a file is the
+logarithm, as GTSAM has it: chi2 is then twice the error that GTSAM tells. ``--gtsam`` prints that
+too, of GTSAM's own Levenberg-Marquardt (``pip install gtsam``).
 """
 
 from __future__ import annotations
@@ -139,11 +141,40 @@ def make_laps(
     return sim3.normalise(torch.stack(poses)), ii, jj, measured, (sigma**-2).expand(len(ii), 7)
 
 
+def gtsam_chi2(file: Path) -> float:
+    """Twice the error of GTSAM's Levenberg-Marquardt on a g2o file, the first pose held.
+
+    Args:
+        file: 2-D or 3-D pose graph.
+
+    Raises:
+        DvoError: GTSAM is not installed.
+    """
+    try:
+        import gtsam
+    except ImportError as error:
+        raise DvoError("GTSAM is not installed", field="--gtsam", remedy="pip install gtsam") from error
+    spatial = "EDGE_SE3" in file.read_text(encoding="utf-8")
+    graph, start = gtsam.readG2o(str(file), spatial)
+    first = min(start.keys())
+    held = gtsam.NonlinearEqualityPose3 if spatial else gtsam.NonlinearEqualityPose2
+    graph.add(held(first, start.atPose3(first) if spatial else start.atPose2(first)))
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setRelativeErrorTol(1e-10)
+    settings.setAbsoluteErrorTol(1e-10)
+    settings.setMaxIterations(500)
+    optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, settings)
+    optimiser.optimize()
+    return 2 * float(optimiser.error())
+
+
 def main() -> None:
     """Run the benchmark and print a row for each graph."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--poses", type=int, default=0, help="of the generated graph")
+    parser.add_argument("--chart", default="g2o", choices=("g2o", "log"), help="coordinates of the error of the files")
+    parser.add_argument("--gtsam", action="store_true", help="minimise each file with GTSAM as well")
     parser.add_argument("--solver", default="auto", choices=("auto", "direct", "cg"))
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--threads", type=int, default=2)
@@ -165,7 +196,10 @@ def main() -> None:
 
     for file in arguments.files:
         g = read_g2o(file)
-        row(file.name, g.chart, g.poses_cw, g.ii, g.jj, g.measurements, g.information)
+        chart = "log" if arguments.chart == "log" else g.chart
+        row(file.name, chart, g.poses_cw, g.ii, g.jj, g.measurements, g.information)
+        if arguments.gtsam:
+            print(f"{'  GTSAM':28} {'':6} {'':6} {'':14} {gtsam_chi2(file):14.6f}")
     if arguments.poses:
         row("laps in Sim(3)", "log", *make_laps(arguments.poses))
 

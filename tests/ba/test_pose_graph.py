@@ -243,6 +243,7 @@ def arguments(graph: PoseGraph) -> tuple[Tensor, ...]:
     ("name", "chi2"),
     [
         ("ring.g2o", 11.163101488554025),
+        ("mit.g2o", 770.2389838995721),
         ("sphere2500.g2o", 1351.4019258518795),
         pytest.param("M3500.g2o", 137.91487824746932, marks=pytest.mark.slow),
         pytest.param("parking-garage.g2o", 1.2683847992644874, marks=pytest.mark.slow),
@@ -252,3 +253,11 @@ def test_the_final_chi2_is_that_of_gtsam(folder: Path, name: str, chi2: float):
     graph = read_g2o(folder / name)
     result = optimise_pose_graph(*arguments(graph), PoseGraphOptions(chart="log"))
     assert result.converged and result.chi2 == pytest.approx(chi2, rel=1e-4)
+
+
+def test_the_final_chi2_of_a_rendered_loop_is_that_of_gtsam():
+    """Pose graph of the tracker on a rendered walk there and back, scales left out; GTSAM as above."""
+    graph = read_g2o(Path(__file__).parent / "rendered_loop.g2o")
+    result = optimise_pose_graph(*arguments(graph), PoseGraphOptions(chart="log"))
+    assert result.initial_chi2 == pytest.approx(35.675317653438256, rel=1e-6)
+    assert result.converged and result.chi2 == pytest.approx(5.800920988659587, rel=1e-6)

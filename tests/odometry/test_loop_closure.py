@@ -149,6 +149,22 @@ def test_a_keyframe_long_after_the_one_before_counts_more(closed):
     assert counts(1e6) == [1] * len(times)
     found = counts(0.125)
     assert found == [1, *np.maximum(1, np.floor(np.diff(times) / 0.125)).astype(int).tolist()] and max(found) > 1
+    assert (np.diff(replace(finder, options=replace(OPTIONS, pace=0.125)).counted()) == found[1:]).all()
+
+
+def test_at_the_end_keyframes_that_are_far_apart_are_all_searched(closed, monkeypatch):
+    closer, found = closed[0].loops, {}
+    finder = closer.finder
+    monkeypatch.setattr(closer, "loops", closer.loops[:1])
+    for pace in (1e6, 0.01):
+        monkeypatch.setattr(finder, "options", replace(OPTIONS, every=12, pace=pace))
+        found[pace] = []
+        monkeypatch.setattr(finder, "find", lambda new, pending=None, looked=found[pace]: looked.append(new))
+        assert not closer.complete(closed[0].state.adjustable)
+    known = finder.kept.index(closer.loops[0].new)
+    rare = [finder.kept.index(new) for new in found[1e6]]
+    assert 0 < len(rare) <= len(finder.kept) / 6 + 2 and min(abs(row - known) for row in rare) >= 6
+    assert len(found[0.01]) > 2 * len(rare)
 
 
 @pytest.fixture(scope="module")
@@ -360,7 +376,6 @@ def test_a_scene_never_seen_before_is_no_loop(film):
     assert not any(loop["from"] > 2.0 > loop["to"] for loop in result.info["loops"])
 
 
-@pytest.mark.slow
 def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
     """A single false match, by whatever likeness, does not change the map."""
     odometry = dvo.load("small", device="cpu", **SHORT)
@@ -368,7 +383,7 @@ def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
     real, calls = odometry.loops.finder.verify, []
 
     def once(search):
-        found = real(search)
+        found = yield from real(search)
         if found is not None:
             calls.append(found)
             shift = torch.tensor([len(calls) * 1.0, 0, 0, 0, 0, 0, 0, 0], dtype=torch.float64)
@@ -378,7 +393,7 @@ def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
     monkeypatch.setattr(odometry.loops.finder, "verify", once)
     for frame in film[0]:
         odometry.track(frame)
-    assert calls and not odometry.loops.loops and odometry.loops.corrections == 0
+    assert len(calls) > 1 and not odometry.loops.loops and odometry.loops.corrections == 0
 
 
 def test_keyframes_of_a_segment_that_is_not_initialised_are_left_alone(closed):

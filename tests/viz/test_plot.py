@@ -54,6 +54,23 @@ def test_the_estimate_is_drawn_where_it_is(tmp_path):
     assert np.flatnonzero(near_truth.any(axis=1)).mean() > np.flatnonzero(near_accent.any(axis=1)).mean() + 30
 
 
+def test_loops_are_marked_where_they_were_found(tmp_path):
+    """The picture with a loop differs from that without one only around the pose, and in the legend."""
+    track = Track(line(50, (1, 0, 0.3)), "dvo", 0)
+    pictures = []
+    for name, loops in (("without.png", None), ("with.png", track.trajectory.positions[25:26])):
+        plot_panels(tmp_path / name, [Panel((track,), loops=loops)])
+        pictures.append(cv2.imread(str(tmp_path / name)).astype(int))
+    assert pictures[0].shape == pictures[1].shape
+    above_legend = int(0.85 * pictures[0].shape[0])
+    changed = np.abs(pictures[1] - pictures[0]).max(axis=2) > 60
+    path = np.argwhere(colour_of(pictures[0][:above_legend], 0))
+    place = path[0] + (path[-1] - path[0]) * 24 / 49  # rows are sorted: the path ends at the top
+    marked = np.argwhere(changed[:above_legend])
+    assert len(marked) > 20 and np.abs(marked - place).max() < 20
+    assert changed[above_legend:].any(), "the legend"
+
+
 def test_the_same_input_gives_the_same_bytes(tmp_path):
     for name in ("a.png", "b.png"):
         plot_trajectory(tmp_path / name, line(30, (1, 0, 2)), points=np.random.default_rng(0).normal(size=(50, 3)))

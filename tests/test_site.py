@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 import yaml
 
@@ -62,6 +63,26 @@ def test_pictures_of_footage_are_small_and_those_of_the_script():
     assert max(picture.stat().st_size for picture in pictures) < 150_000
     text = (DOCS / "footage.md").read_text(encoding="utf-8")
     assert all(f"(footage/{picture.name})" in text for picture in pictures)
+
+
+def test_figures_of_the_method_are_small_and_those_of_the_script():
+    script = runpy.run_path(str(DOCS / "figures" / "make.py"))
+    figures = list((DOCS / "figures").glob("*.png"))
+    assert {figure.stem for figure in figures} == set(script["NAMES"])
+    assert max(figure.stat().st_size for figure in figures) < 150_000
+    text = (DOCS / "method.md").read_text(encoding="utf-8")
+    assert all(f"(figures/{figure.name})" in text for figure in figures)
+
+
+def test_script_of_the_figures_draws_them(tmp_path, monkeypatch):
+    """Of the first frames of the walk, on which the window has just been initialised."""
+    script = runpy.run_path(str(DOCS / "figures" / "make.py"))
+    monkeypatch.setattr(sys, "argv", ["make.py", "--frames", "10", "--out", str(tmp_path)])
+    script["main"]()
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.png" for name in script["NAMES"]}
+    for path in tmp_path.iterdir():
+        picture = cv2.imread(str(path))
+        assert min(picture.shape[:2]) > 200 and picture.std() > 10, path.name  # something is drawn
 
 
 def test_site_builds_without_a_warning(tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dvo.cli import main
+from dvo.commands.page_tables import tables
 from dvo.data.trajectory import read_tum, write_tum
 from dvo.odometry.frame_table import read_frames
 from dvo.odometry.results_reader import read_results
@@ -225,3 +226,9 @@ def test_no_results_folder_and_no_place_for_the_page(run, tmp_path, capsys):
     assert main(["summary", str(out), "--out", str(tmp_path / "no" / "page.html")]) == 2
     first, second, third = errors(capsys.readouterr().err)
     assert "not a results folder" in first and "run.json" in second and "cannot be written" in third
+
+
+def test_a_setting_without_a_value_has_a_dash():
+    settings = {"selection": "", "scale": {"distances": [], "tilt": 30}, "patches": 24}
+    text = tables({"config": settings}, 0.0)
+    assert "<td>–</td>" in text and "distances –, tilt 30" in text and "<td>24</td>" in text

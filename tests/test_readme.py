@@ -7,6 +7,7 @@ import io
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dvo.cli import build_parser
@@ -21,7 +22,7 @@ def blocks(language: str) -> list[str]:
 
 def test_python_block_runs(image_folder, monkeypatch):
     """On twenty small images of noise: the program must end, not track."""
-    (block,) = blocks("python")
+    block, _ = blocks("python")
     assert len([line for line in block.splitlines() if line.strip()]) <= 10
     monkeypatch.chdir(image_folder.parent.parent)
     said = io.StringIO()
@@ -29,6 +30,19 @@ def test_python_block_runs(image_folder, monkeypatch):
         exec(compile(block, str(README), "exec"), {})
     assert len(re.findall(r"initialising|tracking|lost", said.getvalue())) == 20
     assert "parameters" in said.getvalue()
+
+
+def test_live_python_block_runs():
+    """On images of noise in place of a camera: both loops must end, and tell of each frame that was not dropped."""
+    _, block = blocks("python")
+    assert len(block.splitlines()) <= 14
+    images = np.random.default_rng(0).integers(0, 255, (6, 480, 640, 3), dtype=np.uint8)
+    passes = []
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        exec(compile(block, str(README), "exec"), {"grab": lambda: passes.append(len(said.getvalue())) or iter(images)})
+    first, second = said.getvalue()[: passes[1]].splitlines(), said.getvalue()[passes[1] :].splitlines()
+    assert len(first) == 6 and 2 <= len(second) <= 6
 
 
 def test_the_weights_that_it_speaks_of_are_shipped():

@@ -162,13 +162,13 @@ class VideoRecording:
 
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; only every ``stride``-th frame is converted."""
-        read, previous, dropped = 0, -np.inf, 0
+        read, last, previous, dropped = 0, 0.0, -np.inf, 0
 
         def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
-            nonlocal read
+            nonlocal read, last
             for index, milliseconds, failed in _grabs(capture):
                 log.unreadable.extend(f"frame {number}" for number in range(index - failed, index))
-                read += 1
+                read, last = read + 1, milliseconds
                 yield index, milliseconds
 
         with _capture(self.path) as capture:
@@ -188,6 +188,8 @@ class VideoRecording:
                 previous = timestamp
                 yield RawFrame(index, timestamp, to_rgb8(image), f"{self.path} frame {index}")
         missing = (self.frame_count or 0) - read - len(log.unreadable)
+        if self._use_container and missing > 0:  # of a variable rate the announced number may be rate times duration
+            missing = min(missing, round((self.frame_count or 0) - 1 - last / 1000 * self._fps))
         if missing > 0 and self.interval.end is None:
             # healthy files may be off by a frame or so: estimated counts, edit lists
             verdict = ": it is cut short or damaged" if missing > max(1, (self.frame_count or 0) // 200) else ""

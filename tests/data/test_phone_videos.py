@@ -1,0 +1,156 @@
+"""Videos as phones record them: 10 bits, HDR, grey, variable rate, sound, turned."""
+
+import subprocess
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from dvo.data import Calibration, open_source
+
+WIDTH, HEIGHT, COUNT, FPS = 160, 120, 12, 20
+CALIB = Calibration(100, 100, 79.5, 59.5)
+PORTRAIT = Calibration(100, 100, 59.5, 79.5)
+SILENT_X265 = ("-x265-params", "log-level=error")
+TEN_BITS = ("-pix_fmt", "yuv420p10le")
+
+
+def picture(index):
+    """RGB: a gradient in steps of 16 columns, each channel with a slope of its own, and a square that moves."""
+    grey = np.tile(np.repeat(np.linspace(16, 232, WIDTH // 16), 16), (HEIGHT, 1))
+    image = np.stack([grey, 0.8 * grey + 20, 0.5 * grey + 60], axis=-1)
+    image[20:60, 16 + 4 * index : 56 + 4 * index] = [200, 60, 90]
+    return image.round().astype(np.uint8)
+
+
+PICTURES = [picture(index) for index in range(COUNT)]
+
+
+def ffmpeg(*arguments, data=b""):
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *map(str, arguments)]
+    done = subprocess.run(command, input=data, capture_output=True)
+    assert done.returncode == 0, done.stderr.decode(errors="replace")
+
+
+def encode(file, *options, inputs=(), pictures=PICTURES):
+    """Write the pictures as a video at FPS; ``inputs`` are further ones, ``options`` those of the output."""
+    head = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{WIDTH}x{HEIGHT}", "-r", FPS, "-i", "-")
+    ffmpeg(*head, *inputs, *options, file, data=b"".join(image.tobytes() for image in pictures))
+    return file
+
+
+def differences(frames, pictures=PICTURES):
+    """Mean absolute difference of each frame to its picture, grey levels."""
+    assert [frame.image.shape for frame in frames] == [image.shape for image in pictures]
+    assert all(frame.image.dtype == np.uint8 for frame in frames)
+    return [np.abs(f.image.astype(float) - image).mean() for f, image in zip(frames, pictures, strict=True)]
+
+
+FORMS = {
+    "h264.mp4": ("-c:v", "libx264", "-crf", 10, "-pix_fmt", "yuv420p"),
+    "h264 10 bits.mp4": ("-c:v", "libx264", "-crf", 10, *TEN_BITS),
+    "hevc 10 bits.mp4": ("-c:v", "libx265", *SILENT_X265, "-crf", 10, "-tag:v", "hvc1", *TEN_BITS),
+    "full range.mov": ("-vf", "scale=out_range=pc", "-c:v", "libx264", "-crf", 10, "-pix_fmt", "yuv420p"),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_colours_and_times(tmp_path, name):
+    source = open_source(encode(tmp_path / name, *FORMS[name]), calib=CALIB)
+    frames = list(source)
+    assert len(source) == len(frames) == COUNT and source.warnings == []
+    assert [frame.timestamp for frame in frames] == pytest.approx(np.arange(COUNT) / FPS)
+    # 8-bit 4:2:0 loses colour at the edges of the square; exchanged channels or another range are beyond 10 levels
+    assert max(differences(frames)) < 3
+    assert np.mean(np.abs(frames[5].image[..., ::-1].astype(float) - PICTURES[5])) > 10
+
+
+@pytest.mark.parametrize("pixels", ["gray", "gray10le"])
+@pytest.mark.parametrize("codec", ["libx264", "ffv1"])
+def test_grey(tmp_path, codec, pixels):
+    quality = ("-crf", 10) if codec == "libx264" else ()
+    file = encode(tmp_path / "grey.mkv", "-c:v", codec, "-pix_fmt", pixels, *quality)
+    frames = list(open_source(file, calib=CALIB))
+    assert len(frames) == COUNT
+    grey = [np.repeat((image @ [0.299, 0.587, 0.114])[..., None], 3, axis=2) for image in PICTURES]
+    assert max(differences(frames, grey)) < 2
+
+
+def hlg_as_sdr(levels):
+    """Levels of HLG on an SDR display: BT.2100 with the peak of 1000 cd/m2, reference white 203 cd/m2, gamma 2.4."""
+    signal = levels / 255
+    scene = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - 0.55991073) / 0.17883277) + 0.28466892) / 12)
+    return 255 * np.clip(1000 / 203 * scene**1.2, 0, 1) ** (1 / 2.4)
+
+
+def test_hdr_of_phones(tmp_path):
+    """HEVC of 10 bits, BT.2020, HLG: newer FFmpeg takes reference white for white, older leaves the levels."""
+    ramp = np.repeat(np.linspace(0, 255, WIDTH // 8).round(), 8)
+    pictures = [np.repeat(np.tile(ramp, (HEIGHT, 1))[..., None], 3, axis=2).astype(np.uint8)] * COUNT
+    tags = "setparams=color_primaries=bt2020:color_trc=arib-std-b67:colorspace=bt2020nc"
+    filters = f"scale=out_color_matrix=bt2020nc:out_range=tv,{tags}"
+    options = ("-vf", filters, "-c:v", "libx265", *SILENT_X265, "-crf", 4, "-tag:v", "hvc1", *TEN_BITS)
+    source = open_source(encode(tmp_path / "hlg.mov", *options, pictures=pictures), calib=CALIB)
+    frames = list(source)
+    assert len(frames) == COUNT and source.warnings == []
+    assert {(frame.image.shape, frame.image.dtype.name) for frame in frames} == {((HEIGHT, WIDTH, 3), "uint8")}
+    found = frames[5].image[:, 4::8].reshape(HEIGHT, -1, 3).astype(float)
+    errors = [np.abs(found - levels[4::8][:, None]).max() for levels in (hlg_as_sdr(ramp), ramp)]
+    assert min(errors) < 6
+    assert np.abs(hlg_as_sdr(ramp) - ramp).max() > 40  # the two are not the same
+
+
+@pytest.mark.parametrize("container", ["mp4", "mov", "mkv", "webm"])
+def test_variable_rate(tmp_path, container):
+    """Times are the presentation times, and the number of frames that a container only estimates is no fault."""
+    codec = ("-c:v", "libvpx", "-crf", 4, "-b:v", "4M") if container == "webm" else ("-c:v", "libx264", "-crf", 10)
+    index = np.arange(COUNT)
+    times = 0.03 * index + 0.01 * index**2  # gaps of 40 to 250 ms
+    options = ("-vf", "settb=1/1000,setpts='(0.03*N+0.01*N*N)/TB'", "-fps_mode", "passthrough")
+    rest = ("-enc_time_base", "1/1000", *codec, "-pix_fmt", "yuv420p")
+    source = open_source(encode(tmp_path / f"v.{container}", *options, *rest), calib=CALIB)
+    frames = list(source)
+    assert [frame.timestamp for frame in frames] == pytest.approx(times, abs=1.1e-3)
+    assert max(differences(frames)) < 6  # every frame is that of its time
+    assert source.warnings == []
+
+
+def test_a_variable_rate_does_not_hide_that_a_file_was_cut(tmp_path):
+    options = ("-vf", "settb=1/1000,setpts='(0.03*N+0.01*N*N)/TB'", "-fps_mode", "passthrough")
+    file = encode(tmp_path / "v.mkv", *options, "-enc_time_base", "1/1000", "-c:v", "mjpeg", "-q:v", 2)
+    file.write_bytes(file.read_bytes()[: file.stat().st_size * 6 // 10])
+    source = open_source(file, calib=CALIB)
+    assert 4 <= len(list(source)) < COUNT
+    assert "cut short" in source.warnings[-1]
+
+
+def test_a_video_that_begins_late_counts_from_its_first_frame(tmp_path):
+    options = ("-vf", "settb=1/1000,setpts='(3+0.03*N+0.01*N*N)/TB'", "-fps_mode", "passthrough")
+    file = encode(tmp_path / "late.mp4", *options, "-enc_time_base", "1/1000", "-c:v", "libx264", "-pix_fmt", "yuv420p")
+    index = np.arange(COUNT)
+    times = [frame.timestamp for frame in open_source(file, calib=CALIB)]
+    assert times == pytest.approx(0.03 * index + 0.01 * index**2, abs=1.1e-3)
+
+
+@pytest.mark.parametrize("order", [("0:v", "1:a"), ("1:a", "0:v")], ids=["after", "before"])
+def test_sound_is_ignored(tmp_path, order):
+    options = FORMS["h264.mp4"]
+    silent = list(open_source(encode(tmp_path / "silent.mp4", *options), calib=CALIB))
+    tone = ("-f", "lavfi", "-i", "sine=frequency=440:duration=2")  # longer than the images
+    maps = [part for stream in order for part in ("-map", stream)]
+    source = open_source(encode(tmp_path / "sound.mp4", *maps, *options, "-c:a", "aac", inputs=tone), calib=CALIB)
+    frames = list(source)
+    assert len(source) == COUNT and source.warnings == []
+    assert [frame.timestamp for frame in frames] == [frame.timestamp for frame in silent]
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(frames, silent, strict=True))
+
+
+@pytest.mark.parametrize("clockwise", [90, 180, 270])
+def test_turned(tmp_path, clockwise):
+    upright = encode(tmp_path / "v.mp4", *FORMS["h264.mp4"])
+    file = tmp_path / "turned.mp4"
+    ffmpeg("-display_rotation", -clockwise, "-i", upright, "-c", "copy", file)  # its angles are counter-clockwise
+    source = open_source(file, calib=CALIB if clockwise == 180 else PORTRAIT)
+    assert source.turned == clockwise
+    frames = list(source)
+    assert max(differences(frames, [np.rot90(image, -clockwise // 90) for image in PICTURES])) < 3

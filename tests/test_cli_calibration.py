@@ -45,7 +45,7 @@ def test_a_focal_length_that_is_found(image_folder, tmp_path, capsys, calibrated
     assert facts["calibration"] is None
     assert facts["camera"] == {
         "fx": 51.0, "fy": 51.0, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48, "model": "none", "coefficients": [],
-        "readout": 0.0, "turned": 0,
+        "readout": 0.0, "turned": 0, "reduced_by": 1,
     }  # fmt: skip
     told = facts["self_calibration"]
     assert (told["focal"], told["deviation"], told["source"], told["frames"]) == (51.0, 1.5, "self-calibration", 20)

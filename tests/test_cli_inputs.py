@@ -102,3 +102,18 @@ def test_a_mask(given, images, tmp_path):
     assert main(arguments(images, tmp_path / "out", *more)) == 0
     assert all(np.array_equal(frame.mask, mask == 0) for frame in odometry.frames) and len(odometry.frames) == 3
     assert summary(tmp_path / "out")["mask"] == {"file": str(tmp_path / "m.png"), "inverted": True}
+
+
+def test_large_images_are_reduced(given, images, tmp_path):
+    """The frames are smaller; the trajectory, the calibration and the camera of run.json are those of the images."""
+    written = []
+    for number, (limit, size) in enumerate([(1000, (24, 32, 3)), (0, (48, 64, 3))]):
+        odometry = given()
+        assert main(arguments(images, tmp_path / str(number), "--max-pixels", str(limit))) == 0
+        assert {frame.image.shape for frame in odometry.frames} == {size}
+        camera = summary(tmp_path / str(number))["camera"]
+        assert (camera["fx"], camera["cx"], camera["width"], camera["height"]) == (50, 31.5, 64, 48)
+        assert camera["reduced_by"] == (1 if limit == 0 else 2)
+        assert odometry.frames[0].camera.fx == (50 if limit == 0 else 25)
+        written.append((tmp_path / str(number) / "trajectory.txt").read_bytes())
+    assert written[0] == written[1]

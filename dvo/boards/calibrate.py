@@ -166,7 +166,8 @@ def calibrate_board(
     """Calibrate a camera from images of a board.
 
     Args:
-        frames: as recorded, lens distortion included (``dvo.open(..., undistort=False)``); their cameras are not used.
+        frames: as recorded, lens distortion included (``dvo.open(..., undistort=False, max_pixels=None)``); their
+            cameras are not used.
         board: its geometry.
         options: lens model, number of views, and what is believed.
         name: of the source, for messages.
@@ -180,7 +181,7 @@ def calibrate_board(
         DvoError: no frames, no board, too few views, or views that do not determine the focal length.
 
     Example:
-        >>> source = dvo.open("board.mp4", guess=True, undistort=False)
+        >>> source = dvo.open("board.mp4", guess=True, undistort=False, max_pixels=None)
         >>> found = calibrate_board(source, Checkerboard(9, 6, 0.025))
         >>> found.write("calib.txt")
     """

@@ -18,6 +18,7 @@ from dvo.commands.camera import CALIBRATION
 from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.data.capture import is_stream
 from dvo.data.output import replaced
+from dvo.data.reduction import MAX_PIXELS
 from dvo.data.source import Source
 from dvo.errors import DvoError
 from dvo.odometry import results
@@ -48,7 +49,8 @@ def calibrate(arguments: argparse.Namespace) -> int:
     if board is None and (arguments.fisheye or arguments.k3):
         raise DvoError("needs a board", field="--fisheye" if arguments.fisheye else "--k3", remedy="give --board CxR")
     fps = None if board is None else 30.0  # of views of a board, the times do not matter
-    source = dvo.open(arguments.source, guess=True, undistort=False, fps=fps)
+    limit = MAX_PIXELS if board is None else None  # corners are found in the images as recorded
+    source = dvo.open(arguments.source, guess=True, undistort=False, fps=fps, max_pixels=limit)
     for warning in source.warnings:
         warn(warning, "note")
     with results.results_folder(arguments.out, source.name) as folder:

@@ -51,7 +51,8 @@ def with_calibration(
         source = source.recalibrated(found.calibration)
     elif not (is_foreign(file) or _is_given(file, source, arguments.calib)):
         file.unlink(missing_ok=True)  # of an earlier run
-    camera = {**asdict(source.recorded_camera), "turned": source.turned}
+    factor = 1 if source.reduction is None else source.reduction.factor
+    camera = {**asdict(source.recorded_camera), "turned": source.turned, "reduced_by": factor}
     return source, {"camera": camera, "self_calibration": None if found is None else _facts(found)}
 
 

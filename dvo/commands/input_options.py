@@ -23,6 +23,12 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--mask-invert", action="store_true", help="of the mask, black is used and white is ignored")
     parser.add_argument(
+        "--max-pixels",
+        metavar="N",
+        type=int,
+        help="images with more pixels are reduced when they are read (4000000); 0: never",
+    )
+    parser.add_argument(
         "--extrinsics",
         metavar="FILE",
         help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
@@ -36,7 +42,8 @@ def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         arguments: of the command line.
     """
     masks = {"mask": arguments.mask, "mask_invert": arguments.mask_invert}
-    return {"start": arguments.start, "end": arguments.end, **masks}
+    pixels = {} if arguments.max_pixels is None else {"max_pixels": arguments.max_pixels or None}
+    return {"start": arguments.start, "end": arguments.end, **masks, **pixels}
 
 
 def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dvo.data.files import read_image_file
 from dvo.data.image_header import MAX_PIXELS, image_size
+from dvo.data.reduction import Reduction
 from dvo.errors import DvoError
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
@@ -71,11 +72,12 @@ def to_rgb8(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image[..., 2::-1])
 
 
-def read_image(path: Path) -> np.ndarray | None:
+def read_image(path: Path, reduction: Reduction | None = None) -> np.ndarray | None:
     """Decode an image file. EXIF orientation is not applied.
 
     Args:
         path: the file.
+        reduction: of the image; None for none.
 
     Returns:
         ``(H, W, 3)`` uint8 RGB, or None if the file is missing, corrupt or cut short.
@@ -84,7 +86,7 @@ def read_image(path: Path) -> np.ndarray | None:
         DvoError: an image of more than :data:`dvo.data.image_header.MAX_PIXELS`, or a readable one with pixels that
             are no colours (float).
     """
-    image = decode(path)
+    image = decode(path, reduction)
     if image is None:
         return None
     try:
@@ -93,11 +95,12 @@ def read_image(path: Path) -> np.ndarray | None:
         raise DvoError(error.message, file=path, remedy=error.remedy) from None
 
 
-def decode(path: Path) -> np.ndarray | None:
+def decode(path: Path, reduction: Reduction | None = None) -> np.ndarray | None:
     """Decode an image file as it is; its size is taken from the header before.
 
     Args:
         path: the file.
+        reduction: of the image; None for none.
 
     Returns:
         ``(H, W)`` or ``(H, W, C)`` in OpenCV's order of channels; None if the file is missing, no regular file, of an
@@ -107,15 +110,16 @@ def decode(path: Path) -> np.ndarray | None:
         DvoError: an image of more than :data:`dvo.data.image_header.MAX_PIXELS`.
     """
     data = read_image_file(path)
-    return None if data is None else decode_bytes(data, path)
+    return None if data is None else decode_bytes(data, path, reduction)
 
 
-def decode_bytes(data: bytes, name: object) -> np.ndarray | None:
+def decode_bytes(data: bytes, name: object, reduction: Reduction | None = None) -> np.ndarray | None:
     """Decode the bytes of an image file; see :func:`decode`.
 
     Args:
         data: the file.
         name: of it, for messages.
+        reduction: as :func:`decode`.
 
     Returns:
         As :func:`decode`.
@@ -134,11 +138,24 @@ def decode_bytes(data: bytes, name: object) -> np.ndarray | None:
         raise DvoError(
             f"image of {size[0]}x{size[1]} pixels, more than {MAX_PIXELS:,}", file=name, remedy="reduce the images"
         )
+    mode = cv2.IMREAD_UNCHANGED
+    if reduction is not None and reduction.is_exact and reduction.recorded == size and data.startswith(b"\xff\xd8"):
+        mode = _reduced_modes().get(reduction.factor, mode)  # the decoder of JPEG files does less work then
     try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
     except cv2.error:
         return None
-    return None if image is None or image.size == 0 else image
+    if image is None or image.size == 0:
+        return None
+    return image if reduction is None else reduction(image)
+
+
+def _reduced_modes() -> dict[int, int]:
+    """Modes of decoding by factors, without the orientation of EXIF data, which IMREAD_UNCHANGED ignores too."""
+    import cv2
+
+    modes = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
+    return {factor: mode | cv2.IMREAD_IGNORE_ORIENTATION for factor, mode in modes.items()}
 
 
 def is_complete(data: bytes) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dvo.data.images import decode, list_images
 from dvo.data.recording import ImageRecording
+from dvo.data.reduction import Reduction
 from dvo.errors import DvoError
 from dvo.geometry.undistort import Undistorter
 
@@ -73,10 +74,13 @@ class Masks:
         files: one for all images, or one for each of them by position.
         size: width and height of the recorded images.
         invert: white pixels are ignored, black ones used.
+        reduction: of the images; None for none.
     """
 
-    def __init__(self, files: list[Path], size: tuple[int, int], invert: bool) -> None:
-        self.files, self.size, self.invert = files, size, invert
+    def __init__(
+        self, files: list[Path], size: tuple[int, int], invert: bool, reduction: Reduction | None = None
+    ) -> None:
+        self.files, self.size, self.invert, self.reduction = files, size, invert, reduction
         self._read = lru_cache(maxsize=1)(self._load)
 
     def __call__(self, index: int, undistorter: Undistorter | None) -> np.ndarray:
@@ -102,10 +106,14 @@ class Masks:
         if mask.shape[::-1] != self.size:
             found, wanted = (f"{width}x{height}" for width, height in (mask.shape[::-1], self.size))
             raise DvoError(f"is {found}, the images are {wanted}", file=file, field="mask", remedy=_REMEDY)
+        if self.reduction is not None:
+            mask = self.reduction.mask(mask)
         return mask if undistorter is None else undistorter.mask(mask)
 
 
-def open_masks(path: Path, recording: Any, size: tuple[int, int], invert: bool) -> Masks:
+def open_masks(
+    path: Path, recording: Any, size: tuple[int, int], invert: bool, reduction: Reduction | None = None
+) -> Masks:
     """Masks of a recording.
 
     Args:
@@ -114,6 +122,7 @@ def open_masks(path: Path, recording: Any, size: tuple[int, int], invert: bool) 
         recording: a :class:`dvo.data.recording.Recording`.
         size: width and height of its images.
         invert: white pixels are ignored, black ones used.
+        reduction: of the images; None for none.
 
     Raises:
         DvoError: nothing there, another number of masks than of images, or a first mask that cannot be used.
@@ -133,6 +142,6 @@ def open_masks(path: Path, recording: Any, size: tuple[int, int], invert: bool) 
             images_text = "an unknown number of" if count is None else str(count)
             message = f"{len(found)} masks for {images_text} images, and not of the same names"
             raise DvoError(message, file=path, field="mask", remedy="give one mask, or one for every image")
-    masks = Masks(files, size, invert)
+    masks = Masks(files, size, invert, reduction)
     masks(0, None)
     return masks

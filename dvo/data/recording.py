@@ -16,6 +16,7 @@ from dvo.data.depth import read_depth
 from dvo.data.frame import InertialSamples
 from dvo.data.images import read_image
 from dvo.data.interval import Interval
+from dvo.data.reduction import Reduction
 from dvo.data.sensors import Sensors, StereoRig
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
@@ -45,7 +46,7 @@ class RawFrame:
     Attributes:
         index: position in the recording from 0, unreadable images counted.
         timestamp: seconds.
-        image: ``(H, W, 3)`` uint8 RGB.
+        image: ``(H, W, 3)`` uint8 RGB; reduced, if the recording was told so.
         origin: file name or frame number, for messages.
         depth: loads the depth image of this frame: ``(H, W)`` float32 metres with nan for unknown, or None.
         right: loads the right image of this frame: ``(H, W, 3)`` uint8 RGB, or None.
@@ -175,12 +176,14 @@ class ImageRecording:
 
     Attributes:
         interval: that is read, see :func:`dvo.data.interval.limit`.
+        reduction: of the images, see :func:`dvo.data.reduction.reduce_images`.
 
     Raises:
         DvoError: no images, or times that are not finite.
     """
 
     interval = Interval()
+    reduction: Reduction | None = None
 
     def __init__(
         self,
@@ -247,7 +250,7 @@ class ImageRecording:
             The frame, or None if its image is corrupt.
         """
         file = self.images[index]
-        image = read_image(file)
+        image = read_image(file, self.reduction)
         if image is None:
             return None
         depth = partial(self._depth, file, log) if self.sensors.depth else None

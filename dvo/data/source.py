@@ -21,6 +21,7 @@ from dvo.data.interval import Bound, Interval, expected_frames, limit
 from dvo.data.mask import Masks, open_masks
 from dvo.data.opening import check_invert, check_stride, first_frame, locate, no_calibration
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
+from dvo.data.reduction import MAX_PIXELS, Reduction, reduce_images
 from dvo.data.registry import find_reader
 from dvo.data.rosbag import split_topic
 from dvo.data.sensors import StereoRig
@@ -42,8 +43,9 @@ class Source:
         name: of the sequence.
         kind: name of the reader, see :data:`dvo.data.registry.READERS`.
         path: file or folder that was opened.
-        camera: the camera of every frame (without distortion if frames are undistorted).
+        camera: the camera of every frame (without distortion if frames are undistorted, reduced if they are).
         recorded_camera: the camera as calibrated, distortion included.
+        reduction: of the recorded images; None for none.
         calibration: of the recorded images, as read; None for a stream.
         masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
@@ -69,10 +71,12 @@ class Source:
         self.name, self.kind, self.path = recording.name, recording.kind, recording.path
         self.recorded_camera, self.groundtruth, self.stride = recorded_camera, groundtruth, stride
         self._undistort = undistort
-        self._undistorter = Undistorter(recorded_camera) if undistort and needs_undistortion(recorded_camera) else None
+        self.reduction: Reduction | None = getattr(recording, "reduction", None)
+        read = recorded_camera if self.reduction is None else self.reduction.camera(recorded_camera)
+        self._undistorter = Undistorter(read) if undistort and needs_undistortion(read) else None
         self._right_undistorter: Undistorter | None = None  # the size of right images is not known before the first
-        self.camera = self._undistorter.camera if self._undistorter else recorded_camera
-        self._cut = notice_of_cut(recorded_camera, self.camera) if self._undistorter else []
+        self.camera = self._undistorter.camera if self._undistorter else read
+        self._cut = notice_of_cut(read, self.camera) if self._undistorter else []
         count = expected_frames(recording)
         self.frame_count: int | None = None if count is None else -(-count // stride)
         self._doubts = doubts
@@ -156,7 +160,7 @@ class Source:
         previous = float("inf")
         for raw in self.recording.frames(log, self.stride):
             height, width = raw.image.shape[:2]
-            if (width, height) != (self.recorded_camera.width, self.recorded_camera.height):
+            if (width, height) != (self.camera.width, self.camera.height):
                 raise DvoError(
                     f"this image is {width}x{height}, those before are "
                     f"{self.recorded_camera.width}x{self.recorded_camera.height}",
@@ -183,7 +187,7 @@ class Source:
             return None
         if self.depth_calibration is not None:
             return registered_depth(depth, self.depth_calibration, self.camera)
-        depth = resized_depth(depth, (self.recorded_camera.width, self.recorded_camera.height), origin)
+        depth = resized_depth(depth, (self.camera.width, self.camera.height), origin)
         return self._undistorter.depth(depth) if self._undistorter else depth
 
     @cached_property
@@ -196,6 +200,8 @@ class Source:
         if rig is None or image is None:
             return None
         camera = rig.calibration.camera(image.shape[1], image.shape[0])
+        if self.reduction is not None and image.shape[1::-1] == self.reduction.recorded:
+            image, camera = self.reduction(image), self.reduction.camera(camera)
         if self._undistort and needs_undistortion(camera):
             if self._right_undistorter is None or self._right_undistorter.source != camera:
                 self._right_undistorter = Undistorter(camera)
@@ -227,6 +233,7 @@ def open_source(
     end: Bound | None = None,
     mask: Path | str | None = None,
     mask_invert: bool = False,
+    max_pixels: int | None = MAX_PIXELS,
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
     ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it), a bag of ROS; or a stream:
@@ -257,6 +264,9 @@ def open_source(
         mask: image that is white where the recorded images are used and black where they are ignored, or a folder with
             one for each image (:func:`dvo.data.mask.open_masks`); for ``Frame.mask``.
         mask_invert: white is ignored and black used.
+        max_pixels: images with more are reduced by area right after they are decoded, by the smallest whole factor that
+            suffices (:mod:`dvo.data.reduction`); calibration and masks remain those of the recorded images. None for
+            never; streams and bags of ROS are never reduced.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -316,7 +326,10 @@ def open_source(
         calibration = replace(calibration, readout=0.0)
         doubts.append(f"the video is turned by {turned} degrees: the readout of the calibration was not used")
     camera = calibration.camera(width, height)
-    masks = None if mask is None else open_masks(locate(mask, path, "mask"), recording, (width, height), mask_invert)
+    reduction = reduce_images(recording, width, height, max_pixels)
+    size, masks = (width, height), None
+    if mask is not None:
+        masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
     truth = recording.groundtruth
     if groundtruth is not None:
         truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))

@@ -18,6 +18,7 @@ from dvo.data.image_header import MAX_PIXELS
 from dvo.data.images import SUFFIXES, to_rgb8
 from dvo.data.interval import Interval
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.reduction import Reduction
 from dvo.data.sensors import StereoRig
 from dvo.data.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.trajectory import Trajectory
@@ -113,6 +114,7 @@ class VideoRecording:
 
     Attributes:
         interval: that is read, see :func:`dvo.data.interval.limit`; frames before it are decoded, but not converted.
+        reduction: of the images, see :func:`dvo.data.reduction.reduce_images`.
         turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
             rows of the sensor in the order in which it reads them.
 
@@ -122,6 +124,7 @@ class VideoRecording:
 
     kind = "video"
     interval = Interval()
+    reduction: Reduction | None = None
     calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
@@ -186,6 +189,7 @@ class VideoRecording:
                     log.unreadable.append(f"frame {index}")
                     continue
                 previous = timestamp
+                image = image if self.reduction is None else self.reduction(image)
                 yield RawFrame(index, timestamp, to_rgb8(image), f"{self.path} frame {index}")
         missing = (self.frame_count or 0) - read - len(log.unreadable)
         if self._use_container and missing > 0:  # of a variable rate the announced number may be rate times duration

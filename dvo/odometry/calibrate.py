@@ -191,7 +191,8 @@ def calibrate(
     first = next(_readable(frames if kept is None else copy(kept)), None)
     if first is None:
         raise DvoError("no frames", field="frames", remedy="give a video or a folder with images")
-    width, height = first.camera.width, first.camera.height
+    recorded = getattr(frames, "recorded_camera", first.camera)  # frames of large images are reduced
+    width, height = recorded.width, recorded.height
     if guess is None:
         guess = getattr(frames, "guess", None) or guess_from_angle(width, height)
 
@@ -203,7 +204,7 @@ def calibrate(
     for number in range(options.rounds):
         odometry = load(weights, device=device, seed=seed, loops=False)
         clip = islice(_readable(frames if kept is None else copy(kept)), limit)
-        seen = _track(odometry, clip, focal, wanted, options.interval, on_frame)
+        seen = _track(odometry, clip, focal * (first.camera.width / width), wanted, options.interval, on_frame)
         profile, count = _profile(odometry)
         asked = [*walk, (math.log(focal), profile.minimum.value)]
         slope = _slope(asked)

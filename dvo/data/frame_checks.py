@@ -60,13 +60,7 @@ def checked_frame(frame: Frame) -> Frame:
         )
     name = _name(frame.index)
     timestamp = _seconds(frame.timestamp, f"{name}: timestamp")
-    image = frame.image
-    if _is_ready(image):
-        _check_camera(frame.camera, image, name)
-    else:
-        pixels = _with_channels(_array_of(image, f"{name}: image"), f"{name}: image")
-        _check_camera(frame.camera, pixels, name)  # before the conversion, which needs memory for all pixels
-        image = _rgb8(pixels, f"{name}: image")
+    image = checked_image(frame.image, frame.camera, name)
     mask = checked_mask(frame.mask, image.shape[0], image.shape[1], f"{name}: mask")
     if image is frame.image and timestamp is frame.timestamp and mask is frame.mask:
         return frame
@@ -75,6 +69,28 @@ def checked_frame(frame: Frame) -> Frame:
     object.__setattr__(converted, "timestamp", timestamp)
     object.__setattr__(converted, "mask", mask)
     return converted
+
+
+def checked_image(image: Any, camera: Any, name: str) -> np.ndarray:
+    """Check and convert the image of a frame as :func:`checked_frame` does.
+
+    Args:
+        image: as given by the caller.
+        camera: of the image.
+        name: of the frame, for messages.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB, contiguous and writable; the image itself if it is that.
+
+    Raises:
+        DvoError: as :func:`checked_frame`, of the image and the camera.
+    """
+    if _is_ready(image):
+        _check_camera(camera, image, name)
+        return image
+    pixels = _with_channels(_array_of(image, f"{name}: image"), f"{name}: image")
+    _check_camera(camera, pixels, name)  # before the conversion, which needs memory for all pixels
+    return _rgb8(pixels, f"{name}: image")
 
 
 def _name(index: Any) -> str:
@@ -139,7 +155,7 @@ def _array_of(image: Any, field: str) -> np.ndarray:
         return np.asarray(image)
     torch, pil = sys.modules.get("torch"), sys.modules.get("PIL.Image")
     if torch is not None and isinstance(image, torch.Tensor):
-        return _converted(lambda: array_of_tensor(image), image, field)
+        return _converted(lambda: _array_of_tensor(image), image, field)
     if pil is not None and isinstance(image, pil.Image):
         direct = image.mode in _PIL_MODES or image.mode.startswith("I;16")
         return _converted(lambda: np.asarray(image if direct else image.convert("RGB")), image, field)
@@ -150,7 +166,7 @@ def _array_of(image: Any, field: str) -> np.ndarray:
     )
 
 
-def array_of_tensor(image: Any) -> np.ndarray:
+def _array_of_tensor(image: Any) -> np.ndarray:
     """Array of a torch tensor, with the channels last.
 
     Args:
@@ -236,7 +252,7 @@ def _warn_if_twelve_bits(highest: int, field: str) -> None:
         warnings.warn(
             f"{field}: uint16 values up to {highest} only; they are taken as 0..65535, so the image gets dark. "
             "Multiply 12-bit data by 16, 10-bit data by 64.",
-            stacklevel=5,
+            stacklevel=6,
         )
 
 

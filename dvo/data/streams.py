@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
 from dvo.data.frame import Frame
-from dvo.data.frame_checks import array_of_tensor
+from dvo.data.frame_checks import checked_image
 from dvo.data.stamps import checked_rate
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
@@ -84,9 +83,10 @@ def stream(
     """Wrap images in memory, or arriving, for :func:`dvo.odometry.session.run` and whatever else takes a source.
 
     Args:
-        images: any iterable of ``(H, W, 3)`` uint8 RGB (or ``(H, W)`` grey) images, of pairs ``(seconds, image)``, or
-            of :class:`Frame`, which is passed on as it is. Arrays may have any memory layout, torch tensors may lie on
-            any device and have their channels first. Read once, one element at a time.
+        images: any iterable of ``(H, W, 3)`` uint8 RGB images, or others that
+            :func:`dvo.data.frame_checks.checked_frame` converts (grey, RGBA, uint16, float, torch tensors, PIL); of
+            pairs ``(seconds, image)``; or of :class:`Frame`, which is passed on as it is. Read once, one element at a
+            time.
         camera: camera of the images; needed unless the elements are frames.
         timestamps: seconds of the images, in the same order; may be endless.
         fps: images a second, if there are no times.
@@ -99,7 +99,7 @@ def stream(
 
     Raises:
         DvoError: both or unusable ``timestamps`` and ``fps``. While iterating: an element that is no image of the
-            camera's size, or that has no time.
+            camera's size or cannot be converted, or that has no time.
 
     Example:
         >>> import numpy as np
@@ -162,26 +162,7 @@ def _seconds(time: Any, index: int, name: str) -> float:
 
 def _checked(image: Any, camera: Camera, index: int, name: str) -> np.ndarray:
     """``(H, W, 3)`` uint8 RGB of the camera's size."""
-    torch = sys.modules.get("torch")
     try:
-        is_tensor = torch is not None and isinstance(image, torch.Tensor)
-        image = array_of_tensor(image) if is_tensor else np.asarray(image)
-    except (TypeError, ValueError, OverflowError):  # rows of different lengths
-        image = np.zeros(0)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (1,), (3,)):
-        raise DvoError(
-            f"image {index} is {image.dtype} of shape {image.shape}",
-            file=name,
-            field="image",
-            remedy="give (H, W, 3) uint8 RGB images",
-        )
-    if image.shape[:2] != (camera.height, camera.width):
-        raise DvoError(
-            f"image {index} is {image.shape[1]}x{image.shape[0]}, its camera {camera.width}x{camera.height}",
-            file=name,
-            field="image",
-            remedy="give the camera of these images",
-        )
-    if image.shape[2:] != (3,):
-        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
-    return np.ascontiguousarray(image)
+        return checked_image(image, camera, f"frame {index}")
+    except DvoError as error:
+        raise DvoError(error.message, file=name, field=error.field, remedy=error.remedy) from error.__cause__

@@ -4,9 +4,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from dvo.commands.run import track
 from dvo.data import Frame, open_source, stream
+from dvo.data.frame_checks import checked_frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.odometry.session import run
@@ -95,6 +97,19 @@ def test_any_memory_layout_and_tensors():
         assert np.array_equal(first.image, rgb) == (camera is CAMERA) and len(others) == 7
 
 
+def test_images_are_converted_as_those_of_frames():
+    rgb = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    rgba = np.dstack([rgb, np.full((48, 64), 9, np.uint8)])
+    forms = [rgba, rgb.astype(np.uint16) * 257, rgb / 255, (rgb / 255).astype(np.float32), Image.fromarray(rgba)]
+    forms += [torch.from_numpy(rgba).permute(2, 0, 1), torch.from_numpy(rgb / 255).float()]
+    found = list(stream(forms, CAMERA, fps=1))
+    assert len(found) == 7 and all(np.array_equal(frame.image, rgb) for frame in found)
+    assert all(frame.image.dtype == np.uint8 and frame.image.flags.carray for frame in found)
+    (grey,) = stream([rgb[..., 0] / 255], CAMERA, fps=1)
+    assert np.array_equal(grey.image, rgb[..., :1].repeat(3, axis=2))
+    assert np.array_equal(checked_frame(Frame(0, 0.0, rgba, CAMERA)).image, found[0].image)
+
+
 def test_views_are_tracked_as_their_copies(fake_odometry):
     """Frames that are not contiguous reach an odometry as contiguous arrays of the same pixels."""
     whole = np.random.default_rng(0).integers(0, 256, (6, 48, 128, 3), dtype=np.uint8)
@@ -111,9 +126,11 @@ def test_views_are_tracked_as_their_copies(fake_odometry):
         ([np.zeros((48, 64, 3), np.uint8)], {}, "no time for image 0"),
         ([np.zeros((48, 64, 3), np.uint8)] * 2, {"timestamps": [0.5]}, "no time for image 1"),
         ([(float("nan"), np.zeros((48, 64, 3), np.uint8))], {}, "no time for image 0"),
-        ([np.zeros((48, 64, 3), np.float32)], {"fps": 1}, "float32"),
-        ([np.zeros((48, 64, 4), np.uint8)], {"fps": 1}, "shape"),
-        ([np.zeros((24, 32, 3), np.uint8)], {"fps": 1}, "32x24, its camera 64x48"),
+        ([np.full((48, 64, 3), 2.0, np.float32)], {"fps": 1}, "frame 0: image: float values must lie in 0..1"),
+        ([np.zeros((48, 64, 3), np.int64)], {"fps": 1}, "has pixels of type int64"),
+        ([np.zeros((48, 64, 2), np.uint8)], {"fps": 1}, "no image of 1, 3 or 4 channels"),
+        (["image"], {"fps": 1}, "expected an array, got an object of type str"),
+        ([np.zeros((24, 32, 3), np.uint8)], {"fps": 1}, "stream: frame 0: camera: .* 64x48 image, but .* 32x24"),
         ([np.zeros((48, 64, 3), np.uint8)], {"fps": 1, "camera": None}, "no camera"),
     ],
 )

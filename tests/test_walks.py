@@ -120,6 +120,20 @@ def test_owner_of_a_real_phone(shell, data_root):
         assert (shell.folder / "desk" / "calib.txt").is_file()
 
 
+@pytest.mark.slow
+def test_a_phone_that_comes_back_to_its_start(shell, data_root):
+    """The whole clip, without a calibration and without loops: from the last pose to the first is 1.5 % of the path."""
+    images = data_root / "phone_desk_198" / "images"
+    if not images.is_dir():
+        pytest.skip(f"no {images}")
+    said = shell.type(f"dvo run '{images}' --fps 9.4 --no-loops --out desk")
+    assert FOCAL.search(said.out) and len(summary(shell.folder / "desk")["segments"]) == 1
+    positions = read_tum(shell.folder / "desk" / "trajectory.txt").positions
+    assert len(positions) == 198
+    path = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
+    assert np.linalg.norm(positions[-1] - positions[0]) < 0.015 * path
+
+
 # --- roboticist ------------------------------------------------------------------------------------------------------
 
 CAMERA_INFO = """image_width: 160

@@ -29,6 +29,7 @@ from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.adjusting import adjust
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
+from dvo.odometry.exclusive import exclusive
 from dvo.odometry.finishing import finish_segments, run_information
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, keyframe_of, observe
@@ -52,8 +53,9 @@ from dvo.odometry.working_image import masked_image
 from dvo.threads import core_left
 
 
+@exclusive
 class PatchOdometry:
-    """Odometry of one sequence with :class:`dvo.models.patch_vo.PatchVO`.
+    """Odometry of one sequence with :class:`dvo.models.patch_vo.PatchVO`; calls from several threads wait in line.
 
     Args:
         model: the network; moved to ``device`` and used in evaluation mode.
@@ -205,8 +207,7 @@ class PatchOdometry:
     adjust = adjust
 
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
-        info = run_information(self.graph, self.state, self.config, self.loops, self.seed)
-        return result_of(self.graph, info, poses)
+        return result_of(self.graph, run_information(self.graph, self.state, self.config, self.loops, self.seed), poses)
 
     def _take(self, view: View) -> Estimate:
         """Add a frame with content to the window, and estimate its pose."""
@@ -294,8 +295,7 @@ class PatchOdometry:
                 self._update(COLD_UPDATES if supported else age)
             if not supported:
                 drop_unrelated(self.graph, self.step, config)
-        if not supported and len(window):
-            supported = worth_keeping(self.graph, self.step, config, last)
+        supported = supported or (len(window) > 0 and worth_keeping(self.graph, self.step, config, last))
         while len(window):
             self.graph.archive_oldest()
         self.graph.begin_segment(self.state.keyframes, supported, "too few frames with content")

@@ -1,0 +1,84 @@
+"""Calls of an odometry from another thread, while a frame is tracked."""
+
+import threading
+
+import numpy as np
+
+import dvo
+from dvo.odometry.exclusive import METHODS, exclusive
+from dvo.odometry.load import build_odometry
+from dvo.odometry.tracker import PatchOdometry
+from tests.odometry.test_reset import SETTINGS, frames, network
+
+SOON = 0.3  # seconds in which a call that does not wait is done
+
+
+def tracked(images, call=None):
+    """Odometry that has tracked images, and what a call from another thread has given.
+
+    It is made in the middle of the frame before the last one, at the selection of its patches, and must wait for the
+    end of that frame.
+    """
+    odometry = build_odometry(network("patch_vo"), seed=1, **SETTINGS["patch_vo"])
+    outcomes = []
+    for frame in images[:-2]:
+        odometry.track(frame)
+    thread = threading.Thread(target=lambda: outcomes.append(None if call is None else call(odometry)))
+    select, waited = odometry.select, []
+
+    def interrupted(*arguments, **keywords):
+        odometry.select = select
+        thread.start()
+        thread.join(SOON)
+        waited.append(thread.is_alive())
+        return select(*arguments, **keywords)
+
+    if call is not None:
+        odometry.select = interrupted
+    odometry.track(images[-2])
+    if call is not None:
+        thread.join()
+        assert waited == [True]
+    odometry.track(images[-1])
+    return odometry, *outcomes
+
+
+def test_the_result_so_far_is_that_between_two_frames():
+    images = frames(3)
+    (alone,), (odometry, result) = tracked(images), tracked(images, PatchOdometry.current)
+    (expected,) = tracked(images[:-1])
+    poses = result.trajectory.poses_wc
+    assert len(poses) > 3 and np.array_equal(poses, expected.current().trajectory.poses_wc)
+    assert result.frames_read == len(images) - 1
+    assert np.array_equal(odometry.finish().trajectory.poses_wc, alone.finish().trajectory.poses_wc)
+
+
+def test_a_map_saved_by_another_thread_goes_on(tmp_path):
+    images = frames(3)
+    odometry, _ = tracked(images, lambda odometry: odometry.save(tmp_path / "map.dvo"))
+    loaded = dvo.load_map(tmp_path / "map.dvo", weights=network("patch_vo"))
+    loaded.track(images[-1])
+    assert np.array_equal(loaded.finish().trajectory.poses_wc, odometry.finish().trajectory.poses_wc)
+
+
+def test_a_new_beginning_waits_for_the_frame():
+    odometry, _ = tracked(frames(3), PatchOdometry.reset)
+    assert odometry.current().frames_read == 1, "of the frame after it"
+
+
+def test_every_public_method_is_exclusive():
+    public = {name for name, value in vars(PatchOdometry).items() if callable(value) and not name.startswith("_")}
+    assert public == set(METHODS)
+
+
+def test_two_objects_do_not_wait_for_each_other():
+    @exclusive
+    class Meeting:
+        def track(self, barrier):
+            barrier.wait(10)  # raises if the other one does not come
+
+    barrier = threading.Barrier(2)
+    thread = threading.Thread(target=Meeting().track, args=(barrier,))
+    thread.start()
+    Meeting().track(barrier)
+    thread.join()

@@ -1,13 +1,14 @@
-"""Focal length that the EXIF data of a JPEG file state."""
+"""Focal length and orientation that the EXIF data of a JPEG file state."""
 
 from __future__ import annotations
 
 import io
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 _HEAD = 2**18  # bytes in which the EXIF segment begins and ends: it is at most 64 kB, and near the start
-_EXIF_IFD, _FOCAL_35MM = 0x8769, 0xA405
+_EXIF_IFD, _FOCAL_35MM, _ORIENTATION = 0x8769, 0xA405, 0x0112
 _INTEGERS = {3: "H", 4: "I"}
 
 
@@ -20,11 +21,32 @@ def equivalent_focal(file: Path) -> float | None:
     Returns:
         Millimetres, for a diagonal of 43.27 mm; None if the file does not state it or is no JPEG.
     """
+    focal = _read(file, _focal)
+    return float(focal) if focal else None  # 0 stands for unknown
+
+
+def orientation(file: Path) -> int:
+    """Read how an image is turned for display (EXIF 2.3, tag 0x0112).
+
+    Args:
+        file: an image.
+
+    Returns:
+        1 (as stored) to 8; 1 if the file does not state it or is no JPEG.
+    """
+    found = _read(file, lambda tiff, order, first: _value(tiff, order, first, _ORIENTATION))
+    return found if found is not None and 1 <= found <= 8 else 1
+
+
+def _read(file: Path, value: Callable[[bytes, str, int], int | None]) -> int | None:
+    """Value of a TIFF structure, its byte order and the offset of its first directory; None without one."""
     try:
         with file.open("rb") as stream:
-            data = stream.read(_HEAD)
-        exif = _segment(data)
-        return None if exif is None else _focal(exif)
+            tiff = _segment(stream.read(_HEAD))
+        order = {b"II": "<", b"MM": ">"}.get(b"" if tiff is None else tiff[:2])
+        if tiff is None or order is None:
+            return None
+        return value(tiff, order, struct.unpack_from(f"{order}I", tiff, 4)[0])
     except (OSError, ValueError, struct.error):  # cut, or offsets that lead nowhere
         return None
 
@@ -45,14 +67,9 @@ def _segment(data: bytes) -> bytes | None:
     return None
 
 
-def _focal(tiff: bytes) -> float | None:
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if order is None:
-        return None
-    (first,) = struct.unpack_from(f"{order}I", tiff, 4)
+def _focal(tiff: bytes, order: str, first: int) -> int | None:
     inner = _value(tiff, order, first, _EXIF_IFD)
-    millimetres = None if inner is None else _value(tiff, order, inner, _FOCAL_35MM)
-    return float(millimetres) if millimetres else None  # 0 stands for unknown
+    return None if inner is None else _value(tiff, order, inner, _FOCAL_35MM)
 
 
 def _value(tiff: bytes, order: str, at: int, wanted: int) -> int | None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dvo.data.files import read_image_file
 from dvo.data.image_header import MAX_PIXELS, image_size
+from dvo.data.orientation import oriented
 from dvo.data.reduction import Reduction
 from dvo.errors import DvoError
 
@@ -72,12 +73,14 @@ def to_rgb8(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image[..., 2::-1])
 
 
-def read_image(path: Path, reduction: Reduction | None = None) -> np.ndarray | None:
-    """Decode an image file. EXIF orientation is not applied.
+def read_image(path: Path, reduction: Reduction | None = None, orientation: int = 1) -> np.ndarray | None:
+    """Decode an image file.
 
     Args:
         path: the file.
-        reduction: of the image; None for none.
+        reduction: of the image, after it is turned; None for none.
+        orientation: by which it is turned, see :func:`dvo.data.orientation.oriented`; that of its own EXIF data is not
+            looked at.
 
     Returns:
         ``(H, W, 3)`` uint8 RGB, or None if the file is missing, corrupt or cut short.
@@ -86,7 +89,7 @@ def read_image(path: Path, reduction: Reduction | None = None) -> np.ndarray | N
         DvoError: an image of more than :data:`dvo.data.image_header.MAX_PIXELS`, or a readable one with pixels that
             are no colours (float).
     """
-    image = decode(path, reduction)
+    image = decode(path, reduction, orientation)
     if image is None:
         return None
     try:
@@ -95,12 +98,12 @@ def read_image(path: Path, reduction: Reduction | None = None) -> np.ndarray | N
         raise DvoError(error.message, file=path, remedy=error.remedy) from None
 
 
-def decode(path: Path, reduction: Reduction | None = None) -> np.ndarray | None:
+def decode(path: Path, reduction: Reduction | None = None, orientation: int = 1) -> np.ndarray | None:
     """Decode an image file as it is; its size is taken from the header before.
 
     Args:
         path: the file.
-        reduction: of the image; None for none.
+        reduction, orientation: as :func:`read_image`.
 
     Returns:
         ``(H, W)`` or ``(H, W, C)`` in OpenCV's order of channels; None if the file is missing, no regular file, of an
@@ -110,16 +113,18 @@ def decode(path: Path, reduction: Reduction | None = None) -> np.ndarray | None:
         DvoError: an image of more than :data:`dvo.data.image_header.MAX_PIXELS`.
     """
     data = read_image_file(path)
-    return None if data is None else decode_bytes(data, path, reduction)
+    return None if data is None else decode_bytes(data, path, reduction, orientation)
 
 
-def decode_bytes(data: bytes, name: object, reduction: Reduction | None = None) -> np.ndarray | None:
+def decode_bytes(
+    data: bytes, name: object, reduction: Reduction | None = None, orientation: int = 1
+) -> np.ndarray | None:
     """Decode the bytes of an image file; see :func:`decode`.
 
     Args:
         data: the file.
         name: of it, for messages.
-        reduction: as :func:`decode`.
+        reduction, orientation: as :func:`read_image`.
 
     Returns:
         As :func:`decode`.
@@ -139,7 +144,8 @@ def decode_bytes(data: bytes, name: object, reduction: Reduction | None = None) 
             f"image of {size[0]}x{size[1]} pixels, more than {MAX_PIXELS:,}", file=name, remedy="reduce the images"
         )
     mode = cv2.IMREAD_UNCHANGED
-    if reduction is not None and reduction.is_exact and reduction.recorded == size and data.startswith(b"\xff\xd8"):
+    upright = size[::-1] if orientation > 4 else size
+    if reduction is not None and reduction.is_exact and reduction.recorded == upright and data.startswith(b"\xff\xd8"):
         mode = _reduced_modes().get(reduction.factor, mode)  # the decoder of JPEG files does less work then
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
@@ -147,6 +153,7 @@ def decode_bytes(data: bytes, name: object, reduction: Reduction | None = None) 
         return None
     if image is None or image.size == 0:
         return None
+    image = oriented(image, orientation)
     return image if reduction is None else reduction(image)
 
 

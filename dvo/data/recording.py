@@ -16,6 +16,7 @@ from dvo.data.depth import read_depth
 from dvo.data.frame import InertialSamples
 from dvo.data.images import read_image
 from dvo.data.interval import Interval
+from dvo.data.orientation import common_orientation, turn
 from dvo.data.reduction import Reduction
 from dvo.data.sensors import Sensors, StereoRig
 from dvo.data.trajectory import Trajectory
@@ -177,6 +178,8 @@ class ImageRecording:
     Attributes:
         interval: that is read, see :func:`dvo.data.interval.limit`.
         reduction: of the images, see :func:`dvo.data.reduction.reduce_images`.
+        orientation: of EXIF, by which all images are turned; 1 (as stored) if they do not agree, or if the data set has
+            depth or right images.
 
     Raises:
         DvoError: no images, or times that are not finite.
@@ -218,6 +221,8 @@ class ImageRecording:
         self.images = [image for image, keep in zip(images, later, strict=True) if keep]
         self.timestamps = np.asarray(timestamps, dtype=np.float64)[later]
         self.frame_count: int | None = len(self.images)
+        has_others = self.sensors.depth is not None or self.sensors.right is not None
+        self.orientation = 1 if has_others else common_orientation(self.images, self.warnings)
 
     @property
     def stereo(self) -> Callable[[], StereoRig | None] | None:
@@ -228,6 +233,11 @@ class ImageRecording:
     def inertial(self) -> Callable[[], InertialSamples] | None:
         """Reads all inertial samples, if there are any."""
         return self.sensors.inertial
+
+    @property
+    def turned(self) -> int:
+        """Degrees clockwise by which images are turned to stand upright, as their EXIF data ask for."""
+        return turn(self.orientation)
 
     def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
         """See :class:`Recording`."""
@@ -250,7 +260,7 @@ class ImageRecording:
             The frame, or None if its image is corrupt.
         """
         file = self.images[index]
-        image = read_image(file, self.reduction)
+        image = read_image(file, self.reduction, self.orientation)
         if image is None:
             return None
         depth = partial(self._depth, file, log) if self.sensors.depth else None
@@ -266,7 +276,7 @@ class ImageRecording:
 
     def _right(self, image: Path, log: Log) -> np.ndarray | None:
         file = self.sensors.right(image) if self.sensors.right else None
-        right = read_image(file) if file else None
+        right = read_image(file, None, self.orientation) if file else None
         if file and right is None:
             log.without.append(file.name)
         return right

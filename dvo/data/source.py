@@ -50,7 +50,7 @@ class Source:
         masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
         depth_calibration: of depth images that are not registered to the images; None for others.
-        turned: degrees by which the frames of a video are turned to stand upright, as the file asks for.
+        turned: degrees clockwise by which frames are turned to stand upright, as a video or EXIF data ask for.
         stride: every how many-th frame is read.
         frame_count: frames to expect, the stride taken into account; None if a video does not say. A video's header may
             promise more than can be read.
@@ -324,7 +324,8 @@ def open_source(
     doubts = calibration.doubts(width, height)
     if turned and calibration.readout:  # rows of the images are columns of the sensor, or come in reverse order
         calibration = replace(calibration, readout=0.0)
-        doubts.append(f"the video is turned by {turned} degrees: the readout of the calibration was not used")
+        what = "images are" if isinstance(recording, ImageRecording) else "video is"
+        doubts.append(f"the {what} turned by {turned} degrees: the readout of the calibration was not used")
     camera = calibration.camera(width, height)
     reduction = reduce_images(recording, width, height, max_pixels)
     size, masks = (width, height), None

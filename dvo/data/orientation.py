@@ -16,8 +16,8 @@ _CLOCKWISE = {1: 0, 2: 0, 3: 180, 4: 180, 5: 270, 6: 90, 7: 90, 8: 270}  # after
 def common_orientation(images: list[Path], warnings: list[str]) -> int:
     """Orientation of the images of a recording.
 
-    All are read only if the first, the middle or the last one is to be turned: a camera that changes its mind during a
-    recording sees no step in the images as the sensor read them, with one calibration for all.
+    The data of all images are read only if the first, the middle or the last one is to be turned. Where they differ
+    (the camera was turned while recording), images as stored have no jump between them and share one calibration.
 
     Args:
         images: files in order, at least one.

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from dvo.metrics import Metrics, evaluate
     from dvo.models.weights import load_model
     from dvo.nets.config import ModelConfig
-    from dvo.odometry.calibrate import SelfCalibration, calibrate
+    from dvo.odometry.calibrate import calibrate
+    from dvo.odometry.camera_estimate import SelfCalibration
     from dvo.odometry.config import TrackerConfig
     from dvo.odometry.load import load
     from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
@@ -56,7 +57,7 @@ _LAZY = {
     "ModelConfig": ("dvo.nets.config", "ModelConfig"),
     "Odometry": ("dvo.odometry.protocol", "Odometry"),
     "Result": ("dvo.odometry.protocol", "Result"),
-    "SelfCalibration": ("dvo.odometry.calibrate", "SelfCalibration"),
+    "SelfCalibration": ("dvo.odometry.camera_estimate", "SelfCalibration"),
     "Segment": ("dvo.odometry.protocol", "Segment"),
     "SparseMap": ("dvo.odometry.protocol", "SparseMap"),
     "Status": ("dvo.odometry.protocol", "Status"),

@@ -12,7 +12,7 @@ import dvo
 from dvo.cli import main
 from dvo.commands import calibrate as command
 from dvo.data.focal_guess import guess_from_angle
-from dvo.odometry.calibrate import SelfCalibration
+from dvo.odometry.camera_estimate import SelfCalibration
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import dvo
 from dvo.cli import main
 from dvo.commands import camera
 from dvo.data.focal_guess import guess_from_angle
-from dvo.odometry.calibrate import SelfCalibration
+from dvo.odometry.camera_estimate import SelfCalibration
 
 
 @pytest.fixture(autouse=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ import torch
 
 from dvo.commands.console import TrackingProgress, say, seed_everything, warn
 from dvo.data.source import Source
-from dvo.odometry.calibrate import SelfCalibration, calibrate, is_foreign
+from dvo.odometry.calibrate import calibrate
+from dvo.odometry.camera_estimate import SelfCalibration, is_foreign
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.tracker import PatchOdometry
 
@@ -71,6 +73,8 @@ def _announcement(source: Source) -> str:
 
 
 def _facts(found: SelfCalibration) -> dict[str, Any]:
-    size = [found.width, found.height]
+    size, c = [found.width, found.height], found.calibration
+    deviations = [value if math.isfinite(value) else None for value in found.aside_deviation]
+    centre = {"principal_point": [c.cx, c.cy], "principal_point_deviation": deviations}
     facts = {name: getattr(found, name) for name in ("focal", "deviation", "source", "frames", "reason")}
-    return {**facts, "image_size": size, "guess": asdict(found.guess)}
+    return {**facts, **centre, "image_size": size, "guess": asdict(found.guess)}

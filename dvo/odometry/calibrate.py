@@ -2,7 +2,8 @@
 
 The beginning of a clip is tracked with a guess of the focal length, which is then estimated from the measurements
 (:mod:`dvo.odometry.focal_length`); measurements made with a focal length far off are worse ones, so this is repeated
-with what was found. The motion may not tell the focal length; then the guess is kept, and the result says so.
+with what was found. The motion may not tell the focal length; then the guess is kept, and the result says so. The
+principal point is the middle of the image, unless the measurements tell it closely.
 """
 
 from __future__ import annotations
@@ -12,17 +13,15 @@ from collections.abc import Callable, Iterable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import islice, tee
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dvo.data.calibration import Calibration
-from dvo.data.focal_guess import FocalGuess, centred, guess_from_angle
+from dvo.data.focal_guess import FocalGuess, guess_from_angle
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.data.output import replaced
 from dvo.errors import DvoError
+from dvo.odometry.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
 from dvo.odometry.focal_length import FocalProfile, find_focal
 from dvo.odometry.load import load
 from dvo.odometry.protocol import Estimate, Odometry, Status
@@ -31,10 +30,6 @@ from dvo.settings import check_settings
 if TYPE_CHECKING:
     import torch
 
-SELF_CALIBRATED = "self-calibration"
-"""Source of a focal length that was found in the images."""
-
-_HEADER = "# focal length found by dvo; a run without a calibration replaces this file\n"
 _RANGES = {
     "frames": (3, 10**6),
     "rounds": (1, 100),
@@ -44,6 +39,7 @@ _RANGES = {
     "max_deviation": (0, 10),
     "inflation": (1, 1000),
     "floor": (0, 1),
+    "max_aside": (0, 1),
 }
 
 
@@ -55,12 +51,15 @@ class CalibrationOptions:
         frames: tracked frames that the focal length is estimated from. If they cannot tell it, twice as many are tried.
         rounds: times that they are tracked, at most.
         interval: seconds between frames, at least; of a faster camera frames are left out.
-        settled: change of the logarithm of the focal length in a round below which it has settled.
+        settled: change of the logarithm of the focal length in a round below which it has settled; the principal point
+            has, once it moves by less than ``max_aside``.
         min_contrast: increase of the cost at focal lengths a fifth off below which the motion does not tell.
         max_deviation: largest standard deviation of the logarithm of the focal length that is believed.
         inflation: factor of the standard deviation that the curvature of the cost gives; measurements of a patch in
             several frames share their errors.
-        floor: standard deviation, of the logarithm, of what is not modelled (distortion, principal point).
+        floor: standard deviation, of the logarithm, of what is not modelled (distortion).
+        max_aside: largest standard deviation of a coordinate of the principal point that is believed, in longer sides
+            of the image; otherwise it is the middle of the image, as with 0.
 
     Raises:
         DvoError: a value of another type or out of range.
@@ -74,82 +73,10 @@ class CalibrationOptions:
     max_deviation: float = 0.1
     inflation: float = 3.0
     floor: float = 0.02
+    max_aside: float = 0.005
 
     def __post_init__(self) -> None:
         check_settings(self, _RANGES)
-
-
-@dataclass(frozen=True)
-class SelfCalibration:
-    """Focal length of a camera without a calibration.
-
-    Attributes:
-        focal: fx and fy, pixels.
-        deviation: standard deviation, pixels, with the set factor and floor of :class:`CalibrationOptions`.
-        source: ``self-calibration``, or that of the guess that was kept (:class:`dvo.data.focal_guess.FocalGuess`).
-        width, height: of the images, pixels.
-        frames: number of frames that it was estimated from.
-        reason: cause for keeping the guess; empty for a focal length that was found.
-        guess: at the start.
-    """
-
-    focal: float
-    deviation: float
-    source: str
-    width: int
-    height: int
-    frames: int
-    reason: str
-    guess: FocalGuess
-
-    @property
-    def found(self) -> bool:
-        """True if the focal length was found in the images."""
-        return self.source == SELF_CALIBRATED
-
-    @property
-    def calibration(self) -> Calibration:
-        """Square pixels, principal point at the centre, no distortion."""
-        return centred(self.focal, self.width, self.height)
-
-    def __str__(self) -> str:
-        """Sentence for people."""
-        value = f"{self.focal:.0f} +- {self.deviation:.0f} px"
-        if self.found:
-            return f"focal length {value} (self-calibrated from {self.frames} frames)"
-        origin = {"prior": "the usual angle of view", "exif": "EXIF data", "video": "metadata of the video"}
-        return f"focal length: cannot tell ({self.reason}): keeps {value}, from {origin.get(self.source, self.source)}"
-
-    def write(self, file: Path | str) -> bool:
-        """Write a calibration file for the next run, unless a file that somebody else has written is in its place.
-
-        Args:
-            file: text file, ``fx fy cx cy``.
-
-        Returns:
-            Whether it was written.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        if is_foreign(Path(file)):
-            return False
-        c = self.calibration
-        with replaced(Path(file)) as part:
-            part.write_text(f"{_HEADER}# {self}\n{c.fx:.3f} {c.fy:.3f} {c.cx:.1f} {c.cy:.1f}\n", encoding="utf-8")
-        return True
-
-
-def is_foreign(file: Path) -> bool:
-    """True for a file that :meth:`SelfCalibration.write` has not written.
-
-    Args:
-        file: may be missing.
-    """
-    if not file.exists():
-        return False
-    with file.open("rb") as stream:
-        return stream.read(len(_HEADER)) != _HEADER.encode()
 
 
 def calibrate(
@@ -196,15 +123,17 @@ def calibrate(
     if guess is None:
         guess = getattr(frames, "guess", None) or guess_from_angle(width, height)
 
-    def result(focal: float, deviation: float, source: str, count: int, reason: str = "") -> SelfCalibration:
-        return SelfCalibration(focal, deviation, source, width, height, count, reason, guess)
+    def result(focal: float, deviation: float, source: str, count: int, *more: Any) -> SelfCalibration:
+        return SelfCalibration(focal, deviation, source, width, height, count, *more)
 
-    focal, wanted, reason, count = guess.focal, options.frames, "", 0
+    focal, aside, wanted, reason, count = guess.focal, (0.0, 0.0), options.frames, "", 0
     walk: list[tuple[float, float]] = []
     for number in range(options.rounds):
         odometry = load(weights, device=device, seed=seed, loops=False)
         clip = islice(_readable(frames if kept is None else copy(kept)), limit)
-        seen = _track(odometry, clip, focal * (first.camera.width / width), wanted, options.interval, on_frame)
+        ratio = first.camera.width / width
+        seen = _track(odometry, clip, focal * ratio, (aside[0] * ratio, aside[1] * ratio), wanted, options.interval,
+                      on_frame)  # fmt: skip
         profile, count = _profile(odometry)
         asked = [*walk, (math.log(focal), profile.minimum.value)]
         slope = _slope(asked)
@@ -215,15 +144,17 @@ def calibrate(
         if reason:
             if seen < wanted or wanted > options.frames or is_last:
                 break
-            focal, wanted, walk = guess.focal, 2 * wanted, []
+            focal, aside, wanted, walk = guess.focal, (0.0, 0.0), 2 * wanted, []
             continue
         walk = asked
+        before, (aside, unsure) = aside, _principal_point(profile, aside, focal, max(width, height), options)
         focal *= math.exp(step)
         if abs(step) > options.settled:  # the last round may end without having settled
             deviation = math.hypot(deviation, step)
-        if abs(step) <= options.settled or is_last:
-            return result(focal, deviation * focal, SELF_CALIBRATED, count)
-    return result(guess.focal, guess.deviation, guess.source, count, reason)
+        is_settled = abs(step) <= options.settled and math.dist(before, aside) <= options.max_aside * max(width, height)
+        if is_settled or is_last:
+            return result(focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure)
+    return result(guess.focal, guess.deviation, guess.source, count, reason, guess)
 
 
 def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -262,6 +193,7 @@ def _track(
     odometry: Odometry,
     frames: Iterable[Frame],
     focal: float,
+    aside: tuple[float, float],
     wanted: int,
     interval: float,
     on_frame: Callable[[Frame, Estimate | None], None] | None,
@@ -272,7 +204,7 @@ def _track(
         if frame.timestamp < last + interval:
             continue
         last, height, width = frame.timestamp, frame.camera.height, frame.camera.width
-        camera = replace(centred(focal, width, height), readout=frame.camera.readout).camera(width, height)
+        camera = replace(pinhole(focal, aside, width, height), readout=frame.camera.readout).camera(width, height)
         estimate = odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera, mask=frame.mask))
         if on_frame is not None:
             on_frame(frame, estimate)
@@ -297,6 +229,19 @@ def _profile(odometry: Odometry) -> tuple[FocalProfile, int]:
     readout = state.info.get("readout", 0.0)
     shutter = replace(state.shutter, readout=readout if isinstance(readout, float) else 0.0)
     return find_focal(graph, longest, shutter, odometry.config.adjustment), len(graph.members(longest))
+
+
+def _principal_point(
+    profile: FocalProfile, aside: tuple[float, float], focal: float, side: int, options: CalibrationOptions
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Way from the middle of the image to the principal point and its deviations, pixels; 0 and inf if not believed."""
+    found = []
+    for start, minimum in zip(aside, profile.aside, strict=True):
+        deviation = options.inflation * minimum.deviation * focal
+        sure = deviation <= options.max_aside * side
+        found.append((start + minimum.value * focal, deviation) if sure else (0.0, math.inf))
+    (x, dx), (y, dy) = found
+    return (x, y), (dx, dy)
 
 
 def _doubt(

@@ -11,10 +11,13 @@ from dvo.data import read_calibration
 from dvo.data.focal_guess import FocalGuess, guess_from_angle
 from dvo.errors import DvoError
 from dvo.odometry import calibrate as calibrate_module
-from dvo.odometry.calibrate import CalibrationOptions, SelfCalibration, _slope, calibrate
+from dvo.odometry.calibrate import CalibrationOptions, _slope, calibrate
+from dvo.odometry.camera_estimate import SelfCalibration
 from dvo.odometry.focal_length import FocalProfile
 from dvo.odometry.self_calibration import Minimum
 from dvo.synth.sequence import make_sequence
+
+FLAT = (Minimum(0.0, math.inf, 0.0),) * 2
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +41,29 @@ def test_the_focal_length_of_a_rendered_walk_is_found(clip, found):
     assert f"focal length {found.focal:.0f} +- {found.deviation:.0f} px (self-calibrated from" in str(found)
 
 
+def test_the_principal_point_is_told_where_the_measurements_tell_it(clip, found):
+    """That of the rendered camera lies 3 pixels from the middle of the image."""
+    camera, believed = clip[0].camera, CalibrationOptions().max_aside * 192
+    true = camera.cx - 95.5, camera.cy - 71.5
+    assert math.hypot(*true) > 2
+    assert 0 < found.aside_deviation[0] <= believed and abs(found.aside[0] - true[0]) < 1.0
+    for value, deviation, wanted in zip(found.aside, found.aside_deviation, true, strict=True):
+        assert value == 0 if math.isinf(deviation) else abs(value - wanted) < 3 * deviation
+    assert str(found).splitlines()[1].startswith(f"principal point cx {95.5 + found.aside[0]:.1f} +- ")
+
+
+def test_without_its_deviation_the_principal_point_is_the_middle(leaning):
+    sure, unsure = Minimum(0.02, 0.001, 0.1), Minimum(0.02, 0.01, 0.1)
+    guess = FocalGuess(200.0, 40.0, "prior", 192, 144)
+    found, tracked = leaning(1.0, guess, aside=(sure, unsure), rounds=2)
+    assert found.aside_deviation == (pytest.approx(3 * 0.001 * 200), math.inf) and len(tracked) == 2
+    assert found.aside == (pytest.approx(2 * 0.02 * 200), 0.0), "tracked again with what the first round found"
+    assert found.calibration.cx == pytest.approx(95.5 + 8.0) and found.calibration.cy == 71.5
+    assert str(found).splitlines()[1] == "principal point cx 103.5 +- 0.6 px, cy 71.5 px, the centre"
+    found, tracked = leaning(1.0, guess, aside=(sure, unsure), max_aside=0.0)
+    assert found.aside == (0.0, 0.0) and len(str(found).splitlines()) == 1 and len(tracked) == 1
+
+
 def test_the_same_seed_and_an_iterator_give_the_same_bytes(clip):
     options = CalibrationOptions(frames=20, rounds=1)
     assert calibrate(iter(clip), options=options) == calibrate(clip, options=options)
@@ -47,7 +73,8 @@ def test_the_file_for_the_next_run(tmp_path, found):
     file = tmp_path / "calib.txt"
     assert found.write(file) and found.write(file)
     camera = read_calibration(file).camera(192, 144)
-    assert camera.fx == camera.fy == pytest.approx(found.focal, abs=1e-3) and (camera.cx, camera.cy) == (95.5, 71.5)
+    assert camera.fx == camera.fy == pytest.approx(found.focal, abs=1e-3)
+    assert (camera.cx, camera.cy) == pytest.approx((95.5 + found.aside[0], 71.5 + found.aside[1]), abs=0.1)
     file.write_text("1 2 3 4\n")
     assert not found.write(file) and file.read_text() == "1 2 3 4\n"
 
@@ -66,7 +93,7 @@ def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(lean, rounds
 def leaning(clip, monkeypatch):
     """Calibration by measurements that ask for a share of the way to 200 px, the logarithm known to 1 %."""
 
-    def find(share, guess, **options):
+    def find(share, guess, aside=FLAT, **options):
         tracked = []
 
         def track(odometry, frames, focal, *rest):
@@ -75,7 +102,7 @@ def leaning(clip, monkeypatch):
 
         def profile(odometry):
             step = share * math.log(200 / tracked[-1])
-            return FocalProfile(Minimum(step, 0.01, 0.5), 0.5), 60
+            return FocalProfile(Minimum(step, 0.01, 0.5), 0.5, aside), 60
 
         monkeypatch.setattr(calibrate_module, "_track", track)
         monkeypatch.setattr(calibrate_module, "_profile", profile)

@@ -30,6 +30,7 @@ from dvo.settings import check_settings
 if TYPE_CHECKING:
     import torch
 
+_FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sides of the image, are not believed
 _RANGES = {
     "frames": (3, 10**6),
     "rounds": (1, 100),
@@ -238,8 +239,11 @@ def _principal_point(
     found = []
     for start, minimum in zip(aside, profile.aside, strict=True):
         deviation = options.inflation * minimum.deviation * focal
-        sure = deviation <= options.max_aside * side
-        found.append((start + minimum.value * focal, deviation) if sure else (0.0, math.inf))
+        offset = start + minimum.value * focal
+        sure = deviation <= options.max_aside * side and abs(offset) <= _FARTHEST_ASIDE * side
+        if abs(offset - start) > options.max_aside * side:  # the last round may end without having settled
+            deviation = math.hypot(deviation, offset - start)
+        found.append((offset, deviation) if sure else (0.0, math.inf))
     (x, dx), (y, dy) = found
     return (x, y), (dx, dy)
 

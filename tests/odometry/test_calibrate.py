@@ -41,11 +41,12 @@ def test_the_focal_length_of_a_rendered_walk_is_found(clip, found):
     assert f"focal length {found.focal:.0f} +- {found.deviation:.0f} px (self-calibrated from" in str(found)
 
 
-def test_the_principal_point_is_told_where_the_measurements_tell_it(clip, found):
+def test_the_principal_point_is_told_where_the_measurements_tell_it(clip):
     """That of the rendered camera lies 3 pixels from the middle of the image."""
     camera, believed = clip[0].camera, CalibrationOptions().max_aside * 192
     true = camera.cx - 95.5, camera.cy - 71.5
     assert math.hypot(*true) > 2
+    found = calibrate(clip, FocalGuess(camera.fx, 0.3 * camera.fx, "given", 192, 144), options=CalibrationOptions())
     assert 0 < found.aside_deviation[0] <= believed and abs(found.aside[0] - true[0]) < 1.0
     for value, deviation, wanted in zip(found.aside, found.aside_deviation, true, strict=True):
         assert value == 0 if math.isinf(deviation) else abs(value - wanted) < 3 * deviation
@@ -56,10 +57,14 @@ def test_without_its_deviation_the_principal_point_is_the_middle(leaning):
     sure, unsure = Minimum(0.02, 0.001, 0.1), Minimum(0.02, 0.01, 0.1)
     guess = FocalGuess(200.0, 40.0, "prior", 192, 144)
     found, tracked = leaning(1.0, guess, aside=(sure, unsure), rounds=2)
-    assert found.aside_deviation == (pytest.approx(3 * 0.001 * 200), math.inf) and len(tracked) == 2
+    assert found.aside_deviation == (pytest.approx(math.hypot(0.6, 4.0)), math.inf) and len(tracked) == 2
     assert found.aside == (pytest.approx(2 * 0.02 * 200), 0.0), "tracked again with what the first round found"
     assert found.calibration.cx == pytest.approx(95.5 + 8.0) and found.calibration.cy == 71.5
-    assert str(found).splitlines()[1] == "principal point cx 103.5 +- 0.6 px, cy 71.5 px, the centre"
+    assert str(found).splitlines()[1] == "principal point cx 103.5 +- 4.0 px, cy 71.5 px, the centre"
+    last, _ = leaning(1.0, guess, aside=(sure, unsure), rounds=1)
+    assert last.aside_deviation[0] == pytest.approx(math.hypot(0.6, 4.0)), "it has not settled"
+    far, _ = leaning(1.0, guess, aside=(replace(sure, value=0.11), unsure), rounds=1)
+    assert far.found and far.aside == (0.0, 0.0), "22 of 192 pixels are hardly possible"
     found, tracked = leaning(1.0, guess, aside=(sure, unsure), max_aside=0.0)
     assert found.aside == (0.0, 0.0) and len(str(found).splitlines()) == 1 and len(tracked) == 1
 

@@ -104,13 +104,19 @@ def test_owner_of_a_phone_who_mistypes(shell):
     assert names(shell.folder) == ["configs", "video.mp4"]
 
 
-@pytest.mark.slow
-def test_owner_of_a_real_phone(shell, data_root):
-    """A desk, 45 frames, without a calibration or a ground truth."""
+@pytest.fixture
+def desk(data_root: Path) -> Path:
+    """Images of a real phone that goes round a desk and back to its start."""
     images = data_root / "phone_desk_198" / "images"
     if not images.is_dir():
         pytest.skip(f"no {images}")
-    said = shell.type(f"dvo run '{images}' --fps 9.4 --end 45f --out desk")
+    return images
+
+
+@pytest.mark.slow
+def test_owner_of_a_real_phone(shell, desk):
+    """A desk, 45 frames, without a calibration or a ground truth."""
+    said = shell.type(f"dvo run '{desk}' --fps 9.4 --end 45f --out desk")
     written = summary(shell.folder / "desk")
     assert written["frames"]["fed"] == 45 and written["frames"]["tracked"] >= 30 and written["map_points"] > 100
     told = written["self_calibration"]
@@ -121,12 +127,9 @@ def test_owner_of_a_real_phone(shell, data_root):
 
 
 @pytest.mark.slow
-def test_a_phone_that_comes_back_to_its_start(shell, data_root):
+def test_a_phone_that_comes_back_to_its_start(shell, desk):
     """The whole clip, without a calibration and without loops: from the last pose to the first is 1.5 % of the path."""
-    images = data_root / "phone_desk_198" / "images"
-    if not images.is_dir():
-        pytest.skip(f"no {images}")
-    said = shell.type(f"dvo run '{images}' --fps 9.4 --no-loops --out desk")
+    said = shell.type(f"dvo run '{desk}' --fps 9.4 --no-loops --out desk")
     assert FOCAL.search(said.out) and len(summary(shell.folder / "desk")["segments"]) == 1
     positions = read_tum(shell.folder / "desk" / "trajectory.txt").positions
     assert len(positions) == 198

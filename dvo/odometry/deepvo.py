@@ -17,6 +17,7 @@ from dvo.models.deepvo import DeepVO, RecurrentState, step_pose
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.config import with_changes
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
+from dvo.odometry.exclusive import exclusive
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.reset import start_again
@@ -51,6 +52,7 @@ class RegressionConfig:
         check_settings(self, _RANGES)
 
 
+@exclusive
 class DeepVOOdometry:
     """Odometry of one sequence with :class:`dvo.models.deepvo.DeepVO`.
 

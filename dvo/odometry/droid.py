@@ -27,6 +27,7 @@ from dvo.odometry.dense_mapper import DenseMapper, View
 from dvo.odometry.depth_maps import depth_maps, fused
 from dvo.odometry.droid_config import PRESETS, DenseConfig
 from dvo.odometry.evidence import NO_MATCH, missing_content
+from dvo.odometry.exclusive import exclusive
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.reset import start_again
@@ -35,8 +36,7 @@ from dvo.odometry.working_image import working_image
 from dvo.settings import check_seed
 
 _WITH_FEATURES = 32  # frames without a pose whose features are kept until the initialisation
-NOT_INITIALISED = "not initialised"
-"""Reason of a loss of frames whose segment ended before its keyframes agreed with each other."""
+_NOT_INITIALISED = "not initialised"  # reason of a loss: the segment ended before its keyframes agreed with each other
 
 
 def droid_odometry(
@@ -82,6 +82,7 @@ class _Waiting:
     view: View
 
 
+@exclusive
 class DroidOdometry:
     """Odometry of one sequence with :class:`dvo.models.droid.DroidVO`.
 
@@ -336,15 +337,14 @@ class DroidOdometry:
         used = mapper.ready
         mapper.close(self._segment)
         self._segment += used
-        self._recent, self._waiting, self._failures = [], [], 0
-        self._interrupted = ""
+        self._recent, self._waiting, self._failures, self._interrupted = [], [], 0, ""
 
     def _give_up(self) -> None:
         """Lose the frames of keyframes that do not agree with each other."""
         for keyframe in list(self.mapper.window.keyframes):
-            self.log.lose(keyframe.number, NOT_INITIALISED)
+            self.log.lose(keyframe.number, _NOT_INITIALISED)
         for waiting in self._waiting:
             record = self.log.frames[waiting.frame]
-            record.lost, record.reason = True, NOT_INITIALISED
+            record.lost, record.reason = True, _NOT_INITIALISED
         self._waiting = []
         self.mapper.discard()

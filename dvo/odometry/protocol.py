@@ -224,8 +224,9 @@ class Result:
 class Odometry(Protocol):
     """Interface of a streaming visual odometry. One object tracks one sequence.
 
-    An object is used by one thread at a time, unless its class says otherwise; :class:`dvo.data.live.LiveFrames` takes
-    what arrives in another one. Estimates and results may be read in any thread.
+    An object is used by one thread at a time, unless its class is :func:`dvo.odometry.exclusive.exclusive`, as those of
+    the networks of this package are; :class:`dvo.data.live.LiveFrames` takes what arrives in another one. Estimates and
+    results may be read in any thread.
 
     Attributes:
         name: of the system, in reports.

@@ -25,6 +25,7 @@ from dvo.models.weights import LoadedWeights
 from dvo.odometry.config import with_changes
 from dvo.odometry.epipolar_refinement import refine_motion
 from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
+from dvo.odometry.exclusive import exclusive
 from dvo.odometry.flow_reliability import flow_weights
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
@@ -142,6 +143,7 @@ class _View:
     motion: Tensor | None = None  # (7,) of the frame in the coordinates of the one before it, without a length
 
 
+@exclusive
 class TartanOdometry:
     """Odometry of one sequence with :class:`dvo.models.tartanvo.TartanVO`.
 

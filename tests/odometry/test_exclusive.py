@@ -1,14 +1,16 @@
 """Calls of an odometry from another thread, while a frame is tracked."""
 
+import sys
 import threading
 
 import numpy as np
+import pytest
 
 import dvo
 from dvo.odometry.exclusive import METHODS, exclusive
 from dvo.odometry.load import build_odometry
 from dvo.odometry.tracker import PatchOdometry
-from tests.odometry.test_reset import SETTINGS, frames, network
+from tests.odometry.test_reset import MEMBERS, SETTINGS, frames, network
 
 SOON = 0.3  # seconds in which a call that does not wait is done
 
@@ -66,9 +68,33 @@ def test_a_new_beginning_waits_for_the_frame():
     assert odometry.current().frames_read == 1, "of the frame after it"
 
 
-def test_every_public_method_is_exclusive():
-    public = {name for name, value in vars(PatchOdometry).items() if callable(value) and not name.startswith("_")}
-    assert public == set(METHODS)
+@pytest.mark.parametrize("member", MEMBERS)
+def test_every_odometry_finishes_a_frame_first(member, monkeypatch):
+    odometry = build_odometry(network(member), **SETTINGS.get(member, {}))
+    images, waited, counts = frames(3), [], []
+    thread = threading.Thread(target=lambda: counts.append(odometry.current().frames_read))
+    module = sys.modules[type(odometry).__module__]
+    check = module.checked_frame
+
+    def interrupted(frame):
+        if frame is images[2]:
+            thread.start()
+            thread.join(SOON)
+            waited.append(thread.is_alive())
+        return check(frame)
+
+    monkeypatch.setattr(module, "checked_frame", interrupted)
+    for frame in images[:3]:
+        odometry.track(frame)
+    thread.join()
+    assert waited == [True] and counts == [3]
+
+
+@pytest.mark.parametrize("member", MEMBERS)
+def test_every_public_method_is_exclusive(member):
+    cls = type(build_odometry(network(member), **SETTINGS.get(member, {})))
+    public = {name for name, value in vars(cls).items() if callable(value) and not name.startswith("_")}
+    assert public <= set(METHODS) and {"track", "finish", "current", "reset"} <= public
 
 
 def test_two_objects_do_not_wait_for_each_other():

@@ -1,4 +1,8 @@
-"""Measured depths of a graph as arrays, and back; a file of a graph without them has none of these arrays."""
+"""Measured depths of a graph, and slopes of surfaces, as arrays, and back; without any a file has none of these arrays.
+
+Slopes are those of the window alone: measurements of archived patches are not aligned again. Files that were written
+before there were slopes have none.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,10 @@ import torch
 
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.map_file import MapReader
+
+STEEPEST = 1e3
+"""Slope of a surface above which a file is refused, 1 / feature pixel."""
+_SLOPES = "window/slopes"
 
 
 def has_measured(graph: KeyframeGraph) -> bool:
@@ -19,7 +27,7 @@ def has_measured(graph: KeyframeGraph) -> bool:
 
 
 def measured_arrays(graph: KeyframeGraph) -> dict[str, np.ndarray]:
-    """Measured depths as arrays.
+    """Measured depths and slopes as arrays.
 
     Args:
         graph: any.
@@ -35,11 +43,13 @@ def measured_arrays(graph: KeyframeGraph) -> dict[str, np.ndarray]:
         there = [value for value in values if value is not None]
         arrays[f"{name}/has_measured"] = np.array([value is not None for value in values], np.uint8)
         arrays[f"{name}/measured"] = np.stack(there).astype(np.float32) if there else np.zeros((0, m, 2), np.float32)
+    if graph.window.slopes is not None:
+        arrays[_SLOPES] = graph.window.slopes.reshape(-1, m, 2).float().cpu().numpy()
     return arrays
 
 
 def read_measured(source: MapReader, graph: KeyframeGraph, measured: bool, metric: tuple[tuple[int, str], ...]) -> None:
-    """Give the keyframes of a graph their measured depths, and its worlds their scales.
+    """Give the keyframes of a graph their measured depths and slopes, and its worlds their scales.
 
     Args:
         source: map file, with :func:`measured_arrays` if there are measured depths.
@@ -62,6 +72,10 @@ def read_measured(source: MapReader, graph: KeyframeGraph, measured: bool, metri
             graph.archive.set_measured(frame.identifier, values)
     for kept, values in zip(graph.window.frames, _read(source, "window", len(graph.window), m), strict=True):
         kept.measured = None if values is None else torch.from_numpy(values).to(device)
+    if source.has(_SLOPES):
+        slopes = source.array(_SLOPES, np.float32, (len(graph.window), m, 2), -STEEPEST, STEEPEST)
+        for kept, values in zip(graph.window.frames, slopes, strict=True):
+            kept.slopes = torch.from_numpy(values.copy()).to(device)
 
 
 def _read(source: MapReader, name: str, count: int, per_frame: int) -> list[np.ndarray | None]:

@@ -38,6 +38,8 @@ class Keyframe:
         visible: ``(h, w)`` bool, pixels of its feature map that measurements may lie in, None for all.
         measured: ``(M, 2)`` inverse depths (1/m) of its patches by a depth camera, and their weights in bundle
             adjustment, both 0 for a patch without one; None if no depth camera is used.
+        slopes: ``(M, 2)`` derivatives of the inverse depth by x and y, over the inverse depth, of the surfaces of its
+            patches, 1 / feature-map pixel; 0 where the surface is not known; None: that of no patch is.
     """
 
     identifier: int
@@ -51,6 +53,7 @@ class Keyframe:
     fine: Tensor | None = None
     visible: Tensor | None = None
     measured: Tensor | None = None
+    slopes: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -156,10 +159,19 @@ class Window:
     @property
     def measured(self) -> Tensor | None:
         """``(n * M, 2)`` measured inverse depths and weights, see :class:`Keyframe`; None if no frame has any."""
-        if all(frame.measured is None for frame in self.frames):
+        return self._of_patches([frame.measured for frame in self.frames])
+
+    @property
+    def slopes(self) -> Tensor | None:
+        """``(n * M, 2)`` slopes of the surfaces of the patches, see :class:`Keyframe`; None if no frame has any."""
+        return self._of_patches([frame.slopes for frame in self.frames])
+
+    def _of_patches(self, values: list[Tensor | None]) -> Tensor | None:
+        """Values ``(M, 2)`` of each frame one after the other, with 0 for a frame without; None if no frame has any."""
+        if all(value is None for value in values):
             return None
         none = self.poses_cw.new_zeros(self.per_frame, 2)
-        return torch.cat([none if frame.measured is None else frame.measured for frame in self.frames])
+        return torch.cat([none if value is None else value for value in values])
 
     @property
     def map_slots(self) -> Tensor:

@@ -112,11 +112,14 @@ def sample_images_plain(
     return above * (1 - v) + below * v
 
 
-def patch_warps(coords: Float[Tensor, "E p p 2"]) -> Float[Tensor, "E 2 2"]:
+def patch_warps(
+    coords: Float[Tensor, "E p p 2"], tilts: Float[Tensor, "E 2 2"] | None = None
+) -> Float[Tensor, "E 2 2"]:
     """Affine warps of patches from their reprojected pixels.
 
     Args:
-        coords: reprojection of the pixels of each patch, ``p`` at least 3.
+        coords: reprojection of the pixels of each patch, all at the depth of its centre, ``p`` at least 3.
+        tilts: what the slopes of the surfaces add to the derivatives; None for surfaces of constant depth.
 
     Returns:
         Derivative of the position in the target frame by the position in the patch; the identity where a patch is
@@ -126,6 +129,7 @@ def patch_warps(coords: Float[Tensor, "E p p 2"]) -> Float[Tensor, "E 2 2"]:
     c, last = p // 2, p - 1
     columns = (coords[:, c, last] - coords[:, c, 0], coords[:, last, c] - coords[:, 0, c])
     warps = torch.stack(columns, -1) / last
+    warps = warps if tilts is None else warps + tilts
     area = torch.linalg.det(warps)
     good = torch.isfinite(area) & (area > _SCALES[0]) & (area < _SCALES[1])
     return torch.where(good[:, None, None], warps, torch.eye(2, dtype=warps.dtype, device=warps.device))

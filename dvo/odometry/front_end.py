@@ -36,6 +36,7 @@ class Observation:
         visible: ``(h, w)`` bool, pixels of the feature map that a measurement may lie in; None: all.
         measured: ``(M, 2)`` inverse depths of the patches by a depth camera (1/m) and their weights in bundle
             adjustment, both 0 for a patch without one; None if depth is not used.
+        slopes: ``(M, 2)`` of the surfaces of the patches, see :class:`dvo.graph.window.Keyframe`; None: not known.
     """
 
     image: np.ndarray
@@ -50,6 +51,7 @@ class Observation:
     fine: Tensor | None = None
     visible: Tensor | None = None
     measured: Tensor | None = None
+    slopes: Tensor | None = None
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -81,7 +83,7 @@ def keyframe_of(view: View, identifier: int, map_slot: int) -> Keyframe:
         The keyframe.
     """
     s = view.seen
-    features = s.matching, s.context, s.colors, s.intrinsics, s.image, s.fine, s.visible, s.measured
+    features = s.matching, s.context, s.colors, s.intrinsics, s.image, s.fine, s.visible, s.measured, s.slopes
     return Keyframe(identifier, view.records[0].timestamp, map_slot, *features)
 
 

@@ -25,6 +25,9 @@ from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.scale_options import ScaleOptions
 
 _FEWEST = 20  # measured depths that a world needs
+_SYSTEMATIC = (
+    0.01  # relative error of the scale that all measured depths of a recording share, see docs/metric_scale.md
+)
 
 
 @dataclass(frozen=True)
@@ -129,9 +132,9 @@ def scale_of_depths(frames: Sequence[ArchivedKeyframe]) -> ObservedScale:
         frames: archived keyframes of one world.
 
     Returns:
-        Factor 1. Its standard deviation is that of the mean over the keyframes: the depths of one frame share the
-        errors of its registration, and count as one observation. An error that all depths share, as that of the
-        calibration of the depth camera, is not in it.
+        Factor 1. Its standard deviation is that of the mean over the keyframes, where the depths of one frame share the
+        errors of its registration, and count as one observation; and of 1 % that all depths share, as by the
+        calibration of the cameras.
     """
     logs = [
         np.log(metres_of_unit(f.inverse_depth.astype(np.float64), f.measured.astype(np.float64)))
@@ -144,7 +147,7 @@ def scale_of_depths(frames: Sequence[ArchivedKeyframe]) -> ObservedScale:
         return ObservedScale(math.nan, observations=count, problem=f"too few measured depths: {count}")
     medians = np.array([np.median(values) for values in logs])
     spread = 1.4826 * float(np.median(np.abs(medians - np.median(medians))))
-    return ObservedScale(1.0, spread / math.sqrt(len(medians)), count)
+    return ObservedScale(1.0, math.hypot(spread / math.sqrt(len(medians)), _SYSTEMATIC), count)
 
 
 def scale_of_distances(trajectory: Trajectory, distances: Sequence[tuple[float, float, float]]) -> ObservedScale:

@@ -12,6 +12,7 @@ from dvo.data.image_header import MAX_PIXELS
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.graph.map_file import MapReader
+from dvo.graph.measured_arrays import STEEPEST
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.frame_sequence import RECENT
 from dvo.odometry.front_end import View, encode_image, observe
@@ -242,10 +243,14 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
     if source.has("waiting/visible"):  # of frames with masks
         shape = n, size[0] // c.STRIDE, size[1] // c.STRIDE
         visible = torch.from_numpy(source.array("waiting/visible", np.uint8, shape, 0, 1) > 0).to(odometry.device)
-    measured = None
+    measured = slopes = None
     if odometry.config.scale.measures:
-        values = source.array("waiting/measured", np.float32, (n, odometry.config.patches, 2), 0, 1e12)
-        measured = torch.from_numpy(values).to(odometry.device)
+        shape = n, odometry.config.patches, 2
+        measured = torch.from_numpy(source.array("waiting/measured", np.float32, shape, 0, 1e12)).to(odometry.device)
+        slopes = torch.zeros_like(measured)
+        if source.has("waiting/slopes"):  # not in older files
+            values = source.array("waiting/slopes", np.float32, shape, -STEEPEST, STEEPEST)
+            slopes = torch.from_numpy(values).to(odometry.device)
     for k, view in enumerate(table.waiting):
         try:
             fx, fy, cx, cy = intrinsics[k].tolist()
@@ -255,7 +260,8 @@ def _restore_waiting(source: MapReader, odometry: PatchOdometry, table: TrackerT
         known = torch.from_numpy(centres[k])[None, None].to(odometry.device)
         seen = observe(odometry.model, images[k], camera, odometry.select, odometry.device, known)
         seen = seen if visible is None else replace(seen, visible=visible[k])
-        seen = seen if measured is None else replace(seen, measured=measured[k])
+        if measured is not None and slopes is not None:
+            seen = replace(seen, measured=measured[k], slopes=slopes[k])
         odometry.state.waiting.append(View([records[number] for number in view], seen))
 
 

@@ -159,6 +159,7 @@ def _tracker_arrays(odometry: PatchOdometry) -> dict[str, np.ndarray]:
         arrays["waiting/intrinsics"] = np.stack([seen.image_intrinsics for seen in views]).astype(np.float64)
         if odometry.config.scale.measures:
             arrays["waiting/measured"] = np.stack([np.asarray(seen.measured, np.float32) for seen in views])
+            arrays["waiting/slopes"] = np.stack([np.asarray(seen.slopes, np.float32) for seen in views])
         arrays["waiting/centres"] = np.stack([seen.centres[0, 0].cpu().numpy() for seen in views])
         if any(seen.visible is not None for seen in views):
             every = torch.ones(views[0].maps.shape[-2:], dtype=torch.bool)

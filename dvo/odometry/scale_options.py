@@ -48,11 +48,11 @@ class ScaleOptions:
     """
 
     depth: bool = False
-    depth_error: float = 0.02
+    depth_error: float = 0.01
     depth_base: float = 0.0012
     depth_quadratic: float = 0.0019
     stereo: bool = False
-    stereo_error: float = 0.02
+    stereo_error: float = 0.01
     height: float = 0.0
     tilt: float = 30.0
     distances: tuple[tuple[float, float, float], ...] = ()

@@ -3,10 +3,11 @@
 An edge from a patch into the right image is measured as any other edge of the tracker: the patch is reprojected,
 correlated there, and revised by the update operator, several times. The pose of the right camera is known, so that the
 inverse depth alone is fitted. Its start is the best match of the features of the patch along its epipolar line. The
-measurement then enters bundle adjustment as the factor that it is: ``w (u(d) - u_measured)^2`` with the confidence
-``w`` of the network, linear in the inverse depth ``d`` for parallel cameras, is the prior ``w |du/dd|^2 (d -
-d_measured)^2``. Patches whose match is not confident, does not lie on the epipolar line, or tells nothing about the
-depth have none.
+sub-pixel alignment that follows finds the slopes of the surface too (:mod:`dvo.nets.slopes`), which every later
+alignment of the patch uses. The measurement then enters bundle adjustment as the factor that it is: ``w (u(d) -
+u_measured)^2`` with the confidence ``w`` of the network, linear in the inverse depth ``d`` for parallel cameras, is the
+prior ``w |du/dd|^2 (d - d_measured)^2``. Patches whose match is not confident, does not lie on the epipolar line, or
+tells nothing about the depth have none.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ _SPACING = 0.5  # of the matches that are tried, feature pixels
 _WIDEST = 0.4  # largest disparity that is tried, in widths of the image
 _RESIDUAL = 0.06  # distance from the epipolar line above which a patch has none, feature pixels
 _RELATIVE = 0.3  # standard deviation relative to the inverse depth above which a patch has none
+_SLOPE = 0.03  # standard deviation of the slopes of surfaces before anything is measured, 1 / feature pixel
+_STEEPEST = 0.3  # largest slope that is taken
+_ROUNDS = 2  # alignments that the slopes are found from, each with those of the one before
 _NEAREST = 0.2  # metres; bundle adjustment leaves out points that are nearer (dvo.ba.layer)
 
 
@@ -52,12 +56,14 @@ class StereoMatches:
             :data:`dvo.odometry.depth_factor.SIGMA`.
         residual: ``(M,)`` distance of the measurement from the epipolar line, feature pixels.
         found: ``(M,)`` bool, the measurement lies in the image and its alignment was accepted.
+        slopes: ``(M, 2)`` of the surfaces, see :class:`dvo.graph.window.Keyframe`.
     """
 
     inverse_depth: Tensor
     weight: Tensor
     residual: Tensor
     found: Tensor
+    slopes: Tensor
 
     @property
     def good(self) -> Tensor:
@@ -77,18 +83,19 @@ def measure_stereo(model: PatchVO, seen: Observation, frame: Frame, config: Trac
         config: of the tracker: alignment and kernel.
 
     Returns:
-        The observation with ``measured``, of zeros for a frame without a right image.
+        The observation with ``measured`` and ``slopes``, of zeros for a frame without a right image.
 
     Raises:
         DvoError: a right image that cannot be used, see :func:`dvo.odometry.right_view.right_view`.
     """
     view = right_view(frame, seen.image.shape[1], seen.image.shape[0])
-    measured = seen.intrinsics.new_zeros(seen.centres.shape[2], 2)
+    measured = slopes = seen.intrinsics.new_zeros(seen.centres.shape[2], 2)
     if view is not None:
         found = match_right(model, seen, view, config)
         values = torch.stack([found.inverse_depth, found.weight], 1).to(measured)
         measured = torch.where(found.good[:, None], values, measured)
-    return replace(seen, measured=measured)
+        slopes = torch.where(found.good[:, None], found.slopes.to(measured), slopes)
+    return replace(seen, measured=measured, slopes=slopes)
 
 
 def match_right(model: PatchVO, seen: Observation, view: RightView, config: TrackerConfig) -> StereoMatches:
@@ -112,7 +119,7 @@ def match_right(model: PatchVO, seen: Observation, view: RightView, config: Trac
     step = _pair(model, seen, features, view.image, intrinsics, pose, depth, config)
     for _ in range(_UPDATES):
         step(StepOptions(mode="structure", fixed=2, damping=damping_at(COLD_UPDATES)))
-    step.finalise(torch.arange(len(step.window.kk), device=device))
+    _find_slopes(step)
     return _fitted(step.window, seen.bounds, config.scale.stereo_error)
 
 
@@ -207,6 +214,25 @@ def _pair(
     return step
 
 
+def _find_slopes(step: WindowStep) -> None:
+    """Align the edges of a pair, with the slopes of the surfaces that fit the grey levels best."""
+    window, align = step.window, step.align
+    assert align is not None
+    edges, before = torch.arange(len(window.kk), device=window.kk.device), (window.targets, window.weights)
+    frame, slopes = window.frames[0], window.poses_cw.new_zeros(window.per_frame, 2)
+    for _ in range(_ROUNDS):  # each patch has one edge
+        frame.slopes = slopes
+        window.targets, window.weights = before
+        align.finalise(edges)
+        found = align.slope_equations(edges)
+        matrix = found.matrix + torch.eye(2).to(slopes) / _SLOPE**2
+        change = torch.linalg.solve(matrix, found.vector - slopes / _SLOPE**2)
+        slopes = (slopes + change).clamp(-_STEEPEST, _STEEPEST)
+    frame.slopes = slopes
+    window.targets, window.weights = before
+    align.finalise(edges)
+
+
 def _fitted(window: Window, bounds: tuple[int, int], deviation: float) -> StereoMatches:
     """Fit the inverse depths to the measurements of a pair, of the given standard deviation in feature pixels."""
     patches, middle = window.patches[: window.per_frame], window.patches.shape[-1] // 2
@@ -221,4 +247,6 @@ def _fitted(window: Window, bounds: tuple[int, int], deviation: float) -> Stereo
     off = (residual - slope * delta[:, None]).norm(dim=-1)
     aligned = (window.weights > window.confidence).any(-1)
     known = aligned & _inside(window.targets, *bounds) & found.valid[0, :, middle, middle]
-    return StereoMatches(patches[:, 2, middle, middle], (SIGMA / deviation) ** 2 * square, off, known)
+    slopes = window.frames[0].slopes
+    assert slopes is not None
+    return StereoMatches(patches[:, 2, middle, middle], (SIGMA / deviation) ** 2 * square, off, known, slopes)

@@ -12,6 +12,7 @@ from dvo.graph.window import Window
 from dvo.models.step import Measurement, Revision, UpdateState
 from dvo.nets.alignment import AlignmentOptions, accept, align_patches, patch_warps
 from dvo.nets.config import ModelConfig
+from dvo.nets.slopes import SlopeEquations, slope_equations
 
 
 class WindowAlignment:
@@ -139,6 +140,29 @@ class WindowAlignment:
         weights[edges] *= torch.where(good, self.options.gain, 1.0)[:, None]
         window.targets, window.weights = targets, weights
 
+    def slope_equations(self, edges: Tensor) -> SlopeEquations:
+        """Equations of the slopes of the surfaces, from measurements that :meth:`finalise` has aligned.
+
+        Args:
+            edges: ``(e,)`` positions among the edges of the window.
+
+        Returns:
+            Those of each edge, for slopes in 1 / feature-map pixel; zero for one whose alignment was not accepted.
+        """
+        window, stride = self.window, float(ModelConfig.STRIDE)
+        centre, kk, map_slots = window.patches.shape[-1] // 2, window.kk[edges], window.map_slots
+        at = window.poses_cw[None], window.patches[None], window.intrinsics[None]
+        seen = reproject(*at, window.ii[edges], window.jj[edges], kk, jacobians=True)
+        assert seen.jac_d is not None
+        found = slope_equations(
+            self._images, map_slots[window.ii[edges]], map_slots[window.jj[edges]],
+            window.patches[kk, :2, centre, centre] * stride, window.targets[edges] * stride,
+            patch_warps(seen.coords[0], self._tilts(edges)),
+            seen.jac_d[0, ..., 0] * window.patches[kk, 2, centre, centre, None], self.options,
+        )  # fmt: skip
+        good = (window.weights[edges] > window.confidence[edges]).any(-1).to(found.matrix)
+        return SlopeEquations(found.matrix * good[:, None, None], found.vector * good[:, None])
+
     def _align(self, revision: Revision, edges: Tensor) -> None:
         """Align edges and keep the result by edge slot."""
         slots = self.window.edge_slots[edges]
@@ -160,7 +184,23 @@ class WindowAlignment:
         map_slots = window.map_slots
         found = align_patches(
             self._images, map_slots[window.ii[edges]], map_slots[window.jj[edges]], centres, measured * stride,
-            patch_warps(coords), options,
+            patch_warps(coords, self._tilts(edges)), options,
         )  # fmt: skip
         size = self._images.shape[2], self._images.shape[1]
         return found.positions / stride, accept(found, measured * stride, size, stride, options)
+
+    def _tilts(self, edges: Tensor) -> Tensor | None:
+        """Part ``(e, 2, 2)`` of the warps of edges by the slopes of the surfaces; None if no slope is known.
+
+        Where the inverse depth at an offset ``o`` from the centre is ``d (1 + s o)``, the pixel there moves by
+        ``du/dd d s o`` more than at the depth of the centre.
+        """
+        w = self.window
+        slopes, centre = w.slopes, w.patches.shape[-1] // 2
+        if slopes is None:
+            return None
+        kk = w.kk[edges]
+        at = w.poses_cw[None], w.patches[None], w.intrinsics[None], w.ii[edges], w.jj[edges], kk
+        slope_of_depth = reproject(*at, jacobians=True).jac_d
+        assert slope_of_depth is not None
+        return slope_of_depth[0] * w.patches[kk, 2, centre, centre, None, None] * slopes[kk, None]

@@ -58,6 +58,18 @@ def test_a_graph_in_metres_says_so_and_keeps_its_depths(tmp_path):
     assert torch.equal(found.window.measured, graph.window.measured)
 
 
+def test_slopes_are_those_of_the_window(tmp_path):
+    """A file from before there were any has none."""
+    graph, _ = archived_walk(frames=9, unit=2.0, archived=False)
+    save_graph(tmp_path / "old.dvo", graph)
+    assert load_graph(tmp_path / "old.dvo").window.slopes is None
+    rng = np.random.default_rng(0)
+    for frame in graph.window.frames[1:]:
+        frame.slopes = torch.from_numpy(rng.normal(0, 0.02, (graph.window.per_frame, 2))).float()
+    save_graph(tmp_path / "new.dvo", graph)
+    assert torch.equal(load_graph(tmp_path / "new.dvo").window.slopes, graph.window.slopes)
+
+
 def test_a_file_from_before_metric_scale_is_read(tmp_path):
     file = saved(tmp_path)
     with open_map_file(file) as source:

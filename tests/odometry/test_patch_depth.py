@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.nets.alignment import align_patches
 from dvo.odometry.depth_factor import SIGMA
-from dvo.odometry.patch_depth import checked_depth, followed_depth, variance_of_inverse
+from dvo.odometry.patch_depth import checked_depth, followed_planes, variance_of_inverse
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.tracker import PatchOdometry
 from tests.odometry.test_tracker import SMALL, frames, tracker
@@ -30,21 +32,39 @@ def test_windows_on_two_surfaces_or_on_unknown_ones_have_no_depth():
     depth[26:48, :20] = np.nan
     depth[40, 50] = 0.0
     centres = np.array([[10, 10], [38, 20], [50, 20], [10, 34], [50, 40], [62, 46], [100, 20]], float)
-    found = followed_depth(depth, textured(), centres)
-    np.testing.assert_allclose(found, [2, np.nan, 4, np.nan, 4, 4, np.nan])
+    found, slopes = followed_planes(depth, textured(), centres)
+    np.testing.assert_allclose(found, [2, np.nan, 4, np.nan, 4, 4, np.nan], rtol=1e-5)
+    np.testing.assert_allclose(slopes, 0, atol=1e-6)
 
 
-def test_the_depth_of_a_slanted_surface_is_that_where_the_grey_levels_change():
-    """On an even texture that of the centre; otherwise that of the pixels beside the only line of the window."""
+@given(
+    st.tuples(st.floats(-0.008, 0.008), st.floats(-0.008, 0.008)),
+    st.sampled_from([0.5, 1.0, 2.0, 3.0]),
+    st.integers(0, 99),
+)
+@settings(max_examples=20, deadline=None)
+def test_planes_are_found_whatever_the_texture(slopes, scale, seed):
+    """At the centre of a window, from depth images of any size."""
+    size = round(48 * scale), round(64 * scale)
+    y, x = ((np.arange(count) + 0.5) / scale - 0.5 for count in size)
+    inverse = 0.4 + slopes[0] * (x[None] - 32) + slopes[1] * (y[:, None] - 24)
+    centres = np.array([[8.0, 8.0], [32.0, 24.0], [44.0, 32.0]])
+    found, relative = followed_planes((1 / inverse).astype(np.float32), textured(seed=seed), centres)
+    true = 0.4 + (centres - [32, 24]) @ slopes
+    flat = np.hypot(*slopes) < 0.003  # a steep one is rejected where its inverse depth is small
+    assert np.isfinite(found).all() or not flat
+    known = np.isfinite(found)
+    np.testing.assert_allclose(1 / found[known], true[known], rtol=5e-3)
+    np.testing.assert_allclose((relative * true[:, None])[known], np.tile(slopes, (known.sum(), 1)), atol=6e-4)
+
+
+def test_what_changes_on_a_line_alone_tells_no_slope_across_it():
+    """The plane is right beside the line, where its grey levels are."""
     inverse = np.repeat(np.linspace(0.3, 0.5, 64)[None], 48, 0)
-    even = np.indices((48, 64)).sum(0) % 2 * 100
-    centre = np.array([[30.0, 20.0]])
-    found = followed_depth((1 / inverse).astype(np.float32), np.kron(even[::2, ::2], np.ones((2, 2))), centre)
-    assert 1 / found[0] == pytest.approx(inverse[20, 30], rel=2e-3)
     line = np.full((48, 64), 100)
     line[:, 34] = 200
-    found = followed_depth((1 / inverse).astype(np.float32), line, centre)
-    assert 1 / found[0] == pytest.approx(inverse[20, 34], rel=2e-3)
+    found, slopes = followed_planes((1 / inverse).astype(np.float32), line, np.array([[30.0, 20.0]]))
+    assert (1 + 4 * slopes[0, 0]) / found[0] == pytest.approx(inverse[20, 34], rel=2e-3)
 
 
 def waves(x, y, seed=0):
@@ -55,26 +75,18 @@ def waves(x, y, seed=0):
     return 128 + 8 * grey * np.where(y < 24, 1 / 3, 1)
 
 
-def test_the_mean_is_the_parallax_that_the_alignment_of_grey_levels_finds():
-    """Two strips of different texture move by different flows; the aligned window moves by their weighted mean."""
+def test_the_plane_is_the_parallax_that_the_alignment_of_grey_levels_finds():
+    """Two strips of different texture move by different flows; the window with the slope of the plane, by its depth."""
     x, y = np.meshgrid(np.arange(64.0), np.arange(48.0))
     inverse = np.where(y < 24, 0.50, 0.53)
     images = torch.from_numpy(np.stack([waves(x, y), waves(x - 10 * (inverse - 0.5), y)]))
     one, centre = torch.tensor([0]), torch.tensor([[30.0, 24.0]], dtype=torch.float64)
-    found = align_patches(images, one, one + 1, centre, centre, torch.eye(2, dtype=torch.float64)[None])
-    metres = followed_depth((1 / inverse).astype(np.float32), images[0].numpy(), centre.numpy())
-    assert 0.52 < 1 / metres[0] < 0.53  # the lower strip has most of the contrast
+    metres, slopes = followed_planes((1 / inverse).astype(np.float32), images[0].numpy(), centre.numpy())
+    warps = torch.eye(2, dtype=torch.float64)[None].clone()
+    warps[0, 0] += torch.from_numpy(10 * slopes[0] / metres[0])
+    found = align_patches(images, one, one + 1, centre, centre, warps)
+    assert slopes[0, 1] > 0.003
     assert float(found.positions[0, 0] - 30) == pytest.approx(10 * (1 / metres[0] - 0.5), abs=0.02)
-
-
-@pytest.mark.parametrize("scale", [0.5, 2.0, 3.0])
-def test_depth_of_another_size_belongs_to_the_same_places(scale):
-    size = int(48 * scale), int(64 * scale)
-    x = (np.arange(size[1]) + 0.5) / scale - 0.5
-    depth = np.repeat(1 / (0.3 + 0.002 * x)[None], size[0], 0).astype(np.float32)
-    centres = np.array([[8.0, 8.0], [28.0, 20.0], [40.0, 32.0]])
-    even = np.kron(np.indices((24, 32)).sum(0) % 2 * 100, np.ones((2, 2)))
-    np.testing.assert_allclose(1 / followed_depth(depth, even, centres), 0.3 + 0.002 * centres[:, 0], atol=0.0012)
 
 
 def test_the_noise_is_that_of_the_sensor_and_a_relative_one():

@@ -18,7 +18,7 @@ from dvo.metrics import evaluate
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.front_end import observe
-from dvo.odometry.patch_depth import followed_depth
+from dvo.odometry.patch_depth import followed_planes
 from dvo.odometry.right_view import right_view
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.stereo_depth import match_right, sample_features, search_line
@@ -37,9 +37,9 @@ def model():
     return dvo.load_model("small").eval()
 
 
-def rendered_pair(mount):
+def rendered_pair(mount, family="gallery"):
     """Frame with its right image, and its depth."""
-    left = make_sequence(3, frames=4, fps=10.0, width=320, height=240, family="gallery")
+    left = make_sequence(3, frames=4, fps=10.0, width=320, height=240, family=family)
     mount = np.concatenate([mount[:3], mount[3:] / np.linalg.norm(mount[3:])])
     path, times = Offset(left.path, mount), left.groundtruth.timestamps
     right = replace(left, path=path, groundtruth=Trajectory(times, path.poses_wc(times)), seed=left.seed + 1)
@@ -61,7 +61,7 @@ def test_depths_of_a_rendered_pair(model, mount):
     frame, depth = rendered_pair(mount)
     seen = observed(model, frame)
     found = match_right(model, seen, right_view(frame, 320, 240), TrackerConfig(scale=STEREO))
-    true = followed_depth(depth, seen.image.mean(2), seen.centres[0, 0].double().numpy() * 4)
+    true, _ = followed_planes(depth, seen.image.mean(2), seen.centres[0, 0].double().numpy() * 4)
     known = np.isfinite(true) & found.good.numpy()
     assert known.sum() > 0.5 * np.isfinite(true).sum()
     error = found.inverse_depth.numpy()[known] * true[known] - 1
@@ -72,6 +72,20 @@ def test_depths_of_a_rendered_pair(model, mount):
     if mount is PARALLEL:  # the weight is that of the disparity
         weight = (SIGMA / STEREO.stereo_error * 0.2 * float(seen.intrinsics[0])) ** 2
         np.testing.assert_allclose(found.weight.numpy(), weight, rtol=1e-4)
+
+
+@torch.inference_mode()
+def test_slopes_of_floor_and_walls(model):
+    """One image beside the other tells the slopes roughly: better than that there are none."""
+    frame, depth = rendered_pair(PARALLEL, "hall")
+    seen = observed(model, frame, 96)
+    found = match_right(model, seen, right_view(frame, 320, 240), TrackerConfig(scale=STEREO))
+    metres, slopes = followed_planes(depth, seen.image.mean(2), seen.centres[0, 0].double().numpy() * 4)
+    known = np.isfinite(metres) & found.good.numpy() & (metres < 5)
+    true, slopes = 4 * slopes[known], found.slopes.numpy()[known]  # 1 / feature pixel
+    assert known.sum() > 20 and np.median(np.abs(true).max(1)) > 0.02
+    assert np.median(np.abs(slopes - true).max(1)) < 0.6 * np.median(np.abs(true).max(1))
+    assert np.corrcoef(slopes.ravel(), true.ravel())[0, 1] > 0.8
 
 
 @torch.inference_mode()

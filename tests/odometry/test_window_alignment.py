@@ -6,10 +6,11 @@ import torch
 
 import dvo
 from dvo.geometry import se3
+from dvo.geometry.projection import reproject
 from dvo.graph.window import Keyframe, Window
 from dvo.metrics import evaluate
 from dvo.models.step import Revision, UpdateState
-from dvo.nets.alignment import AlignmentOptions
+from dvo.nets.alignment import AlignmentOptions, patch_warps
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.session import run
 from dvo.odometry.window_alignment import WindowAlignment
@@ -116,3 +117,28 @@ def test_measurements_that_leave_the_window_are_replaced_once(two_frames):
     found = (window.targets - truth).norm(dim=-1)
     assert (found[[0, 2]] < 0.01).all() and torch.allclose(found[[1, 3]], error.norm())
     assert window.weights[:, 0].tolist() == [5.0, 0.5, 5.0, 0.5]  # edge 3: its window is not inside the image
+
+
+def test_the_warp_of_a_slanted_surface_is_that_of_its_plane():
+    """By reprojection of the corners of a window with the inverse depths of the plane."""
+    slopes = torch.tensor([[0.03, -0.02], [0.0, 0.0]])
+    window = Window.empty(2, 3, 8, torch.device("cpu"))
+    alignment = WindowAlignment(window, AlignmentOptions(), torch.device("cpu"))
+    focal = torch.tensor([20.0, 21.0, 16.0, 12.0])
+    patches = patch_coordinates(torch.tensor([[[[9.0, 7.0], [20.0, 15.0]]]]), torch.tensor([[0.5, 0.25]]), 3)[0]
+    for i in range(2):
+        none = torch.zeros(2, 1)
+        frame = Keyframe(i, float(i), i, none, torch.zeros(2, 8), none, focal, slopes=slopes if i == 0 else None)
+        window.append(frame, se3.exp(i * torch.tensor([0.3, 0.1, -0.2, 0.02, -0.03, 0.05])), patches)
+    window.connect(torch.arange(2), torch.ones(2, dtype=torch.long))
+    at = window.poses_cw[None], window.intrinsics[None], window.ii, window.jj, window.kk
+    flat = reproject(at[0], window.patches[None], *at[1:]).coords[0]
+    found = patch_warps(flat, alignment._tilts(torch.arange(2)))
+    tilted = window.patches.clone()
+    offsets = tilted[:, :2] - tilted[:, :2, 1:2, 1:2]
+    tilted[:, 2] *= 1 + torch.einsum("kc,kcpq->kpq", window.slopes, offsets)
+    torch.testing.assert_close(found, patch_warps(reproject(at[0], tilted[None], *at[1:]).coords[0]), atol=1e-4, rtol=0)
+    assert (found - patch_warps(flat)).abs().amax((1, 2)).tolist() == [pytest.approx(0.09, abs=0.06), 0]
+    for frame in window.frames:
+        frame.slopes = None
+    assert alignment._tilts(torch.arange(2)) is None

@@ -51,6 +51,7 @@ class Errors:
         worlds: number of segments, those that share a world counted once.
         scored: share of the matched frames that count for the ATE; nan without any.
         scale_error: percent by which the scale of the longest world is wrong; nan where the alignment fits it.
+        shape: ATE after a Sim(3) alignment of each world, metres; nan where the alignment is not SE(3).
     """
 
     metrics: Metrics | None = None
@@ -63,6 +64,7 @@ class Errors:
     worlds: int = 0
     scored: float = math.nan
     scale_error: float = math.nan
+    shape: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,7 @@ def all_errors(
         worlds=whole.worlds,
         scored=whole.scored_share,
         scale_error=_scale_error(pieces, align),
+        shape=_shape(pieces, align),
     )
 
 
@@ -126,6 +129,15 @@ def _scale_error(pieces: Pieces, align: Alignment) -> float:
         return math.nan
     estimate, reference = max(pieces.worlds, key=lambda world: len(world[0]))
     return 100 * abs(1 / evaluate(estimate, reference, "sim3").scale - 1)
+
+
+def _shape(pieces: Pieces, align: Alignment) -> float:
+    """ATE of the worlds after Sim(3) alignment, the error without that of the scale, metres; nan unless under SE(3)."""
+    if align != "se3":
+        return math.nan
+    pairs = [align_pair(estimate, reference, "sim3") for estimate, reference in pieces.worlds]
+    aligned = [pair for pair in pairs if isinstance(pair, Aligned)]
+    return absolute_rmse(*aligned) if aligned else math.nan
 
 
 def align_segments(

@@ -46,6 +46,7 @@ class Row:
         unseen: number of frames without a view, see :func:`eval.scoring.blackout.without_view`.
         made_up: share of them that carry a pose; nan without such a frame.
         scale_error: percent by which the scale of the longest segment is wrong, with the alignment SE(3).
+        ate_sim3_percent: of the path, after a Sim(3) alignment where that of the suite is SE(3).
         loops, false_loops, revisit_s, loop_recall: see :class:`eval.scoring.loops.LoopErrors`.
         threads, parallel, device: how the resources were measured; ``parallel`` above 1 means on a shared machine.
     """
@@ -99,6 +100,7 @@ class Row:
     revisit_s: float
     loop_recall: float
     scale_error: float
+    ate_sim3_percent: float
     threads: int
     parallel: int
     device: str
@@ -256,6 +258,7 @@ def score(
         revisit_s=loops.revisit_s,
         loop_recall=loops.recall,
         scale_error=errors.scale_error,
+        ate_sim3_percent=100 * errors.shape / value("path_length") if value("path_length") > 0 else math.nan,
         threads=prediction.threads,
         parallel=prediction.parallel,
         device=prediction.device,

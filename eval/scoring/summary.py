@@ -27,7 +27,10 @@ FIGURES = (
     ("rot. error / rot.", "rotation_error_ratio", 2),
     ("scale drift", "scale_drift", 2),
 )
-SCALE = (("scale error %", "scale_error", 2),)  # shown where the alignment leaves the scale to the systems
+SCALE = (
+    ("scale error %", "scale_error", 2),
+    ("ATE %, Sim(3)", "ate_sim3_percent", 2),
+)  # shown where the alignment leaves the scale to the systems
 RECOVERY = (("recovery s", "recovery_s", 1),)  # shown where sequences are judged by it
 # Column, field, digits, factor; shown where a run has several segments, or frames without a view.
 SEGMENTS = (("segments", "segments", 0, 1.0), ("scored %", "scored", 0, 100.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,6 +57,19 @@ def test_one_segment_is_scored_as_a_trajectory():
     rescaled = align_pair(per_frame_scale(estimate, truth), truth)
     assert isinstance(rescaled, Aligned) and found.per_frame_scale == absolute_rmse(rescaled)
     assert (found.worlds, found.scored) == (1, 1.0)
+
+
+def test_the_error_without_that_of_the_scale_stands_beside_it():
+    """Under SE(3); under Sim(3) the error itself is without it."""
+    truth, suite = walk(), replace(SUITE, alignment="se3")
+    exact = moved(truth, 0.5, 1.0)
+    found = all_errors([segment(exact)], truth, suite, [], most=1)
+    assert found.metrics is not None and found.metrics.ate_rmse > 1
+    assert found.scale_error == pytest.approx(50) and found.shape < 1e-9
+    estimate = noisy(exact)
+    found = all_errors([segment(estimate)], truth, suite, [], most=1)
+    assert found.shape == pytest.approx(all_errors([segment(estimate)], truth, SUITE, [], most=1).metrics.ate_rmse)
+    assert math.isnan(all_errors([segment(estimate)], truth, SUITE, [], most=1).shape)
 
 
 def test_no_segments_give_no_errors():

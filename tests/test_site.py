@@ -56,22 +56,14 @@ def test_links_lead_somewhere_on_a_code_host(page):
         assert re.match(r"https?:", link) or (page.parent / link).is_file(), link
 
 
-def test_pictures_of_footage_are_small_and_those_of_the_script():
-    script = runpy.run_path(str(DOCS / "footage" / "make.py"))
-    pictures = list((DOCS / "footage").glob("*.png"))
-    assert {picture.stem for picture in pictures} == set(script["CLIPS"])
+@pytest.mark.parametrize(("folder", "page", "names"), [("footage", "footage", "CLIPS"), ("figures", "method", "NAMES")])
+def test_pictures_are_small_and_those_of_their_script(folder, page, names):
+    script = runpy.run_path(str(DOCS / folder / "make.py"))
+    pictures = list((DOCS / folder).glob("*.png"))
+    assert {picture.stem for picture in pictures} == set(script[names])
     assert max(picture.stat().st_size for picture in pictures) < 150_000
-    text = (DOCS / "footage.md").read_text(encoding="utf-8")
-    assert all(f"(footage/{picture.name})" in text for picture in pictures)
-
-
-def test_figures_of_the_method_are_small_and_those_of_the_script():
-    script = runpy.run_path(str(DOCS / "figures" / "make.py"))
-    figures = list((DOCS / "figures").glob("*.png"))
-    assert {figure.stem for figure in figures} == set(script["NAMES"])
-    assert max(figure.stat().st_size for figure in figures) < 150_000
-    text = (DOCS / "method.md").read_text(encoding="utf-8")
-    assert all(f"(figures/{figure.name})" in text for figure in figures)
+    text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    assert all(f"({folder}/{picture.name})" in text for picture in pictures)
 
 
 def test_script_of_the_figures_draws_them(tmp_path, monkeypatch):

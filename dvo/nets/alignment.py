@@ -135,6 +135,30 @@ def patch_warps(
     return torch.where(good[:, None, None], warps, torch.eye(2, dtype=warps.dtype, device=warps.device))
 
 
+def grey_windows(
+    images: Float[Tensor, "N H W"], frames: Int[Tensor, " E"], centres: Float[Tensor, "E 2"], side: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Grey levels of windows around points, and their central differences.
+
+    Args:
+        images: grey levels.
+        frames: image of each window.
+        centres: of the windows, pixels.
+        side: of the windows, pixels, odd.
+
+    Returns:
+        ``(1, S, 2)`` offsets of the ``S = side^2`` pixels from the centre; ``(E, S)`` their grey levels, and the
+        derivatives of these by x and by y.
+    """
+    half = side // 2
+    ticks = torch.arange(-half - 1, half + 2, dtype=images.dtype, device=images.device)
+    offsets = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
+    around = sample_images(images, frames, centres[:, None] + offsets.reshape(1, -1, 2)).unflatten(1, offsets.shape[:2])
+    across = (around[:, 1:-1, 2:] - around[:, 1:-1, :-2]) / 2
+    down = (around[:, 2:, 1:-1] - around[:, :-2, 1:-1]) / 2
+    return offsets[1:-1, 1:-1].reshape(1, -1, 2), around[:, 1:-1, 1:-1].flatten(1), across.flatten(1), down.flatten(1)
+
+
 def align_patches(
     images: Float[Tensor, "N H W"],
     source: Int[Tensor, " E"],
@@ -166,19 +190,14 @@ def align_patches(
         >>> found.positions.shape
         torch.Size([1, 2])
     """
-    half = options.window // 2
-    ticks = torch.arange(-half - 1, half + 2, dtype=images.dtype, device=images.device)
-    offsets = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
-    around = sample_images(images, source, centres[:, None] + offsets.reshape(1, -1, 2)).unflatten(1, offsets.shape[:2])
-    gx = _centred(((around[:, 1:-1, 2:] - around[:, 1:-1, :-2]) / 2).flatten(1))
-    gy = _centred(((around[:, 2:, 1:-1] - around[:, :-2, 1:-1]) / 2).flatten(1))
-    template = _centred(around[:, 1:-1, 1:-1].flatten(1))
+    offsets, *window = grey_windows(images, source, centres, options.window)
+    template, gx, gy = map(_centred, window)
     floor = _NOISE * options.window
     energy = template.square().sum(1) + floor
     # Damped by noise, so that a direction without texture does not move.
     a, b, c = gx.square().sum(1) + floor, (gx * gy).sum(1), gy.square().sum(1) + floor
     determinant = a * c - b * b
-    warped = offsets[1:-1, 1:-1].reshape(1, -1, 2) @ warps.mT
+    warped = offsets @ warps.mT
     positions, length = start, torch.zeros_like(a)
     for _ in range(options.iterations):
         seen = _centred(sample_images(images, target, positions[:, None] + warped))

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dvo.nets.alignment import AlignmentOptions, sample_images
+from dvo.nets.alignment import AlignmentOptions, grey_windows, sample_images
 
 _NOISE = 2.0  # grey levels, standard deviation of those of any image
 
@@ -56,21 +56,15 @@ def slope_equations(
     Returns:
         The equations of slopes in 1 / pixel.
     """
-    half = options.window // 2
-    ticks = torch.arange(-half - 1, half + 2, dtype=images.dtype, device=images.device)
-    offsets = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
-    around = sample_images(images, source, centres[:, None] + offsets.reshape(1, -1, 2)).unflatten(1, offsets.shape[:2])
-    gx = ((around[:, 1:-1, 2:] - around[:, 1:-1, :-2]) / 2).flatten(1)
-    gy = ((around[:, 2:, 1:-1] - around[:, :-2, 1:-1]) / 2).flatten(1)
-    inner = offsets[1:-1, 1:-1].reshape(-1, 2)
-    seen = sample_images(images, target, positions[:, None] + inner @ warps.mT)
-    template, seen = (values - values.mean(1, keepdim=True) for values in (around[:, 1:-1, 1:-1].flatten(1), seen))
-    floor = _NOISE**2 * inner.shape[0]
+    offsets, grey, gx, gy = grey_windows(images, source, centres, options.window)
+    seen = sample_images(images, target, positions[:, None] + offsets @ warps.mT)
+    template, seen = (values - values.mean(1, keepdim=True) for values in (grey, seen))
+    floor = _NOISE**2 * offsets.shape[1]
     gain = ((template.square().sum(1) + floor) / (seen.square().sum(1) + floor)).sqrt()
     error = seen * gain[:, None] - template
     back = torch.linalg.solve(warps, rates[..., None])[..., 0]  # the rates in the source image
     along = gx * back[:, :1] + gy * back[:, 1:]
-    columns = torch.stack([along * inner[:, 0], along * inner[:, 1], gx, gy, template], 1)
+    columns = torch.stack([along * offsets[..., 0], along * offsets[..., 1], gx, gy, template], 1)
     columns = columns - columns.mean(2, keepdim=True)
     matrix, vector = columns @ columns.mT, -(columns @ error[..., None])[..., 0]
     rest = matrix[:, 2:, 2:] + floor * torch.eye(3, dtype=images.dtype, device=images.device)

@@ -33,18 +33,19 @@ def measured_arrays(graph: KeyframeGraph) -> dict[str, np.ndarray]:
         graph: any.
 
     Returns:
-        Arrays by name.
+        Arrays by name; none of what the graph does not have.
     """
-    m = graph.window.per_frame
+    m, arrays = graph.window.per_frame, {}
+    if graph.window.slopes is not None:
+        arrays[_SLOPES] = graph.window.slopes.reshape(-1, m, 2).float().cpu().numpy()
+    if not has_measured(graph):
+        return arrays
     parts = {"archive": [f.measured for f in graph.archive.keyframes]}
     parts["window"] = [None if f.measured is None else f.measured.cpu().numpy() for f in graph.window.frames]
-    arrays = {}
     for name, values in parts.items():
         there = [value for value in values if value is not None]
         arrays[f"{name}/has_measured"] = np.array([value is not None for value in values], np.uint8)
         arrays[f"{name}/measured"] = np.stack(there).astype(np.float32) if there else np.zeros((0, m, 2), np.float32)
-    if graph.window.slopes is not None:
-        arrays[_SLOPES] = graph.window.slopes.reshape(-1, m, 2).float().cpu().numpy()
     return arrays
 
 
@@ -62,9 +63,13 @@ def read_measured(source: MapReader, graph: KeyframeGraph, measured: bool, metri
     """
     graph.metric = dict(metric)
     source.require(all(0 <= k <= graph.segment for k in graph.metric), "holds no such world", "graph: metric")
+    m, device = graph.window.per_frame, graph.window.poses_cw.device
+    if source.has(_SLOPES):
+        slopes = source.array(_SLOPES, np.float32, (len(graph.window), m, 2), -STEEPEST, STEEPEST)
+        for kept, values in zip(graph.window.frames, slopes, strict=True):
+            kept.slopes = torch.from_numpy(values.copy()).to(device)
     if not measured:
         return
-    m, device = graph.window.per_frame, graph.window.poses_cw.device
     frames = graph.archive.keyframes
     for frame, values in zip(frames, _read(source, "archive", len(frames), m), strict=True):
         source.require(values is None or len(frame.inverse_depth), "of a keyframe without patches", "archive/measured")
@@ -72,10 +77,6 @@ def read_measured(source: MapReader, graph: KeyframeGraph, measured: bool, metri
             graph.archive.set_measured(frame.identifier, values)
     for kept, values in zip(graph.window.frames, _read(source, "window", len(graph.window), m), strict=True):
         kept.measured = None if values is None else torch.from_numpy(values).to(device)
-    if source.has(_SLOPES):
-        slopes = source.array(_SLOPES, np.float32, (len(graph.window), m, 2), -STEEPEST, STEEPEST)
-        for kept, values in zip(graph.window.frames, slopes, strict=True):
-            kept.slopes = torch.from_numpy(values.copy()).to(device)
 
 
 def _read(source: MapReader, name: str, count: int, per_frame: int) -> list[np.ndarray | None]:

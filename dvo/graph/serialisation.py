@@ -129,7 +129,7 @@ def graph_arrays(graph: KeyframeGraph) -> tuple[dict[str, Any], Arrays]:
         has_measured(graph), tuple(sorted(graph.metric.items())),
     )  # fmt: skip
     arrays = {"segments": np.array(graph.starts, np.int64)} | _log_arrays(graph.log, reasons) | _archive_arrays(graph)
-    return asdict(table), arrays | window_arrays(window) | (measured_arrays(graph) if table.measured else {})
+    return asdict(table), arrays | window_arrays(window) | measured_arrays(graph)
 
 
 def read_graph(source: MapReader, graph: KeyframeGraph, table: GraphTable) -> None:

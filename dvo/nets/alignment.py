@@ -33,6 +33,8 @@ class AlignmentOptions:
         reach: largest distance from the measurement of the network, feature pixels.
         gain: factor of the weight of an aligned measurement in bundle adjustment.
         moved: an edge is aligned anew once the measurement of the network has moved by this, feature pixels.
+        slope: standard deviation of the slopes of surfaces before they are measured (:mod:`dvo.nets.slopes`), 1 /
+            feature pixel; 0: surfaces of constant depth.
 
     Raises:
         DvoError: a value out of range.
@@ -45,6 +47,7 @@ class AlignmentOptions:
     reach: float = 0.3
     gain: float = 10.0
     moved: float = 0.1
+    slope: float = 0.0
 
     def __post_init__(self) -> None:
         check_settings(
@@ -57,6 +60,7 @@ class AlignmentOptions:
                 "reach": (0, 100),
                 "gain": (0, 1e6),
                 "moved": (0, 100),
+                "slope": (0, 1),
             },
         )
 

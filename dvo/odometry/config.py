@@ -28,6 +28,7 @@ _RANGES = {
     "patches": (1, 2**14),
     "align_gain": (0, 1e4),
     "align_reach": (0, 100),
+    "align_slope": (0, 1),
     "lifetime": (1, 1000),
     "removal": (1, 1000),
     "robust": (0, 1e4),
@@ -63,11 +64,13 @@ class TrackerConfig:
         patches: number of patches in each frame.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; empty for the one that the network
             was trained with.
-        align: sub-pixel alignment of the measurements (:mod:`dvo.nets.alignment`), with the two settings below:
+        align: sub-pixel alignment of the measurements (:mod:`dvo.nets.alignment`), with the three settings below:
             ``final`` for those that leave the window, which serves the final adjustment; ``always`` in every step,
             which serves the poses of ``track`` as well and takes longer; ``none``.
         align_gain: factor of the weight of aligned measurements in bundle adjustment.
         align_reach: largest distance of an alignment from the measurement of the network, feature pixels.
+        align_slope: standard deviation, 1 / feature pixel, of the slopes of surfaces that an alignment of measurements
+            that leave the window finds too (:mod:`dvo.nets.slopes`), with ``final``; 0: surfaces of constant depth.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
@@ -129,6 +132,7 @@ class TrackerConfig:
     align: Literal["none", "final", "always"] = "final"
     align_gain: float = 10.0
     align_reach: float = 0.3
+    align_slope: float = 0.0
     lifetime: int = 7
     removal: int = 9
     optimisation: int = 8
@@ -173,7 +177,7 @@ class TrackerConfig:
     @property
     def alignment(self) -> AlignmentOptions:
         """Options of the sub-pixel alignment."""
-        return AlignmentOptions(gain=self.align_gain, reach=self.align_reach)
+        return AlignmentOptions(gain=self.align_gain, reach=self.align_reach, slope=self.align_slope)
 
     @property
     def adjustment(self) -> AdjustmentOptions:
@@ -218,7 +222,7 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "fast": {"pixels": 256 * 192, "patches": 16, "lifetime": 5, "removal": 7, "optimisation": 7},
-    "accurate": {"pixels": 448 * 336, "patches": 48, "updates": 2},
+    "accurate": {"pixels": 448 * 336, "patches": 48, "updates": 2, "align_slope": 0.03},
 }
 """Settings that trade accuracy for speed, on top of those of the weights; ``dvo.load("small", preset="fast")``."""
 

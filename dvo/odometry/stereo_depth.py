@@ -41,8 +41,6 @@ _WIDEST = 0.4  # largest disparity that is tried, in widths of the image
 _RESIDUAL = 0.06  # distance from the epipolar line above which a patch has none, feature pixels
 _RELATIVE = 0.3  # standard deviation relative to the inverse depth above which a patch has none
 _SLOPE = 0.03  # standard deviation of the slopes of surfaces before anything is measured, 1 / feature pixel
-_STEEPEST = 0.3  # largest slope that is taken
-_ROUNDS = 2  # alignments that the slopes are found from, each with those of the one before
 _NEAREST = 0.2  # metres; bundle adjustment leaves out points that are nearer (dvo.ba.layer)
 
 
@@ -119,7 +117,7 @@ def match_right(model: PatchVO, seen: Observation, view: RightView, config: Trac
     step = _pair(model, seen, features, view.image, intrinsics, pose, depth, config)
     for _ in range(_UPDATES):
         step(StepOptions(mode="structure", fixed=2, damping=damping_at(COLD_UPDATES)))
-    _find_slopes(step)
+    step.finalise(torch.arange(len(step.window.kk), device=device))
     return _fitted(step.window, seen.bounds, config.scale.stereo_error)
 
 
@@ -200,7 +198,7 @@ def _pair(
     """Window of the left and the right image, with an edge from each patch into the right one."""
     c, device = model.config, seen.intrinsics.device
     window = Window.empty(seen.centres.shape[2], c.patch_size, c.hidden_channels, device)
-    align = WindowAlignment(window, config.alignment, device)
+    align = WindowAlignment(window, replace(config.alignment, slope=_SLOPE), device)
     step = WindowStep(model, window, WindowCorrelation(window, c, device), align, True, config.kernel)
     patches = patch_coordinates(seen.centres, depth, c.patch_size)[0]
     maps = (seen.maps, features.matching), (seen.fine_maps, features.fine)
@@ -212,25 +210,6 @@ def _pair(
     kk = torch.arange(window.per_frame, device=device)
     step.forget(window.connect(kk, torch.ones_like(kk)))
     return step
-
-
-def _find_slopes(step: WindowStep) -> None:
-    """Align the edges of a pair, with the slopes of the surfaces that fit the grey levels best."""
-    window, align = step.window, step.align
-    assert align is not None
-    edges, before = torch.arange(len(window.kk), device=window.kk.device), (window.targets, window.weights)
-    frame, slopes = window.frames[0], window.poses_cw.new_zeros(window.per_frame, 2)
-    for _ in range(_ROUNDS):  # each patch has one edge
-        frame.slopes = slopes
-        window.targets, window.weights = before
-        align.finalise(edges)
-        found = align.slope_equations(edges)
-        matrix = found.matrix + torch.eye(2).to(slopes) / _SLOPE**2
-        change = torch.linalg.solve(matrix, found.vector - slopes / _SLOPE**2)
-        slopes = (slopes + change).clamp(-_STEEPEST, _STEEPEST)
-    frame.slopes = slopes
-    window.targets, window.weights = before
-    align.finalise(edges)
 
 
 def _fitted(window: Window, bounds: tuple[int, int], deviation: float) -> StereoMatches:
@@ -248,5 +227,5 @@ def _fitted(window: Window, bounds: tuple[int, int], deviation: float) -> Stereo
     aligned = (window.weights > window.confidence).any(-1)
     known = aligned & _inside(window.targets, *bounds) & found.valid[0, :, middle, middle]
     slopes = window.frames[0].slopes
-    assert slopes is not None
+    assert slopes is not None, "the alignment of the pair was to find them"
     return StereoMatches(patches[:, 2, middle, middle], (SIGMA / deviation) ** 2 * square, off, known, slopes)

@@ -14,6 +14,9 @@ from dvo.nets.alignment import AlignmentOptions, accept, align_patches, patch_wa
 from dvo.nets.config import ModelConfig
 from dvo.nets.slopes import SlopeEquations, slope_equations
 
+_ROUNDS = 2  # alignments that slopes are found from, each with those of the one before
+_STEEPEST = 0.3  # largest slope that is found, 1 / feature pixel
+
 
 class WindowAlignment:
     """Alignment of the edges of a window: as a :class:`dvo.models.step.Refinement`, or of those that leave it.
@@ -131,6 +134,18 @@ class WindowAlignment:
         Args:
             edges: ``(e,)`` positions among the edges of the window; its targets and weights are changed.
         """
+        window, before = self.window, (self.window.targets, self.window.weights)
+        if self.options.slope > 0:
+            first = window.slopes
+            first = window.poses_cw.new_zeros(len(window.patches), 2) if first is None else first
+            for _ in range(_ROUNDS):
+                self._replace(edges)
+                self._revise_slopes(edges, first)
+                window.targets, window.weights = before
+        self._replace(edges)
+
+    def _replace(self, edges: Tensor) -> None:
+        """Replace measurements by alignments with the present slopes."""
         window = self.window
         poses, patches, intrinsics = window.poses_cw[None], window.patches[None], window.intrinsics[None]
         coords = reproject(poses, patches, intrinsics, window.ii[edges], window.jj[edges], window.kk[edges]).coords[0]
@@ -162,6 +177,22 @@ class WindowAlignment:
         )  # fmt: skip
         good = (window.weights[edges] > window.confidence[edges]).any(-1).to(found.matrix)
         return SlopeEquations(found.matrix * good[:, None, None], found.vector * good[:, None])
+
+    def _revise_slopes(self, edges: Tensor, first: Tensor) -> None:
+        """One step of the slopes of the surfaces that edges see, from all of these and the first slopes ``(K, 2)``."""
+        window, m = self.window, self.window.per_frame
+        found = self.slope_equations(edges)
+        patches, row = window.kk[edges].unique(return_inverse=True)
+        count = len(patches)
+        matrix = found.matrix.new_zeros(count, 2, 2).index_add_(0, row, found.matrix)
+        vector = found.vector.new_zeros(count, 2).index_add_(0, row, found.vector)
+        slopes = first.clone() if window.slopes is None else window.slopes
+        prior = 1 / self.options.slope**2
+        vector = vector + prior * (first - slopes)[patches]
+        change = torch.linalg.solve(matrix + prior * torch.eye(2).to(matrix), vector)
+        slopes[patches] = (slopes[patches] + change).clamp(-_STEEPEST, _STEEPEST)
+        for frame in (patches // m).unique().tolist():
+            window.frames[frame].slopes = slopes[frame * m : (frame + 1) * m].clone()
 
     def _align(self, revision: Revision, edges: Tensor) -> None:
         """Align edges and keep the result by edge slot."""

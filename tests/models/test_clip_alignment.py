@@ -77,7 +77,7 @@ def test_it_is_the_alignment_of_the_tracker(measured):
     for clip in range(len(images)):
         window = SimpleNamespace(
             patches=state.patches[clip], kk=graph.kk, ii=graph.ii, jj=graph.jj, map_slots=torch.arange(3),
-            edge_slots=torch.arange(len(graph.kk)),
+            edge_slots=torch.arange(len(graph.kk)), slopes=None,
         )  # fmt: skip
         tracker = WindowAlignment(window, AlignmentOptions(), torch.device("cpu"))
         for frame, image in enumerate(images[clip]):

@@ -64,6 +64,7 @@ def check_cuts(new, images, cuts, folder, weights=None):
     [
         ("gated", {}),
         ("gated", {"align": "always", "keyframe_motion": 1e9}),
+        ("gated", {"align_slope": 0.03, "align_reach": 100.0}),
         ("mamba", {"align": "none", "initial_pose": "nearest", "selection": "structure", "restart": False}),
     ],
 )

@@ -30,6 +30,8 @@ _CELL = 0.01  # side of a cell, of the median depth
 _SMALLEST = 0.005  # and at least, metres
 _FARTHEST = 3.0  # of the median depth, beyond which depths are left out
 _STEP = 0.05  # relative difference of neighbouring depths at the edge of a body
+_TRUNCATION = 4.0  # of the signed distance, in cells
+_BLOCKS = 4000  # of 16^3 voxels, room for them at the start; more is taken when it is needed
 _BATCH = 16  # views whose points are averaged at once, which bounds the memory
 
 
@@ -209,13 +211,16 @@ def import_open3d() -> Any:
         The module.
 
     Raises:
-        DvoError: it is not installed.
+        DvoError: it is not installed, or lacks a library of the system.
     """
     try:
         import open3d
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         remedy = "run pip install 'dvo[tsdf]'"
-        raise DvoError("the package open3d is not installed", field="--tsdf", remedy=remedy) from error
+        raise DvoError(f"the package {error.name} is not installed", field="--tsdf", remedy=remedy) from error
+    except ImportError as error:
+        remedy = "install the system library that it names, or leave --tsdf out"
+        raise DvoError(f"the package open3d cannot be imported: {error}", field="--tsdf", remedy=remedy) from error
     return open3d
 
 
@@ -234,19 +239,28 @@ def write_mesh(
     Raises:
         DvoError: Open3D has not written the file, for instance because there is no surface.
     """
-    kind = open3d.pipelines.integration
-    volume = kind.ScalableTSDFVolume(cell, 4 * cell, kind.TSDFVolumeColorType.RGB8)
+    core, tensors = open3d.core, open3d.t.geometry
+    grid = tensors.VoxelBlockGrid(
+        attr_names=("tsdf", "weight", "color"),
+        attr_dtypes=(core.float32, core.float32, core.float32),
+        attr_channels=(1, 1, 3),
+        voxel_size=cell,
+        block_resolution=16,
+        block_count=_BLOCKS,
+    )
+    ranges = {"depth_scale": 1.0, "depth_max": farthest, "trunc_voxel_multiplier": _TRUNCATION}
     for view, pose_wc in posed:
-        height, width = view.depth.shape
-        depth = open3d.geometry.Image(np.nan_to_num(view.depth, nan=0.0))
-        color = open3d.geometry.Image(np.ascontiguousarray(view.colors))
-        image = open3d.geometry.RGBDImage.create_from_color_and_depth(
-            color, depth, depth_scale=1.0, depth_trunc=farthest, convert_rgb_to_intensity=False
-        )
-        camera = open3d.camera.PinholeCameraIntrinsic(width, height, *view.intrinsics)
-        volume.integrate(image, camera, np.linalg.inv(pose_matrices(pose_wc)))
-    mesh = volume.extract_triangle_mesh()
+        if not (view.depth <= farthest).any():
+            continue
+        fx, fy, cx, cy = view.intrinsics
+        camera = core.Tensor(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+        pose_cw = core.Tensor(np.linalg.inv(pose_matrices(pose_wc)))
+        depth = tensors.Image(core.Tensor(np.nan_to_num(view.depth, nan=0.0)))
+        color = tensors.Image(core.Tensor(view.colors.astype(np.float32) / 255))
+        blocks = grid.compute_unique_block_coordinates(depth, camera, pose_cw, **ranges)
+        grid.integrate(blocks, depth, color, camera, camera, pose_cw, **ranges)
+    mesh = grid.extract_triangle_mesh(weight_threshold=1.0).to_legacy()
     with replaced(file) as part:
-        if not open3d.io.write_triangle_mesh(str(part), mesh):
+        if not (len(mesh.vertices) and open3d.io.write_triangle_mesh(str(part), mesh)):
             remedy = "check the depth images and their scale; the fused cloud is written without it"
             raise DvoError("Open3D has written no mesh", file=file, field="--tsdf", remedy=remedy)

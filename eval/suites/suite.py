@@ -8,6 +8,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from dvo.data.depth_source import with_depth
+from dvo.data.right_source import with_right
 from dvo.data.source import Source, open_source
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
@@ -35,6 +37,10 @@ class Sequence:
             ``recovery_s`` where the question is if a place is found again.
         about: a few words.
         calib, times, groundtruth: files relative to the folder, where the layout itself does not say.
+        start, end: part of the recording: seconds since its first frame (``"2.5"``), or the number of a frame
+            (``"120f"``); the end is not in it.
+        depth: folder or list of depth images, where the layout itself does not say; of a 16-bit folder in millimetres.
+        right: folder of the right images of a rectified stereo pair, ``baseline`` metres apart.
         rendered: options of :func:`dvo.synth.make_sequence` and ``version``, as pairs, for a sequence that is rendered
             into a cache (:mod:`eval.suites.rendered`) when it is first wanted; None for a recording.
     """
@@ -46,6 +52,11 @@ class Sequence:
     calib: str | None = None
     times: str | None = None
     groundtruth: str | None = None
+    start: str | None = None
+    end: str | None = None
+    depth: str | None = None
+    right: str | None = None
+    baseline: float | None = None
     rendered: tuple[tuple[str, Any], ...] | None = None
 
 
@@ -202,7 +213,13 @@ def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, 
         times=sequence.times,
         groundtruth=sequence.groundtruth,
         stride=stride,
+        start=sequence.start,
+        end=sequence.end,
     )
+    if sequence.depth is not None:
+        source = with_depth(source, sequence.depth)
+    if sequence.right is not None:
+        source = with_right(source, sequence.right, sequence.baseline)
     if source.groundtruth is None:
         raise DvoError("no ground truth", file=place, remedy="name its file under 'groundtruth'")
     return source, source.groundtruth

@@ -45,7 +45,8 @@ CATALOGUE = (
     System("direct", f"{_BASELINES}.direct.system:DirectOdometry",
            about="semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)"),
     System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",
-           about="ORB-SLAM3 monocular (pyorbslam3), without the official vocabulary; closes loops, unless loops=false",
+           about="ORB-SLAM3 (pyorbslam3), without the official vocabulary; monocular, or in metres with "
+           "sensor=stereo or sensor=rgbd; closes loops, unless loops=false",
            version_from=f"{_PEERS}.orbslam3:version", missing_from=f"{_PEERS}.orbslam3:missing"),
     System("svo", f"{_PEERS}.svo:Svo", licence="GPL-3", about="SVO (svo-cpp)",
            version_from=f"{_PEERS}.svo:version", missing_from=f"{_PEERS}.svo:missing"),

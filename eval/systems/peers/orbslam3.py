@@ -1,4 +1,7 @@
-"""ORB-SLAM3 (Campos et al. 2021), monocular, from the package ``pyorbslam3`` (GPL-3).
+"""ORB-SLAM3 (Campos et al. 2021) from the package ``pyorbslam3`` (GPL-3).
+
+It is monocular, or takes the right images of rectified stereo pairs or depth images of its frames, and is in metres
+then (``--systems orbslam3+sensor=stereo``, ``orbslam3+sensor=rgbd``).
 
 Its threads race: fed faster than the camera delivers, mapping starves. So frames are fed no faster than their stamps
 say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). A machine that is busy
@@ -21,22 +24,30 @@ import os
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
+import cv2
 import numpy as np
 
-from dvo.data.frame import Frame
+from dvo.data.frame import Frame, StereoView
 from dvo.data.root import data_root
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
+from dvo.geometry.undistort import needs_undistortion
 from dvo.odometry.protocol import Estimate, Result, Status
 from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of
 
 VOCABULARY = "DVO_ORB_VOCABULARY"
 FEATURES = 1500
+KINECT_BASELINE = 0.08
+"""Metres between projector and camera of a Kinect; ORB-SLAM3 makes a virtual right image of a depth image with it."""
+CLOSE = 40
+"""Number of baselines up to which a point counts as close, with a depth of its own."""
+Sensor = Literal["monocular", "stereo", "rgbd"]
 version = version_of("pyorbslam3")
 
 
@@ -78,22 +89,27 @@ class OrbSlam3:
     Args:
         loops: closes loops, merges maps and relocalises; see the module.
         pace: seconds of the recording that are fed in a second, at most.
+        sensor: of ``"stereo"`` and ``"rgbd"`` the trajectory is in metres.
 
     Raises:
-        DvoError: a pace that is not above 0.
+        DvoError: a pace that is not above 0, another sensor, or (when tracking) frames without what the sensor gives.
     """
 
     name = "orbslam3"
 
-    def __init__(self, loops: bool = True, pace: float = 1.0) -> None:
+    def __init__(self, loops: bool = True, pace: float = 1.0, sensor: Sensor = "monocular") -> None:
         import pyorbslam3
 
         if not pace > 0:
             raise DvoError(f"must be above 0, got {pace}", field="pace", remedy="1 is the pace of the camera")
+        if sensor not in get_args(Sensor):
+            remedy = f"choose from {', '.join(get_args(Sensor))}"
+            raise DvoError(f"no such sensor: {sensor}", field="sensor", remedy=remedy)
+        self._sensor: Sensor = sensor
         self._package, self._loops, self._pace = pyorbslam3, loops, pace
         self._vocabulary = vocabulary_file()
         self._folder = tempfile.TemporaryDirectory(prefix="orbslam3-")
-        self._pictures = Pictures()
+        self._pictures, self._pictures_right = Pictures(), Pictures()
         self._slam: Any = None
         self._rows: list[Row] = []
         self._keyframes: dict[int, Trajectory] = {}
@@ -107,17 +123,21 @@ class OrbSlam3:
         if self._slam is None:
             assert self._pictures.camera is not None
             file = Path(self._folder.name) / "settings.yaml"
-            file.write_text(settings(self._pictures.camera, self._loops), encoding="utf-8")
-            monocular = self._package.Sensor.MONOCULAR
-            self._slam = self._package.Slam(str(self._vocabulary), str(file), monocular, use_viewer=False)
+            baseline = None if self._sensor == "monocular" else KINECT_BASELINE
+            if self._sensor == "stereo":
+                baseline = rectified_view(frame).baseline
+            file.write_text(settings(self._pictures.camera, self._loops, baseline), encoding="utf-8")
+            sensor = getattr(self._package.Sensor, self._sensor.upper())
+            self._slam = self._package.Slam(str(self._vocabulary), str(file), sensor, use_viewer=False)
             self._fed, self._stamp = time.perf_counter(), frame.timestamp
+        second = self._second(frame)
         self._frames += 1
         # From frame to frame: after a pause of the machine nothing is made up for.
         due = self._fed + (frame.timestamp - self._stamp) / self._pace
         time.sleep(max(0.0, due - time.perf_counter()))
         start = self._fed = time.perf_counter()
         self._stamp = frame.timestamp
-        said = self._slam.track_monocular(image, frame.timestamp)
+        said = getattr(self._slam, f"track_{self._sensor}")(image, *second, frame.timestamp)
         self._computing += time.perf_counter() - start
         if self._slam.map_changed():
             self._map_changes.append(frame.timestamp)
@@ -150,10 +170,25 @@ class OrbSlam3:
             "keyframes": keyframes,
             "place_recognition": self._loops,
             "pace": self._pace,
+            "sensor": self._sensor,
             "map_changes": self._map_changes,
             "computing_fps": self._frames / self._computing if self._computing else None,
         }
         return result(rows, self._frames, info, worlds)
+
+    def _second(self, frame: Frame) -> tuple[np.ndarray, ...]:
+        """Image that the sensor gives beside that of the frame, of the same size: none of a monocular one."""
+        if self._sensor == "monocular":
+            return ()
+        if self._sensor == "stereo":
+            view = rectified_view(frame)
+            return (self._pictures_right(replace(frame, image=view.image, camera=view.camera)),)
+        assert self._pictures.camera is not None
+        if frame.depth is None:
+            raise _lacks(frame, "depth")
+        size = self._pictures.camera.width, self._pictures.camera.height
+        depth = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
+        return (np.ascontiguousarray(cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST)),)
 
     def _read_keyframes(self) -> None:
         """Keep where the keyframes of the present map are."""
@@ -214,21 +249,45 @@ def follow_keyframes(rows: list[Row], stamps: np.ndarray, T_wk: np.ndarray) -> t
     ], len(corrections)
 
 
-def settings(camera: Camera, loops: bool = True) -> str:
+def rectified_view(frame: Frame) -> StereoView:
+    """Right image of a frame, of a camera that is parallel to its own, with its calibration, on its x axis.
+
+    Args:
+        frame: with a right image, both undistorted.
+
+    Raises:
+        DvoError: no right image, or another pair.
+    """
+    view = frame.right
+    if view is None:
+        raise _lacks(frame, "right")
+    aside = np.abs(view.T_left_right[1:6]).max() > 1e-6 or view.T_left_right[0] <= 0
+    if aside or view.camera != frame.camera or needs_undistortion(frame.camera):
+        remedy = "rectify the images; this peer is given rectified pairs only"
+        raise DvoError("not a rectified stereo pair", field=f"frame {frame.index}: right", remedy=remedy)
+    return view
+
+
+def _lacks(frame: Frame, field: str) -> DvoError:
+    return DvoError(
+        "not there", field=f"frame {frame.index}: {field}", remedy="choose the sensor that the sequence has"
+    )
+
+
+def settings(camera: Camera, loops: bool = True, baseline: float | None = None) -> str:
     """Text of its settings file.
 
     Args:
         camera: of the images, undistorted.
         loops: recognises places: closes loops, merges maps, relocalises.
+        baseline: metres between the cameras of rectified stereo pairs, or of the virtual pair of a depth image; None
+            for a single camera.
     """
-    lines = {
+    lines: dict[str, Any] = {
         "File.version": '"1.0"',
+        # Of its type "Rectified" ORB-SLAM3 1.0 prints a second calibration that it has not got, and ends.
         "Camera.type": '"PinHole"',
-        "Camera1.fx": camera.fx,
-        "Camera1.fy": camera.fy,
-        "Camera1.cx": camera.cx,
-        "Camera1.cy": camera.cy,
-        **{f"Camera1.{name}": 0.0 for name in ("k1", "k2", "p1", "p2")},
+        **_intrinsics("Camera1", camera),
         "Camera.width": camera.width,
         "Camera.height": camera.height,
         "Camera.fps": 30,
@@ -239,12 +298,30 @@ def settings(camera: Camera, loops: bool = True) -> str:
         "ORBextractor.iniThFAST": 20,
         "ORBextractor.minThFAST": 7,
         "loopClosing": int(loops),
+        **({} if baseline is None else _pair(camera, baseline)),
         # The viewer is off, but its settings are required.
         **{f"Viewer.{name}": 0.1 for name in ("KeyFrameSize", "GraphLineWidth", "PointSize", "CameraSize")},
         **{f"Viewer.{name}": 1.0 for name in ("KeyFrameLineWidth", "CameraLineWidth", "ViewpointX", "ViewpointY")},
         **{f"Viewer.{name}": 1.0 for name in ("ViewpointZ", "ViewpointF")},
     }
     return "%YAML:1.0\n" + "".join(f"{name}: {value}\n" for name, value in lines.items())
+
+
+def _intrinsics(name: str, camera: Camera) -> dict[str, float]:
+    values = dict(zip(("fx", "fy", "cx", "cy"), camera.intrinsics.tolist(), strict=True))
+    return {f"{name}.{key}": value for key, value in {**values, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}.items()}
+
+
+def _pair(camera: Camera, baseline: float) -> dict[str, Any]:
+    """Settings of a rectified pair, and of depth images in metres."""
+    T_left_right = f"1.0, 0.0, 0.0, {baseline}, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0"
+    return {
+        **_intrinsics("Camera2", camera),
+        "Stereo.T_c1_c2": f"!!opencv-matrix {{rows: 4, cols: 4, dt: f, data: [{T_left_right}]}}",
+        "Stereo.b": baseline,
+        "Stereo.ThDepth": float(CLOSE),
+        "RGBD.DepthMapFactor": 1.0,
+    }
 
 
 def count_words(vocabulary: Path) -> int:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from dvo.data.root import data_root
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from eval.suites.suite import read_suite, reference_for
+from eval.suites.selection import settle
+from eval.suites.suite import Sequence, open_sequence, read_suite, reference_for
 
 
 def test_validation_suite_of_the_checkout():
@@ -123,3 +127,32 @@ def test_missing_data_folder(tmp_path, monkeypatch):
     with pytest.raises(DvoError, match="nowhere"):
         data_root()
     assert data_root(tmp_path) == tmp_path
+
+
+def test_a_part_of_a_recording_with_depth_or_right_images(image_folder):
+    root = image_folder.parent
+    for name in ("depth", "right"):
+        (root / name).mkdir()
+        for number in range(20):
+            image = np.full((48, 64), 1000 + number, np.uint16) if name == "depth" else np.zeros((48, 64, 3), np.uint8)
+            cv2.imwrite(str(root / name / f"{number:04d}.png"), image)
+    files = {"calib": "../calib.txt", "times": "../times.txt", "groundtruth": "../truth.txt"}
+    one = Sequence("one", "clip/images", start="4f", end="0.6", depth="../depth", **files)
+    frames = list(open_sequence(one, root.parent, 1)[0])
+    assert [frame.index for frame in frames] == [4, 5]
+    assert frames[0].depth is not None and frames[0].depth[0, 0] == pytest.approx(1.004) and frames[0].right is None
+    pair = replace(one, depth=None, right="../right", baseline=0.25)
+    (frame, _) = open_sequence(pair, root.parent, 1)[0]
+    assert frame.depth is None and frame.right is not None and frame.right.baseline == 0.25
+    with pytest.raises(DvoError, match="--baseline"):
+        open_sequence(replace(pair, baseline=None), root.parent, 1)
+
+
+def test_recordings_in_metres(data_root):
+    suite = read_suite("metric")
+    assert suite.alignment == "se3" and "validation" in suite.label
+    for sequence in suite.sequences:
+        source, _ = open_sequence(settle(suite, sequence, data_root), data_root, 1)
+        frame = next(iter(source))
+        assert (frame.right is not None) == ("stereo" in sequence.name), sequence.name
+        assert (frame.depth is not None) == ("depth" in sequence.name), sequence.name

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -99,3 +101,12 @@ def test_list(tmp_path, monkeypatch, capsys):
     assert "klt-pnp        MIT        available" in told and "MH_01 " in told
     assert f"missing: {tmp_path / 'MH_01_easy'}" in told and "data: https://www.cvlibs.net" in told
     assert main(["--list"]) == 0 and capsys.readouterr().out == told
+
+
+def test_a_reader_that_has_seen_enough_ends_it_quietly(repository):
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-m", "eval", "list"], cwd=repository, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b"" and process.wait() == 0

@@ -10,7 +10,7 @@ depths, with the poses that these suggest, and compared by their robust cost.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -111,32 +111,78 @@ def restart(
     return _solve(poses_cw, patches, measured, fixed, options, options.iterations)
 
 
+@dataclass(frozen=True)
+class Solution:
+    """Solution of a problem.
+
+    Attributes:
+        start: name in :data:`STARTS`; empty for the present solution.
+        poses_cw: ``(N, 7)`` world to camera.
+        patches: ``(K, 3, p, p)``.
+        cost: with :attr:`RestartOptions.kernel`.
+    """
+
+    start: str
+    poses_cw: Tensor
+    patches: Tensor
+    cost: float
+
+
+def solutions(
+    poses_cw: Tensor,
+    patches: Tensor,
+    measured: Measured,
+    fixed: Tensor,
+    options: RestartOptions = RestartOptions(),  # noqa: B008 (frozen)
+) -> list[Solution]:
+    """Solve from all :data:`STARTS`.
+
+    Args:
+        poses_cw, patches, measured, fixed, options: see :func:`restart`.
+
+    Returns:
+        The present solution, refined, and those of the starts that were not abandoned.
+    """
+    half, rest = options.iterations // 2, options.iterations - options.iterations // 2
+    found = [Solution("", *_solve(poses_cw, patches, measured, fixed, options, options.iterations))]
+    for start in STARTS:
+        part = restart(poses_cw, patches, measured, fixed, start, replace(options, iterations=half))
+        if part[2] <= options.abandon * found[0].cost:
+            found.append(Solution(start, *_solve(part[0], part[1], measured, fixed, options, rest)))
+    return found
+
+
+def better_solution(found: Sequence[Solution], options: RestartOptions = RestartOptions()) -> Solution | None:  # noqa: B008
+    """Best of other solutions, if its cost is lower than that of the present one by the margin.
+
+    Args:
+        found: of :func:`solutions`.
+        options: the margin.
+
+    Returns:
+        The solution; None if the present one is better.
+    """
+    now, *others = found
+    best = min(others, key=lambda other: other.cost, default=now)
+    return best if best.cost < options.margin * now.cost else None
+
+
 def better_start(
     poses_cw: Tensor,
     patches: Tensor,
     measured: Measured,
     fixed: Tensor,
     options: RestartOptions = RestartOptions(),  # noqa: B008 (frozen)
-) -> tuple[str, Tensor, Tensor] | None:
+) -> Solution | None:
     """Best of the :data:`STARTS`, if it leads to a lower cost than the present solution.
 
     Args:
         poses_cw, patches, measured, fixed, options: see :func:`restart`; the present solution is refined first.
 
     Returns:
-        Name of the start, with the poses and patches of its solution; None if the present solution is better.
+        Its solution; None if the present one is better.
     """
-    half, rest = options.iterations // 2, options.iterations - options.iterations // 2
-    now = _solve(poses_cw, patches, measured, fixed, options, options.iterations)[2]
-    best, limit = None, options.margin * now
-    for start in STARTS:
-        part = restart(poses_cw, patches, measured, fixed, start, replace(options, iterations=half))
-        if part[2] > options.abandon * now:
-            continue
-        poses, depths, cost = _solve(part[0], part[1], measured, fixed, options, rest)
-        if cost < limit:
-            best, limit = (start, poses, depths), cost
-    return best
+    return better_solution(solutions(poses_cw, patches, measured, fixed, options), options)
 
 
 def _solve(

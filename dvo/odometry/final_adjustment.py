@@ -205,9 +205,9 @@ def _leave_minimum(
     # The whole may be in another minimum than its beginning: both the better beginning, extended, and the better start.
     known = replace(options, kernels=options.kernels[-1:])
     poses_cw, depths, cost = solve_part(part, poses_cw, depths, fixed, known)
-    start = _extended(poses_cw, depths, better[1], better[2][:, 2, 0, 0].reshape(n, m)[:, ::2])
+    start = _extended(poses_cw, depths, better.poses_cw, better.patches[:, 2, 0, 0].reshape(n, m)[:, ::2])
     settings = replace(settings, iterations=3 * options.iterations)
-    poses, new_patches, new = restart(poses_cw, patches, measured, fixed, better[0], settings)
+    poses, new_patches, new = restart(poses_cw, patches, measured, fixed, better.start, settings)
     found = new_patches[:, 2, 0, 0].reshape_as(depths)
     if measured_share(part.measured) > 0:  # a cost without those of measured depths cannot be compared
         poses, found = to_measured(poses, found, part.measured)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import torch
 
 from dvo.ba.cold_start import damping_at, robust_cost, solve_from_nothing
-from dvo.ba.restart import better_start
+from dvo.ba.restart import better_solution, solutions
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import MOST, match_window, measured_share
+from dvo.odometry.displacement import flow_metric, median_inverse_depth
 from dvo.odometry.evidence import NO_MATCH, last_unrelated, measured, related_share, window_inliers
 from dvo.odometry.motion import parallax
+from dvo.odometry.second_solution import second_solutions
+from dvo.odometry.window_gauge import window_gauge
 from dvo.odometry.window_step import WindowStep
 
 RESTARTS = frozenset({4, 8, 16, 32})
@@ -178,28 +181,47 @@ def worth_keeping(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig,
     return agree and (only or rows >= config.initial_frames)
 
 
-def leave_minimum(window: Window, age: int) -> bool:
-    """Start the window anew if that leads to a better solution (:mod:`dvo.ba.restart`).
+def restart_due(age: int, ambiguous: bool) -> bool:
+    """Tell if a second solution is looked for after a frame (:func:`leave_minimum`).
 
     The first frames have too little parallax to tell a relief from the reversed one; later frames have more.
 
     Args:
-        window: of an initialised tracker; poses and inverse depths are changed in place.
-        age: number of frames since the initialisation; nothing is tried but at :data:`RESTARTS`.
+        age: number of frames since the initialisation.
+        ambiguous: another solution was nearly as good the last time.
 
     Returns:
-        True if they were changed.
+        True at :data:`RESTARTS`, and later from time to time as long as the window is ambiguous.
     """
-    if age not in RESTARTS or measured_share(window.measured) >= MOST:
+    return age in RESTARTS or (ambiguous and age % max(RESTARTS) == 0)
+
+
+def leave_minimum(window: Window, size: tuple[int, int]) -> bool:
+    """Start the window anew if that leads to a better solution (:mod:`dvo.ba.restart`).
+
+    Args:
+        window: of an initialised tracker; poses and inverse depths are changed in place.
+        size: width and height of the feature map.
+
+    Returns:
+        True if another solution is nearly as good as the one that is left (:mod:`dvo.odometry.second_solution`).
+    """
+    if measured_share(window.measured) >= MOST:
         return False
     measured = (window.intrinsics, window.targets, window.weights)
     # On the CPU in double precision, which not every accelerator has; the problem is small.
     real = (x.cpu().double() for x in (window.poses_cw, window.patches, *measured))
     poses, patches, intrinsics, targets, weights = real
-    fixed = torch.arange(len(window)) < 1
     edges = (window.ii.cpu(), window.jj.cpu(), window.kk.cpu())
-    found = better_start(poses, patches, (intrinsics, targets, weights, *edges), fixed)
-    if found is not None:
-        window.poses_cw, window.patches = found[1].to(window.poses_cw), found[2].to(window.patches)
+    found = solutions(poses, patches, (intrinsics, targets, weights, *edges), torch.arange(len(window)) < 1)
+    best = better_solution(found)
+    if best is not None:
+        window.poses_cw, window.patches = best.poses_cw.to(window.poses_cw), best.patches.to(window.patches)
         match_window(window)
-    return found is not None
+        found = [best, *(other for other in found if other is not best)]
+    gauge = window_gauge(window)
+    if gauge is None:
+        return False
+    depth = median_inverse_depth(found[0].patches[:, 2, 0, 0], window.per_frame)
+    metric = flow_metric(window.frames[-1].intrinsics.double().cpu().numpy(), size, depth)
+    return bool(second_solutions(found, gauge, metric))

@@ -36,7 +36,7 @@ class Estimate:
         status: state of the tracker.
         confidence: in [0, 1], 0 without a pose. Of the patch tracker, the probability that the error of the pose
             relative to the reference displaces the scene by less than half a pixel of an image of 320x240, in the RMS
-            over the image (:func:`dvo.odometry.uncertainty.confidence_of`): comparable between runs. Of other
+            over the image (:func:`dvo.odometry.displacement.confidence_of`): comparable between runs. Of other
             odometries comparable within one run only.
         segment: number of the segment that the pose belongs to, from 0. Poses of two segments have different worlds and
             different scales.

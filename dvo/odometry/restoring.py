@@ -71,6 +71,7 @@ class TrackerTable:
         new: time of the first frame with the last image, seconds.
         last: last estimate.
         waiting: for each waiting view, the positions of its frames in the log.
+        ambiguous: of the state; not in files of earlier versions.
     """
 
     name: str
@@ -91,6 +92,7 @@ class TrackerTable:
     new: float
     last: EstimateTable | None
     waiting: tuple[tuple[int, ...], ...]
+    ambiguous: bool = False
 
     RANGES: ClassVar[dict[str, tuple[float, float]]] = {
         "seed": (0, LARGEST_SEED),
@@ -121,6 +123,7 @@ def restore_tracker(source: MapReader, odometry: PatchOdometry, table: TrackerTa
     source.require(not table.finished or not len(odometry.window), "finished, with a window", "tracker: finished")
     source.require(not table.initialised or len(odometry.window) > 1, "initialised without a window", "tracker")
     state.keyframes, state.tracked, state.initialised = table.keyframes, table.tracked, table.initialised
+    state.ambiguous = table.ambiguous
     state.finished, state.adjustable = table.finished, list(table.adjustable)
     state.joining, state.skipped, state.info = table.joining, table.skipped, table.info
     state.shutter = Shutter(table.readout, table.rows)
@@ -147,7 +150,7 @@ def restore_tracker(source: MapReader, odometry: PatchOdometry, table: TrackerTa
     _restore_window(source, odometry, size)
     if state.last is not None and state.last[1].pose_wc is not None and len(odometry.window):
         image, estimate = state.last
-        again = newest_uncertainty(odometry.step, odometry.config)
+        again = newest_uncertainty(odometry.step, odometry.config, state.ambiguous)
         state.last = image, replace(estimate, covariance=again.covariance, reference=again.reference)
     _restore_waiting(source, odometry, table, size)
 

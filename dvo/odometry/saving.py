@@ -137,7 +137,7 @@ def _tracker_table(odometry: PatchOdometry) -> TrackerTable:
         odometry.name, odometry.seed, odometry.config, state.keyframes, state.tracked, state.initialised,
         state.finished, tuple(state.adjustable), state.joining, state.skipped, state.info, state.shutter.readout,
         state.shutter.rows, state.sequence.size, tuple(state.sequence.intervals), state.sequence.new, estimate,
-        tuple(tuple(number[id(record)] for record in view.records) for view in _views(odometry)),
+        tuple(tuple(number[id(record)] for record in view.records) for view in _views(odometry)), state.ambiguous,
     )  # fmt: skip
 
 

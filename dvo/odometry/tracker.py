@@ -28,13 +28,21 @@ from dvo.models.step import StepOptions
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.adjusting import adjust
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.depth_factor import MOST, measured_share
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
 from dvo.odometry.exclusive import exclusive
 from dvo.odometry.finishing import finish_segments, run_information
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, keyframe_of, observe
 from dvo.odometry.initial_pose import first_depth, first_pose
-from dvo.odometry.initialisation import drop_unrelated, first_motion, initialise_related, leave_minimum, worth_keeping
+from dvo.odometry.initialisation import (
+    drop_unrelated,
+    first_motion,
+    initialise_related,
+    leave_minimum,
+    restart_due,
+    worth_keeping,
+)
 from dvo.odometry.late_join import join_waiting
 from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
@@ -45,7 +53,7 @@ from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
 from dvo.odometry.tracker_state import TrackerState
-from dvo.odometry.uncertainty import UNKNOWN, later_uncertainty
+from dvo.odometry.uncertainty import later_uncertainty
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
@@ -230,8 +238,8 @@ class PatchOdometry:
         record.place(keyframe.identifier, self.graph.segment, state.joining if state.skipped else "")
         state.joining, state.skipped = "", False
         state.tracked += 1
-        if config.restart:
-            leave_minimum(window, state.tracked)
+        if config.restart and restart_due(state.tracked, state.ambiguous):
+            state.ambiguous = leave_minimum(window, self.step.bounds)
         join_waiting(self.graph, self.step, state, config, record)
         self._reduce()  # may correct the window
         return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
@@ -253,6 +261,7 @@ class PatchOdometry:
             enough = initialise_related(self.graph, self.step, config)
             state.initialised = enough and newest_evidence(self.step).supports(config)
             state.adjustable += [self.graph.segment] * state.initialised
+            state.ambiguous = config.restart and measured_share(window.measured) < MOST  # until it is tried
         self._reduce()
         pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)
@@ -339,10 +348,12 @@ class PatchOdometry:
         self.loops.advance(self.state.adjustable)
 
     def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status) -> Estimate:
-        graph, reason = self.graph, record.reason if status is Status.LOST else ""
-        recovered = pose_wc is not None and self.state.enter(graph.segment, graph.world_of(graph.segment))
+        graph, state, reason = self.graph, self.state, record.reason if status is Status.LOST else ""
+        recovered = pose_wc is not None and state.enter(graph.segment, graph.world_of(graph.segment))
         segment = graph.segment - graph.recording.segment
-        sure = UNKNOWN if pose_wc is None else later_uncertainty(self.step, self.config, self.state.unread)
+        if pose_wc is None:
+            return Estimate(record.timestamp, None, status, 0.0, segment, reason, recovered)
+        sure = later_uncertainty(self.step, self.config, state.ambiguous, state.unread)
         return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
                         sure.covariance, sure.reference)  # fmt: skip
 

@@ -25,6 +25,7 @@ class TrackerState:
         keyframes: number of identifiers of keyframes given so far.
         tracked: frames of the segment since its initialisation.
         initialised: the segment is.
+        ambiguous: its window may have a second solution (:mod:`dvo.odometry.second_solution`).
         finished: no frame is taken any more.
         adjustable: segments that were initialised.
         waiting: frames with content since tracking was lost.
@@ -42,6 +43,7 @@ class TrackerState:
     keyframes: int = 0
     tracked: int = 0
     initialised: bool = False
+    ambiguous: bool = False
     finished: bool = False
     adjustable: list[int] = field(default_factory=list)
     waiting: list[View] = field(default_factory=list)
@@ -56,6 +58,7 @@ class TrackerState:
     def begin_segment(self) -> None:
         """Forget the segment that has been closed."""
         self.initialised, self.joining, self.skipped, self.tracked, self.world = False, "", False, 0, -1
+        self.ambiguous = False
 
     def enter(self, segment: int, world: int) -> bool:
         """Record the world of a pose.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 from weakref import ref
 
@@ -63,6 +63,15 @@ class WindowMeasurements:
             tuple(frame.intrinsics for frame in w.frames), tuple(frame.measured for frame in w.frames),
             tuple(frame.timestamp for frame in w.frames), step.bounds, step.kernel,
         )  # fmt: skip
+
+    def at(self, poses_cw: Tensor, patches: Tensor) -> WindowMeasurements:
+        """The same measurements at another solution.
+
+        Args:
+            poses_cw: ``(n, 7)``.
+            patches: ``(n * M, 3, 1, 1)`` patch centres.
+        """
+        return replace(self, poses_cw=poses_cw.to(self.poses_cw), centres=patches[..., 0, 0].to(self.centres))
 
 
 class Later(Generic[T]):

@@ -6,10 +6,10 @@
 
 After every frame the newest pose relative to the reference of its covariance (:mod:`dvo.odometry.uncertainty`) is
 compared with the truth, whose scale is fitted to what the covariance holds fixed: the RMS distance of the keyframes in
-between from the reference. Printed are, by sequence and for all, the normalised error squared ``xi^T C^-1 xi`` for each
-of the six degrees of freedom (its expectation is 1), the same of the rotation and of the position alone, and the
-displacement that the error causes in the image; and for bins of the confidence the share of poses whose displacement is
-below the tolerance that it is the probability of.
+between from the reference. Printed are, by sequence, by suite and for all, the normalised error squared
+``xi^T C^-1 xi`` for each of the six degrees of freedom (its expectation is 1), the same of the rotation and of the
+position alone, and the displacement that the error causes in the image; and for bins of the confidence the share of
+poses whose displacement is below the tolerance that it is the probability of.
 
 The split ``validation`` is that of the suites. ``calibration`` has the same options and other scenes;
 ``TrackerConfig.covariance_scale`` is fitted on it: the present one times the geometric mean, over the sequences, of
@@ -29,21 +29,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dvo.data.frame import Frame, StereoView
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3
-from dvo.graph.window import Window
+from dvo.odometry.displacement import TOLERANCE, window_metric
 from dvo.odometry.load import load
 from dvo.odometry.tracker import PatchOdometry
-from dvo.odometry.uncertainty import TOLERANCE, Gauge, flow_metric, median_inverse_depth, window_gauge
+from dvo.odometry.window_gauge import relative_error, window_gauge
+from dvo.odometry.window_measurements import WindowMeasurements
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.threads import settle_threads
 from eval.benchmarks.weight_calibration import rendered_sequences
 
-SUITES = "plain,scale,textureless,fast,blur,rotation,lighting,dynamic"
+SUITES = "plain,scale,textureless,fast,blur,rotation,lighting,dynamic,rolling_shutter,blackout,loop,low_light"
 CALIBRATION = -500_000_000
 """Added to the seed of a validation sequence for one of the calibration split."""
 MEDIAN = 5.3481 / 6
@@ -83,9 +83,9 @@ class Errors:
         """Record a pose.
 
         Args:
-            xi: ``(6,)`` error, see :func:`pose_error`.
+            xi: ``(6,)`` error, see :func:`dvo.odometry.window_gauge.relative_error`.
             covariance: ``(6, 6)`` of it.
-            metric: of :func:`dvo.odometry.uncertainty.flow_metric`.
+            metric: of :func:`dvo.odometry.displacement.flow_metric`.
             confidence: of the estimate.
         """
         for values, rows in ((self.joint, slice(6)), (self.position, slice(3)), (self.rotation, slice(3, 6))):
@@ -103,26 +103,6 @@ class Errors:
 
 
 _LISTS = ("joint", "rotation", "position", "displacement", "expected", "confidence")
-
-
-def pose_error(window: Window, gauge: Gauge, true_cw: Tensor, metric: bool = False) -> np.ndarray:
-    """Error of the newest pose of a window relative to the reference, under the gauge of its covariance.
-
-    Args:
-        window: of a tracker, right after a frame.
-        gauge: of the window.
-        true_cw: ``(n, 7)`` float64 true poses of its frames, world to camera.
-        metric: the window is in metres, and its scale is part of the error.
-
-    Returns:
-        ``(6,)`` right tangent ``[tau, phi]`` with ``T_wc_true = T_wc Exp(xi)``, in units of the segment and radians.
-    """
-    members, first = list(gauge.members), gauge.reference
-    poses = window.poses_cw.double().cpu(), true_cw
-    found, true = (se3.relative(x[first : first + 1].expand_as(x), x) for x in poses)
-    scale = (found[members, :3].square().sum() / true[members, :3].square().sum()).sqrt()
-    newest = true[-1] if metric else torch.cat([scale * true[-1, :3], true[-1, 3:]])
-    return np.asarray(se3.log(se3.compose(found[-1], se3.inverse(newest))).numpy())
 
 
 def frames_of(sequence: SyntheticSequence, scale: str = "none", baseline: float = BASELINE) -> Iterator[Frame]:
@@ -184,9 +164,8 @@ def measure(
             continue
         stamps = np.array([keyframe.timestamp for keyframe in window.frames])
         true_cw = poses_cw[np.abs(times - stamps[:, None]).argmin(1)]
-        intrinsics = window.frames[-1].intrinsics.double().cpu().numpy()
-        pixels = flow_metric(intrinsics, odometry.step.bounds, median_inverse_depth(window))
-        xi = pose_error(window, gauge, true_cw, metric)
+        pixels = window_metric(WindowMeasurements.of(odometry.step))
+        xi = relative_error(window.poses_cw.cpu(), true_cw, gauge, metric)
         errors.add(xi, estimate.covariance, pixels, estimate.confidence)
     return errors
 
@@ -280,6 +259,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _print_tables(given: argparse.Namespace) -> None:
     found: list[Errors] = []
     families: dict[str, list[Errors]] = {}
+    suites: dict[str, list[Errors]] = {}
     calibrate = given.split == "calibration"
     entries = rendered_sequences(given.suites or SCALES[given.scale])
     clips = [(entry, clip) for entry in entries for clip in range(given.clips if calibrate else 1)]
@@ -291,10 +271,13 @@ def _print_tables(given: argparse.Namespace) -> None:
         errors = measure(sequence, given.weights, given.seed, given.scale, baseline)
         found.append(errors)
         families.setdefault(options["family"], []).append(errors)
+        suites.setdefault(entry.name.rsplit("_validation", 1)[0], []).append(errors)
         if number == 0:
             print(HEADER)
         name = entry.name.replace("validation", given.split)
         print(line(f"{name} clip {clip}" if given.clips > 1 and calibrate else name, errors), flush=True)
+    for suite, parts in suites.items():
+        print(line(f"suite {suite}", Errors.concatenate(parts)))
     print(line("all", Errors.concatenate(found)))
     print(f"geometric mean of the sequences' robust NEES/6: {scale_factor(found):.2f}")
     tolerance = f"share: displacement below {TOLERANCE:g} px"

@@ -44,8 +44,8 @@ def test_a_reversed_relief_is_left(seed):
     wrong, relief, cost = restart(poses, patches, measured, FIXED, "reversed")
     assert rotation_error(wrong, poses) > 0.02  # a minimum of its own: iterations do not lead out of it
     found = better_start(wrong, relief, measured, FIXED)
-    assert found is not None and rotation_error(found[1], poses) < 0.01
-    assert restart(wrong, relief, measured, FIXED, found[0])[2] < 0.5 * cost
+    assert found is not None and rotation_error(found.poses_cw, poses) < 0.01
+    assert restart(wrong, relief, measured, FIXED, found.start)[2] < 0.5 * cost
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -64,7 +64,7 @@ def test_the_motion_of_a_moving_body_is_left(seed):
     wrong, relief, _ = restart(along, patches, (*measured[:2], weights, *measured[3:]), FIXED, "equal")
     assert rotation_error(wrong, poses) > 0.02
     found = better_start(wrong, relief, measured, FIXED, RestartOptions(iterations=30))
-    assert found is not None and rotation_error(found[1], poses) < 0.7 * rotation_error(wrong, poses)
+    assert found is not None and rotation_error(found.poses_cw, poses) < 0.7 * rotation_error(wrong, poses)
 
 
 def test_starts_are_positive_and_keep_the_median():

@@ -19,14 +19,10 @@ from dvo.odometry import tracker as tracker_module
 from dvo.odometry import uncertainty, window_measurements
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import SIGMA, depth_factors
+from dvo.odometry.displacement import confidence_of, flow_metric
 from dvo.odometry.protocol import Estimate, Status
-from dvo.odometry.uncertainty import (
-    UNKNOWN,
-    confidence_of,
-    flow_metric,
-    newest_uncertainty,
-    window_gauge,
-)
+from dvo.odometry.uncertainty import UNKNOWN, newest_uncertainty
+from dvo.odometry.window_gauge import window_gauge
 from dvo.odometry.window_measurements import Later, Waiting
 from dvo.synth.sequence import make_sequence
 
@@ -209,7 +205,7 @@ def test_the_gauge_leaves_out_frames_without_measurements(tracked):
 
 
 def test_no_pose_depends_on_it(tracked, monkeypatch):
-    monkeypatch.setattr(tracker_module, "later_uncertainty", lambda step, config, waiting: UNKNOWN)
+    monkeypatch.setattr(tracker_module, "later_uncertainty", lambda step, config, ambiguous, waiting: UNKNOWN)
     odometry = dvo.load("small", **FAST)
     for frame, estimate in zip(walk(), tracked[2], strict=False):
         found = odometry.track(frame)

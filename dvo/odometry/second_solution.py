@@ -1,0 +1,92 @@
+"""Second solutions of a window: other motions that its measurements bear out nearly as well (:mod:`dvo.ba.restart`).
+
+The curvature of the cost at one minimum says nothing of another one. While the motion is small, or the scene has little
+texture, a window may have two of similar cost, and the tracker may be at the wrong one. Each solution then has a
+probability, by its cost, and the distances between them are a part of the uncertainty of the pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dvo.ba.restart import Solution, solutions
+from dvo.odometry.displacement import TOLERANCE
+from dvo.odometry.window_gauge import Gauge, relative_error
+from dvo.odometry.window_measurements import WindowMeasurements
+
+INDEPENDENT = 10.0
+"""Number of independent residuals that the probability of a solution is computed for. A window has a thousand, but
+those of a patch, and of neighbouring ones, share their errors (docs/uncertainty.md)."""
+LEAST = 0.01
+"""Probability below which a solution is left out."""
+
+
+@dataclass(frozen=True)
+class SecondSolution:
+    """Another solution of a window.
+
+    Attributes:
+        probability: that it is the right one.
+        error: ``(6,)`` right tangent ``[tau, phi]`` of the newest pose that leads to it, under the gauge.
+        solution: its poses and patches.
+    """
+
+    probability: float
+    error: np.ndarray
+    solution: Solution
+
+
+def window_solutions(window: WindowMeasurements) -> list[Solution]:
+    """Solutions of a window from all starts (:func:`dvo.ba.restart.solutions`), the present one first.
+
+    Args:
+        window: its measurements. Those of depths do not take part.
+
+    Returns:
+        The solutions, on the CPU in double precision, which not every accelerator has; the problem is small. Their
+        patches are the centres alone.
+    """
+    real = window.poses_cw, window.centres, torch.stack(window.camera), window.targets, window.confidence
+    poses, centres, camera, targets, confidence = (x.cpu().double() for x in real)
+    jj, kk = window.jj.cpu(), window.kk.cpu()
+    measured = camera, targets, confidence, kk // window.per_frame, jj, kk
+    return solutions(poses, centres[..., None, None], measured, torch.arange(len(poses)) < 1)
+
+
+def second_solutions(solved: Sequence[Solution], gauge: Gauge, metric: np.ndarray) -> list[SecondSolution]:
+    """Solutions that differ from the present one, with their probabilities.
+
+    The likelihood of a solution of cost ``c``, for ``n`` independent residuals of unknown variance, is proportional to
+    ``c^(-n/2)``.
+
+    Args:
+        solved: the present solution, followed by others.
+        gauge: under which the newest poses are compared.
+        metric: of :func:`dvo.odometry.displacement.flow_metric`. Solutions whose newest poses displace the scene in the
+            image by less than its :data:`~dvo.odometry.displacement.TOLERANCE` are one.
+
+    Returns:
+        The others, best first; those of a probability below :data:`LEAST` are left out.
+    """
+    now = solved[0]
+    different: list[tuple[float, np.ndarray, Solution]] = []
+    for other in sorted(solved[1:], key=lambda other: other.cost):
+        error = relative_error(now.poses_cw, other.poses_cw, gauge)
+        distances = [error] + [error - known for _, known, _ in different]
+        if np.isfinite(error).all() and min(float(d @ metric @ d) for d in distances) > TOLERANCE**2:
+            different.append((_likelihood(other.cost, now.cost), error, other))
+    total = 1 + sum(weight for weight, _, _ in different)
+    found = [SecondSolution(weight / total, error, other) for weight, error, other in different]
+    return [other for other in found if other.probability >= LEAST]
+
+
+def _likelihood(cost: float, now: float) -> float:
+    """Likelihood over that of the present solution; 1 if both costs vanish."""
+    tiny = np.finfo(np.float64).tiny
+    exponent = -INDEPENDENT / 2 * math.log(max(cost, tiny) / max(now, tiny))
+    return math.exp(min(exponent, 100.0))

@@ -64,11 +64,13 @@ def test_owner_of_a_phone(shell, filmed):
     assert "tracked 24 of 24 frames" in said.out
     (first,) = (shell.folder / "runs").glob("video-*")
     assert f"results in {first.relative_to(shell.folder)}/" in said.out and names(first) == ["calib.txt", *RESULTS]
+    assert said.out.rstrip().endswith("run.json, calib.txt")
     assert str(focal) in (first / "calib.txt").read_text()
 
     (shell.folder / "calib.txt").write_bytes((first / "calib.txt").read_bytes())
     said = shell.type("dvo run video.mp4 --calib calib.txt --out again --export colmap --overlay again.mp4")
     again = shell.folder / "again"
+    assert "run.json\n" in said.out and "overlay in again.mp4" in said.out
     assert "focal length" not in said.out + said.err and names(again) == ["export", *RESULTS]
     written = summary(again)
     assert written["self_calibration"] is None and written["camera"]["fx"] == pytest.approx(focal, abs=0.5)

@@ -22,16 +22,25 @@ class GuardedObserver:
     Args:
         observer: to call.
         option: of the command line that asks for it, for the warning.
+
+    Attributes:
+        option: of the command line.
     """
 
     def __init__(self, observer: Observer, option: str) -> None:
-        self._observer, self._option, self._failed = observer, option, False
+        self.option = option
+        self._observer, self._failed = observer, False
         self._warnings: list[str] = []
 
     @property
     def warnings(self) -> list[str]:
         """Sentences that were printed so far, by the observer (its attribute ``warnings``) and at its failure."""
         return [*getattr(self._observer, "warnings", ()), *self._warnings]
+
+    @property
+    def file(self) -> Path | None:
+        """File that the observer writes (its attribute ``file``); None if it writes none, or has failed."""
+        return None if self._failed else getattr(self._observer, "file", None)
 
     def begin(self, odometry: Odometry) -> None:
         """See :class:`dvo.odometry.observer.Observer`."""
@@ -62,7 +71,7 @@ class GuardedObserver:
             yield
         except Exception as error:
             if not self._failed:
-                problem = f"{self._option} ended by {type(error).__name__}: {error}; the run goes on without it"
+                problem = f"{self.option} ended by {type(error).__name__}: {error}; the run goes on without it"
                 self._warnings.append(problem)
                 warn(problem)
             self._failed = True

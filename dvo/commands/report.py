@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,13 +159,14 @@ def describe_scale(scale: Mapping[str, Any]) -> str:
     return f"poses and map are in metres, from {sources}{sure}" + (f"; but {problems}" if problems else "")
 
 
-def print_report(folder: Path, run: Run, scores: Scores) -> None:
+def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = ()) -> None:
     """Print counts, breaks, segments, errors and the names of the files.
 
     Args:
         folder: of the results.
         run: record of the session.
         scores: its errors.
+        more: names of other files that the run has written into the folder.
     """
     result, metrics = run.result, scores.longest
     several = len(result.segments) > 1
@@ -200,6 +201,7 @@ def print_report(folder: Path, run: Run, scores: Scores) -> None:
         longest = " of the longest segment" if several else ""
         say(f"{error_text(metrics)} after {group} alignment{longest}, {relative}{wrong}")
     files = [results.TRAJECTORY, results.MAP, results.PICTURE, results.PAGE, results.FRAMES, results.SUMMARY]
+    files += [*more, *(name for name in (results.CLOUD, results.MESH, results.BASE) if (folder / name).exists())]
     if several:
         last = len(result.segments) - 1
         files.insert(1, f"{results.segment_file(0)}{',' if last == 1 else ' ...'} {results.segment_file(last)}")

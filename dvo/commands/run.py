@@ -16,7 +16,7 @@ import torch
 import dvo
 from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
 from dvo.commands.base_frame import base_observers
-from dvo.commands.camera import with_calibration
+from dvo.commands.camera import CALIBRATION, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.commands.input_options import input_facts, input_settings
 from dvo.commands.maps import check_place, load_in_map
@@ -32,6 +32,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.export.formats import check_formats, export_run, remove_exports
 from dvo.odometry import results, session
+from dvo.odometry.camera_estimate import is_foreign
 from dvo.odometry.frame_table import FrameTable
 from dvo.odometry.observer import Observer
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
@@ -256,7 +257,12 @@ def _track(
         progress.finish(done.result)
     for warning in new_warnings:
         warn(warning)
-    print_report(folder, done, scores)
+    found = facts.get("self_calibration") is not None and not is_foreign(folder / CALIBRATION)
+    print_report(folder, done, scores, [CALIBRATION] * found)
+    for observer in observers:
+        file = getattr(observer, "file", None)
+        if file is not None and file.resolve().parent != folder.resolve():  # those in the folder are listed
+            say(f"{getattr(observer, 'option', '').removeprefix('--')} in {file}")
     if save_map is not None:
         say(f"map in {save_map}")
     if export:

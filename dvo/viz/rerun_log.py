@@ -62,7 +62,7 @@ class RerunLog:
     def __init__(self, file: Path | None, name: str) -> None:
         self._rr = rr = import_rerun()
         self._stream = rr.RecordingStream(APPLICATION)
-        self._file = file
+        self.file = file
         self._odometry: Odometry | None = None
         self._path: list[np.ndarray] = []
         self._piece = self._segment = self._count = 0
@@ -90,8 +90,8 @@ class RerunLog:
             odometry: newly built.
         """
         self._odometry = odometry
-        if self._file is not None:  # now, so that a run that cannot begin leaves an earlier file as it is
-            self._stream.save(self._file, default_blueprint=self._layout())
+        if self.file is not None:  # now, so that a run that cannot begin leaves an earlier file as it is
+            self._stream.save(self.file, default_blueprint=self._layout())
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
         """Log a frame.
@@ -141,8 +141,8 @@ class RerunLog:
             self._stream.flush()
         finally:
             self._stream.disconnect()
-            if self._file is not None:
-                remove_empty(self._file)
+            if self.file is not None:
+                remove_empty(self.file)
 
     # -- parts of a frame ----------------------------------------------------------------------------------------------
 

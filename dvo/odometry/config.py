@@ -87,8 +87,8 @@ class TrackerConfig:
         robust: width of the Cauchy kernel of bundle adjustment in ``track``, feature pixels; 0 for no kernel.
         sigma: standard deviation of a measurement of confidence 1, feature pixels, with the shipped weights; variances
             are ``sigma^2`` over the confidence (docs/precision.md, "Weights in pixels"). It scales covariances
-            (:attr:`dvo.odometry.protocol.Estimate.covariance`; :attr:`dvo.ba.options.BAOptions.sigma`); no pose depends
-            on it.
+            (:attr:`dvo.odometry.protocol.Estimate.covariance`; :attr:`dvo.ba.options.BAOptions.sigma`); of what poses
+            depend on, it decides only how often a second solution is looked for.
         covariance_scale: factor of the covariances beyond ``sigma^2``, as errors of measurements are not independent,
             with the shipped weights: fitted by ``python -m eval.benchmarks.covariance`` (docs/uncertainty.md).
         restart: start the window anew, some frames after the initialisation, and the final adjustment, if that leads to

@@ -12,15 +12,15 @@ from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import MOST, match_window, measured_share
-from dvo.odometry.displacement import flow_metric, median_inverse_depth
 from dvo.odometry.evidence import NO_MATCH, last_unrelated, measured, related_share, window_inliers
 from dvo.odometry.motion import parallax
-from dvo.odometry.second_solution import second_solutions
-from dvo.odometry.window_gauge import window_gauge
+from dvo.odometry.uncertainty import has_second_solution
 from dvo.odometry.window_step import WindowStep
 
 RESTARTS = frozenset({4, 8, 16, 32})
 """Numbers of frames after the initialisation at which its solution is compared with others."""
+AGAIN = 8
+"""Frames from one comparison to the next as long as another solution is nearly as good."""
 
 
 def median_revision(revision: Revision, window: Window) -> float:
@@ -191,21 +191,22 @@ def restart_due(age: int, ambiguous: bool) -> bool:
         ambiguous: another solution was nearly as good the last time.
 
     Returns:
-        True at :data:`RESTARTS`, and later from time to time as long as the window is ambiguous.
+        True at :data:`RESTARTS`, and each :data:`AGAIN` frames as long as the window is ambiguous.
     """
-    return age in RESTARTS or (ambiguous and age % max(RESTARTS) == 0)
+    return age in RESTARTS or (ambiguous and age % AGAIN == 0)
 
 
-def leave_minimum(window: Window, size: tuple[int, int]) -> bool:
+def leave_minimum(step: WindowStep, config: TrackerConfig) -> bool:
     """Start the window anew if that leads to a better solution (:mod:`dvo.ba.restart`).
 
     Args:
-        window: of an initialised tracker; poses and inverse depths are changed in place.
-        size: width and height of the feature map.
+        step: of the model on the window of an initialised tracker; its poses and inverse depths are changed in place.
+        config: scale of the covariance.
 
     Returns:
         True if another solution is nearly as good as the one that is left (:mod:`dvo.odometry.second_solution`).
     """
+    window = step.window
     if measured_share(window.measured) >= MOST:
         return False
     measured = (window.intrinsics, window.targets, window.weights)
@@ -219,9 +220,4 @@ def leave_minimum(window: Window, size: tuple[int, int]) -> bool:
         window.poses_cw, window.patches = best.poses_cw.to(window.poses_cw), best.patches.to(window.patches)
         match_window(window)
         found = [best, *(other for other in found if other is not best)]
-    gauge = window_gauge(window)
-    if gauge is None:
-        return False
-    depth = median_inverse_depth(found[0].patches[:, 2, 0, 0], window.per_frame)
-    metric = flow_metric(window.frames[-1].intrinsics.double().cpu().numpy(), size, depth)
-    return bool(second_solutions(found, gauge, metric))
+    return has_second_solution(step, config, found)

@@ -22,8 +22,11 @@ from dvo.odometry.window_measurements import WindowMeasurements
 INDEPENDENT = 10.0
 """Number of independent residuals that the probability of a solution is computed for. A window has a thousand, but
 those of a patch, and of neighbouring ones, share their errors (docs/uncertainty.md)."""
-LEAST = 0.01
+LEAST = 0.05
 """Probability below which a solution is left out."""
+DISTANCE = 4.0
+"""Normalised squared distance, for each degree of freedom, below which two solutions are one: a window that determines
+its pose loosely has many of nearly the same cost, which its covariance contains."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,9 @@ def window_solutions(window: WindowMeasurements) -> list[Solution]:
     return solutions(poses, centres[..., None, None], measured, torch.arange(len(poses)) < 1)
 
 
-def second_solutions(solved: Sequence[Solution], gauge: Gauge, metric: np.ndarray) -> list[SecondSolution]:
+def second_solutions(
+    solved: Sequence[Solution], gauge: Gauge, covariance: np.ndarray, metric: np.ndarray
+) -> list[SecondSolution]:
     """Solutions that differ from the present one, with their probabilities.
 
     The likelihood of a solution of cost ``c``, for ``n`` independent residuals of unknown variance, is proportional to
@@ -67,18 +72,22 @@ def second_solutions(solved: Sequence[Solution], gauge: Gauge, metric: np.ndarra
     Args:
         solved: the present solution, followed by others.
         gauge: under which the newest poses are compared.
+        covariance: ``(6, 6)`` of the newest pose, see :data:`DISTANCE`.
         metric: of :func:`dvo.odometry.displacement.flow_metric`. Solutions whose newest poses displace the scene in the
-            image by less than its :data:`~dvo.odometry.displacement.TOLERANCE` are one.
+            image by less than its :data:`~dvo.odometry.displacement.TOLERANCE` are one too.
 
     Returns:
         The others, best first; those of a probability below :data:`LEAST` are left out.
     """
-    now = solved[0]
+    now, information = solved[0], np.linalg.inv(covariance) / len(covariance)
+
+    def differs(error: np.ndarray) -> bool:
+        return bool(error @ metric @ error > TOLERANCE**2 and error @ information @ error > DISTANCE)
+
     different: list[tuple[float, np.ndarray, Solution]] = []
     for other in sorted(solved[1:], key=lambda other: other.cost):
         error = relative_error(now.poses_cw, other.poses_cw, gauge)
-        distances = [error] + [error - known for _, known, _ in different]
-        if np.isfinite(error).all() and min(float(d @ metric @ d) for d in distances) > TOLERANCE**2:
+        if np.isfinite(error).all() and all(map(differs, [error, *(error - known for _, known, _ in different)])):
             different.append((_likelihood(other.cost, now.cost), error, other))
     total = 1 + sum(weight for weight, _, _ in different)
     found = [SecondSolution(weight / total, error, other) for weight, error, other in different]

@@ -239,7 +239,7 @@ class PatchOdometry:
         state.joining, state.skipped = "", False
         state.tracked += 1
         if config.restart and restart_due(state.tracked, state.ambiguous):
-            state.ambiguous = leave_minimum(window, self.step.bounds)
+            state.ambiguous = leave_minimum(self.step, config)
         join_waiting(self.graph, self.step, state, config, record)
         self._reduce()  # may correct the window
         return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)

@@ -17,6 +17,7 @@ While a window may have a second solution, covariance and confidence are those o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -28,6 +29,7 @@ from dvo.ba.blocks import INVERSE_DEPTHS
 from dvo.ba.covariance import marginal_covariance, size_gradient
 from dvo.ba.linearisation import NormalEquations
 from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.restart import Solution
 from dvo.ba.window_equations import window_equations
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import depth_factors
@@ -118,27 +120,52 @@ def newest_uncertainty(step: WindowStep, config: TrackerConfig, ambiguous: bool 
 
 
 @torch.no_grad()
+def has_second_solution(step: WindowStep, config: TrackerConfig, solved: Sequence[Solution]) -> bool:
+    """Tell if another solution of a window is nearly as good as the present one.
+
+    Args:
+        step: of the model on the window, which is at the first of the solutions.
+        config: scale of the covariance.
+        solved: solutions of the window.
+
+    Returns:
+        True if covariance and confidence have to take another one into account.
+    """
+    window = WindowMeasurements.of(step)
+    gauge = window_gauge(window)
+    if gauge is None:
+        return False
+    covariance = _covariance(window, gauge, config)
+    return covariance is not None and bool(second_solutions(solved, gauge, covariance, window_metric(window)))
+
+
+@torch.no_grad()
 def _uncertainty(window: WindowMeasurements, config: TrackerConfig, ambiguous: bool) -> Uncertainty:
     gauge = window_gauge(window)
     if gauge is None:
         return UNKNOWN
     reference = window.timestamps[gauge.reference]
-    scale = config.sigma**2 * config.covariance_scale
-    covariance = scale * _marginal(window, gauge)
-    if not np.isfinite(covariance).all():
+    covariance = _covariance(window, gauge, config)
+    if covariance is None:
         return Uncertainty(None, reference)
     metric = window_metric(window)
     confidence = confidence_of(covariance, metric)
-    others = second_solutions(window_solutions(window), gauge, metric) if ambiguous else []
+    others = second_solutions(window_solutions(window), gauge, covariance, metric) if ambiguous else []
     if not others:
         return Uncertainty(covariance, reference, confidence)
     share = 1 - sum(other.probability for other in others)
     mixture = share * covariance
     for other in others:
-        own = scale * _marginal(window.at(other.solution.poses_cw, other.solution.patches), gauge)
-        own = own if np.isfinite(own).all() else covariance
+        own = _covariance(window.at(other.solution.poses_cw, other.solution.patches), gauge, config)
+        own = covariance if own is None else own
         mixture = mixture + other.probability * (own + np.outer(other.error, other.error))
     return Uncertainty(mixture, reference, share * confidence)
+
+
+def _covariance(window: WindowMeasurements, gauge: Gauge, config: TrackerConfig) -> np.ndarray | None:
+    """Covariance ``(6, 6)`` of the newest pose, of one solution; None if the measurements do not determine it."""
+    covariance = config.sigma**2 * config.covariance_scale * _marginal(window, gauge)
+    return covariance if np.isfinite(covariance).all() else None
 
 
 def _marginal(w: WindowMeasurements, gauge: Gauge) -> np.ndarray:

@@ -22,6 +22,7 @@ from tests.archived_walk import archived_walk, pose_at
 
 SIZE = 60, 60
 GAUGE = Gauge(0, (1, 2))
+COVARIANCE = 1e-5 * np.eye(6)
 METRIC = np.diag([100.0**2] * 6)  # a displacement of 0.5 pixels is an error of 0.005
 
 
@@ -39,30 +40,34 @@ def solution(cost, *last, start="reversed"):
 
 def test_probabilities_follow_the_costs():
     now = solution(1.0, 0, 0, 0, start="")
-    for cost in (0.5, 1.0, 1.3, 2.0):
-        (other,) = second_solutions([now, solution(cost, 0.1, 0, 0)], GAUGE, METRIC)
+    for cost in (0.5, 1.0, 1.3, 1.7):
+        (other,) = second_solutions([now, solution(cost, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
         likelihood = cost ** (-INDEPENDENT / 2)
         assert other.probability == pytest.approx(likelihood / (1 + likelihood))
         truth = se3.exp(torch.from_numpy(other.error))  # T_wc_other = T_wc Exp(xi)
         there = se3.compose(se3.inverse(now.poses_cw[3]), truth)
         np.testing.assert_allclose(there, se3.inverse(line(0.1, 0, 0)[3]), atol=1e-12)
-    assert second_solutions([now], GAUGE, METRIC) == []
-    assert second_solutions([now, solution(4.0, 0.1, 0, 0)], GAUGE, METRIC) == []
-    (sure,) = second_solutions([now, solution(0.0, 0.1, 0, 0)], GAUGE, METRIC)
-    (unsure,) = second_solutions([solution(0.0, 0, 0, 0), solution(0.0, 0.1, 0, 0)], GAUGE, METRIC)
+    assert second_solutions([now], GAUGE, COVARIANCE, METRIC) == []
+    assert second_solutions([now, solution(2.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC) == []
+    (sure,) = second_solutions([now, solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
+    (unsure,) = second_solutions([solution(0.0, 0, 0, 0), solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
     assert sure.probability == pytest.approx(1) and unsure.probability == 0.5
 
 
 def test_solutions_that_agree_are_one():
     near, far = 0.8 * TOLERANCE / 100, 4 * TOLERANCE / 100
     now = solution(1.0, 0, 0, 0, start="")
-    assert second_solutions([now, solution(1.0, near, 0, 0)], GAUGE, METRIC) == []
-    found = second_solutions([now, solution(1.2, far + near, 0, 0), solution(1.1, far, 0, 0)], GAUGE, METRIC)
+    assert second_solutions([now, solution(1.0, near, 0, 0)], GAUGE, COVARIANCE, METRIC) == []
+    close = [now, solution(1.2, far + near, 0, 0), solution(1.1, far, 0, 0)]
+    found = second_solutions(close, GAUGE, COVARIANCE, METRIC)
     assert len(found) == 1 and found[0].probability == pytest.approx(1 / (1 + 1.1 ** (INDEPENDENT / 2)))
-    two = second_solutions([now, solution(1.2, 0, far, 0), solution(1.1, far, 0, 0)], GAUGE, METRIC)
+    two = second_solutions([now, solution(1.2, 0, far, 0), solution(1.1, far, 0, 0)], GAUGE, COVARIANCE, METRIC)
     assert len(two) == 2 and two[0].probability > two[1].probability
+    loose = np.diag([far**2 / 20, *[1e-5] * 5])  # of standard deviations of a quarter of the distance
+    assert second_solutions([now, solution(1.0, far, 0, 0)], GAUGE, loose, METRIC) == []
+    assert len(second_solutions([now, solution(1.0, far, 0, 0)], GAUGE, loose / 2, METRIC)) == 1
     broken = solution(0.1, 0, 0, math.nan)
-    assert second_solutions([now, broken], GAUGE, METRIC) == []
+    assert second_solutions([now, broken], GAUGE, COVARIANCE, METRIC) == []
 
 
 NOISE = 0.2  # of the measurements, pixels
@@ -98,7 +103,7 @@ def test_covariance_and_confidence_are_those_of_the_mixture():
     window, gauge = WindowMeasurements.of(step), window_gauge(step.window)
     plain = newest_uncertainty(step, TrackerConfig())
     mixed = newest_uncertainty(step, TrackerConfig(), ambiguous=True)
-    others = second_solutions(window_solutions(window), gauge, window_metric(window))
+    others = second_solutions(window_solutions(window), gauge, plain.covariance, window_metric(window))
     assert others and mixed.reference == plain.reference
     share = 1 - sum(other.probability for other in others)
     expected = share * plain.covariance

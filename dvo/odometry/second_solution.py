@@ -79,13 +79,14 @@ def second_solutions(
     Returns:
         The others, best first; those of a probability below :data:`LEAST` are left out.
     """
-    now, information = solved[0], np.linalg.inv(covariance) / len(covariance)
+    now, information = solved[0], np.linalg.pinv(covariance, hermitian=True) / len(covariance)
 
     def differs(error: np.ndarray) -> bool:
         return bool(error @ metric @ error > TOLERANCE**2 and error @ information @ error > DISTANCE)
 
     different: list[tuple[float, np.ndarray, Solution]] = []
-    for other in sorted(solved[1:], key=lambda other: other.cost):
+    others = (other for other in solved[1:] if math.isfinite(other.cost))
+    for other in sorted(others, key=lambda other: other.cost):
         error = relative_error(now.poses_cw, other.poses_cw, gauge)
         if np.isfinite(error).all() and all(map(differs, [error, *(error - known for _, known, _ in different)])):
             different.append((_likelihood(other.cost, now.cost), error, other))

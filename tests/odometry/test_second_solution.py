@@ -68,6 +68,9 @@ def test_solutions_that_agree_are_one():
     assert len(second_solutions([now, solution(1.0, far, 0, 0)], GAUGE, loose / 2, METRIC)) == 1
     broken = solution(0.1, 0, 0, math.nan)
     assert second_solutions([now, broken], GAUGE, COVARIANCE, METRIC) == []
+    assert second_solutions([now, solution(math.nan, far, 0, 0)], GAUGE, COVARIANCE, METRIC) == []
+    flat = np.diag([1e-5, 1e-5, 0, 0, 0, 0])  # as good as no covariance; never an error
+    assert len(second_solutions([now, solution(1.0, far, 0, 0)], GAUGE, flat, METRIC)) == 1
 
 
 NOISE = 0.2  # of the measurements, pixels

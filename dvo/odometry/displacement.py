@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dvo.odometry.window_measurements import WindowMeasurements
 
@@ -27,18 +26,8 @@ def window_metric(window: WindowMeasurements) -> np.ndarray:
     Returns:
         ``(6, 6)`` float64.
     """
-    depth = median_inverse_depth(window.centres[:, 2], window.per_frame)
-    return flow_metric(window.camera[-1].double().cpu().numpy(), window.bounds, depth)
-
-
-def median_inverse_depth(inverse_depths: Tensor, per_frame: int) -> float:
-    """Median inverse depth of the patches of the newest frames of a window.
-
-    Args:
-        inverse_depths: ``(n * per_frame,)``.
-        per_frame: patches of a frame.
-    """
-    return float(inverse_depths[-_DEPTH_FRAMES * per_frame :].median())
+    depths = window.centres[-_DEPTH_FRAMES * window.per_frame :, 2]
+    return flow_metric(window.camera[-1].double().cpu().numpy(), window.bounds, float(depths.median()))
 
 
 def flow_metric(intrinsics: np.ndarray, size: tuple[int, int], inverse_depth: float) -> np.ndarray:

@@ -261,7 +261,8 @@ class PatchOdometry:
             enough = initialise_related(self.graph, self.step, config)
             state.initialised = enough and newest_evidence(self.step).supports(config)
             state.adjustable += [self.graph.segment] * state.initialised
-            state.ambiguous = config.restart and measured_share(window.measured) < MOST  # until it is tried
+            if state.initialised and config.restart:
+                state.ambiguous = measured_share(window.measured) < MOST  # until it is tried
         self._reduce()
         pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)

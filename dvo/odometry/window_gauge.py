@@ -1,4 +1,4 @@
-"""Gauge of a window: what is held fixed where the newest pose is compared between two solutions, or with the truth.
+"""Gauge of a window, under which the newest pose is compared between two solutions, or with the truth.
 
 The pose is that relative to the reference, the oldest keyframe that a measurement still reaches. Scale is free in a
 monocular window: the RMS distance of the keyframes in between from the reference is held.

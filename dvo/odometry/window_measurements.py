@@ -65,11 +65,14 @@ class WindowMeasurements:
         )  # fmt: skip
 
     def at(self, poses_cw: Tensor, patches: Tensor) -> WindowMeasurements:
-        """The same measurements at another solution.
+        """Same measurements at another solution.
 
         Args:
             poses_cw: ``(n, 7)``.
             patches: ``(n * M, 3, 1, 1)`` patch centres.
+
+        Returns:
+            The measurements with these poses and centres.
         """
         return replace(self, poses_cw=poses_cw.to(self.poses_cw), centres=patches[..., 0, 0].to(self.centres))
 

@@ -8,6 +8,7 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.restart import restart
 from dvo.geometry import se3
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.depth_factor import MOST, measured_share
 from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.odometry.initialisation import RESTARTS, leave_minimum, restart_due
 from tests.archived_walk import archived_walk, pose_at
@@ -20,9 +21,9 @@ def _step(window):
     return SimpleNamespace(window=window, bounds=(60, 60), kernel=Kernel("cauchy", 0.3))
 
 
-def _reversed_window():
+def _reversed_window(unit=0.0):
     """Window of six frames with the second solution of its measurements, and the true poses."""
-    graph, _ = archived_walk(frames=6, interval=0.03, archived=False)
+    graph, _ = archived_walk(frames=6, interval=0.03, archived=False, unit=unit)
     window = graph.window
     true = pose_at(0.03 * torch.arange(6, dtype=torch.float64))
     window.poses_cw = true.float()
@@ -59,10 +60,11 @@ def test_frames_at_which_a_second_solution_is_looked_for():
     assert {age for age in range(33, 200) if restart_due(age, True)} == set(range(40, 200, 8))
 
 
-def test_measured_depths_leave_no_second_solution():
-    graph, _ = archived_walk(frames=6, interval=0.03, archived=False, unit=1.0)
-    poses = graph.window.poses_cw
-    assert not leave_minimum(_step(graph.window), CONFIG) and graph.window.poses_cw is poses
+def test_nothing_is_tried_where_depths_are_measured():
+    window, true = _reversed_window(unit=1.0)
+    poses = window.poses_cw
+    assert measured_share(window.measured) >= MOST and _error(poses, true) > 0.01
+    assert not leave_minimum(_step(window), CONFIG) and window.poses_cw is poses
 
 
 def test_settings_turn_kernel_and_restart_off():

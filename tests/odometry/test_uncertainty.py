@@ -241,3 +241,16 @@ def test_the_confidence_is_a_probability():
 def test_an_odometry_without_one_leaves_it_out():
     estimate = Estimate(0.0, np.array([0.0, 0, 0, 0, 0, 0, 1]), Status.TRACKING)
     assert estimate.covariance is None and estimate.reference is None and estimate.rotation_sigma is None
+
+
+def test_a_window_may_have_a_second_solution_until_the_tracker_has_tried(monkeypatch):
+    solved, solve = [], uncertainty.window_solutions
+    monkeypatch.setattr(uncertainty, "window_solutions", lambda window: solved.append(1) or solve(window))
+    odometry, known = dvo.load("small", **FAST | {"restart": True}), []
+    for frame in walk():
+        estimate = odometry.track(frame)
+        before = len(solved)
+        if estimate.covariance is not None:
+            known.append((odometry.state.ambiguous, len(solved) > before))
+    assert known[:4] == [(True, True)] * 4 and all(ambiguous == tried for ambiguous, tried in known)
+    assert known[-1] == (False, False)

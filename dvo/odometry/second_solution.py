@@ -98,5 +98,5 @@ def second_solutions(
 def _likelihood(cost: float, now: float) -> float:
     """Likelihood over that of the present solution; 1 if both costs vanish."""
     tiny = np.finfo(np.float64).tiny
-    exponent = -INDEPENDENT / 2 * math.log(max(cost, tiny) / max(now, tiny))
+    exponent = -INDEPENDENT / 2 * (math.log(max(cost, tiny)) - math.log(max(now, tiny)))
     return math.exp(min(exponent, 100.0))

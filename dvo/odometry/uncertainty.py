@@ -133,7 +133,7 @@ def has_second_solution(step: WindowStep, config: TrackerConfig, solved: Sequenc
     """
     window = WindowMeasurements.of(step)
     gauge = window_gauge(window)
-    if gauge is None:
+    if gauge is None or len(solved) < 2:
         return False
     covariance = _covariance(window, gauge, config)
     return covariance is not None and bool(second_solutions(solved, gauge, covariance, window_metric(window)))

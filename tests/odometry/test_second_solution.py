@@ -52,6 +52,8 @@ def test_probabilities_follow_the_costs():
     (sure,) = second_solutions([now, solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
     (unsure,) = second_solutions([solution(0.0, 0, 0, 0), solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
     assert sure.probability == pytest.approx(1) and unsure.probability == 0.5
+    huge = solution(1e30, 0, 0, 0, start="")  # the ratio of the costs is not a number that can be stored
+    assert second_solutions([huge, solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)[0].probability == 1
 
 
 def test_solutions_that_agree_are_one():

@@ -20,7 +20,6 @@ from dvo.odometry.evidence import NO_MATCH, matched_share, missing_content
 from dvo.odometry.exclusive import exclusive
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.reset import start_again
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_settings
@@ -91,7 +90,11 @@ class DeepVOOdometry:
         self.name, self.config, self.seed = name, config, seed
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
-        self._sequence = FrameSequence(config.max_gap)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new odometry with the same seed would."""
+        self._sequence = FrameSequence(self.config.max_gap)
         self._estimates: list[Estimate] = []
         self._reasons: dict[float, str] = {}
         self._segment = -1  # number of the newest segment; -1 before the first one
@@ -159,10 +162,6 @@ class DeepVOOdometry:
             "config": asdict(self.config),
         }  # fmt: skip
         return result_of_estimates(self._estimates, self._reasons, info)
-
-    def reset(self) -> None:
-        """Begin a new sequence as a new odometry with the same seed would."""
-        start_again(self, DeepVOOdometry(self.model, self.config, seed=self.seed, device=self.device, name=self.name))
 
     def _advance(self, image: np.ndarray) -> float:
         """Move on to an image, or begin a segment with it.

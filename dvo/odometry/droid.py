@@ -30,7 +30,6 @@ from dvo.odometry.evidence import NO_MATCH, missing_content
 from dvo.odometry.exclusive import exclusive
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.reset import start_again
 from dvo.odometry.segments import result_of_log
 from dvo.odometry.working_image import working_image
 from dvo.settings import check_seed
@@ -121,9 +120,13 @@ class DroidOdometry:
         self.name, self.config, self.seed = name, config, seed
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new odometry with the same seed would."""
         self.log = KeyframeLog()
-        self.mapper = DenseMapper(self.model, config, self.log)
-        self._sequence = FrameSequence(config.max_gap)
+        self.mapper = DenseMapper(self.model, self.config, self.log)
+        self._sequence = FrameSequence(self.config.max_gap)
         self._last: tuple[np.ndarray, Estimate] | None = None  # working image of the last frame, and its estimate
         self._recent: list[tuple[float, Tensor]] = []  # times and poses of the last two frames
         self._waiting: list[_Waiting] = []
@@ -199,10 +202,6 @@ class DroidOdometry:
         )  # fmt: skip
         points = fused([cloud for item, cloud in zip(maps, clouds, strict=True) if item.segment == main])
         return replace(result, map=points, depth=tuple(maps))
-
-    def reset(self) -> None:
-        """Begin a new sequence as a new odometry with the same seed would."""
-        start_again(self, DroidOdometry(self.model, self.config, seed=self.seed, device=self.device, name=self.name))
 
     # -- frames --------------------------------------------------------------------------------------------------
 

@@ -6,22 +6,19 @@ import threading
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
-from weakref import WeakKeyDictionary
 
 T = TypeVar("T")
 
 METHODS = ("track", "finish", "current", "reset", "save", "adjust")
 """Methods of an odometry that read or change its state."""
 
-# Beside the objects, because `reset` replaces all attributes, and an object with a lock cannot be copied.
-_LOCKS: WeakKeyDictionary[Any, Any] = WeakKeyDictionary()
-
 
 def exclusive(cls: type[T]) -> type[T]:
     """Let the methods of an odometry wait for each other: a class decorator.
 
     A method of :data:`METHODS` that is called while another thread is in one of them, of the same object, begins when
-    that one has ended: ``current`` and ``save`` see the state between two frames. Attributes are not protected.
+    that one has ended: ``current`` and ``save`` see the state between two frames. Attributes are not protected. The
+    lock is an attribute of the object, which its constructor makes first.
 
     Args:
         cls: any of the methods may be missing.
@@ -39,17 +36,25 @@ def exclusive(cls: type[T]) -> type[T]:
         >>> Counter().track()
         1
     """
-    for name in METHODS:
-        if name in vars(cls):
-            setattr(cls, name, _locked(vars(cls)[name]))
+    changed = {name: _locked(vars(cls)[name]) for name in METHODS if name in vars(cls)}
+    for name, method in {"__init__": _with_lock(cls.__init__), **changed}.items():
+        setattr(cls, name, method)
     return cls
+
+
+def _with_lock(construct: Callable[..., None]) -> Callable[..., None]:
+    @wraps(construct)
+    def call(self: Any, *args: Any, **keywords: Any) -> None:
+        self._lock = threading.RLock()
+        construct(self, *args, **keywords)
+
+    return call
 
 
 def _locked(method: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(method)
     def call(self: Any, *args: Any, **keywords: Any) -> Any:
-        # Atomic: of two threads that call at once for the first time, both get the same lock.
-        with _LOCKS.setdefault(self, threading.RLock()):
+        with self._lock:
             return method(self, *args, **keywords)
 
     return call

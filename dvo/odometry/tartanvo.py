@@ -29,7 +29,6 @@ from dvo.odometry.exclusive import exclusive
 from dvo.odometry.flow_reliability import flow_weights
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.reset import start_again
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.two_view import parallax_of, returning_share
 from dvo.odometry.working_image import working_image
@@ -180,7 +179,11 @@ class TartanOdometry:
         self.name, self.config, self.seed = name, config, seed
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
-        self._sequence = FrameSequence(config.max_gap)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new odometry with the same seed would."""
+        self._sequence = FrameSequence(self.config.max_gap)
         self._view: _View | None = None
         self._last: tuple[np.ndarray, Estimate] | None = None  # working image of the last frame, and its estimate
         self._estimates: list[Estimate] = []
@@ -259,10 +262,6 @@ class TartanOdometry:
         """
         info = {**self._info, "seed": self.seed, "config": asdict(self.config)}
         return result_of_estimates(self._estimates, self._reasons, info)
-
-    def reset(self) -> None:
-        """Begin a new sequence as a new odometry with the same seed would."""
-        start_again(self, TartanOdometry(self.model, self.config, seed=self.seed, device=self.device, name=self.name))
 
     def _stranger(self, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> str:
         """Find out if a frame with content does not show the scene of the frame before it, and remember it."""

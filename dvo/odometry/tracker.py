@@ -48,7 +48,6 @@ from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
 from dvo.odometry.patch_depth import measure_depth
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.reset import start_again
 from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
@@ -101,12 +100,17 @@ class PatchOdometry:
         self.name, self.config, self.seed, self.weights = name, config, seed, weights
         self.device = torch.device(device)
         self.model = model.to(self.device).eval()
-        c = model.config
+        self.archive = archive
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new tracker with the same seed would; a map that it was loaded with is left."""
+        config, c = self.config, self.model.config
         select = self.model.selection(config.selection)
-        self.state = TrackerState(torch.Generator().manual_seed(seed), FrameSequence(config.max_gap))
+        self.state = TrackerState(torch.Generator().manual_seed(self.seed), FrameSequence(config.max_gap))
         self.select = partial(select, patches=config.patches, generator=self.state.generator)
         sizes = config.patches, c.patch_size, c.hidden_channels
-        self.graph = KeyframeGraph(*sizes, self.device, archive, lambda edges: self.step.finalise(edges))
+        self.graph = KeyframeGraph(*sizes, self.device, self.archive, lambda edges: self.step.finalise(edges))
         self.correlation = WindowCorrelation(self.window, c, self.device)
         align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
         self.step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final", config.kernel)
@@ -195,11 +199,6 @@ class PatchOdometry:
         poses = self.window.poses_cw.double().cpu().numpy()
         known = {frame.identifier: pose for frame, pose in zip(self.window.frames, poses, strict=True)}
         return self._result(known if self.state.initialised else {})
-
-    def reset(self) -> None:
-        """Begin a new sequence as a new tracker with the same seed would; a map that it was loaded with is left."""
-        build = partial(PatchOdometry, self.model, self.config, seed=self.seed, device=self.device, name=self.name)
-        start_again(self, build(archive=self.graph.archive.config, weights=self.weights))
 
     def save(self, file: str | Path) -> None:
         """Write everything to a map file: to go on later (:func:`dvo.load_map`), or as a map. Tracking may go on.

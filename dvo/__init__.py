@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from dvo.odometry.camera_estimate import SelfCalibration
     from dvo.odometry.config import TrackerConfig
     from dvo.odometry.load import load
+    from dvo.odometry.load_map import load_map
     from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
-    from dvo.odometry.saving import load_map
     from dvo.odometry.session import run
     from dvo.synth.dataset import ClipDataset
 
@@ -70,7 +70,7 @@ _LAZY = {
     "export_map": ("dvo.export.formats", "export_map"),
     "export_trajectory": ("dvo.export.formats", "export_trajectory"),
     "load": ("dvo.odometry.load", "load"),
-    "load_map": ("dvo.odometry.saving", "load_map"),
+    "load_map": ("dvo.odometry.load_map", "load_map"),
     "load_model": ("dvo.models.weights", "load_model"),
     "losses": ("dvo.losses", ""),
     "open": ("dvo.data.source", "open_source"),

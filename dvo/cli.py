@@ -84,7 +84,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="NAMES",
         help="write the results for other programs too: colmap, colmap-text, nerfstudio, tum, kitti, euroc; by commas",
     )
-    run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for dvo.load_map")
+    run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for a later --map")
     run.add_argument("--map", metavar="FILE", help="map file (.dvo) of an earlier recording, to be localised in")
     add_input_options(run)
     add_stream_options(run)

@@ -114,7 +114,6 @@ def test_export_of_a_map_file(tmp_path, capsys):
         odometry.track(frame)
     odometry.save(file)
     assert main(["export", str(file), str(tmp_path / "early"), "--to", "kitti"]) == 0
-    assert "the sequence was not finished" in capsys.readouterr().err
     result = odometry.finish()
     odometry.save(file)
     assert main(["export", str(file), str(tmp_path / "kitti"), "--to", "kitti"]) == 0

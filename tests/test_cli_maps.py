@@ -89,7 +89,7 @@ def test_a_new_recording_in_a_map(in_map, image_folder, tmp_path, capsys):
     both = str(tmp_path / "both.dvo")
     more = ("--map", "old.dvo", "--seed", "3", "--set", "updates=2", "--save-map", both)
     assert main(arguments(image_folder, tmp_path / "out", *more)) == 0
-    assert in_map.asked == {"file": "old.dvo", "device": torch.device("cpu"), "weights": None, "new_recording": True,
+    assert in_map.asked == {"file": "old.dvo", "device": torch.device("cpu"), "weights": None,
                             "seed": 3, "updates": 2}  # fmt: skip
     line = "localised at 10.40 s (61 % of 432 measurements are inliers) in the world of the map"
     assert line in capsys.readouterr().out.splitlines() and Path(both).read_text() == "20 frames"

@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from dvo.commands.console import say, warn
+from dvo.commands.console import say
 from dvo.data.trajectory import read_tum
 from dvo.errors import DvoError
 from dvo.export.formats import (
@@ -62,8 +62,6 @@ def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> in
     result, main = result_of_log(graph.log, {}, None, graph.worlds, graph.recording)
     if segment is not None and segment >= len(result.segments):
         raise DvoError(f"no segment {segment}", file=file, field="--segment", remedy=f"it has {len(result.segments)}")
-    if len(graph.window):
-        warn("the sequence was not finished; frames and keyframes of its window are left out", "note")
     if name in MAP_FORMATS:
         chosen = graph.recording.segment + (main if segment is None else segment)
         say(f"exported to {out}: {export_graph(graph, chosen, name, out)}")

@@ -39,7 +39,7 @@ def load_in_map(file: str, weights: str, device: torch.device, seed: int, settin
     if "new_recording" in settings:
         raise DvoError("not a setting of the odometry", field="new_recording", remedy="leave it out")
     place = None if weights == DEFAULT_WEIGHTS else weights
-    return dvo.load_map(file, device=device, weights=place, new_recording=True, seed=seed, **settings)
+    return dvo.load_map(file, device=device, weights=place, seed=seed, **settings)
 
 
 def check_place(file: Path, option: str) -> None:

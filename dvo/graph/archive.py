@@ -124,6 +124,13 @@ class Archive:
         self._with_patches: deque[int] = deque()
         self._storage = {kind: ArrayStorage() for kind in ("features", "edges", "patches", "poses")}  # poses stay
 
+    def copy(self) -> Archive:
+        """Archive with the same content, by references, which takes and releases content on its own."""
+        new = Archive(self.config)
+        new._keyframes, new._edges, new._bytes = dict(self._keyframes), deque(self._edges), self._bytes
+        new._with_features, new._with_patches = deque(self._with_features), deque(self._with_patches)
+        return new
+
     def __len__(self) -> int:
         return len(self._keyframes)
 

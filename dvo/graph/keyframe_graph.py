@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -39,7 +41,7 @@ class KeyframeGraph:
         device: of the window's tensors.
         archive: memory bound and content of the archive.
         finalise: called with the positions ``(e,)`` of edges of the window that are about to be archived; it may change
-            their targets and weights in the window.
+            their targets and weights in the window. None for nothing.
 
     Attributes:
         window: active keyframes and edges.
@@ -76,7 +78,7 @@ class KeyframeGraph:
         finalise: Callable[[Tensor], None] | None = None,
     ) -> None:
         self.window = Window.empty(per_frame, patch_size, hidden, device)
-        self.archive, self._finalise = Archive(archive), finalise
+        self.archive, self.finalise = Archive(archive), finalise
         self.log = KeyframeLog()
         self.segment = 0
         self.starts: list[tuple[int, int]] = [(0, 0)]
@@ -84,6 +86,20 @@ class KeyframeGraph:
         self.loops = 0
         self.metric: dict[int, str] = {}
         self.recordings = [Recording()]
+
+    def copy(self) -> KeyframeGraph:
+        """Graph with the same content, by references, which changes on its own and archives edges as they are."""
+        new = copy(self)
+        new.window = replace(self.window, frames=[replace(frame) for frame in self.window.frames])
+        new.archive, new.log, new.finalise = self.archive.copy(), self.log.copy(), None
+        new.starts, new.worlds, new.metric = list(self.starts), dict(self.worlds), dict(self.metric)
+        new.recordings = list(self.recordings)
+        return new
+
+    def archive_window(self) -> None:
+        """Move all keyframes of the window to the archive."""
+        while len(self.window):
+            self.archive_oldest()
 
     @property
     def recording(self) -> Recording:
@@ -309,8 +325,8 @@ class KeyframeGraph:
         chosen = mask & (window.weights > 0).any(-1)
         if not chosen.any():
             return
-        if self._finalise is not None:
-            self._finalise(chosen.nonzero()[:, 0])
+        if self.finalise is not None:
+            self.finalise(chosen.nonzero()[:, 0])
         identifiers = np.array([frame.identifier for frame in window.frames], dtype=np.int32)
         kk, jj = window.kk[chosen].cpu().numpy(), window.jj[chosen].cpu().numpy()
         self.archive.add_edges(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,14 @@ class KeyframeLog:
         self._removed: dict[int, tuple[int, np.ndarray]] = {}  # anchor and relative pose of removed keyframes
         self._points: list[np.ndarray] = []
         self._colors: list[np.ndarray] = []
+
+    def copy(self) -> KeyframeLog:
+        """Log with the same content, which changes on its own; poses and points are shared."""
+        new = KeyframeLog()
+        new.frames = [replace(record) for record in self.frames]
+        new._poses, new._removed = dict(self._poses), dict(self._removed)
+        new._points, new._colors = list(self._points), list(self._colors)
+        return new
 
     def add(self, timestamp: float, anchor: int | None = None) -> FrameRecord:
         """Append a frame with the pose of keyframe ``anchor``, or without a pose.

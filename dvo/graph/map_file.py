@@ -2,7 +2,7 @@
 
 Nothing in it is executed or unpickled, and nothing needs more memory than the file is long: an entry that is compressed
 is refused. ``unzip`` and ``numpy.load`` read it as well. What the arrays mean is for the caller
-(:mod:`dvo.graph.serialisation`, :mod:`dvo.odometry.saving`); here their types, sizes and ranges are checked.
+(:mod:`dvo.graph.serialisation`, :mod:`dvo.odometry.map_tables`); here their types, sizes and ranges are checked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dvo.data.output import replaced
 from dvo.errors import DvoError
 from dvo.settings import from_table
 
-FORMAT, VERSION = "dvo-map", 2
+FORMAT, VERSION = "dvo-map", 3
 """Name of the format, and the version that is written. Files of older versions are read, newer ones refused."""
 
 _DESCRIPTION = "map.json"
@@ -101,6 +101,7 @@ class MapReader:
     Attributes:
         file: the file.
         description: its JSON values.
+        version: of the format.
 
     Raises:
         DvoError: entries that no map has, or a description that is not one of a known version.
@@ -116,6 +117,7 @@ class MapReader:
         if sum(entry.file_size for entry in self._entries.values()) > file.stat().st_size:
             raise self.refused("entries that are longer than the file")
         self.description = self._described()
+        self.version = int(self.description["version"])
 
     def refused(self, problem: str, field: str | None = None, remedy: str = _REMEDY) -> DvoError:
         """Describe a problem of the file.
@@ -222,15 +224,15 @@ class MapReader:
         self.require((np.abs(lengths - 1) < _UNIT).all(), "holds rotations that are no unit quaternions", name)
         return found
 
-    def similarities(self, name: str, count: int) -> np.ndarray:
+    def similarities(self, name: str, count: int | None = None) -> np.ndarray:
         """Read similarities, with positive scales and quaternions of length 1.
 
         Args:
             name: of the array.
-            count: number of similarities.
+            count: number of similarities; None for any.
 
         Returns:
-            ``(count, 8)`` float64.
+            ``(N, 8)`` float64.
 
         Raises:
             DvoError: as :meth:`array`, or another quaternion or scale.

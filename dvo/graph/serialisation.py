@@ -1,11 +1,11 @@
 """A keyframe graph as arrays and plain values, and back; files of a graph alone or with a tracker.
 
-The archive is written as it is held (float16 features, JPEG images); the window at full precision, with its working
-images. Edge slots are not written: a graph that is read numbers them anew, which changes no value.
+The archive is written as it is held (float16 features, JPEG images). A graph with keyframes in its window is written as
+it would be had they just been archived; a file has no window.
 
-The parts of the log, the archive and the window each have a function that writes arrays, by names such as
-``archive/poses_cw``, and one that reads and checks them. What they refuse would fail later: indices out of range,
-anchors that lead nowhere or in a circle, sizes that do not belong together, times that do not increase.
+Log and archive each have a function that writes arrays, by names such as ``archive/poses_cw``, and one that reads and
+checks them. What they refuse would fail later: indices out of range, anchors that lead nowhere or in a circle, sizes
+that do not belong together, times that do not increase.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from dvo.graph.keyframe_log import FrameRecord, KeyframeLog
 from dvo.graph.map_file import MapReader, open_map_file, write_map_file
 from dvo.graph.measured_arrays import has_measured, measured_arrays, read_measured
 from dvo.graph.measurements import ArchivedEdges
+from dvo.graph.old_window import archive_old_window
 from dvo.graph.recordings import Recording, increase
-from dvo.graph.window_arrays import read_window, window_arrays
 
 Arrays = dict[str, np.ndarray]
 _LAST = 2**31 - 1  # largest number of a keyframe
@@ -115,11 +115,14 @@ def graph_arrays(graph: KeyframeGraph) -> tuple[dict[str, Any], Arrays]:
     """Graph as plain values and arrays.
 
     Args:
-        graph: its poses are vectors ``(7,)``.
+        graph: its poses are vectors ``(7,)``. It is not changed.
 
     Returns:
         JSON-able values of a :class:`GraphTable`, and arrays by name.
     """
+    if len(graph.window):
+        graph = graph.copy()
+        graph.archive_window()
     window = graph.window
     reasons = sorted({record.reason for record in graph.log.frames})
     table = GraphTable(
@@ -129,7 +132,7 @@ def graph_arrays(graph: KeyframeGraph) -> tuple[dict[str, Any], Arrays]:
         has_measured(graph), tuple(sorted(graph.metric.items())),
     )  # fmt: skip
     arrays = {"segments": np.array(graph.starts, np.int64)} | _log_arrays(graph.log, reasons) | _archive_arrays(graph)
-    return asdict(table), arrays | window_arrays(window) | measured_arrays(graph)
+    return asdict(table), arrays | measured_arrays(graph)
 
 
 def read_graph(source: MapReader, graph: KeyframeGraph, table: GraphTable) -> None:
@@ -161,8 +164,9 @@ def read_graph(source: MapReader, graph: KeyframeGraph, table: GraphTable) -> No
     _read_log(source, graph.log, table)
     source.require(begun[-1][0] <= len(graph.log.frames), "begins after the last frame", "graph: recordings")
     _read_archive(source, graph)
-    read_window(source, graph.window)
     read_measured(source, graph, table.measured, table.metric)
+    if source.has("window/keyframes"):
+        archive_old_window(source, graph)
     _check_keyframes(source, graph)
 
 
@@ -252,6 +256,7 @@ def _read_archive(source: MapReader, graph: KeyframeGraph) -> None:
     m, p = graph.window.per_frame, graph.window.patches.shape[-1]
     identifiers = source.array("archive/keyframes", np.int64, (None,), 0, _LAST)
     n = len(identifiers)
+    source.require(len(np.unique(identifiers)) == n, "holds a keyframe twice", "archive/keyframes")
     times = source.array("archive/times", np.float64, (n,))
     intrinsics = source.array("archive/intrinsics", np.float32, (n, 4))
     source.require((intrinsics[:, :2] > 0).all(), "holds a focal length that is not positive", "archive/intrinsics")
@@ -322,10 +327,7 @@ def _split_jpeg(source: MapReader, count: int) -> list[np.ndarray | None]:
 
 def _check_keyframes(source: MapReader, graph: KeyframeGraph) -> None:
     """Refuse keyframes that are there twice, whose times do not increase, or whose anchors lead nowhere."""
-    frames = [(frame.identifier, frame.timestamp) for frame in graph.archive]
-    frames += [(frame.identifier, frame.timestamp) for frame in graph.window.frames]
-    times = dict(frames)
-    source.require(len(times) == len(frames), "holds a keyframe twice", "archive/keyframes")
+    times = {frame.identifier: frame.timestamp for frame in graph.archive}
     ordered = np.array([times[identifier] for identifier in sorted(times)])
     begun = np.searchsorted(sorted(times), [recording.keyframe for recording in graph.recordings]).tolist()
     source.require(increase(ordered, begun), "holds keyframes whose times do not increase", "archive/times")

@@ -12,7 +12,7 @@ contiguous range at every position, and products are stored with x fastest, so t
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 _NOWHERE = -(10**6)
@@ -98,18 +98,6 @@ class EdgeCorrelation:
         """
         return self._origin[slots]
 
-    def are_origins(self, origins: Int[Tensor, "n 2"]) -> Bool[Tensor, " n"]:
-        """Check corners of windows against the size of the maps.
-
-        Args:
-            origins: of :meth:`origins`, or numbers of a file.
-
-        Returns:
-            True for a window that meets the map, or that has not been computed.
-        """
-        limit = torch.tensor([self._maps.shape[2], self._maps.shape[1]], device=origins.device) - 2 * self.side
-        return ((origins >= -self.side) & (origins <= limit)).all(-1) | (origins == _NOWHERE).all(-1)
-
     def restore(
         self,
         origins: Int[Tensor, "n 2"],
@@ -121,7 +109,7 @@ class EdgeCorrelation:
         """Compute the cached windows of edges at given positions.
 
         Args:
-            origins: see :meth:`origins`; those of :meth:`are_origins`.
+            origins: see :meth:`origins`.
             slots: edge slots; storage is reserved for new ones.
             features, kk, frames: see :meth:`lookup`.
         """

@@ -60,47 +60,18 @@ class Steps(Generic[T]):
     def __init__(self, generator: Generator[None, None, T]) -> None:
         self._generator = generator
         self._outcome: list[T] = []  # empty until it is known
-        self._ahead = 0
-
-    @classmethod
-    def finished(cls, result: T, left: int) -> Steps[T]:
-        """Work with a result that is known already.
-
-        Args:
-            result: of the work.
-            left: see :attr:`left`.
-        """
-
-        def empty() -> Generator[None, None, T]:
-            yield from ()
-            return result
-
-        steps = cls(empty())
-        steps.result()
-        steps._ahead = left
-        return steps
-
-    @property
-    def left(self) -> int:
-        """Calls of :meth:`step` until it returns True; the work is finished to find that out."""
-        self.result()
-        return self._ahead
 
     def step(self) -> bool:
-        """Take a step, unless :meth:`result` has taken it.
+        """Take a step.
 
         Returns:
             True once all have been taken.
         """
-        if not self._outcome:
-            return self._next()
-        self._ahead = max(0, self._ahead - 1)
-        return self._ahead == 0
+        return bool(self._outcome) or self._next()
 
     def result(self) -> T:
-        """Result of the work. Steps that are missing are taken, and do not count as taken by :meth:`step`."""
+        """Result of the work, for which steps that are missing are taken."""
         while not self._outcome:
-            self._ahead += 1
             self._next()
         return self._outcome[0]
 

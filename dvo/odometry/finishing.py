@@ -38,7 +38,7 @@ def finish_segments(
 def run_information(
     graph: KeyframeGraph, state: TrackerState, config: TrackerConfig, loops: LoopCloser, seed: int
 ) -> dict[str, Any]:
-    """Metadata of a recording for run.json.
+    """Metadata of a recording for run.json; of a map without a frame of a new recording, those of the map.
 
     Args:
         graph: of the tracker.
@@ -47,6 +47,8 @@ def run_information(
         loops: of the tracker.
         seed: of the patch centres.
     """
+    if state.map is not None:
+        return {**state.map.info, "seed": state.map.seed, "config": asdict(state.map.config)}
     begun, keyframes = graph.recording, graph.log.poses
     return {
         **state.info, **loops.information(), "keyframes": sum(k >= begun.keyframe for k in keyframes),

@@ -162,18 +162,24 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
     return True
 
 
-def worth_keeping(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, last: bool) -> bool:
-    """Decide if the frames of a segment that was never initialised are kept.
+def settle_first_window(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, last: bool) -> bool:
+    """Optimise the window of a segment that was never initialised and ends, and decide if its frames are kept.
 
     Args:
-        graph: of the sequence, its window not empty.
-        step: of the model on the window, after some steps.
+        graph: of the sequence; its window is changed in place.
+        step: of the model on the window.
         config: settings of the tracker.
         last: no frame will follow.
 
     Returns:
         True if they agree with each other, and are as many as an initialisation needs or the only ones of the sequence.
     """
+    if len(graph.window) > 1:
+        for age in range(config.initial_updates):
+            step(StepOptions(fixed=1, damping=damping_at(age)))
+        drop_unrelated(graph, step, config)
+    if not len(graph.window):
+        return False
     records = graph.log.frames
     rows = sum(not record.lost and record.segment == graph.segment for record in records)
     only = last and graph.segment == 0 and not any(record.reason == NO_MATCH for record in records)

@@ -11,8 +11,9 @@ import torch
 from dvo.errors import DvoError
 from dvo.graph.merging import append_graph
 from dvo.models.weights import LoadedWeights, tensor_digest
-from dvo.odometry.new_recording import describe_places, images_size
-from dvo.odometry.saving import load_map
+from dvo.odometry.load_map import load_map
+from dvo.odometry.new_recording import begin_in_map, images_size
+from dvo.odometry.rolling_shutter import Shutter
 
 if TYPE_CHECKING:
     from dvo.odometry.tracker import PatchOdometry
@@ -28,7 +29,7 @@ def merge_maps(
     """Tracker with the content of two maps, of which ``finish`` searches the second in the first.
 
     The first map stays as it is. What of the second one is recognised gets its world and scale; ``info["localised"]``
-    of the result is None if nothing is. A sequence that is not finished is finished first.
+    of the result is None if nothing is.
 
     Args:
         first: file of a map.
@@ -47,22 +48,20 @@ def merge_maps(
         >>> if odometry.finish().info["localised"] is not None:
         ...     odometry.save("office.dvo")
     """
-    merged = load_map(first, device=device, weights=weights, new_recording=True)
+    merged = load_map(first, device=device, weights=weights)
     other = load_map(second, device=device, weights=weights)
-    other.finish()
     _check(Path(second), merged, other)
+    state, found, loops, finder = merged.state, other.state, merged.loops, other.loops.finder
+    assert found.map is not None
+    begin_in_map(merged.graph, loops.finder, state)
     keyframe, segment = append_graph(merged.graph, other.graph)
-    merged.config = replace(merged.config, pixels=other.config.pixels)  # by which its last frames are described
-    state, found, loops = merged.state, other.state, merged.loops
     state.keyframes += found.keyframes
     state.adjustable += [number + segment for number in found.adjustable]
-    state.sequence, state.last, state.info, state.shutter = found.sequence, found.last, found.info, found.shutter
+    state.info, state.shutter = found.map.info, Shutter(found.map.readout, found.map.rows)
     for loop in other.loops.loops:
         loops.loops.append(replace(loop, old=loop.old + keyframe, new=loop.new + keyframe))
-    with torch.inference_mode():
-        places = describe_places(other)
-    for identifier in places.identifiers.tolist():
-        row = places.descriptor(identifier)
+    for identifier in finder.places.identifiers.tolist():
+        row = finder.places.descriptor(identifier)
         if row is not None:
             loops.finder.describe(identifier + keyframe, row)
     return merged

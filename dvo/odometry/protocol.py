@@ -300,7 +300,7 @@ class Saveable(Protocol):
     """Interface of an odometry that can be written to a map file."""
 
     def save(self, file: str | Path) -> None:
-        """Write everything that is needed to go on, or to use the map.
+        """Write the map so far; tracking goes on unchanged.
 
         Args:
             file: to write; replaced as a whole.

@@ -36,16 +36,16 @@ from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, keyframe_of, observe
 from dvo.odometry.initial_pose import first_depth, first_pose
 from dvo.odometry.initialisation import (
-    drop_unrelated,
     first_motion,
     initialise_related,
     leave_minimum,
     restart_due,
-    worth_keeping,
+    settle_first_window,
 )
 from dvo.odometry.late_join import join_waiting
 from dvo.odometry.loop_closure import loop_closer
 from dvo.odometry.motion import flow_magnitude
+from dvo.odometry.new_recording import begin_in_map
 from dvo.odometry.patch_depth import measure_depth
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.rolling_shutter import Shutter
@@ -152,6 +152,8 @@ class PatchOdometry:
         image, camera, mask = masked_image(frame, self.config.pixels)
         state.shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
         state.sequence.check(frame)
+        if state.map is not None:
+            begin_in_map(self.graph, self.loops.finder, state)
         record = self.graph.log.add(frame.timestamp)
         if state.last is not None and np.array_equal(image, state.last[0]):
             state.sequence.repeat(frame.timestamp)
@@ -177,11 +179,11 @@ class PatchOdometry:
 
         Returns:
             Trajectories ``T_wc`` of all segments and the sparse map of the longest, each in the world of its first
-            keyframe, up to scale.
+            keyframe, up to scale. Of a map without a frame of a new recording, the result of the map.
         """
         config, state = self.config, self.state
-        if not state.finished:
-            state.finished = True
+        begun, state.finished = not state.finished and state.map is None, True
+        if begun:
             if len(state.waiting) >= config.initial_frames:
                 self._begin_segment()
             self._close_segment(last=True)
@@ -201,7 +203,10 @@ class PatchOdometry:
         return self._result(known if self.state.initialised else {})
 
     def save(self, file: str | Path) -> None:
-        """Write everything to a map file: to go on later (:func:`dvo.load_map`), or as a map. Tracking may go on.
+        """Write the map to a file, for other recordings of the place (:func:`dvo.load_map`) or other programs.
+
+        Between two frames it is the map so far: in the file, the window is closed with its present poses, without the
+        final optimisation. Tracking goes on as if nothing had been saved.
 
         Args:
             file: to write, by convention ``*.dvo``; replaced as a whole.
@@ -298,16 +303,14 @@ class PatchOdometry:
 
     def _close_segment(self, last: bool = False) -> None:
         """Refine the window and archive it, and decide if the rows of the segment are kept."""
-        window, config, supported = self.window, self.config, self.state.initialised
-        if len(window) > 1:
-            for age in range(config.final_updates if supported else config.initial_updates):
-                self._update(COLD_UPDATES if supported else age)
-            if not supported:
-                drop_unrelated(self.graph, self.step, config)
-        supported = supported or (len(window) > 0 and worth_keeping(self.graph, self.step, config, last))
-        while len(window):
-            self.graph.archive_oldest()
-        self.graph.begin_segment(self.state.keyframes, supported, "too few frames with content")
+        config, keep = self.config, self.state.initialised
+        if keep:
+            for _ in range(config.final_updates if len(self.window) > 1 else 0):
+                self._update()
+        else:
+            keep = settle_first_window(self.graph, self.step, config, last)
+        self.graph.archive_window()
+        self.graph.begin_segment(self.state.keyframes, keep, "too few frames with content")
         self.state.begin_segment()
 
     def _append(self, view: View) -> Keyframe:
@@ -323,10 +326,10 @@ class PatchOdometry:
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe
 
-    def _update(self, age: int = COLD_UPDATES) -> None:
-        """Take a step on the window; ``age``, the number of earlier steps, sets the damping of bundle adjustment."""
-        fixed = max(1, len(self.window) - self.config.optimisation) if self.state.initialised else 1
-        self.step(StepOptions(fixed=fixed, damping=damping_at(age)), align=self.state.initialised)
+    def _update(self) -> None:
+        """Take a step on the window of an initialised segment."""
+        fixed = max(1, len(self.window) - self.config.optimisation)
+        self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)), align=True)
 
     def _updated(self, count: int) -> Evidence:
         for _ in range(count):

@@ -9,6 +9,7 @@ import torch
 
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View
+from dvo.odometry.map_tables import MapTable
 from dvo.odometry.protocol import Estimate
 from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.uncertainty import Uncertainty
@@ -17,7 +18,7 @@ from dvo.odometry.window_measurements import Waiting
 
 @dataclass
 class TrackerState:
-    """State of :class:`dvo.odometry.tracker.PatchOdometry`; :mod:`dvo.odometry.saving` writes and reads all of it.
+    """State of :class:`dvo.odometry.tracker.PatchOdometry`.
 
     Attributes:
         generator: of the patch centres.
@@ -35,7 +36,8 @@ class TrackerState:
         world: that of the last pose of the segment (:meth:`KeyframeGraph.world_of`); -1 before its first one.
         shutter: timing of the rows of the last frame.
         info: metadata for run.json.
-        unread: uncertainties of estimates that nobody has read yet; not written, as they change nothing.
+        map: of the file that the tracker was loaded from, until the first frame of the new recording.
+        unread: uncertainties of estimates that nobody has read yet.
     """
 
     generator: torch.Generator
@@ -53,6 +55,7 @@ class TrackerState:
     world: int = -1
     shutter: Shutter = Shutter(0.0, 1.0)
     info: dict[str, object] = field(default_factory=dict)
+    map: MapTable | None = None
     unread: Waiting[Uncertainty] = field(default_factory=Waiting)
 
     def begin_segment(self) -> None:

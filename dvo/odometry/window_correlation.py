@@ -74,17 +74,6 @@ class WindowCorrelation:
         """
         return torch.stack([level.origins(self.window.edge_slots) for level in self._all])
 
-    def are_origins(self, origins: Tensor) -> bool:
-        """Check positions of a file against the maps, which are stored already.
-
-        Args:
-            origins: ``(L, E, 2)``.
-
-        Returns:
-            True if :meth:`restore` takes them.
-        """
-        return all(bool(level.are_origins(part).all()) for level, part in zip(self._all, origins, strict=True))
-
     def restore(self, origins: Tensor) -> None:
         """Compute the cached windows of all edges at given positions; the maps of the frames are stored already.
 

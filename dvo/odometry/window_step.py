@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -42,6 +43,14 @@ class WindowStep:
         self.model, self.window, self.lookup, self.align, self.final = model, window, lookup, align, final
         self.kernel = kernel
         self.bounds = (0, 0)
+
+    def of_copy(self, window: Window) -> WindowStep:
+        """Step on a copy of the window, with caches of its own.
+
+        Args:
+            window: with the same frames and edges.
+        """
+        return deepcopy(self, {id(self.model): self.model, id(self.window): window})
 
     def keep_frame(self, map_slot: int, image: np.ndarray, maps: Tensor, fine_maps: Tensor | None) -> None:
         """Store feature maps and image of a frame.

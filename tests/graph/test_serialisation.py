@@ -56,17 +56,18 @@ def test_what_is_read_is_what_was_written(tmp_path_factory, frames, dropped, arc
     first = load_graph(file)
     save_graph(file, first)
     same(first, load_graph(file))
+    graph.archive_window()
     if graph.archive.nbytes <= bound:
         same(graph, first)
 
 
 def test_a_read_graph_releases_and_solves_as_the_one_written(tmp_path):
     graph = walk()
+    before, edges = len(graph.window), len(graph.archive.edges().source)
     save_graph(tmp_path / "a.dvo", graph)
+    assert len(graph.window) == before > 1 and len(graph.archive.edges().source) == edges
     found = load_graph(tmp_path / "a.dvo")
-    for one in (graph, found):
-        while len(one.window):
-            one.archive_oldest()
+    graph.archive_window()
     same(graph, found)
     assert found.points(0)[0].tobytes() == graph.points(0)[0].tobytes() and len(found.points(0)[0])
     assert torch.equal(found.problem().targets, graph.problem().targets)
@@ -80,6 +81,7 @@ def test_a_read_graph_releases_and_solves_as_the_one_written(tmp_path):
 
 def test_the_images_of_the_archive_are_the_jpeg_bytes(tmp_path):
     graph = walk()
+    graph.archive_window()
     save_graph(tmp_path / "a.dvo", graph)
     with open_map_file(tmp_path / "a.dvo") as source:
         content = source.array("archive/jpeg", np.uint8, (None,)).tobytes()
@@ -97,12 +99,6 @@ def changed(graph, **arrays):
 
 
 WRONG = {
-    "window__edge_targets": lambda a: a + 100,
-    "window__edge_patches": lambda a: a - 1,
-    "window__poses_cw": lambda a: a * np.float32("nan"),
-    "window__hidden": lambda a: a[:-1],
-    "window__map_slots": lambda a: a * 0,
-    "window__times": lambda a: a[::-1].copy(),
     "archive__poses_cw": lambda a: a * 0,
     "archive__anchors": lambda a: a + 7,
     "archive__keyframes": lambda a: a * 0,

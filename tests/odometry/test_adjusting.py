@@ -1,4 +1,4 @@
-"""Global adjustments of a tracker on a walk there and back: after a loop, from a map file, and on request."""
+"""Global adjustments of a tracker on a walk there and back: after a loop, and on request."""
 
 import threading
 from dataclasses import replace
@@ -15,61 +15,47 @@ from tests.odometry import test_loop_closure as closing
 film, OPTIONS = closing.film, closing.OPTIONS
 
 
-@pytest.fixture(scope="module")
-def saved(film, tmp_path_factory):
-    """Map files during the first correction and after it, each with the number of frames by then."""
-    odometry, found = dvo.load("small", device="cpu", **closing.SHORT), {}
-    odometry.loops.finder.options = OPTIONS
-    for count, frame in enumerate(film[0], 1):
-        odometry.track(frame)
-        state = "correcting" if isinstance(odometry.loops.work, Correcting) else ""
-        state = "closed" if odometry.loops.corrections and odometry.loops.work is None else state
-        if state and state not in found:
-            found[state] = tmp_path_factory.mktemp("maps") / f"{state}.dvo", count
-            odometry.save(found[state][0])
-        if state == "closed":
-            break
-    return found
+def adjusting(film, state):
+    """Tracker in a state that searches no further, and adjusts nine frames after a correction; the frames by then."""
+    odometry, count = closing.until(film, state)
+    odometry.loops.finder.options = replace(OPTIONS, adjust_delay=9)
+    odometry.loops.wait, odometry.loops.adjuster.after_loop = 1000, True
+    return odometry, count
 
 
-def continued(file):
-    """Tracker of a map file that searches no further, and adjusts nine frames after a correction."""
-    loaded = dvo.load_map(file)
-    loaded.loops.finder.options = replace(OPTIONS, adjust_delay=9)
-    loaded.loops.wait, loaded.loops.adjuster.after_loop = 1000, True
-    return loaded
+def test_a_world_is_adjusted_after_a_loop(film, tmp_path):
+    """Saving in the meantime changes nothing, and tells the adjustments that were made."""
+    trajectories = []
+    for saves in (True, False):
+        odometry, count = adjusting(film, lambda loops: isinstance(loops.work, Correcting))
+        begun, errors = 0, []
+        for number in range(count, count + 16):
+            before, made = odometry.current().trajectory, list(odometry.loops.adjuster.records)
+            odometry.track(film[0][number])
+            if isinstance(odometry.loops.work, Adjusting) and not begun:
+                begun = number
+            elif begun and number == begun + 3 and saves:
+                odometry.save(tmp_path / "adjusting.dvo")
+            if odometry.loops.adjuster.records != made:
+                assert number == begun + 9
+                errors = [evaluate(rows, film[1]).ate_percent for rows in (before, odometry.current().trajectory)]
+        assert errors[1] < errors[0]
+        (record,) = odometry.loops.adjuster.records
+        assert record.cause == "loop" and record.accepted and record.cost < record.cost_before
+        assert record.keyframes > 20
+        assert (record.begun, record.applied) == (film[0][begun].timestamp, film[0][begun + 9].timestamp)
+        trajectories.append(odometry.current().trajectory.poses_wc)
+        odometry.save(tmp_path / "adjusted.dvo")
+        told = dvo.load_map(tmp_path / "adjusted.dvo").finish().info["adjustments"]
+        assert told == odometry.current().info["adjustments"] and len(told) == 1
+    assert np.array_equal(*trajectories)
+    assert dvo.load_map(tmp_path / "adjusting.dvo").finish().info["adjustments"] == []
 
 
-def test_a_world_is_adjusted_after_a_loop_and_goes_on_from_a_file(film, saved, tmp_path):
-    file, count = saved["correcting"]
-    loaded, begun, errors = continued(file), 0, []
-    for number in range(count, count + 16):
-        before, made = loaded.current().trajectory, list(loaded.loops.adjuster.records)
-        loaded.track(film[0][number])
-        if isinstance(loaded.loops.work, Adjusting) and not begun:
-            begun = number
-        elif begun and number == begun + 3:
-            loaded.save(tmp_path / "adjusting.dvo")
-        if loaded.loops.adjuster.records != made:
-            assert number == begun + 9
-            errors = [evaluate(rows, film[1]).ate_percent for rows in (before, loaded.current().trajectory)]
-    assert errors[1] < errors[0]
-    (record,) = loaded.loops.adjuster.records
-    assert record.cause == "loop" and record.accepted and record.cost < record.cost_before and record.keyframes > 20
-    assert (record.begun, record.applied) == (film[0][begun].timestamp, film[0][begun + 9].timestamp)
-    again = continued(tmp_path / "adjusting.dvo")
-    assert again.loops.work.left == 6
-    for frame in film[0][begun + 4 : count + 16]:
-        again.track(frame)
-    assert np.array_equal(again.current().trajectory.poses_wc, loaded.current().trajectory.poses_wc)
-    assert again.loops.information()["adjustments"] == loaded.loops.information()["adjustments"]
-    assert [x.measurement.tolist() for x in again.loops.loops] == [x.measurement.tolist() for x in loaded.loops.loops]
-
-
-def test_an_adjustment_on_request(film, saved):
+def test_an_adjustment_on_request(film):
     """It waits, and lowers cost and error; in real time it is done beside tracking, and no frame waits for it."""
-    file, count = saved["closed"]
-    loaded, release = continued(file), threading.Event()
+    loaded, count = adjusting(film, lambda loops: loops.corrections > 0 and loops.work is None)
+    release = threading.Event()
     before = evaluate(loaded.current().trajectory, film[1]).ate_percent
     (record,) = loaded.adjust()
     assert record.accepted and record.cost < record.cost_before

@@ -22,19 +22,16 @@ def counted(number, taken):
 
 
 @given(number=st.integers(0, 6), early=st.integers(0, 8))
-def test_steps_are_due_at_the_same_call_whether_the_result_was_taken_early_or_not(number, early):
-    taken, due = [], None
-    steps, other = Steps(counted(number, taken)), Steps(counted(number, []))
+def test_steps_are_taken_one_by_one_or_all_for_the_result(number, early):
+    taken = []
+    steps = Steps(counted(number, taken))
     for call in range(number + 1):
         if call == early:
-            assert steps.result() == "done" and len(taken) == number + 1 and steps.left == number + 1 - call
-            other = Steps.finished("done", steps.left)  # as it comes back from a file
+            assert steps.result() == "done" and len(taken) == number + 1 and steps.step()
         elif call < early:
             assert len(taken) == call
-        found, again = steps.step(), other.step()
-        assert found == again
-        due = call if found and due is None else due
-    assert due == number and steps.result() == other.result() == "done"
+            assert steps.step() == (call == number)
+    assert steps.result() == "done"
     assert taken == [*range(number), True] and all_steps(counted(number, [])) == "done"
 
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 import dvo
-from dvo.errors import DvoError
 from dvo.metrics import align_trajectory
 from dvo.odometry import late_join
 from dvo.odometry.evidence import Evidence, evidence_of, newest_evidence
@@ -15,7 +14,7 @@ from dvo.odometry.protocol import Status
 from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
 from tests.odometry.test_interruptions import with_images
-from tests.odometry.test_saving import FAST, check_cuts, content, told
+from tests.odometry.test_saving import FAST, content, told
 
 CUT, DARK, END = 16, 6, 32
 BACK = CUT + DARK  # first frame after the darkness
@@ -147,27 +146,14 @@ def test_later_frames_are_no_evidence(dark):
         window.confidence = kept
 
 
-def test_going_on_from_a_file_while_a_view_waits_and_after_it_was_joined(dark, monkeypatch, tmp_path):
-    """With a repetition of the view, which shares its pose."""
+def test_a_repetition_of_a_view_that_was_joined_late_shares_its_pose(dark, monkeypatch):
     frames = with_images(dark, [dark[BACK].image], BACK + 1)
     refuse(monkeypatch, frames[BACK].timestamp)
     tries = count_tries(monkeypatch)
-    _, result = check_cuts(lambda: dvo.load("small", **FAST), frames, (BACK + 2, BACK + 3), tmp_path)
-    assert tries == [True, True]  # of the whole sequence, and of the one that goes on before the late join
-    assert lost_frames(frames, result) == list(range(CUT, BACK))
+    _, result, _ = track(frames)
+    assert tries == [True] and lost_frames(frames, result) == list(range(CUT, BACK))
     poses = dict(zip(result.trajectory.timestamps, result.trajectory.poses_wc.tolist(), strict=True))
     assert poses[frames[BACK].timestamp] == poses[frames[BACK + 1].timestamp]
-
-
-def test_a_file_without_room_for_the_identifier_of_a_waiting_view_is_refused(dark, monkeypatch, tmp_path):
-    refuse(monkeypatch, dark[BACK].timestamp)
-    odometry = dvo.load("small", device="cpu", **FAST)
-    for frame in dark[: BACK + 1]:
-        odometry.track(frame)
-    odometry.state.keyframes -= 1
-    odometry.save(tmp_path / "a.dvo")
-    with pytest.raises(DvoError, match="more views than identifiers"):
-        dvo.load_map(tmp_path / "a.dvo")
 
 
 def test_a_gap_in_time_is_told_before_the_frame_that_was_joined_late(film, monkeypatch):

@@ -14,12 +14,13 @@ from dvo.geometry import sim3
 from dvo.graph.correction import apply_similarities
 from dvo.graph.merging import append_graph
 from dvo.graph.recordings import begin_recording
+from dvo.odometry.front_end import encode_image
 from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.loops import Loop
 from dvo.odometry.protocol import Status
 from tests.archived_walk import archived_walk
 from tests.odometry.recorded_walk import COUNT, OPTIONS, SHORT, error_of_both, room, street, tracked, way_back
-from tests.odometry.test_saving import content, network, told
+from tests.odometry.test_saving import content, network
 from tests.odometry.test_tracker import frames as wall
 from tests.odometry.test_tracker import run, tracker
 
@@ -38,7 +39,7 @@ def old(walk, tmp_path_factory):
 
 
 def begin(file, **settings):
-    odometry = dvo.load_map(file, new_recording=True, **settings)
+    odometry = dvo.load_map(file, **settings)
     odometry.loops.finder.options = OPTIONS
     return odometry
 
@@ -106,20 +107,19 @@ def test_the_map_stays_as_it_was(old, back, tmp_path):
     again = dvo.load_map(tmp_path / "both.dvo")
     assert content(again.finish()) == content(odometry.finish())
     third = begin(tmp_path / "both.dvo")
-    assert len(third.graph.recordings) == 3 and len(third.loops.finder.kept) == len(odometry.loops.finder.kept)
-    assert third.finish().info["localised"] is None and third.finish().frames_read == 0
+    assert len(third.loops.finder.kept) == len(odometry.loops.finder.kept) and len(third.graph.recordings) == 2
+    third.track(wall(1, size=(160, 120))[0])
+    assert len(third.graph.recordings) == 3
+    assert third.finish().info["localised"] is None and third.finish().frames_read == 1
 
 
-def test_it_goes_on_from_a_file(walk, back):
-    odometry, estimates, file, cut, repeated = back
-    found = dvo.load_map(file)
-    found.loops.finder.options = OPTIONS
-    assert found.loops.pending is not None
-    for frame, expected in zip(way_back(walk[0])[cut:], estimates[cut:], strict=True):
-        assert told(found.track(frame)) == told(expected)
-        if expected.recovered:
-            found.track(replace(frame, timestamp=frame.timestamp + 0.01))
-    assert content(found.finish()) == content(odometry.finish())
+def test_a_recording_that_was_not_recognised_yet_is_saved_with_its_map(old, back):
+    found, cut = dvo.load_map(back[2]), back[3]
+    assert len(found.graph.recordings) == 2 and found.loops.finder.kept[-1] > found.graph.recording.keyframe
+    result = found.finish()
+    assert result.info["localised"] is None and result.frames_read == cut
+    assert not any(segment.in_map for segment in result.segments)
+    assert np.array_equal(found.graph.log.trajectory(0).poses_wc, old[1].trajectory.poses_wc)
 
 
 def test_another_place_is_not_recognised(old):
@@ -130,22 +130,39 @@ def test_another_place_is_not_recognised(old):
     assert set(result.trajectory.timestamps) <= {k / 15 for k in range(16)}
 
 
-def test_an_unfinished_map_without_loops_is_finished_and_described(walk, tmp_path):
+def test_a_map_in_progress_without_loops_is_described(walk, tmp_path):
     odometry = dvo.load("small", device="cpu", **SHORT, loops=False)
     for frame in walk[0][14:30]:
         odometry.track(frame)
     odometry.save(tmp_path / "a.dvo")
     found = dvo.load_map(tmp_path / "a.dvo", new_recording=True, updates=2, seed=5)
-    assert not len(found.window) and found.graph.recording.frame == 16 and not odometry.state.finished
+    assert not len(found.window) and not odometry.state.finished
     assert (found.config.updates, found.config.loops, found.seed) == (2, True, 5)
     kept = found.loops.finder.kept
-    assert kept and found.loops.finder.places.identifiers.tolist() == kept
+    assert kept[-1] == odometry.window.frames[-1].identifier
+    assert found.loops.finder.places.identifiers.tolist() == kept
+    assert found.current().info["config"]["loops"] is False and found.current().info["seed"] == 0
     # Saved before its first frame it still knows the size that its frames must have.
     found.save(tmp_path / "b.dvo")
     for tracker_ in (found, dvo.load_map(tmp_path / "b.dvo")):
         for size in ((160, 96), (80, 60)):
             with pytest.raises(DvoError, match=r"images of the map are 160x120.*pixels=19200"):
                 tracker_.track(wall(1, size=size)[0])
+
+
+def test_the_keyframes_of_the_window_have_the_same_descriptors_as_computed_from_their_images(walk, tmp_path):
+    """Those of the map of a sequence in progress come from the tracker; they agree with the archived image."""
+    odometry = dvo.load("small", device="cpu", **SHORT)
+    for frame in walk[0][:20]:
+        odometry.track(frame)
+    odometry.save(tmp_path / "a.dvo")
+    places = dvo.load_map(tmp_path / "a.dvo").loops.finder.places
+    last = odometry.window.frames[-1].identifier
+    assert places.identifiers[-1] == last
+    with torch.inference_mode():
+        image = odometry.window.frames[-1].image
+        again = odometry.loops.finder.descriptor(image, encode_image(odometry.model, image, odometry.device).matching)
+    np.testing.assert_allclose(places.descriptor(last), again, atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -158,19 +175,15 @@ def test_settings_that_do_not_go_with_the_map(settings, match, old):
         begin(old[0], **settings)
 
 
-def test_settings_without_a_new_recording_are_refused(old):
-    for settings in ({"seed": 1}, {"updates": 2}):
-        with pytest.raises(DvoError, match="goes on with the settings"):
-            dvo.load_map(old[0], **settings)
-
-
-def test_a_map_that_cannot_be_recognised_is_refused(tmp_path):
+def test_a_map_that_cannot_be_recognised_is_read_and_takes_no_frames(tmp_path):
     for name, count in (("empty", 0), ("tiny", 9)):
         odometry = tracker()
         run(odometry, wall(count))
         odometry.save(tmp_path / f"{name}.dvo")
+        found = dvo.load_map(tmp_path / f"{name}.dvo", weights=network())
         with pytest.raises(DvoError, match="no keyframes that can be recognised"):
-            dvo.load_map(tmp_path / f"{name}.dvo", weights=network(), new_recording=True)
+            found.track(wall(1)[0])
+        assert found.finish().frames_read == count
 
 
 def three_walks():

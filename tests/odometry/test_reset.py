@@ -9,8 +9,8 @@ from dvo.geometry.camera import Camera
 from dvo.models.registry import ARCHITECTURES
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.load import build_odometry
+from dvo.odometry.load_map import load_map
 from dvo.odometry.protocol import Resettable
-from dvo.odometry.saving import load_map
 
 SETTINGS = {
     "patch_vo": {

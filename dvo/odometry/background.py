@@ -29,13 +29,6 @@ class Task(Generic[T]):
     def __init__(self, outcome: Future[T]) -> None:
         self._outcome = outcome
 
-    @classmethod
-    def finished(cls, result: T) -> Task[T]:
-        """Task with a result that is known already."""
-        outcome: Future[T] = Future()
-        outcome.set_result(result)
-        return cls(outcome)
-
     @property
     def done(self) -> bool:
         """True if :meth:`result` returns at once."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import median
 
@@ -86,33 +85,6 @@ class FrameSequence:
         self._size: tuple[int, int] | None = None
         self._last: float | None = None  # time of the last frame
         self._new = 0.0  # time of the first frame with the image of the last one
-
-    @property
-    def size(self) -> tuple[int, int] | None:
-        """Width and height of the images; None before the first."""
-        return self._size
-
-    @property
-    def intervals(self) -> list[float]:
-        """Recent times between two frames, seconds, oldest first."""
-        return list(self._intervals)
-
-    @property
-    def new(self) -> float:
-        """Time of the first frame with the image of the last one, seconds."""
-        return self._new
-
-    def restore(self, size: tuple[int, int] | None, intervals: Iterable[float], last: float, new: float) -> None:
-        """Take the state of another sequence, which has frames.
-
-        Args:
-            size: see :attr:`size`.
-            intervals: see :attr:`intervals`.
-            last: time of the last frame, seconds.
-            new: see :attr:`new`.
-        """
-        self._size, self._last, self._new = size, last, new
-        self._intervals.extend(intervals)
 
     def check(self, frame: Frame) -> None:
         """Check that a frame continues the sequence.

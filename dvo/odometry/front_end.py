@@ -108,7 +108,6 @@ def observe(
     camera: Camera,
     select: Callable[..., Tensor],
     device: torch.device,
-    centres: Tensor | None = None,
     mask: np.ndarray | None = None,
 ) -> Observation:
     """Encode a working image and select its patches.
@@ -119,7 +118,6 @@ def observe(
         camera: of the image.
         select: selection of the patches, with their number and the generator given (:mod:`dvo.nets.selection`).
         device: of the network.
-        centres: ``(1, 1, M, 2)`` of the patches, if they are known already; nothing is selected then.
         mask: ``(H, W)`` bool, pixels of the image to use; None for all.
 
     Returns:
@@ -127,11 +125,10 @@ def observe(
     """
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
     features = encode_image(model, image, device)
-    if centres is None:
-        centres = model.centres(rgb[None, None], features, select)
-        if mask is not None:
-            again = partial(model.centres, rgb[None, None], features, select)
-            centres = unmasked_centres(centres, again, places_of_patches(mask, model.config.patch_size, device))
+    centres = model.centres(rgb[None, None], features, select)
+    if mask is not None:
+        again = partial(model.centres, rgb[None, None], features, select)
+        centres = unmasked_centres(centres, again, places_of_patches(mask, model.config.patch_size, device))
     matching, context = model.patchify.cut(features, centres)
     fine = cut_fine(features, centres, model.config.patch_size)
     stride = model.config.STRIDE

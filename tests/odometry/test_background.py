@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvo.odometry.background import Background, Steps, Task, all_steps
+from dvo.odometry.background import Background, Steps, all_steps
 
 
 def counted(number, taken):
@@ -74,11 +74,6 @@ def test_an_error_of_the_work_is_that_of_the_result():
 
     with pytest.raises(ValueError, match="no"):
         Background().start(fail).result()
-
-
-def test_a_finished_task_has_its_result():
-    task = Task.finished(3)
-    assert task.done and task.result() == 3
 
 
 def test_the_thread_gives_way_to_tracking():

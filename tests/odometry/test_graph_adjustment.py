@@ -15,7 +15,7 @@ from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.recordings import Recording
 from dvo.metrics import evaluate
 from dvo.odometry.adjuster import Adjuster, Adjusting
-from dvo.odometry.background import Task
+from dvo.odometry.background import Background
 from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.odometry.graph_adjustment import apply, prepare
 from dvo.odometry.loop_options import LoopOptions
@@ -67,7 +67,7 @@ def test_the_cost_never_increases(wrong, iterations, frames):
     before = cost(graph)
     limits = LoopOptions(adjust_iterations=iterations)
     adjuster = Adjuster(graph, None, AdjustmentOptions())
-    adjuster.take(Adjusting(Task.finished(prepared(graph, limits).solve()), 0, 0, "loop", 0.0))
+    adjuster.take(Adjusting(Background().start(prepared(graph, limits).solve), 0, 0, "loop", 0.0))
     assert cost(graph) <= before * (1 + 1e-6)
     (record,) = adjuster.records
     assert record.cost_before == before and record.accepted == (record.cost < before)
@@ -78,7 +78,7 @@ def test_a_solution_that_is_no_better_changes_nothing():
     before, found = state(graph), prepared(graph).solve()
     adjuster = Adjuster(graph, None, AdjustmentOptions())
     worse = replace(found, cost=found.cost_before)
-    assert adjuster.take(Adjusting(Task.finished(worse), 0, 0, "request", 1.5)) == {}
+    assert adjuster.take(Adjusting(Background().start(lambda: worse), 0, 0, "request", 1.5)) == {}
     for mine, other in zip(before, state(graph), strict=True):
         assert np.array_equal(mine, other)
     (entry,) = adjuster.information()["adjustments"]
@@ -169,9 +169,9 @@ def test_a_short_or_unknown_world_is_left_alone():
     graph, _ = archived_walk(frames=2)
     adjuster = Adjuster(graph, None, AdjustmentOptions())
     for world in (0, 5):
-        found = prepare(graph, world, GLOBAL, AdjustmentOptions()).solve()
-        assert not found.better
-        assert adjuster.take(Adjusting(Task.finished(found), 0, world, "request", 0.0)) == {}
+        task = Background().start(prepare(graph, world, GLOBAL, AdjustmentOptions()).solve)
+        assert not task.result().better
+        assert adjuster.take(Adjusting(task, 0, world, "request", 0.0)) == {}
     assert adjuster.information() == {}
     assert replace(adjuster, after_loop=True).information() == {"adjustments": []}
 

@@ -10,6 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 LIBRARY = sorted((ROOT / "dvo").rglob("*.py"))
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
 EVERYTHING = LIBRARY + [file for folder in ("train", "eval") for file in sorted((ROOT / folder).rglob("*.py"))]
 
 # A room may import these rooms, itself, and dvo.errors.
@@ -81,6 +82,18 @@ def test_imports_follow_the_arrows(file: Path) -> None:
             continue
         allowed = ARROWS[room] | {room, "errors", "registry", "settings", "yaml_files"}
         assert target in allowed, f"{name(file)}:{line}: {room} must not know {target}"
+
+
+@pytest.mark.parametrize("file", TESTS, ids=name)
+def test_tests_share_only_what_lies_in_support(file: Path) -> None:
+    own = "tests.fuzz" if (ROOT / "tests" / "fuzz") in file.parents else "tests.support"
+    for line, module in imports(file):
+        if module.split(".")[0] == "tests":
+            assert any(f"{module}.".startswith(f"{room}.") for room in ("tests.support", own)), (
+                f"{name(file)}:{line} imports {module}: what tests share belongs into tests/support"
+            )
+            last = module.rsplit(".", 1)[-1]
+            assert not last.startswith("test_"), f"{name(file)}:{line} imports a test's file, {module}"
 
 
 def is_module(target: str) -> bool:

@@ -9,8 +9,8 @@ from dvo.cli import main
 from dvo.data.euroc import read_state_groundtruth
 from dvo.data.trajectory import read_kitti_poses, read_tum
 from dvo.geometry.poses import pose_matrices
-from tests.command_line import arguments, errors, names, summary
-from tests.odometry.test_tracker import frames, tracker
+from tests.support.command_line import arguments, errors, names, summary
+from tests.support.tiny_tracker import frames, tracker
 
 
 def same(found, expected):

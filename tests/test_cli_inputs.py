@@ -11,7 +11,7 @@ import pytest
 from dvo.cli import main
 from dvo.data.extrinsics import base_trajectory
 from dvo.data.trajectory import read_tum
-from tests.command_line import arguments, errors, summary
+from tests.support.command_line import arguments, errors, summary
 
 
 @pytest.fixture

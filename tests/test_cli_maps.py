@@ -13,8 +13,8 @@ import torch
 import dvo
 from dvo.cli import main
 from dvo.errors import DvoError
-from tests.command_line import arguments, summary
-from tests.conftest import FakeOdometry, curve
+from tests.support.command_line import arguments, summary
+from tests.support.fake_odometry import FakeOdometry, curve
 
 
 class SavingOdometry(FakeOdometry):

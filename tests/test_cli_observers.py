@@ -10,7 +10,7 @@ from dvo.cli import main
 from dvo.commands.observers import open_observers
 from dvo.errors import DvoError
 from dvo.viz.overlay import OverlayVideo
-from tests.command_line import arguments, summary
+from tests.support.command_line import arguments, summary
 
 
 @pytest.mark.parametrize("method", ["begin", "update", "finish", "close"])

@@ -22,7 +22,7 @@ from dvo.commands.report import describe_breaks
 from dvo.data.trajectory import read_tum
 from dvo.odometry import files
 from dvo.odometry.protocol import Break, Estimate, Status
-from tests.command_line import arguments, errors, names, summary
+from tests.support.command_line import arguments, errors, names, summary
 
 resource = pytest.importorskip("resource")
 

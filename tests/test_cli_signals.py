@@ -16,7 +16,7 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
-from tests.command_line import arguments, errors, names, summary
+from tests.support.command_line import arguments, errors, names, summary
 
 # A program that is `dvo` with an odometry that knows the answer, several times over in processes of their own: imports
 # take longer than all runs. Each logs a line when the odometry is asked for a frame, at which moment the frame before

@@ -14,7 +14,7 @@ import pytest
 
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
-from tests.command_line import errors, summary
+from tests.support.command_line import errors, summary
 
 COMMON = ["--device", "cpu"]
 

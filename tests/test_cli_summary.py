@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 from html import escape
@@ -16,15 +15,8 @@ from dvo.commands.page_tables import tables
 from dvo.data.trajectory import read_tum, write_tum
 from dvo.odometry.frame_table import read_frames
 from dvo.odometry.results_reader import read_results
-from tests.command_line import arguments, errors, summary
-
-
-def data_of(file: Path) -> dict:
-    return json.loads(re.search(r'id="data">(.*?)</script>', file.read_text(encoding="utf-8"), re.DOTALL)[1])
-
-
-def floats(text: str) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(text), "<f4")
+from tests.support.command_line import arguments, errors, summary
+from tests.support.summary_page import data_of, floats
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import pytest
 
 import dvo
 from dvo.cli import main
-from tests.command_line import errors, summary
-from tests.data.fisheye_clip import write_clips
+from tests.support.command_line import errors, summary
+from tests.support.fisheye_clip import write_clips
 
 
 @pytest.mark.slow

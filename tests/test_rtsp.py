@@ -13,7 +13,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from tests.command_line import summary
+from tests.support.command_line import summary
 
 
 @pytest.mark.slow

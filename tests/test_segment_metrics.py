@@ -13,7 +13,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.metrics import evaluate
 from dvo.segment_metrics import SEGMENT_POSES, evaluate_segments, match_worlds, most_worlds, rows_of
-from tests.walks import cut, moved, segment
+from tests.support.trajectories import cut, moved, segment
 
 
 def walk(count: int = 120, seed: int = 0) -> Trajectory:

@@ -20,11 +20,11 @@ import dvo
 from dvo.data.trajectory import read_tum, write_tum
 from dvo.models.weights import load_weights
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from tests.command_line import names, summary
-from tests.data.test_rosbag import Bag
-from tests.odometry.recorded_walk import COUNT, SHORT, error_of_both, room
-from tests.terminal import Terminal
-from tests.test_cli_summary import data_of, floats
+from tests.support.command_line import names, summary
+from tests.support.recorded_walk import COUNT, SHORT, error_of_both, room
+from tests.support.rosbags import Bag
+from tests.support.summary_page import data_of, floats
+from tests.support.terminal import Terminal
 
 RESULTS = ["frames.csv", "map.ply", "run.json", "summary.html", "trajectory.png", "trajectory.txt"]
 FOCAL = re.compile(r"^focal length (\d+) \+- (\d+) px \(self-calibrated from (\d+) frames\)$", re.MULTILINE)

@@ -1,1 +1,1 @@
-"""Benchmarks of speed and of malformed input, each a program of its own: ``python -m eval.benchmarks.NAME``."""
+"""Benchmarks of speed, accuracy and memory, each a program of its own: ``python -m eval.benchmarks.NAME``."""

@@ -9,7 +9,7 @@ from dvo.data.depth import registered_depth, resized_depth
 from dvo.data.depth_source import with_depth
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from tests.data.test_sensors import depth_image, tum
+from tests.support.tum_folder import depth_image, tum
 
 
 def images(make, names=("1.png", "2.png", "3.png")):

@@ -11,7 +11,7 @@ from dvo.data.right_source import with_right
 from dvo.data.stereo_calibration import right_camera
 from dvo.errors import DvoError
 from dvo.geometry.poses import invert_poses, poses_from_matrices
-from tests.command_line import errors
+from tests.support.command_line import errors
 
 ROW = "P{}: 50 0 31 {} 0 51 23 0 0 0 1 0\n"
 KITTI = "".join(ROW.format(k, -50 * x) for k, x in enumerate((0.0, 0.54, -0.06, 0.47)))

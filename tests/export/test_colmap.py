@@ -16,7 +16,8 @@ from dvo.export.colmap import write_colmap, write_colmap_text
 from dvo.export.reconstruction import reconstruct
 from dvo.geometry.camera import Camera
 from dvo.synth.sequence import make_sequence
-from tests.export.models import SIDE, one_view, read_binary, read_text, views, walk
+from tests.support.colmap_models import read_binary, read_text
+from tests.support.reconstructions import SIDE, one_view, views, walk
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from dvo.export.formats import (
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.odometry.protocol import Result, Segment, SparseMap
 from dvo.odometry.tracker import PatchOdometry
-from tests.archived_walk import archived_walk
-from tests.command_line import names
-from tests.export.models import walk
+from tests.support.archived_walk import archived_walk
+from tests.support.command_line import names
+from tests.support.reconstructions import walk
 
 
 class Tracker:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from dvo.export.nerfstudio import APPLIED_TRANSFORM, write_nerfstudio
 from dvo.export.reconstruction import reconstruct
 from dvo.geometry.camera import Camera
-from tests.export.models import SIDE, one_view, views, walk
+from tests.support.reconstructions import SIDE, one_view, views, walk
 
 
 def read(folder):

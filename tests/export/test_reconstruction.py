@@ -6,8 +6,8 @@ import pytest
 from dvo.errors import DvoError
 from dvo.export.reconstruction import PointOptions, longest_segment, reconstruct
 from dvo.graph.keyframe_log import FrameRecord
-from tests.archived_walk import INTRINSICS, M
-from tests.export.models import SIDE, image, walk
+from tests.support.archived_walk import INTRINSICS, M
+from tests.support.reconstructions import SIDE, image, walk
 
 
 def reprojected(found):

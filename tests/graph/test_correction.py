@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from dvo.geometry import se3, sim3
 from dvo.geometry.projection import reproject
 from dvo.graph.correction import apply_similarities, move_window, similarity_between
-from tests.archived_walk import archived_walk
+from tests.support.archived_walk import archived_walk
 
 TANGENT = st.lists(st.floats(-1, 1), min_size=7, max_size=7).map(lambda xi: torch.tensor(xi, dtype=torch.float64))
 

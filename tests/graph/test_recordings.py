@@ -8,7 +8,7 @@ from dvo.graph.merging import append_graph, moved_edges
 from dvo.graph.recordings import begin_recording, count_earlier, increase, increasing_times
 from dvo.graph.serialisation import load_graph, save_graph
 from dvo.odometry.final_adjustment import adjust_segment
-from tests.archived_walk import INTERVAL, archived_walk
+from tests.support.archived_walk import INTERVAL, archived_walk
 
 
 def two_walks(dropped=()):

@@ -15,7 +15,7 @@ from dvo.graph.archive import ArchiveConfig, encode_jpeg
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.map_file import VERSION, open_map_file, write_map_file
 from dvo.graph.serialisation import graph_arrays, load_graph, save_graph
-from tests.archived_walk import M, archived_walk
+from tests.support.archived_walk import M, archived_walk
 
 
 def same(a: KeyframeGraph, b: KeyframeGraph) -> None:

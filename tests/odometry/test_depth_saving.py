@@ -8,10 +8,10 @@ import pytest
 import dvo
 from dvo.graph.serialisation import load_graph, save_graph
 from dvo.odometry.scale_options import ScaleOptions
-from tests.archived_walk import archived_walk
-from tests.odometry.test_saving import SMALL, check_saved_run, network
-from tests.odometry.test_stereo_depth import clip
-from tests.odometry.test_tracker import frames, tracker
+from tests.support.archived_walk import archived_walk
+from tests.support.saved_maps import check_saved_run
+from tests.support.stereo_wall import stereo_wall
+from tests.support.tiny_tracker import SMALL, frames, network, tracker
 
 WITH_DEPTH = replace(SMALL, scale=ScaleOptions(depth=True))
 
@@ -41,7 +41,7 @@ def test_a_map_with_depths_from_right_images(tmp_path):
         settings = {"removal": 5, "lifetime": 4, "patches": 12, "initial_frames": 4, "keyframe_motion": 0.5}
         return dvo.load("small", pixels=160 * 120, scale={"stereo": True}, estimate_readout=False, **settings)
 
-    _, result = check_saved_run(new, clip(14), (3, 11), tmp_path)
+    _, result = check_saved_run(new, stereo_wall(14), (3, 11), tmp_path)
     assert result.metric and result.info["scale"]["source"] == "stereo"
     whole = load_graph(tmp_path / "11.dvo")
     assert whole.archive and any((frame.measured[:, 1] > 0).any() for frame in whole.archive)

@@ -10,7 +10,7 @@ import dvo
 from dvo.odometry.exclusive import METHODS, exclusive
 from dvo.odometry.load import build_odometry
 from dvo.odometry.tracker import PatchOdometry
-from tests.odometry.test_reset import MEMBERS, SETTINGS, frames, network
+from tests.support.tiny_members import MEMBERS, SETTINGS, frames, network
 
 SOON = 0.3  # seconds in which a call that does not wait is done
 

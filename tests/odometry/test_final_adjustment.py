@@ -15,7 +15,7 @@ from dvo.metrics import evaluate
 from dvo.odometry.final_adjustment import AdjustmentOptions, _extended, adjust_segment
 from dvo.odometry.session import run
 from dvo.synth.sequence import make_sequence
-from tests.archived_walk import archived_walk
+from tests.support.archived_walk import archived_walk
 
 
 @pytest.mark.parametrize("block", [600, 15])

@@ -8,8 +8,8 @@ from dvo.geometry import se3
 from dvo.odometry.final_adjustment import adjust_segment
 from dvo.odometry.focal_length import find_focal
 from dvo.odometry.rolling_shutter import Shutter
-from tests import archived_walk as walks
-from tests.archived_walk import ROWS, archived_walk
+from tests.support import archived_walk as walks
+from tests.support.archived_walk import ROWS, archived_walk
 
 
 def walk_with(factor, noise=0.1, **options):

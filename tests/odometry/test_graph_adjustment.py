@@ -20,7 +20,7 @@ from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.odometry.graph_adjustment import apply, prepare
 from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.rolling_shutter import Shutter
-from tests.archived_walk import M, archived_walk
+from tests.support.archived_walk import M, archived_walk
 
 GLOBAL = Shutter(0.0, 60.0)
 DROPPED = (7, 8, 20)

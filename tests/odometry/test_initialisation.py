@@ -11,7 +11,7 @@ from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import MOST, measured_share
 from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.odometry.initialisation import RESTARTS, leave_minimum, restart_due
-from tests.archived_walk import archived_walk, pose_at
+from tests.support.archived_walk import archived_walk, pose_at
 
 CONFIG = TrackerConfig(sigma=0.2, covariance_scale=1.0)  # of measurements whose weights are not those of a network
 

@@ -11,6 +11,7 @@ from dvo.metrics import evaluate
 from dvo.odometry.protocol import Status
 from dvo.segment_metrics import worlds_of
 from dvo.synth.sequence import make_sequence
+from tests.support.changed_images import with_images
 
 CUT, DARK, FPS = 18, 18, 15.0
 SIZE = {"height": 120, "width": 160, "fps": FPS, "sensor": False}
@@ -24,14 +25,6 @@ def film():
 @pytest.fixture(scope="module")
 def clear(film):
     return list(film)
-
-
-def with_images(frames, images, start):
-    """The frames with other images from position ``start`` on."""
-    changed = list(frames)
-    for position, image in enumerate(images, start):
-        changed[position] = replace(frames[position], image=image)
-    return changed
 
 
 def track(frames, seed=0):

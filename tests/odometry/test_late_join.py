@@ -13,8 +13,9 @@ from dvo.odometry.evidence import Evidence, evidence_of, newest_evidence
 from dvo.odometry.protocol import Status
 from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
-from tests.odometry.test_interruptions import with_images
-from tests.odometry.test_saving import FAST, content, told
+from tests.support.changed_images import with_images
+from tests.support.outcome import content, told
+from tests.support.saved_maps import FAST
 
 CUT, DARK, END = 16, 6, 32
 BACK = CUT + DARK  # first frame after the darkness

@@ -20,29 +20,12 @@ from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.loop_work import Correcting, Searching
 from dvo.synth.sequence import make_sequence
-
-THERE = 40
-SHORT = {"keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5}  # keyframes leave the window soon
-OPTIONS = LoopOptions(seconds=1.0, every=2, neighbours=1, steps=4, delay=4)
+from tests.support.loop_walk import OPTIONS, SHORT, THERE, there_and_back, track, until
 
 
 @pytest.fixture(scope="module")
 def film():
-    """Frames of a walk and the same in reverse, with times that go on; and the true trajectory."""
-    walk = make_sequence(
-        63, frames=THERE, family="room", kind="handheld", speed=5.0, height=120, width=160, fps=15.0, sensor=False
-    )
-    order = [*range(THERE), *range(THERE - 2, -1, -1)]
-    clip, times = list(walk), np.arange(len(order)) / 15.0
-    frames = [replace(clip[k], timestamp=float(t)) for k, t in zip(order, times, strict=True)]
-    return frames, Trajectory(times, walk.groundtruth.poses_wc[order])
-
-
-def track(frames, options=OPTIONS, **settings):
-    odometry = dvo.load("small", device="cpu", **SHORT, **settings)
-    odometry.loops.finder.options = options
-    estimates = [odometry.track(frame) for frame in frames]
-    return odometry, estimates, odometry.finish()
+    return there_and_back()
 
 
 @pytest.fixture(scope="module")
@@ -166,17 +149,6 @@ def test_at_the_end_keyframes_that_are_far_apart_are_all_searched(closed, monkey
     rare = [finder.kept.index(new) for new in found[1e6]]
     assert 0 < len(rare) <= len(finder.kept) / 6 + 2 and min(abs(row - known) for row in rare) >= 6
     assert len(found[0.01]) > 2 * len(rare)
-
-
-def until(film, state, **settings):
-    """Tracker of the walk as soon as its loop closure is in a state, and the frames tracked by then."""
-    odometry = dvo.load("small", device="cpu", **SHORT, **settings)
-    odometry.loops.finder.options = OPTIONS
-    for count, frame in enumerate(film[0], 1):
-        odometry.track(frame)
-        if state(odometry.loops):
-            return odometry, count
-    raise AssertionError
 
 
 @pytest.fixture

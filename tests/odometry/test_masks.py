@@ -14,8 +14,8 @@ from dvo.odometry.evidence import measured, missing_content
 from dvo.odometry.load import build_odometry
 from dvo.odometry.load_map import load_map
 from dvo.odometry.protocol import Status
-from tests.odometry.overlay_clip import overlay_clip
-from tests.odometry.test_reset import SETTINGS, frames, network, outcome
+from tests.support.overlay_clip import overlay_clip
+from tests.support.tiny_members import SETTINGS, frames, network, outcome
 
 MASK = np.ones((72, 96), bool)
 MASK[:, 72:] = False

@@ -7,10 +7,10 @@ import dvo
 from dvo.cli import main
 from dvo.errors import DvoError
 from dvo.odometry.merging import merge_maps
-from tests.odometry.recorded_walk import error_of_both, room, street, tracked, way_back
-from tests.odometry.test_saving import content, network
-from tests.odometry.test_tracker import frames as wall
-from tests.odometry.test_tracker import run, tracker
+from tests.support.outcome import content
+from tests.support.recorded_walk import error_of_both, room, street, tracked, way_back
+from tests.support.tiny_tracker import frames as wall
+from tests.support.tiny_tracker import network, run, tracker
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from dvo.odometry.final_adjustment import adjust_segment
 from dvo.odometry.ground_plane import ground_height, plane_below
 from dvo.odometry.metric_scale import scale_of_distances, settle_scale
 from dvo.odometry.scale_options import ScaleOptions
-from tests.archived_walk import archived_walk
+from tests.support.archived_walk import archived_walk
 
 
 def scale_of(graph, truth):

@@ -18,11 +18,11 @@ from dvo.odometry.front_end import encode_image
 from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.loops import Loop
 from dvo.odometry.protocol import Status
-from tests.archived_walk import archived_walk
-from tests.odometry.recorded_walk import COUNT, OPTIONS, SHORT, error_of_both, room, street, tracked, way_back
-from tests.odometry.test_saving import content, network
-from tests.odometry.test_tracker import frames as wall
-from tests.odometry.test_tracker import run, tracker
+from tests.support.archived_walk import archived_walk
+from tests.support.outcome import content
+from tests.support.recorded_walk import COUNT, OPTIONS, SHORT, error_of_both, room, street, tracked, way_back
+from tests.support.tiny_tracker import frames as wall
+from tests.support.tiny_tracker import network, run, tracker
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ import dvo
 from dvo.errors import DvoError
 from dvo.graph.serialisation import load_graph
 from dvo.models.weights import tensor_digest
-from tests.odometry.test_saving import network, rewritten
+from tests.support.saved_maps import rewritten
+from tests.support.tiny_tracker import network
 
 FILE = Path(__file__).with_name("version_2.dvo")
 LAST = [-0.142333, 0.153711, 0.074020, 0.118075, 0.035928, 0.036177, 0.991695]  # pose of the last of its 9 frames

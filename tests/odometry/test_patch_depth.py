@@ -16,7 +16,7 @@ from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.patch_depth import checked_depth, followed_planes, variance_of_inverse
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.tracker import PatchOdometry
-from tests.odometry.test_tracker import SMALL, frames, tracker
+from tests.support.tiny_tracker import SMALL, frames, tracker
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 

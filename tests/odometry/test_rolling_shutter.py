@@ -12,7 +12,7 @@ from dvo.odometry.final_adjustment import adjust_segment
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter
 from dvo.odometry.self_calibration import adjust_segments, find_readout, profile_minimum
 from dvo.synth.render.rolling import row_offsets
-from tests.archived_walk import ROWS, archived_walk, pose_at
+from tests.support.archived_walk import ROWS, archived_walk, pose_at
 
 
 def test_rows_are_read_at_the_times_that_the_renderer_reads_them():

@@ -9,7 +9,6 @@ import torch
 
 import dvo
 from dvo.errors import DvoError
-from dvo.graph.map_file import open_map_file, write_map_file
 from dvo.graph.serialisation import load_graph, save_graph
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights, save_weights
@@ -17,65 +16,9 @@ from dvo.nets.config import preset
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.protocol import Status
 from dvo.synth.sequence import make_sequence
-from tests.odometry.test_tracker import SMALL, frames, run, tracker
-
-FAST = {"pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "initial_updates": 6, "final_updates": 2}
-
-
-def network(operator="gated"):
-    return LoadedWeights.of(tracker(operator=operator).model, "tiny")
-
-
-def content(result):
-    """All of a result as bytes."""
-    rows = [
-        segment.trajectory.poses_wc.tobytes() + segment.trajectory.timestamps.tobytes() for segment in result.segments
-    ]
-    return [
-        *rows,
-        result.map.points.tobytes(),
-        result.map.colors.tobytes(),
-        repr(result.breaks),
-        repr(sorted(result.info.items())),
-    ]
-
-
-def told(estimate):
-    pose = None if estimate.pose_wc is None else estimate.pose_wc.tobytes()
-    covariance = None if estimate.covariance is None else estimate.covariance.tobytes()
-    known = estimate.confidence, estimate.reference, covariance
-    return estimate.timestamp, pose, estimate.status, known, estimate.segment, estimate.reason
-
-
-def check_saved_run(new, images, cuts, folder, weights=None):
-    """Track everything twice, once with maps saved at the cuts, each with the rows of the moment; and finish."""
-    runs = []
-    for saves in (True, False):
-        odometry, estimates = new(), []
-        for number, frame in enumerate(images):
-            if saves and number in cuts:
-                odometry.save(folder / f"{number}.dvo")
-                expected = odometry.current() if odometry.state.initialised else None
-                check_map(dvo.load_map(folder / f"{number}.dvo", weights=weights), number, expected)
-            estimates.append(odometry.track(frame))
-        runs.append(([told(estimate) for estimate in estimates], content(odometry.finish()), estimates))
-    assert runs[0][:2] == runs[1][:2]
-    return runs[0][2], odometry.finish()
-
-
-def check_map(found, count, expected):
-    """A loaded map: nothing is in a window, and its result is that of the moment, with the points of the window too."""
-    result = found.current()
-    assert not len(found.window) and result.frames_read == count
-    if expected is None:
-        return
-    if not result.metric:  # a scale by depth images is told, too
-        assert result.info.keys() == expected.info.keys()
-    assert [len(segment) for segment in result.segments] == [len(segment) for segment in expected.segments]
-    for mine, other in zip(result.segments, expected.segments, strict=True):
-        assert np.array_equal(mine.trajectory.timestamps, other.trajectory.timestamps)
-        np.testing.assert_allclose(mine.trajectory.poses_wc, other.trajectory.poses_wc, atol=1e-5)
-    assert len(result.map.points) >= len(expected.map.points)  # of the longest world, which may be closed
+from tests.support.outcome import content
+from tests.support.saved_maps import FAST, check_saved_run, rewritten
+from tests.support.tiny_tracker import SMALL, frames, network, run, tracker
 
 
 @pytest.mark.parametrize(
@@ -194,18 +137,6 @@ def saved(tmp_path, count=9, **settings):
         odometry.track(frame)
     odometry.save(tmp_path / "a.dvo")
     return tmp_path / "a.dvo"
-
-
-def rewritten(file, description, arrays):
-    """Change values of the tracker and arrays of a map file."""
-    with open_map_file(file) as source:
-        found = source.description
-        held = {name.removesuffix(".npy"): array for name, array in np.load(file).items() if name != "map.json"}
-    for name, value in description.items():
-        table, _, entry = name.partition(".")
-        found[table][entry] = value
-    held |= {name: change(held[name]) for name, change in arrays.items()}
-    write_map_file(file, found, held)
 
 
 WRONG = [

@@ -18,7 +18,7 @@ from dvo.odometry.second_solution import INDEPENDENT, second_solutions, window_s
 from dvo.odometry.uncertainty import later_uncertainty, newest_uncertainty
 from dvo.odometry.window_gauge import Gauge, relative_error, window_gauge
 from dvo.odometry.window_measurements import WindowMeasurements
-from tests.archived_walk import archived_walk, pose_at
+from tests.support.archived_walk import archived_walk, pose_at
 
 SIZE = 60, 60
 GAUGE = Gauge(0, (1, 2))

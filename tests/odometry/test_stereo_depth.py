@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import partial
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,7 +23,8 @@ from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.stereo_depth import match_right, sample_features, search_line
 from dvo.synth.render.shot import Offset
 from dvo.synth.sequence import make_sequence
-from tests.odometry.test_tracker import SMALL, frames, tracker
+from tests.support.stereo_wall import stereo_wall
+from tests.support.tiny_tracker import SMALL, frames, tracker
 
 STEREO = ScaleOptions(stereo=True)
 PARALLEL = np.array([0.2, 0, 0, 0, 0, 0, 1.0])
@@ -119,21 +119,6 @@ def test_samples_of_a_map_are_bilinear():
     torch.testing.assert_close(found, torch.tensor([[[9.0, 2.5], [0.0, 11.0]]]))
 
 
-def clip(count, step=0.05, baseline=0.1, metres=2.0):
-    """A camera that moves sideways along a wall, 0.05 m a frame, with its right images."""
-    rng = np.random.default_rng(0)
-    wall = cv2.resize(rng.integers(0, 255, (30, 90, 3), np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-    camera = Camera(160.0, 160.0, 79.5, 59.5, 160, 120)
-    mount = np.array([baseline, 0, 0, 0, 0, 0, 1.0])
-    found = []
-    for k in range(count):
-        left, right = (round(160 * (step * k + shift) / metres) for shift in (0, baseline))
-        view = StereoView(np.ascontiguousarray(wall[:, right : right + 160]), camera, mount)
-        image = np.ascontiguousarray(wall[:, left : left + 160])
-        found.append(Frame(k, k / 10, image, camera, right=view))
-    return found
-
-
 def tracked(images, **settings):
     odometry = dvo.load("small", pixels=160 * 120, estimate_readout=False, **settings)
     for frame in images:
@@ -142,7 +127,7 @@ def tracked(images, **settings):
 
 
 def test_a_walk_with_right_images_is_in_metres_and_repeats_its_bytes():
-    first, again = (tracked(clip(14), scale={"stereo": True}) for _ in range(2))
+    first, again = (tracked(stereo_wall(14), scale={"stereo": True}) for _ in range(2))
     assert first.metric and first.info["scale"]["source"] == "stereo"
     positions = first.trajectory.positions
     assert np.linalg.norm(positions[-1] - positions[0]) == pytest.approx(13 * 0.05, rel=0.02)

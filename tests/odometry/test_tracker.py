@@ -12,36 +12,10 @@ from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.metrics import evaluate
-from dvo.models.patch_vo import PatchVO
-from dvo.nets.config import preset
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.protocol import Odometry, Status
-from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
-
-SMALL = TrackerConfig(
-    pixels=96 * 72, patches=6, lifetime=4, removal=5, optimisation=4, initial_frames=5, initial_updates=3,
-    final_updates=2, initial_motion=0.0, initial_parallax=0.0, keyframe_motion=0.0, lost_confidence=0.0,
-    min_inliers=0.0, search_inliers=0.0, join_inliers=0.0, initial_inliers=0.0,
-)  # fmt: skip
-
-
-def frames(count, seed=0, size=(96, 72)):
-    rng = np.random.default_rng(seed)
-    width, height = size
-    wall = rng.integers(0, 255, (height, width + 4 * count, 3), dtype=np.uint8)
-    camera = Camera(80.0, 80.0, width / 2, height / 2, width, height)
-    return [Frame(i, 0.1 * i, np.ascontiguousarray(wall[:, 4 * i : 4 * i + width]), camera) for i in range(count)]
-
-
-def tracker(config=SMALL, seed=0, operator="gated"):
-    torch.manual_seed(0)
-    return PatchOdometry(PatchVO(replace(preset("tiny"), update_operator=operator)), config, seed=seed)
-
-
-def run(odometry, images):
-    estimates = [odometry.track(frame) for frame in images]
-    return estimates, odometry.finish()
+from tests.support.tiny_tracker import SMALL, frames, run, tracker
 
 
 def test_sigma_changes_no_trajectory():
@@ -172,9 +146,9 @@ def test_a_covered_lens_is_lost_and_the_way_found_again():
     clear = list(film)
     covered = [replace(f, image=np.zeros_like(f.image)) if 26 <= f.index < 33 else f for f in clear]
     errors = []
-    for frames in (clear, covered):
+    for images in (clear, covered):
         odometry = dvo.load("small", device="cpu", seed=0)
-        estimates = [odometry.track(frame) for frame in frames]
+        estimates = [odometry.track(frame) for frame in images]
         result = odometry.finish()
         errors.append(evaluate(result.trajectory, film.groundtruth).ate_percent)
     assert [e.status is Status.LOST for e in estimates] == [26 <= k < 33 for k in range(48)]

@@ -17,7 +17,7 @@ from dvo.graph.window import Keyframe
 from dvo.odometry.protocol import Estimate, Status
 from dvo.viz.marks import pixels, shade
 from dvo.viz.overlay import OverlayVideo
-from tests.command_line import arguments
+from tests.support.command_line import arguments
 
 CAMERA = Camera(50, 40, 31.5, 23.5, 64, 48)
 

@@ -10,7 +10,7 @@ import pytest
 from dvo.cli import main
 from dvo.commands.view_options import VIEWER
 from dvo.viz.rerun_log import _loop_lines
-from tests.command_line import arguments, errors, names
+from tests.support.command_line import arguments, errors, names
 
 
 @pytest.fixture

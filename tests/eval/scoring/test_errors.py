@@ -15,7 +15,7 @@ from eval.scoring.errors import align_segments, all_errors
 from eval.scoring.metrics import Aligned, absolute_rmse, align_pair, metrics_of, path_errors
 from eval.scoring.protocols import kitti_errors, per_frame_scale, relative_pose_auc
 from eval.suites.suite import Suite
-from tests.walks import cut, moved, segment
+from tests.support.trajectories import cut, moved, segment
 
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 SUITE = Suite("s", "l", (), rpe_gap=2)

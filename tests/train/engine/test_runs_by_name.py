@@ -15,7 +15,7 @@ from train.engine.checkpoint import read_state
 ROOT = Path(__file__).resolve().parents[3]
 NAME = "two_frame_rotation"
 SETTINGS = {
-    "task": "rotation_task:RotationTask",
+    "task": "tests.support.rotation_task:RotationTask",
     "trainer": {
         "accelerator": "cpu", "devices": 1, "max_epochs": -1, "log_every_n_steps": 1, "enable_model_summary": False,
         "use_distributed_sampler": False,
@@ -32,8 +32,7 @@ SETTINGS = {
 @pytest.fixture
 def fit(tmp_path, monkeypatch):
     """``fit("--name", "a")`` trains a small network of two frames, in an empty working folder."""
-    monkeypatch.syspath_prepend(Path(__file__).parent)
-    dvo.models.registry.ARCHITECTURES.register(NAME, "rotation_task:RotationRegressor")
+    dvo.models.registry.ARCHITECTURES.register(NAME, "tests.support.rotation_task:RotationRegressor")
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(SETTINGS))
     monkeypatch.chdir(tmp_path)
 

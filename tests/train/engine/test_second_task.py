@@ -3,7 +3,6 @@
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,12 +29,11 @@ NAME = "two_frame_rotation"
 
 
 @pytest.fixture(autouse=True)
-def outside_package(monkeypatch):
+def outside_package():
     """The module is importable, as if it were installed with entry points."""
-    monkeypatch.syspath_prepend(Path(__file__).parent)
     registries = (ARCHITECTURES, ODOMETRIES, TASKS)
     for registry, target in zip(registries, ("RotationRegressor", "RotationOdometry", "RotationTask"), strict=True):
-        registry.register(NAME, f"rotation_task:{target}")
+        registry.register(NAME, f"tests.support.rotation_task:{target}")
     yield
     for registry in registries:
         registry.unregister(NAME)
@@ -121,15 +119,15 @@ def test_from_a_configuration_to_a_trajectory(tmp_path, command, capsys):
 def test_a_task_by_module_and_class(runs, tmp_path):
     """Without any registration of the task; the state goes on under the same name only."""
     TASKS.unregister(NAME)
-    program = make_program("rotation_task:RotationTask", channels=3, learning_rate=1e-2)
+    program = make_program("tests.support.rotation_task:RotationTask", channels=3, learning_rate=1e-2)
     assert program.settings.learning_rate == 1e-2 and program.hparams["channels"] == 3
     _, losses = runs.fit(tmp_path, 6, program, data=runs.data(sizes=[(48, 64)]))
     assert None not in losses and losses[-1] != losses[0]
     assert load_any(tmp_path / "last.ckpt").architecture == NAME
-    again = make_program("rotation_task:RotationTask", channels=3)
+    again = make_program("tests.support.rotation_task:RotationTask", channels=3)
     runs.fit(tmp_path, 7, again, tmp_path / "last.ckpt", data=runs.data(sizes=[(48, 64)]))
     assert int(again.seen) == 7
-    with pytest.raises(DvoError, match="task: the state is of the task 'rotation_task:RotationTask'"):
+    with pytest.raises(DvoError, match="task: the state is of the task 'tests.support.rotation_task:RotationTask'"):
         runs.module().on_load_checkpoint(read_state(tmp_path / "last.ckpt"))
 
 

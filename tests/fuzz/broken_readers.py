@@ -1,4 +1,4 @@
-"""Readers that are broken on purpose, to show that the benchmark reports them."""
+"""Readers that are broken on purpose, to show that the fuzzer reports them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
-from eval.benchmarks.malformed.target import Target, check_trajectory
+from tests.fuzz.target import Target, check_trajectory
 
 
 def build(folder: Path) -> None:

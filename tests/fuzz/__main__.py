@@ -1,4 +1,4 @@
-"""Table of malformed inputs: ``python -m eval.benchmarks.malformed --cases 10000``.
+"""Table of malformed inputs: ``python -m tests.fuzz --cases 10000``.
 
 ``--case READER:SEED`` runs one case again and prints what happened. The exit code is 1 if any case failed.
 """
@@ -17,15 +17,15 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from dvo.errors import DvoError
-from eval.benchmarks.malformed.target import Target
-from eval.benchmarks.malformed.worker import Outcome, run_cases, warm
+from tests.fuzz.target import Target
+from tests.fuzz.worker import Outcome, run_cases, warm
 
 ROOMS = ("data", "files", "settings", "models", "maps", "scenes", "frames")
 
 
 def all_targets() -> list[Target]:
     """Readers of every room, in the order of the table."""
-    modules = [importlib.import_module(f"eval.benchmarks.malformed.readers_{room}") for room in ROOMS]
+    modules = [importlib.import_module(f"tests.fuzz.readers_{room}") for room in ROOMS]
     return [target for module in modules for target in module.TARGETS]
 
 
@@ -95,7 +95,7 @@ def table(outcomes: list[Outcome], names: list[str]) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the benchmark.
+    """Try the cases and print the table.
 
     Args:
         arguments: of the command line; None for those of this process.
@@ -103,7 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         Exit code: 0, or 1 if a case failed.
     """
-    parser = argparse.ArgumentParser(prog="python -m eval.benchmarks.malformed", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=1000, help="number of mutated inputs (1000)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first mutation of each reader (0)")
     parser.add_argument("--readers", nargs="*", default=[], metavar="NAME", help="only readers that begin so (all)")

@@ -1,18 +1,15 @@
-"""The benchmark fails when a reader is broken, and goes on after it."""
+"""The fuzzer fails when a reader is broken, and goes on after it."""
 
 from __future__ import annotations
 
 import resource
-import sys
 from pathlib import Path
 
 import pytest
 
-from eval.benchmarks.malformed import __main__ as program
-from eval.benchmarks.malformed.worker import Limits, Outcome, run_cases
-
-sys.path.insert(0, str(Path(__file__).parent))
-from broken_readers import READERS  # noqa: E402
+from tests.fuzz import __main__ as program
+from tests.fuzz.broken_readers import READERS
+from tests.fuzz.worker import Limits, Outcome, run_cases
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="the limits need Linux")
 RESIDENT = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

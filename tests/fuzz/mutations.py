@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from eval.benchmarks.malformed import images, text
+from tests.fuzz import images, text
 
 Random = np.random.Generator
 Mutation = Callable[[Path, Random], str]

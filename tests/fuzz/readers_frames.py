@@ -10,8 +10,8 @@ import numpy as np
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.geometry.camera import Camera
-from eval.benchmarks.malformed.readers_data import HEIGHT, WIDTH, lines, picture
-from eval.benchmarks.malformed.target import Target, require
+from tests.fuzz.readers_data import HEIGHT, WIDTH, lines, picture
+from tests.fuzz.target import Target, require
 
 MODULES = ("torch", "dvo.odometry.load", "dvo.odometry.tracker", "dvo.models.patch_vo", "dvo.data.frame_checks")
 CAMERA = Camera(50.0, 51.0, 31.5, 23.5, WIDTH, HEIGHT)

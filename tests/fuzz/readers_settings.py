@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from dvo.settings import parse_settings, read_settings
-from eval.benchmarks.malformed.mutations import mutate_folder, mutate_text
-from eval.benchmarks.malformed.readers_data import lines
-from eval.benchmarks.malformed.target import CleanExit, Target, require
+from tests.fuzz.mutations import mutate_folder, mutate_text
+from tests.fuzz.readers_data import lines
+from tests.fuzz.target import CleanExit, Target, require
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = ["patches: 24", "pixels: 76800", "motion_damping: 0.5", "lost_confidence: 0.01", "updates: 1"]
 SUITE = [
     "name: mine", "label: a suite of one's own", "alignment: sim3", "rpe_gap: 2", "stride: 1", "lost_below: 0.5",

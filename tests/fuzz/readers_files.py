@@ -17,8 +17,8 @@ from dvo.data.streams import stream
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import Undistorter, needs_undistortion
-from eval.benchmarks.malformed.readers_data import HEIGHT, MODULES, WIDTH, K, images, lines, picture, poses
-from eval.benchmarks.malformed.target import Target, check_frames, check_times, check_trajectory, require
+from tests.fuzz.readers_data import HEIGHT, MODULES, WIDTH, K, images, lines, picture, poses
+from tests.fuzz.target import Target, check_frames, check_times, check_trajectory, require
 
 CALIBRATIONS = {
     "line": ("calib.txt", [f"{K} -0.1 0.01 0.001 0.001 0.0001"]),

@@ -10,10 +10,10 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
-from eval.benchmarks.malformed import text
-from eval.benchmarks.malformed.mutations import mutate_folder
-from eval.benchmarks.malformed.readers_models import MODULES, ODD
-from eval.benchmarks.malformed.target import Target, require
+from tests.fuzz import text
+from tests.fuzz.mutations import mutate_folder
+from tests.fuzz.readers_models import MODULES, ODD
+from tests.fuzz.target import Target, require
 
 SETTINGS = {
     "pixels": 96 * 72, "patches": 6, "lifetime": 4, "removal": 5, "optimisation": 4, "initial_frames": 5,

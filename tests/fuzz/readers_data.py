@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from dvo.data.source import open_source
-from eval.benchmarks.malformed.target import Target, chance, check_frames, check_trajectory, require
+from tests.fuzz.target import Target, chance, check_frames, check_trajectory, require
 
 WIDTH, HEIGHT, COUNT = 64, 48, 4
 K = "50 51 31.5 23.5"

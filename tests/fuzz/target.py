@@ -11,7 +11,7 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from eval.benchmarks.malformed.mutations import mutate_folder
+from tests.fuzz.mutations import mutate_folder
 
 Mutate = Callable[[Path, np.random.Generator], str]
 Read = Callable[[Path, np.random.Generator | None], object]

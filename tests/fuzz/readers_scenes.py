@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from eval.benchmarks.malformed.readers_data import images, lines
-from eval.benchmarks.malformed.target import Target, chance, require
+from tests.fuzz.readers_data import images, lines
+from tests.fuzz.target import Target, chance, require
 
 MODULES = ("trimesh", "PIL.Image", "dvo.synth.meshes.files", "dvo.synth.textures.photographs", "dvo.synth.sequence")
 

@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 
 from dvo.errors import DvoError
-from eval.benchmarks.malformed.target import CleanExit, Target
+from tests.fuzz.target import CleanExit, Target
 
 Verdict = Literal["refused", "accepted", "failed"]
 TICK = 0.02  # seconds between two looks at the running processes

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from eval.benchmarks.malformed import text
-from eval.benchmarks.malformed.mutations import mutate_folder
-from eval.benchmarks.malformed.target import Target, chance, require
+from tests.fuzz import text
+from tests.fuzz.mutations import mutate_folder
+from tests.fuzz.target import Target, chance, require
 
 MODULES = ("torch", "safetensors.torch", "dvo.models.weights", "dvo.models.patch_vo", "dvo.odometry.load",
            "dvo.odometry.tracker")  # fmt: skip

@@ -10,18 +10,18 @@ import zlib
 import numpy as np
 import pytest
 
-from eval.benchmarks.malformed.__main__ import all_targets, cases_of, choose
-from eval.benchmarks.malformed.images import headers
-from eval.benchmarks.malformed.mutations import BYTES, PLACES, mutate_folder
-from eval.benchmarks.malformed.text import MUTATIONS as TEXT
-from eval.benchmarks.malformed.text import YAML
+from tests.fuzz.__main__ import all_targets, cases_of, choose
+from tests.fuzz.images import headers
+from tests.fuzz.mutations import BYTES, PLACES, mutate_folder
+from tests.fuzz.text import MUTATIONS as TEXT
+from tests.fuzz.text import YAML
 
 SAMPLE = ["--cases", "200", "--jobs", "2"]  # four of each reader
 
 
 def test_a_sample_fails_nowhere(repository):
     done = subprocess.run(
-        [sys.executable, "-m", "eval.benchmarks.malformed", *SAMPLE],
+        [sys.executable, "-m", "tests.fuzz", *SAMPLE],
         cwd=repository, env={**os.environ, "PYTHONPATH": str(repository)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dvo.ba.edges import EdgePlan
 from dvo.ba.kernels import Kernel
-from dvo.ba.levenberg import robust_cost, robust_weight
 from dvo.ba.normal_equations import Gate, View, counts, pose_jacobian, relative_motion, view
 from dvo.ba.schur_pattern import SchurPattern
 from dvo.geometry import so3
@@ -81,7 +80,7 @@ class ReprojectionEdges:
         total = 0.0
         for part in self.plan.chunks():
             s = self._view(rotation, t, inverse_depth, part)[3]
-            total += 0.5 * float(robust_cost(self.kernel, s).sum(dtype=torch.float64))
+            total += 0.5 * float(self.kernel.cost(s).sum(dtype=torch.float64))
         return total
 
     def inliers(self, poses_cw: Tensor, inverse_depth: Tensor) -> Tensor:
@@ -132,7 +131,7 @@ class ReprojectionEdges:
             group = plan.group_pair[part]
             places = slice(part.start * plan.size, part.stop * plan.size)
             v, residual, weight, s = self._view(rotation, t, inverse_depth, part)
-            weight = weight * robust_weight(self.kernel, s)
+            weight = weight * self.kernel.slope(s)
             motion = t.index_select(1, group)
             j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
             # Rows: the six columns of J_j, then the residual, then J_d; each for the x and the y axis.

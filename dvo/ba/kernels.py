@@ -1,4 +1,4 @@
-"""Robust kernels as weights of iteratively reweighted least squares."""
+"""Robust kernels: their cost, and their weights in iteratively reweighted least squares."""
 
 from __future__ import annotations
 
@@ -34,6 +34,40 @@ class Kernel:
             raise DvoError(f"unknown kernel {self.name!r}", field="kernel", remedy=f"use one of {known}")
         if not self.width > 0:
             raise DvoError(f"is {self.width}, not positive", field="kernel.width", remedy="give a positive width")
+
+    def cost(self, s: Tensor) -> Tensor:
+        """``rho(s)`` of squared whitened residuals ``s = r^T W r``; a term of a robust cost is ``rho(s) / 2``.
+
+        "none" is ``s``; "huber" is ``s`` up to ``width^2``, then ``2 width sqrt(s) - width^2``; "cauchy" is
+        ``width^2 log(1 + s / width^2)``.
+
+        Args:
+            s: of any shape, not negative.
+
+        Returns:
+            Values of the same shape.
+        """
+        square = self.width * self.width
+        if self.name == "huber":
+            return torch.where(s <= square, s, 2 * self.width * s.clamp(min=square).sqrt() - square)
+        if self.name == "cauchy":
+            return square * torch.log1p(s / square)
+        return s
+
+    def slope(self, s: Tensor) -> Tensor:
+        """``rho'(s)``, the weight of iteratively reweighted least squares; see :meth:`cost`.
+
+        Args:
+            s: of any shape, not negative.
+
+        Returns:
+            Values of the same shape.
+        """
+        if self.name == "huber":
+            return self.width / s.clamp(min=self.width**2).sqrt()
+        if self.name == "cauchy":
+            return 1 / (1 + s / self.width**2)
+        return torch.ones_like(s)
 
     def weights(self, residual: Tensor, weight: Tensor, dim: int) -> Tensor | None:
         """Factor of the weight of each row, without gradient; None for no kernel.

@@ -20,9 +20,9 @@ from dvo.ba.covariance import pose_covariance
 from dvo.ba.edges import EdgePlan, check_index, plan_edges
 from dvo.ba.grouped import group_measurements
 from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
-from dvo.ba.reprojection import PatchReprojection
-from dvo.ba.step import solve
+from dvo.ba.step import gauss_newton
 from dvo.errors import DvoError
 from dvo.geometry.precision import full_precision
 
@@ -83,90 +83,72 @@ def bundle_adjust(
         >>> loss = pose_loss(result.poses_cw, true_poses_cw)
         >>> loss.backward()
     """
-    _check_shapes(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk, sensors=options.sensors)
-    if options.check or (options.check is None and weights.device.type == "cpu"):
-        _check_values(poses_cw.shape[1], patches.shape[1], intrinsics.shape[1], weights, ii, jj, kk, options.sensors)
-    arguments = (intrinsics, targets, weights, ii, jj, kk, options)
-    with full_precision(poses_cw.device):
-        factors = tuple(factors)
-        problem = make_problem(poses_cw, patches, *arguments, factors=factors, blocks=blocks, plan=plan)
-        problem = solve(problem, options.iterations, options.damping)
-        state = problem.state
+    given = poses_cw, patches, intrinsics, targets, weights, ii, jj, kk
+    return adjust_dense(PatchProblem(*given, options.sensors, tuple(factors), blocks or {}, plan), options)
+
+
+def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
+    """The dense solution of a batch; see :func:`bundle_adjust` and :func:`dvo.ba.solve.solve`."""
+    _check_shapes(given)
+    if options.check or (options.check is None and given.weights.device.type == "cpu"):
+        _check_values(given)
+    with full_precision(given.poses_cw.device):
+        problem = gauss_newton(make_problem(given, options), options.iterations, options.damping)
+        state, patches = problem.state, given.patches
         poses_cw, inverse_depths = state[POSES].value, state[INVERSE_DEPTHS].value
         patches = patches.to(poses_cw.dtype)
         if not state[INVERSE_DEPTHS].held:
             row = inverse_depths[:, :, None, None, None].expand_as(patches[:, :, :1])
             patches = torch.cat((patches[:, :, :2], row), 2)
-        intrinsics = state[INTRINSICS].value if INTRINSICS in state.blocks else intrinsics.to(poses_cw.dtype)
+        intrinsics = state[INTRINSICS].value if INTRINSICS in state.blocks else given.intrinsics.to(poses_cw.dtype)
         cost = inliers = covariance = None
         if options.covariance is not None:
             covariance = pose_covariance(problem, options.covariance, options.damping, sigma=options.sigma)
         if options.report:
-            arguments = (intrinsics, *arguments[1:])
-            more = {name: state[name] for name in blocks or {}}
-            final = make_problem(poses_cw, patches, *arguments, factors=factors, blocks=more, grouped=False)
-            cost, inliers = _report(final)
-        further = {name: state[name].value for name in blocks or {}}
+            blocks = {name: state[name] for name in given.blocks}
+            now = given.with_values(poses_cw=poses_cw, patches=patches, intrinsics=intrinsics, blocks=blocks)
+            cost, inliers = _report(make_problem(now, options, grouped=False))
+        further = {name: state[name].value for name in given.blocks}
         return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance, further)
 
 
-def make_problem(
-    poses_cw: Tensor,
-    patches: Tensor,
-    intrinsics: Tensor,
-    targets: Tensor,
-    weights: Tensor,
-    ii: Tensor,
-    jj: Tensor,
-    kk: Tensor,
-    options: BAOptions = _DEFAULT,
-    *,
-    factors: Iterable[Factor] = (),
-    blocks: Mapping[str, StateBlock] | None = None,
-    plan: EdgePlan | None = None,
-    grouped: bool = True,
-) -> Problem:
-    """State blocks and factors of a call of :func:`bundle_adjust`, the reprojection first.
+def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped: bool = True) -> Problem:
+    """State blocks and factors of a batch, the reprojection first. They are not checked; half precision is float32.
 
     Args:
+        given: the batch.
+        options: what moves and what counts.
         grouped: use the fast reprojection where it applies: one camera with given intrinsics. False: the generic one,
             with the intrinsics as a state block.
 
-    The other arguments are those of :func:`bundle_adjust`. They are not checked. Half precision becomes float32.
+    Returns:
+        The least-squares problem.
     """
-    dtype = poses_cw.dtype
+    dtype = given.poses_cw.dtype
     if dtype in (torch.float16, torch.bfloat16):
         dtype = torch.float32
-    poses_cw, patches, intrinsics, targets, weights = (
-        x.to(dtype) for x in (poses_cw, patches, intrinsics, targets, weights)
-    )
-    frames, count, centre = poses_cw.shape[1], patches.shape[1], patches.shape[-1] // 2
-    centres = patches[:, :, :2, centre, centre]
-    poses = pose_block(poses_cw, options.fixed, held=options.structure_only)
-    inverse_depths = patches[:, :, 2, centre, centre]
-    depths = inverse_depth_block(inverse_depths, options.depth_range, held=options.motion_only)
-    further = {name: block.with_value(block.value.to(dtype)) for name, block in (blocks or {}).items()}
+    names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
+    given = given.with_values(**{name: getattr(given, name).to(dtype) for name in names})
+    poses = pose_block(given.poses_cw, options.fixed, held=options.structure_only)
+    depths = inverse_depth_block(given.inverse_depths, options.depth_range, held=options.motion_only)
+    further = {name: block.with_value(block.value.to(dtype)) for name, block in given.blocks.items()}
     own = {POSES: poses, INVERSE_DEPTHS: depths}
-    sensors, refine = options.sensors, options.refine_intrinsics
+    refine = options.refine_intrinsics
     reprojection: Factor
-    if grouped and sensors is None and refine == "none":
+    if grouped and given.sensors is None and refine == "none":
+        plan = given.plan
         if plan is None:
-            plan = plan_edges(ii, jj, kk, frames, count)
+            frames, count = given.poses_cw.shape[1], given.patches.shape[1]
+            plan = plan_edges(given.ii, given.jj, given.kk, frames, count)
         reprojection = group_measurements(
-            centres, intrinsics, targets, weights, plan, poses, max_residual=options.max_residual,
-            bounds=options.bounds, kernel=options.kernel,
+            given.centres, given.intrinsics, given.targets, given.weights, plan, poses,
+            max_residual=options.max_residual, bounds=options.bounds, kernel=options.kernel,
         )  # fmt: skip
     else:
-        own = {INTRINSICS: intrinsics_block(intrinsics, refine, shared=sensors is None), **own}
-        extrinsics, camera_i, camera_j = None, ii, jj
-        if sensors is not None:
-            extrinsics = sensors.from_body.to(poses_cw).expand(len(poses_cw), -1, 7)
-            camera_i, camera_j = sensors.source, sensors.target
-        reprojection = PatchReprojection(
-            centres, targets, weights, ii, jj, kk, camera_i, camera_j, extrinsics, options.max_residual,
-            options.bounds, options.kernel, focal_only=refine == "focal",
-        )  # fmt: skip
-    more = (factor.with_tensors([x.to(poses_cw) for x in factor.tensors()]) for factor in factors)
+        own = {INTRINSICS: intrinsics_block(given.intrinsics, refine, shared=given.sensors is None), **own}
+        focal_only = refine == "focal"
+        reprojection = given.reprojection(options.max_residual, options.bounds, options.kernel, focal_only)
+    more = (factor.with_tensors([x.to(dtype) for x in factor.tensors()]) for factor in given.factors)
     return Problem(State({**further, **own}), (reprojection, *more))
 
 
@@ -178,26 +160,19 @@ def _report(problem: Problem) -> tuple[Tensor, Tensor]:
     return torch.stack([x.cost() for x in linear]).sum(0), (linear[0].weight > 0).any(-1)
 
 
-def _check_shapes(
-    poses_cw: Tensor,
-    patches: Tensor,
-    intrinsics: Tensor,
-    targets: Tensor,
-    weights: Tensor,
-    *edges: Tensor,
-    sensors: Sensors | None,
-) -> None:
+def _check_shapes(given: PatchProblem) -> None:
+    poses_cw, patches, sensors = given.poses_cw, given.patches, given.sensors
     b, n = poses_cw.shape[:2] if poses_cw.dim() == 3 else (-1, -1)
-    count = len(edges[0])
+    count = len(given.ii)
     wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {"poses_cw": (poses_cw, (b, n, 7))}
     if sensors is None:
-        wanted["intrinsics"] = (intrinsics, (b, n, 4))
+        wanted["intrinsics"] = (given.intrinsics, (b, n, 4))
     else:
         cameras = sensors.from_body.shape[-2] if sensors.from_body.dim() > 1 else -1
-        wanted["intrinsics"] = (intrinsics, (b, cameras, 4))
+        wanted["intrinsics"] = (given.intrinsics, (b, cameras, 4))
         wanted |= {"sensors.source": (sensors.source, (count,)), "sensors.target": (sensors.target, (count,))}
-    wanted |= {"targets": (targets, (b, count, 2)), "weights": (weights, (b, count, 2))}
-    wanted |= {name: (x, (count,)) for name, x in zip(("ii", "jj", "kk"), edges, strict=True)}
+    wanted |= {"targets": (given.targets, (b, count, 2)), "weights": (given.weights, (b, count, 2))}
+    wanted |= {name: (getattr(given, name), (count,)) for name in ("ii", "jj", "kk")}
     if patches.dim() == 5:
         wanted["patches"] = (patches, (b, patches.shape[1], 3, *patches.shape[3:]))
     else:
@@ -209,22 +184,15 @@ def _check_shapes(
             )
 
 
-def _check_values(
-    frames: int,
-    patches: int,
-    cameras: int,
-    weights: Tensor,
-    ii: Tensor,
-    jj: Tensor,
-    kk: Tensor,
-    sensors: Sensors | None,
-) -> None:
-    for field, index, count in (("ii", ii, frames), ("jj", jj, frames), ("kk", kk, patches)):
+def _check_values(given: PatchProblem) -> None:
+    frames, patches, cameras = given.poses_cw.shape[1], given.patches.shape[1], given.intrinsics.shape[1]
+    for field, index, count in (("ii", given.ii, frames), ("jj", given.jj, frames), ("kk", given.kk, patches)):
         check_index(index, count, field)
-    if sensors is not None:
-        check_index(sensors.source, cameras, "sensors.source")
-        check_index(sensors.target, cameras, "sensors.target")
+    if given.sensors is not None:
+        check_index(given.sensors.source, cameras, "sensors.source")
+        check_index(given.sensors.target, cameras, "sensors.target")
     # The smallest weight is NaN if any is; only then look at each.
+    weights = given.weights
     least = float(weights.detach().amin()) if weights.numel() else 0.0
     if least < 0 or (least != least and bool((weights < 0).any())):
         raise DvoError("negative", field="weights", remedy="give inverse variances, zero for an edge to leave out")

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt with acceptance of steps, and the cost of robust kernels.
+"""Levenberg-Marquardt with acceptance of steps.
 
 Shared by the sparse problems of this package; not differentiable.
 """
@@ -9,37 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
-import torch
-from torch import Tensor
-
 from dvo.ba.block_matrix import CGOptions, LinearSolver
-from dvo.ba.kernels import Kernel
 
 MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32
 """Bounds of the diagonal that damping is a fraction of, as in Ceres: directions without measurement are damped too."""
-
-
-def robust_cost(kernel: Kernel, s: Tensor) -> Tensor:
-    """``rho(s)`` of squared whitened residuals ``s = r^T W r``; a term of the cost is ``rho(s) / 2``.
-
-    "none" is ``s``; "huber" is ``s`` up to ``width^2``, then ``2 width sqrt(s) - width^2``; "cauchy" is
-    ``width^2 log(1 + s / width^2)``. :func:`robust_weight` is its derivative.
-    """
-    square = kernel.width * kernel.width
-    if kernel.name == "huber":
-        return torch.where(s <= square, s, 2 * kernel.width * s.clamp(min=square).sqrt() - square)
-    if kernel.name == "cauchy":
-        return square * torch.log1p(s / square)
-    return s
-
-
-def robust_weight(kernel: Kernel, s: Tensor) -> Tensor:
-    """``rho'(s)``, the weight of iteratively reweighted least squares."""
-    if kernel.name == "huber":
-        return kernel.width / s.clamp(min=kernel.width**2).sqrt()
-    if kernel.name == "cauchy":
-        return 1 / (1 + s / kernel.width**2)
-    return torch.ones_like(s)
 
 
 @dataclass(frozen=True)

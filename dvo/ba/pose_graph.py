@@ -18,7 +18,7 @@ from torch import Tensor
 
 from dvo.ba.edges import free_slots
 from dvo.ba.kernels import Kernel
-from dvo.ba.levenberg import LMOptions, levenberg_marquardt, robust_cost, robust_weight
+from dvo.ba.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.schur_pattern import make_schur_pattern
 from dvo.ba.sparse import SparseSystem
 from dvo.errors import DvoError
@@ -109,13 +109,13 @@ def optimise_pose_graph(
 
         def cost(poses: Tensor) -> float:
             s = whitened(poses).square().sum(-1)
-            return 0.5 * float(robust_cost(options.kernel, s).sum(dtype=torch.float64))
+            return 0.5 * float(options.kernel.cost(s).sum(dtype=torch.float64))
 
         def linearise(poses: Tensor) -> SparseSystem:
             e, j_i, j_j = residuals_and_jacobians(poses, ii, jj, measurements, options.chart)
             if root is not None:
                 e, j_i, j_j = (root @ e[..., None])[..., 0], root @ j_i, root @ j_j
-            weight = robust_weight(options.kernel, e.square().sum(-1, keepdim=True)).expand_as(e)
+            weight = options.kernel.slope(e.square().sum(-1, keepdim=True)).expand_as(e)
             zeros = poses.new_zeros
             system = SparseSystem(
                 pattern, zeros(pattern.h_pp.count, dim, dim), zeros(0, dim), zeros(0), zeros(free, dim), zeros(0), False

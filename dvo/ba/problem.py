@@ -51,6 +51,11 @@ class Factor(ABC):
     def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
         """Residuals, weights and Jacobians at the values ``(B, N, ...)`` of the state blocks, differentiably."""
 
+    def cost(self, values: Mapping[str, Tensor]) -> Tensor:
+        """``(B,)`` what a solution with acceptance of steps lowers: ``sum weight * residual^2``, unless a factor has a
+        robust cost of its own, of which the weights are the derivative."""
+        return self.linearise(values).cost()
+
     def tensors(self) -> tuple[Tensor, ...]:
         """Parameters that may need a gradient: the floating-point tensors among the fields."""
         return tuple(getattr(self, name) for name in self._parameters())

@@ -7,7 +7,7 @@ complement, no implicit differentiation.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import torch
@@ -17,7 +17,8 @@ from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
 from dvo.ba.layer import make_problem
 from dvo.ba.linearisation import landmark_count, landmark_part, reduced_part
 from dvo.ba.options import BADamping, BAOptions, BAResult
-from dvo.ba.problem import Factor, Problem
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.problem import Factor, Problem, StateBlock
 
 _DEFAULT = BAOptions()
 
@@ -63,7 +64,7 @@ def dense_step(problem: Problem, damping: BADamping) -> tuple[Tensor, Tensor]:
 
 
 def solve_reference(problem: Problem, iterations: int, damping: BADamping) -> Problem:
-    """As :func:`dvo.ba.step.solve`."""
+    """As :func:`dvo.ba.step.gauss_newton`."""
     for _ in range(iterations):
         problem = replace(problem, state=problem.state.moved(*dense_step(problem, damping)))
     return problem
@@ -81,12 +82,15 @@ def bundle_adjust_reference(
     options: BAOptions = _DEFAULT,
     *,
     factors: Iterable[Factor] = (),
+    blocks: Mapping[str, StateBlock] | None = None,
 ) -> BAResult:
     """As :func:`dvo.ba.layer.bundle_adjust`, without checks, cost and covariance."""
-    arguments = (targets, weights, ii, jj, kk, options)
-    problem = make_problem(poses_cw, patches, intrinsics, *arguments, factors=factors, grouped=False)
+    given = poses_cw, patches, intrinsics, targets, weights, ii, jj, kk
+    asked = PatchProblem(*given, options.sensors, tuple(factors), blocks or {})
+    problem = make_problem(asked, options, grouped=False)
     state = solve_reference(problem, options.iterations, options.damping).state
     row = state[INVERSE_DEPTHS].value[:, :, None, None, None].expand_as(patches[:, :, :1])
     if not state[INVERSE_DEPTHS].held:
         patches = torch.cat((patches[:, :, :2], row), 2)
-    return BAResult(state[POSES].value, patches, state[INTRINSICS].value)
+    further = {name: state[name].value for name in blocks or {}}
+    return BAResult(state[POSES].value, patches, state[INTRINSICS].value, blocks=further)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -107,3 +107,14 @@ class PatchReprojection(Factor):
             (self.ii, self.jj, self.kk, self.camera_i, self.camera_j),
             (jac_i, jac_j, jac_d, jac_from, jac_to),
         )
+
+    def cost(self, values: Mapping[str, Tensor]) -> Tensor:
+        """``(B,)`` sum of the robust squared residuals; an edge that does not count costs as the longest residual.
+
+        So a step gains nothing by moving points behind a camera.
+        """
+        plain = replace(self, kernel=Kernel()).linearise(values)
+        s = (plain.weight * plain.residual.square()).sum(-1)
+        weight = torch.where(torch.isfinite(self.weights), self.weights, 0.0)
+        s = torch.where((plain.weight > 0).any(-1), s, weight.amax(-1) * self.max_residual**2)
+        return self.kernel.cost(s).sum(1)

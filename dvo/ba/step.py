@@ -80,7 +80,7 @@ class GaussNewtonStep(torch.autograd.Function):
         return None, None, *out
 
 
-def solve(problem: Problem, iterations: int, damping: BADamping) -> Problem:
+def gauss_newton(problem: Problem, iterations: int, damping: BADamping) -> Problem:
     """Damped Gauss-Newton steps without acceptance test, differentiable from end to end.
 
     Args:

@@ -1,15 +1,19 @@
 """Further state blocks: unknowns that only factors from outside concern."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from torch import Tensor
 
-from dvo.ba.blocks import POSES, vector_block
+from dvo.ba.blocks import INVERSE_DEPTHS, POSES, vector_block
+from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
+from dvo.ba.kernels import Kernel
 from dvo.ba.layer import BADamping, BAOptions, bundle_adjust
+from dvo.ba.levenberg import LMOptions
 from dvo.ba.problem import Factor, Linearisation
+from dvo.ba.reference import bundle_adjust_reference
 from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
 from dvo.nets.patchifier import patch_coordinates
@@ -102,3 +106,111 @@ def test_gradients_pass_through_a_further_block():
     )
     (gradient,) = torch.autograd.grad(velocity(begin, measured, weight).sum(), measured)
     assert gradient.abs().max() > 0
+
+
+@dataclass(frozen=True)
+class Motion(Factor):
+    """Unknowns of nine numbers for each frame, a velocity and two biases, and one scale of what was measured.
+
+    Attributes:
+        steps: ``(B, N - 1, 3)`` measured ways of the camera, to be multiplied by the scale.
+        biases: ``(B, N - 1, 6)`` measured.
+        dt: seconds between frames.
+    """
+
+    steps: Tensor
+    biases: Tensor
+    dt: float = 0.5
+
+    def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
+        poses, motion, scale = values[POSES], values["motion"], values["scale"]
+        centres, turn = se3.inverse(poses)[..., :3], so3.matrix(poses[..., 3:]).mT
+        i = torch.arange(poses.shape[1] - 1)
+        way = centres[:, 1:] - centres[:, :-1]
+        residual = torch.cat(
+            [scale * self.steps - way, way / self.dt - motion[:, :-1, :3], self.biases - motion[:, :-1, 3:],
+             motion[:, 1:] - motion[:, :-1]], -1,
+        )  # fmt: skip
+        weight = torch.cat([torch.full_like(residual[..., :12], 10.0), torch.full_like(residual[..., 12:], 0.5)], -1)
+        zeros, eye = residual.new_zeros, torch.eye(9, dtype=poses.dtype).expand(*i.shape, 9, 9)
+        of_j, of_i, of_scale = zeros(1, len(i), 21, 6), zeros(1, len(i), 21, 6), zeros(1, len(i), 21, 1)
+        of_j[..., :3, :3], of_i[..., :3, :3] = -turn[:, 1:], turn[:, :-1]
+        of_j[..., 3:6, :3], of_i[..., 3:6, :3] = turn[:, 1:] / self.dt, -turn[:, :-1] / self.dt
+        of_scale = torch.cat([-self.steps, zeros(1, len(i), 18)], -1)[..., None]
+        of_next = torch.cat([zeros(1, len(i), 12, 9), -eye[None]], 2)
+        of_here = torch.cat([zeros(1, len(i), 3, 9), eye[None], eye[None]], 2)
+        return Linearisation(
+            residual, weight, (POSES, POSES, "motion", "motion", "scale"),
+            (i + 1, i, i + 1, i, torch.zeros_like(i)), (of_j, of_i, of_next, of_here, of_scale),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ScaledDepth(Factor):
+    """Inverse depths ``(B, F)`` of the first patches, measured but for the scale."""
+
+    value: Tensor
+
+    def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
+        index = torch.arange(self.value.shape[1])
+        residual = (self.value - values[INVERSE_DEPTHS][:, index] * values["scale"][:, :, 0])[..., None]
+        of_depth = values["scale"].expand(-1, len(index), -1)[..., None]
+        of_scale = values[INVERSE_DEPTHS][:, index, None, None]
+        names, elements = (INVERSE_DEPTHS, "scale"), (index, torch.zeros_like(index))
+        return Linearisation(residual, torch.full_like(residual, 20.0), names, elements, (of_depth, of_scale))
+
+
+def measured_motion():
+    """The moving camera from a wrong start, with noise, blocks of another size and their factors."""
+    poses, patches, intrinsics, targets, *edges = moving_camera()
+    g = torch.Generator().manual_seed(1)
+
+    def noise(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    start = torch.cat([poses[:, :2], se3.retract(poses[:, 2:], 0.02 * noise(1, N - 2, 6))], 1)
+    centres = se3.inverse(poses)[..., :3]
+    steps = (centres[:, 1:] - centres[:, :-1]) / 1.2 + 0.002 * noise(1, N - 1, 3)
+    depths = patches[:, :10, 2, 1, 1] * 1.2 + 0.01 * noise(1, 10)
+    blocks = {"motion": vector_block(0.1 * noise(1, N, 9)), "scale": vector_block(torch.ones(1, 1, 1).double())}
+    factors = (Motion(steps, 0.05 * noise(1, N - 1, 6)), ScaledDepth(depths))
+    arguments = (start, patches, intrinsics, targets + 0.2 * noise(*targets.shape), torch.ones_like(targets), *edges)
+    return arguments, factors, blocks
+
+
+def test_dense_and_sparse_solutions_of_any_block_are_one_minimum():
+    """Blocks and factors that the library does not know, by the differentiable layer, its dense twin and the sparse
+    solver."""
+    arguments, factors, blocks = measured_motion()
+    options = BAOptions(fixed=2, iterations=25, damping=BADamping(1e-9, 1e-9, 1e-9), report=True)
+    layer = bundle_adjust(*arguments, options, factors=factors, blocks=blocks)
+    few = replace(options, iterations=3)
+    twin, again = (solve(*arguments, few, factors=factors, blocks=blocks) for solve in
+                   (bundle_adjust_reference, bundle_adjust))  # fmt: skip
+    torch.testing.assert_close(twin.poses_cw, again.poses_cw)
+    one = [x[0] for x in arguments[:5]] + [*arguments[5:]]
+    exact = LMOptions(max_iterations=100, tolerance=1e-14)
+    for solver in ("direct", "cg"):
+        settings = GlobalBAOptions(fixed=2, kernel=Kernel(), solver=replace(exact, solver=solver))
+        sparse = global_bundle_adjust(*one, settings, factors, blocks)
+        assert 2 * sparse.cost == pytest.approx(float(layer.cost), rel=1e-7)
+        torch.testing.assert_close(sparse.poses_cw[None], layer.poses_cw, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(sparse.patches[None], layer.patches, atol=1e-4, rtol=1e-3)
+        for name, value in layer.blocks.items():
+            torch.testing.assert_close(sparse.blocks[name], value, atol=1e-4, rtol=1e-3)
+    assert abs(float(layer.blocks["scale"]) - 1) > 0.05 and layer.blocks["motion"].abs().max() > 0.05
+
+
+def test_gradients_of_any_block_are_those_of_finite_differences():
+    arguments, factors, blocks = measured_motion()
+    options = BAOptions(fixed=2, iterations=2, damping=BADamping(1e-3, 1e-3, 1e-3))
+
+    def solved(steps, depths, motion, scale, targets):
+        given = {"motion": vector_block(motion), "scale": vector_block(scale)}
+        found = bundle_adjust(*arguments[:3], targets, *arguments[4:], options, blocks=given,
+                              factors=(replace(factors[0], steps=steps), ScaledDepth(depths)))  # fmt: skip
+        return found.poses_cw, found.blocks["motion"], found.blocks["scale"], found.patches[:, :, 2, 1, 1]
+
+    leaves = (factors[0].steps, factors[1].value, *(block.value for block in blocks.values()), arguments[3])
+    leaves = tuple(x.clone().requires_grad_() for x in leaves)
+    assert torch.autograd.gradcheck(solved, leaves, atol=1e-6, rtol=1e-4, fast_mode=True)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dvo.ba.covariance import pose_covariance, size_gradient
 from dvo.ba.layer import BADamping, BAOptions, make_problem
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.reference import dense_rows
 from dvo.geometry import se3
 
@@ -21,7 +22,7 @@ WEAK = BADamping(pose=1e-8, relative=0.0, depth=1e-9)
 
 def bordered_inverse(p: Any, gradient: Tensor, damping: BADamping) -> Tensor:
     """Inverse of the Hessian of all unknowns but the first pose, bordered with the constraint; plain and dense."""
-    made = make_problem(*p.arguments(), BAOptions(fixed=1), grouped=False)
+    made = make_problem(PatchProblem(*p.arguments()), BAOptions(fixed=1), grouped=False)
     _, w, jac_p, jac_l = dense_rows(made)
     jacobian = torch.cat((jac_p, jac_l), -1)
     hessian = jacobian.mT @ (w[..., None] * jacobian)
@@ -35,7 +36,7 @@ def bordered_inverse(p: Any, gradient: Tensor, damping: BADamping) -> Tensor:
 def test_the_inverse_of_the_bordered_dense_hessian(problem: Maker) -> None:
     p = problem(noise=0.3)
     gradient = size_gradient(p.poses, 0, [1, 2])
-    made = make_problem(*p.arguments(), BAOptions(fixed=1))
+    made = make_problem(PatchProblem(*p.arguments()), BAOptions(fixed=1))
     found = pose_covariance(made, [3, 1], WEAK, constraint=gradient)
     rows = torch.cat((torch.arange(12, 18), torch.arange(6)))
     plain = bordered_inverse(p, gradient, WEAK)[:, rows][:, :, rows]
@@ -47,7 +48,7 @@ def test_the_size_is_held_and_free_without_the_constraint(problem: Maker) -> Non
     p = problem()
     gradient = size_gradient(p.true_poses, 0, [1, 2, 3])
     exact = replace(p, poses=p.true_poses, patches=p.true_patches)
-    made = make_problem(*exact.arguments(), BAOptions(fixed=1))
+    made = make_problem(PatchProblem(*exact.arguments()), BAOptions(fixed=1))
     a = gradient[:, 1:].flatten(1)[..., None]
     held, free = (pose_covariance(made, [1, 2, 3], WEAK, constraint=c) for c in (gradient, None))
     assert (a.mT @ held @ a).abs().max() < 1e-8
@@ -83,7 +84,7 @@ def test_it_predicts_the_spread_of_the_estimate_at_fixed_size(problem: Maker) ->
     size = [x[:, 1:3, :3].square().sum((1, 2)).sqrt() for x in (found, true)]
     newest = torch.cat(((size[1] / size[0])[:, None] * found[:, 3, :3], found[:, 3, 3:]), -1)
     errors = se3.log(se3.relative(true[:, 3], newest))
-    made = make_problem(p.true_poses, p.true_patches, *p.arguments()[2:], BAOptions(fixed=1))
+    made = make_problem(PatchProblem(p.true_poses, p.true_patches, *p.arguments()[2:]), BAOptions(fixed=1))
     covariance = pose_covariance(made, [3], WEAK, constraint=size_gradient(p.true_poses, 0, [1, 2]))
     whitened = torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), errors[..., None], upper=False)
     assert 0.8 < whitened.square().mean().item() < 1.25

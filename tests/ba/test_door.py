@@ -15,9 +15,10 @@ from dvo.ba.covariance import pose_covariance
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.kernels import Kernel
 from dvo.ba.layer import BADamping, BAOptions, Sensors, bundle_adjust, make_problem
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Linearisation, Problem
 from dvo.ba.reference import bundle_adjust_reference, dense_rows
-from dvo.ba.step import solve
+from dvo.ba.step import gauss_newton
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
@@ -78,7 +79,7 @@ def test_cost_and_inliers_only_when_asked(problem: Maker) -> None:
     assert plain.cost is None and plain.inliers is None and plain.covariance is None
     assert torch.equal(plain.poses_cw, full.poses_cw) and torch.equal(plain.patches, full.patches)
     assert torch.equal(full.inliers, (torch.arange(len(p.ii)) % 9 != 0).expand(2, -1))
-    made = make_problem(full.poses_cw, full.patches, *p.arguments()[2:], grouped=False)
+    made = make_problem(PatchProblem(full.poses_cw, full.patches, *p.arguments()[2:]), grouped=False)
     torch.testing.assert_close(full.cost, made.cost())
     start = p.adjust(report=True, iterations=0).cost
     assert (full.cost < 0.5 * start).all()
@@ -163,7 +164,7 @@ def test_covariance_is_the_inverse_of_the_dense_hessian(problem: Maker) -> None:
     p = problem(noise=0.3)
     damping = BADamping(pose=0.1, relative=0.5, depth=1e-3)
     result = p.adjust(covariance=(3, 0, 1), damping=damping)
-    made = make_problem(result.poses_cw, result.patches, *p.arguments()[2:], grouped=False)
+    made = make_problem(PatchProblem(result.poses_cw, result.patches, *p.arguments()[2:]), grouped=False)
     _, w, jac_p, jac_l = dense_rows(made)
     jacobian = torch.cat((jac_p, jac_l), -1)
     hessian = jacobian.mT @ (w[..., None] * jacobian)
@@ -183,7 +184,7 @@ def test_covariance_is_the_inverse_of_the_dense_hessian(problem: Maker) -> None:
     with pytest.raises(DvoError, match="sigma: is 0, not positive"):
         p.adjust(covariance=(3,), sigma=0)
     nothing = replace(p, weights=torch.zeros_like(p.weights))
-    found = pose_covariance(make_problem(*nothing.arguments()), (1,), BADamping(pose=0.0))
+    found = pose_covariance(make_problem(PatchProblem(*nothing.arguments())), (1,), BADamping(pose=0.0))
     assert torch.isinf(found.diagonal(dim1=1, dim2=2)).all() and not torch.isnan(found).any()
 
 
@@ -292,7 +293,7 @@ def test_kernel_weights_are_constants_of_the_backward_pass(problem: Maker) -> No
     """The layer with a kernel has the gradient of the layer with the kernel's weights multiplied in, detached."""
     p = problem(noise=1.0).leaves()
     options = BAOptions(iterations=1, kernel=Kernel("huber", 0.3))
-    made = make_problem(*p.arguments(), options, grouped=False)
+    made = make_problem(PatchProblem(*p.arguments()), options, grouped=False)
     scale = made.factors[0].linearise(made.state.values()).weight.detach() / p.weights.detach()
     assert scale.min() < 0.5
     p.solve(iterations=1, kernel=options.kernel)[0].sum().backward()
@@ -331,6 +332,6 @@ def test_a_factor_from_outside_needs_its_linearisation_only(problem: Maker) -> N
 
 
 def test_a_problem_without_factors(problem: Maker) -> None:
-    made = make_problem(*problem().arguments())
+    made = make_problem(PatchProblem(*problem().arguments()))
     with pytest.raises(DvoError, match="without factors"):
-        solve(Problem(made.state, ()), 1, BADamping())
+        gauss_newton(Problem(made.state, ()), 1, BADamping())

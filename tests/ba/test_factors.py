@@ -17,8 +17,9 @@ from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.kernels import Kernel
 from dvo.ba.layer import BAOptions, Sensors, make_problem
 from dvo.ba.linearisation import adjoint_term, assemble
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import AdjointConstants, Factor, Problem, State
-from dvo.ba.step import solve
+from dvo.ba.step import gauss_newton
 from dvo.errors import DvoError
 from dvo.geometry import se3, sim3
 
@@ -126,8 +127,9 @@ def test_jacobians_of_reprojection(problem: Maker, refine: str, several: bool) -
     intrinsics, sensors = p.intrinsics, None
     if several:
         p, sensors, intrinsics = rig(p)
-    options = BAOptions(refine_intrinsics=refine, sensors=sensors, fixed=0, max_residual=1e9)  # type: ignore[arg-type]
-    made = make_problem(p.poses, p.patches, intrinsics, p.targets, p.weights, p.ii, p.jj, p.kk, options, grouped=False)
+    options = BAOptions(refine_intrinsics=refine, fixed=0, max_residual=1e9)  # type: ignore[arg-type]
+    given = PatchProblem(p.poses, p.patches, intrinsics, p.targets, p.weights, p.ii, p.jj, p.kk, sensors)
+    made = make_problem(given, options, grouped=False)
     assert (made.factors[0].linearise(made.state.values()).weight > 0).any(-1).float().mean() > 0.7
     assert_jacobians(made.factors[0], made.state)
 
@@ -154,7 +156,7 @@ def test_grouped_reprojection_is_its_generic_twin(problem: Maker, options: dict[
     found, lines = [], []
     for grouped in (True, False):
         leaves = p.leaves()
-        made = make_problem(*leaves.arguments(), BAOptions(**options), grouped=grouped)
+        made = make_problem(PatchProblem(*leaves.arguments()), BAOptions(**options), grouped=grouped)
         factor, state = made.factors[0], made.state
         equations, memo = factor.normal_equations(state)
         randn = generator_of(0)
@@ -182,8 +184,8 @@ def test_grouped_reprojection_is_its_generic_twin(problem: Maker, options: dict[
 
 
 def test_destinations_follow_the_fixed_frames_of_the_state(problem: Maker) -> None:
-    made = make_problem(*problem(noise=0.5).arguments())
-    other = make_problem(*problem(noise=0.5).arguments(), BAOptions(fixed=2))
+    made = make_problem(PatchProblem(*problem(noise=0.5).arguments()))
+    other = make_problem(PatchProblem(*problem(noise=0.5).arguments()), BAOptions(fixed=2))
     found, _ = made.factors[0].normal_equations(other.state)
     expected, _ = other.factors[0].normal_equations(other.state)
     torch.testing.assert_close(found.h_pp, expected.h_pp)
@@ -223,7 +225,7 @@ def test_a_loop_of_relative_poses_is_closed() -> None:
         block = sim3_block(start) if dim == 7 else pose_block(start)
         problem = Problem(State({POSES: block}), (RelativePose(measured, torch.full((dim,), 1e4, dtype=F64), ii, jj),))
         assert problem.cost() > 1
-        found = solve(problem, 8, replace(damping, relative=0.0, pose=1e-6)).state[POSES].value
+        found = gauss_newton(problem, 8, replace(damping, relative=0.0, pose=1e-6)).state[POSES].value
         torch.testing.assert_close(group.matrix(found), group.matrix(truth), atol=1e-6, rtol=0)
 
 

@@ -11,6 +11,7 @@ import torch
 
 from dvo.ba.kernels import Kernel
 from dvo.ba.layer import BAOptions, make_problem
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.step import normal_equations
 from dvo.ba.window_equations import window_equations
 
@@ -40,7 +41,7 @@ def test_the_sums_of_any_graph(problem: Maker, first: int, kernel: Kernel, bound
     poses[0, 4, 2] -= 3  # behind some points
     p = replace(p, poses=poses, targets=targets, weights=weights, ii=kk // 6, jj=jj, kk=kk)
     options = BAOptions(fixed=0, bounds=bounds, kernel=kernel, max_residual=25.0)
-    plain, _ = normal_equations(make_problem(*p.arguments(), options), 0.0)
+    plain, _ = normal_equations(make_problem(PatchProblem(*p.arguments()), options), 0.0)
     centre = p.patches[0, 6 * first :, :, 1, 1].unflatten(0, (-1, 6))
     found = window_equations(p.poses[0], centre[..., :2], centre[..., 2], p.intrinsics[0], targets[0], weights[0], jj,
                              kk - 6 * first, first, options)  # fmt: skip

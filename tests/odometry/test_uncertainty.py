@@ -13,6 +13,7 @@ import dvo
 from dvo.ba.blocks import POSES
 from dvo.ba.covariance import size_gradient
 from dvo.ba.layer import BAOptions, make_problem
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.reference import dense_rows
 from dvo.geometry import se3
 from dvo.odometry import tracker as tracker_module
@@ -77,7 +78,8 @@ def information(step, factors=()):
     options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, kernel=step.kernel)
     tensors = window.poses_cw, window.patches, window.intrinsics, window.targets, window.confidence
     edges = window.ii, window.jj, window.kk
-    problem = make_problem(*(x[None].double() for x in tensors), *edges, options, factors=factors, grouped=False)
+    given = PatchProblem(*(x[None].double() for x in tensors), *edges, factors=factors)
+    problem = make_problem(given, options, grouped=False)
     state, (_, w, jac_p, jac_l) = problem.state, dense_rows(problem)
     jacobian = torch.cat((jac_p, jac_l), -1)[0]
     hessian = jacobian.T @ (w[0, :, None] * jacobian)

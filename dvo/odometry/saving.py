@@ -69,7 +69,7 @@ def _closed(odometry: PatchOdometry) -> tuple[KeyframeGraph, LoopCloser, dict[st
     finder = replace(finder, graph=graph, kept=list(finder.kept), places=places)
     loops = replace(odometry.loops, graph=graph, finder=finder, loops=list(odometry.loops.loops))
     with torch.inference_mode():
-        step = odometry.step.of_copy(graph.window)
+        step = odometry.step.of_copy(graph.window, state.initialised)
         graph.finalise = step.finalise
         keep = state.initialised or settle_first_window(graph, step, config, last=True)
         graph.archive_window()

@@ -44,13 +44,15 @@ class WindowStep:
         self.kernel = kernel
         self.bounds = (0, 0)
 
-    def of_copy(self, window: Window) -> WindowStep:
+    def of_copy(self, window: Window, last: bool) -> WindowStep:
         """Step on a copy of the window, with caches of its own.
 
         Args:
             window: with the same frames and edges.
+            last: no step will be taken, only measurements aligned that leave the window (:meth:`finalise`).
         """
-        return deepcopy(self, {id(self.model): self.model, id(self.window): window})
+        shared = {id(self.model): self.model, id(self.window): window}
+        return deepcopy(self, shared | ({id(self.lookup): self.lookup} if last else {}))
 
     def keep_frame(self, map_slot: int, image: np.ndarray, maps: Tensor, fine_maps: Tensor | None) -> None:
         """Store feature maps and image of a frame.

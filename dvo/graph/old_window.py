@@ -42,6 +42,10 @@ def archive_old_window(source: MapReader, graph: KeyframeGraph) -> None:
     source.require((intrinsics[:, :2] > 0).all(), "holds a focal length that is not positive", "window/intrinsics")
     matching = source.array("window/matching", np.float32, (n, m, None, p, p), -65504, 65504)
     context = source.array("window/context", np.float32, (n, m, None), -65504, 65504)
+    for frame in graph.archive:
+        for name, mine, other in (("matching", matching, frame.matching), ("context", context, frame.context)):
+            same = other is None or mine.shape[1:] == other.shape
+            source.require(same, "holds features of another size than the archive", f"window/{name}")
     colors = source.array("window/colors", np.uint8, (n, m, 3))
     has_image = source.array("window/has_image", np.uint8, (n,), 0, 1)
     images = source.array("window/images", np.uint8, (int(has_image.sum()), None, None, 3))
@@ -64,8 +68,8 @@ def archive_old_window(source: MapReader, graph: KeyframeGraph) -> None:
         image = images[row[k]] if has_image[k] else None
         colours, camera = torch.from_numpy(colors[k]), tensor(intrinsics[k])
         features = tensor(matching[k]), tensor(context[k])
-        frame = Keyframe(identifier, float(times[k]), k, *features, colours, camera, image, measured=measured[k])
-        window.append(frame, tensor(poses[k]), tensor(patches[k * m : (k + 1) * m]))
+        keyframe = Keyframe(identifier, float(times[k]), k, *features, colours, camera, image, measured=measured[k])
+        window.append(keyframe, tensor(poses[k]), tensor(patches[k * m : (k + 1) * m]))
     window.connect(tensor(kk), tensor(jj))
     window.targets, window.weights = tensor(targets), tensor(weights)
     finalise, graph.finalise = graph.finalise, None  # without the images that measurements are aligned in

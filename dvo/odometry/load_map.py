@@ -97,6 +97,7 @@ def load_map(
             device=device, name=table.name, archive=graph.archive, weights=source_of(network),
         )  # fmt: skip
         read_graph(source, odometry.graph, graph)
+        _check_features(source, odometry)
         _read_loops(source, odometry.loops, loops)
         if is_old:
             table = close_old_sequence(source, odometry, tracker, old_loops)
@@ -126,6 +127,15 @@ def _network(
     if not isinstance(found.model, PatchVO) or tensor_digest(found.model) != table.digest:
         raise source.refused(f"'{found.name}' are other weights than those it was made with", "weights", remedy)
     return found
+
+
+def _check_features(source: MapReader, odometry: PatchOdometry) -> None:
+    """Refuse features that are not of the size of those of the network."""
+    c, archive = odometry.model.config, odometry.graph.archive
+    matching = {frame.matching.shape[1] for frame in archive if frame.matching is not None}
+    context = {frame.context.shape[1] for frame in archive if frame.context is not None}
+    source.require(matching <= {c.feature_channels}, "not the features of the network", "archive/matching")
+    source.require(context <= {c.hidden_channels}, "not the features of the network", "archive/context")
 
 
 def _changed(config: TrackerConfig, preset: str, overrides: dict[str, Any]) -> TrackerConfig:

@@ -12,7 +12,7 @@ from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
 from tests.fuzz import text
 from tests.fuzz.mutations import mutate_folder
-from tests.fuzz.readers_models import MODULES, ODD
+from tests.fuzz.readers_models import MODULES, ODD, _network
 from tests.fuzz.target import Target, require
 
 SETTINGS = {
@@ -22,6 +22,7 @@ SETTINGS = {
     "search_updates": 1,
 }  # fmt: skip
 WIDTH, HEIGHT, COUNT = 96, 72, 10
+OLD = Path(__file__).parent.parent / "odometry" / "version_2.dvo"
 
 
 def _frames() -> list[Frame]:
@@ -66,6 +67,31 @@ def _read(folder: Path, random: np.random.Generator | None) -> None:
     odometry.graph.problem()
     odometry.save(folder / "out.dvo")
     load_map(folder / "out.dvo")
+
+
+def _build_old(folder: Path) -> None:
+    """A file of version 2, as if the network of these tests had made it."""
+    from dvo.models.weights import tensor_digest
+    from tests.support.saved_maps import rewritten
+
+    file = folder / "a.dvo"
+    file.write_bytes(OLD.read_bytes())
+    rewritten(file, {"weights.digest": tensor_digest(_network("tiny"))}, {})
+
+
+def _read_old(folder: Path, random: np.random.Generator | None) -> None:
+    """Its network is too small to recognise a place, so that it takes no recording."""
+    from dvo.graph.serialisation import load_graph
+    from dvo.models.weights import LoadedWeights
+    from dvo.odometry.load_map import load_map
+
+    weights = LoadedWeights.of(_network("tiny"), "tiny")
+    load_graph(folder / "a.dvo")
+    odometry = load_map(folder / "a.dvo", weights=weights)
+    require(np.isfinite(odometry.finish().trajectory.poses_wc).all(), "poses that are not finite")
+    odometry.graph.problem()
+    odometry.save(folder / "out.dvo")
+    load_map(folder / "out.dvo", weights=weights)
 
 
 def mutate_map(folder: Path, random: np.random.Generator) -> str:
@@ -167,4 +193,5 @@ ALL = (*MODULES, "dvo.odometry.load_map", "dvo.graph.serialisation")
 TARGETS = (
     Target("map", _build, _read, mutate_map, ALL),
     Target("map_in_progress", _build_in_progress, _read, mutate_map, ALL),
+    Target("map_old", _build_old, _read_old, mutate_map, ALL),
 )

@@ -76,6 +76,7 @@ WRONG = [
     ({}, {"window/edge_patches": lambda a: a - 100}, "window/edge_patches"),
     ({}, {"window/weights": cut(3)}, "window/weights"),
     ({}, {"window/matching": lambda a: a * 1e6}, "window/matching"),
+    ({}, {"window/context": lambda a: np.repeat(a, 2, 2)}, "window/context"),
     ({}, {"window/images": lambda a: a[:, 1:].copy()}, "window/images"),
     ({}, {"window/measured": cut(3)}, "window/measured"),
 ]

@@ -150,6 +150,8 @@ WRONG = [
     ({"loops.loops": [{"old": 0, "new": 99, "kind": "", "inliers": 1.0, "count": 1, "joins": False}]},
      {"loops/measurements": lambda a: np.array([[0.0, 0, 0, 0, 0, 0, 1, 1]])}, "loops"),
     ({}, {"segments": lambda a: a[:1]}, "segments"),
+    ({}, {"archive/matching": lambda a: np.repeat(a, 2, 2)}, "archive/matching"),
+    ({}, {"archive/context": lambda a: np.repeat(a, 2, 2)}, "archive/context"),
     ({}, {"places/identifiers": lambda a: a[:0] - 1.0}, "identifiers"),
     ({}, {"places/identifiers": lambda a: np.array([99]), "places/descriptors": lambda a: np.zeros((1, 1), np.float16)},
      "identifiers"),

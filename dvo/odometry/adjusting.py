@@ -41,5 +41,7 @@ def adjust(odometry: PatchOdometry) -> tuple[AdjustmentRecord, ...]:
     """
     if odometry.state.finished:
         raise DvoError("the sequence is finished and adjusted", field="adjust()", remedy="adjust before finish()")
+    if odometry.state.map is not None:  # which stays as it is
+        return ()
     with torch.inference_mode():
         return tuple(odometry.loops.adjust(odometry.state.adjustable, wait=not odometry.config.real_time))

@@ -14,6 +14,7 @@ from dvo.errors import DvoError
 from dvo.graph.archive import ArchiveConfig, encode_jpeg
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.map_file import VERSION, open_map_file, write_map_file
+from dvo.graph.recordings import begin_recording
 from dvo.graph.serialisation import graph_arrays, load_graph, save_graph
 from tests.support.archived_walk import M, archived_walk
 
@@ -187,3 +188,24 @@ def test_an_existing_file_stays_if_the_new_one_cannot_be_written(tmp_path, monke
     with pytest.raises(DvoError, match="No space left"):
         save_graph(tmp_path / "a.dvo", graph)
     assert (tmp_path / "a.dvo").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_copy_of_a_graph_and_the_graph_change_on_their_own():
+    graph, other = walk(), walk()
+    copy = graph.copy()
+    same(copy, graph)
+    copy.log.frames[0].lost = True
+    copy.window.frames[0].slopes = torch.ones(M, 2)
+    copy.archive_window()
+    copy.begin_segment(9)
+    copy.correct(0, np.array([1.0, 2, 3, 0, 0, 0, 1]))
+    copy.metric[0], copy.worlds[0] = "depth", 0
+    begin_recording(copy)
+    copy.archive.config = replace(copy.archive.config, max_bytes=0)
+    copy.archive.add_part(copy.archive.parts[0])
+    assert not len(copy.window) and not copy.archive.parts and len(graph.window) == len(other.window) > 0
+    assert graph.window.slopes is None and torch.equal(graph.window.kk, other.window.kk)
+    same(graph, other)
+    second = graph.copy()
+    graph.archive_window()
+    same(second, other)

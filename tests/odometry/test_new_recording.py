@@ -108,6 +108,7 @@ def test_the_map_stays_as_it_was(old, back, tmp_path):
     assert content(again.finish()) == content(odometry.finish())
     third = begin(tmp_path / "both.dvo")
     assert len(third.loops.finder.kept) == len(odometry.loops.finder.kept) and len(third.graph.recordings) == 2
+    assert third.adjust() == () and content(third.current()) == content(odometry.finish())
     third.track(wall(1, size=(160, 120))[0])
     assert len(third.graph.recordings) == 3
     assert third.finish().info["localised"] is None and third.finish().frames_read == 1

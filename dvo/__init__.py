@@ -5,7 +5,8 @@
         estimate = odometry.track(frame)
     result = odometry.finish()
 
-The names below are imported when first used, so that ``import dvo`` and ``dvo --help`` stay fast.
+The names below are imported when first used, so that ``import dvo`` and ``dvo --help`` stay fast. It
+also decides how the threads of a torch that is imported later wait, see :mod:`dvo.threads`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from dvo.errors import DvoError
+from dvo.threads import wait_passively
 
 if TYPE_CHECKING:
     from dvo import losses
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
     from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
     from dvo.odometry.session import run
     from dvo.synth.dataset import ClipDataset
+
+wait_passively()
 
 __version__ = "0.2.0"
 
@@ -93,9 +97,6 @@ def __getattr__(name: str) -> Any:
     """Resolve a public name on first use (PEP 562)."""
     if name not in _LAZY:
         raise AttributeError(f"module 'dvo' has no attribute '{name}'")
-    from dvo.threads import wait_passively
-
-    wait_passively()  # before a module imports torch
     module, attribute = _LAZY[name]
     found = import_module(module)
     value = getattr(found, attribute) if attribute else found

@@ -24,7 +24,6 @@ from dvo.commands.scale_options import add_scale_options
 from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
 from dvo.errors import DvoError
-from dvo.threads import wait_passively
 
 EXIT_CODES = (
     "exit codes: 0 done, 1 no frame could be tracked, 2 bad input or results that cannot be written, 130 interrupted, "
@@ -271,7 +270,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     try:
         arguments = build_parser().parse_args(argv)
-        wait_passively()  # before a command imports torch
         module, function = arguments.run.split(":")
         command: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
         return command(arguments)

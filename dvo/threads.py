@@ -3,7 +3,7 @@
 OpenMP threads that wait spin by default: with another busy process on the same cores, the others spin for whole time
 slices until the one that is not running comes back, and tracking gets 30 to 100 times slower. Threads that sleep until
 they are woken (passive waiting) do not, and lose little on an idle machine if they spin for some microseconds before.
-OpenMP reads its settings when torch is imported.
+OpenMP reads its settings when torch is imported, so ``import dvo`` chooses them, whoever sets the number of threads.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 WAIT_POLICY = "OMP_WAIT_POLICY"
 NUMBERS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _WAITING = (WAIT_POLICY, "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # of OpenMP, of its GNU and of its LLVM library
-_CHOICE = {WAIT_POLICY: "PASSIVE", "GOMP_SPINCOUNT": "10000"}  # turns of GNU's loop before a thread sleeps
+_CHOICE = {WAIT_POLICY: "PASSIVE", "GOMP_SPINCOUNT": "1000"}  # turns of GNU's loop, 25 to 50 us, before a thread sleeps
 _CGROUPS = Path("/sys/fs/cgroup")
 _MEMBERSHIP = Path("/proc/self/cgroup")
 
@@ -115,9 +115,8 @@ def settle_threads() -> Threads:
     _state["chosen_by"] = by or "program"
     if not passive and torch.get_num_threads() > 1:
         warnings.warn(
-            f"torch was imported before dvo, so its {torch.get_num_threads()} threads spin while they wait, which is "
-            f"slow beside other busy programs: set {WAIT_POLICY}=PASSIVE in the environment, or call "
-            "dvo.threads.wait_passively() before torch is imported",
+            f"torch was imported before dvo, so its {torch.get_num_threads()} threads spin while they wait, which "
+            f"is slow beside other busy programs: import dvo before torch, or set {WAIT_POLICY}=PASSIVE",
             stacklevel=3,
         )
     return current_threads()

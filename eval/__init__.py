@@ -1,5 +1,3 @@
 """Evaluation of visual odometries: systems on suites of sequences, scored alike; ``python -m eval --help``."""
 
-from dvo.threads import wait_passively
-
-wait_passively()  # before a module imports torch
+import dvo  # noqa: F401, decides how threads wait, before a module imports torch

@@ -7,13 +7,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import dvo  # decides how threads wait, before torch is imported
+
+# isort: split
 import cv2
 import numpy as np
 import pytest
 import torch
 from hypothesis import settings
 
-import dvo
 from dvo.data.root import data_root as find_data_root
 from dvo.data.trajectory import Trajectory, write_tum
 from tests.support.fake_odometry import FakeOdometry, curve

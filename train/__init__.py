@@ -1,0 +1,1 @@
+import dvo  # noqa: F401, decides how threads wait, before a module imports torch

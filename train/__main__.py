@@ -35,9 +35,7 @@ COMMANDS = {
 def main() -> None:
     """Entry point; bad input ends with code 2 and one line."""
     from dvo.errors import DvoError
-    from dvo.threads import wait_passively
 
-    wait_passively()  # before a command imports torch
     try:
         run()
     except DvoError as error:

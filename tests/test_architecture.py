@@ -28,7 +28,7 @@ ARROWS: dict[str, set[str]] = {
     "metrics": {"data", "geometry"},
     "segment_metrics": {"metrics", "odometry", "data", "geometry"},
     "relative_pose": {"segment_metrics", "metrics", "odometry", "data", "geometry"},
-    "graph": {"data", "geometry"},
+    "graph": {"ba", "data", "geometry"},
     "nets": {"geometry", "ba", "data", "graph"},
     "models": {"nets", "graph", "ba", "data", "geometry"},
     "synth": {"geometry", "ba", "data"},

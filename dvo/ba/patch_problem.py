@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
-from dvo.ba.edges import EdgePlan
+from dvo.ba.edges import EdgePlan, plan_edges
 from dvo.ba.kernels import Kernel
 from dvo.ba.options import Sensors
 from dvo.ba.problem import Factor
@@ -44,7 +44,7 @@ class PatchProblem:
         factors: further measurements. They and ``blocks`` have a batch dimension, of 1 for one graph.
         blocks: further unknowns that the factors concern, by name.
         plan: layout that :func:`dvo.ba.edges.plan_edges` made of the edges; None: it is made when it is needed.
-        identifiers: ``(N,)`` of the frames in a keyframe graph; None without one.
+        identifiers: ``(N,)`` of the frames in a keyframe graph; empty without one.
     """
 
     poses_cw: Tensor
@@ -59,7 +59,7 @@ class PatchProblem:
     factors: tuple[Factor, ...] = ()
     blocks: Mapping[str, StateBlock] = field(default_factory=dict)
     plan: EdgePlan | None = None
-    identifiers: Tensor | None = None
+    identifiers: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
 
     @property
     def inverse_depths(self) -> Tensor:
@@ -142,7 +142,7 @@ class PatchProblem:
             poses_cw=self.poses_cw.index_select(-2, rows),
             patches=self.patches.index_select(-4, patches.nonzero()[:, 0]), intrinsics=intrinsics,
             ii=place[chosen.ii], jj=place[chosen.jj], kk=patch_place[chosen.kk],
-            identifiers=None if self.identifiers is None else self.identifiers[rows],
+            identifiers=self.identifiers[rows] if len(self.identifiers) else self.identifiers,
         )  # fmt: skip
 
     def reprojection(
@@ -166,6 +166,28 @@ class PatchProblem:
             kernel, focal_only,
         )  # fmt: skip
 
+    def exact(self) -> PatchProblem:
+        """The problem on the CPU in double precision, with the layout of its edges.
+
+        Returns:
+            A problem whose tensors are detached.
+        """
+
+        def real(x: Tensor) -> Tensor:
+            return x.detach().cpu().double()
+
+        sensors = self.sensors
+        if sensors is not None:
+            sensors = Sensors(sensors.source.cpu(), sensors.target.cpu(), real(sensors.from_body))
+        ii, jj, kk = self.ii.cpu(), self.jj.cpu(), self.kk.cpu()
+        return PatchProblem(
+            real(self.poses_cw), real(self.patches), real(self.intrinsics), real(self.targets), real(self.weights),
+            ii, jj, kk, sensors,
+            tuple(factor.with_tensors([real(x) for x in factor.tensors()]) for factor in self.factors),
+            {name: block.with_value(real(block.value)) for name, block in self.blocks.items()},
+            plan_edges(ii, jj, kk, self.poses_cw.shape[-2], self.patches.shape[-4]), self.identifiers,
+        )  # fmt: skip
+
     def batched(self) -> PatchProblem:
         """One graph as a batch of one.
 
@@ -185,7 +207,7 @@ class PatchProblem:
         """Mean robust cost of the measurements at the present values: what solutions are compared by.
 
         An edge whose point is not in front of the camera, or whose residual is too long, costs as much as the longest
-        residual. Further factors do not take part.
+        residual. Further factors add the costs that they have.
 
         Args:
             kernel: robust kernel of the weighted residual, pixels times the root of the weight.
@@ -197,6 +219,8 @@ class PatchProblem:
         """
         p = self.batched()
         values = {POSES: p.poses_cw, INVERSE_DEPTHS: p.inverse_depths, INTRINSICS: p.intrinsics}
+        values |= {name: block.value for name, block in p.blocks.items()}
+        factors = p.reprojection(max_residual, None, kernel), *p.factors
         total = p.weights.sum((1, 2)).clamp(min=torch.finfo(p.weights.dtype).tiny)
-        cost = 0.5 * p.reprojection(max_residual, None, kernel).cost(values) / total
+        cost = 0.5 * torch.stack([factor.cost(values) for factor in factors]).sum(0) / total
         return cost if self.poses_cw.dim() == 3 else cost[0]

@@ -16,12 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
 from dvo.graph.archive import Archive, ArchiveConfig, ArchivedKeyframe, encode_jpeg
 from dvo.graph.heap import release_free_memory
 from dvo.graph.keyframe_log import KeyframeLog
 from dvo.graph.measurements import ArchivedEdges
-from dvo.graph.problem import GraphProblem, graph_problem
+from dvo.graph.problem import graph_problem
 from dvo.graph.recordings import Recording
 from dvo.graph.window import Keyframe, Window
 
@@ -61,8 +62,7 @@ class KeyframeGraph:
         >>> odometry = dvo.load("small")
         >>> done = dvo.run(odometry, dvo.open("video.mp4", calib="calib.txt"))
         >>> p = odometry.graph.problem()
-        >>> blocks = (p.poses_cw[0], p.patches[0], p.intrinsics[0], p.targets[0], p.weights[0])
-        >>> solved = global_bundle_adjust(*blocks, p.ii, p.jj, p.kk)
+        >>> solved = dvo.ba.solve.solve(p, dvo.ba.global_adjust.GlobalBAOptions())
         >>> for identifier, pose_cw in zip(p.identifiers.tolist(), solved.poses_cw.numpy()):
         ...     odometry.graph.correct(identifier, pose_cw)
         >>> trajectory = odometry.graph.log.trajectory()
@@ -305,7 +305,7 @@ class KeyframeGraph:
             poses = torch.where(moving[:, None], se3.compose(poses, anchors), poses)
         return poses
 
-    def problem(self, dropped: bool = True, segment: int = 0, first: int = 0, last: int | None = None) -> GraphProblem:
+    def problem(self, dropped: bool = True, segment: int = 0, first: int = 0, last: int | None = None) -> PatchProblem:
         """Bundle adjustment problem of the archived keyframes and edges of a segment.
 
         Args:

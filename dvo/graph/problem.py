@@ -2,49 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.patch_problem import PatchProblem
+from dvo.graph.measured_depths import depth_factors
+
 if TYPE_CHECKING:
     from dvo.graph.archive import ArchivedKeyframe
     from dvo.graph.keyframe_graph import KeyframeGraph
 
 
-@dataclass(frozen=True)
-class GraphProblem:
-    """Bundle adjustment problem of archived keyframes: arguments of
-    :func:`dvo.ba.global_adjust.global_bundle_adjust`.
-
-    Attributes:
-        identifiers: ``(N,)`` identifier of the keyframe of each pose.
-        poses_cw: ``(N, 7)`` float64 world to camera.
-        patches: ``(K, 3, 1, 1)`` float64 x, y (feature-map pixels), inverse depth.
-        intrinsics: ``(N, 4)`` float64 of the feature maps.
-        targets, weights: ``(E, 2)`` float64 measured positions of the patch centres (feature-map pixels), and their
-            confidence.
-        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge.
-        measured: ``(K, 2)`` float64 inverse depths by a depth camera and their weights, 0 for none; None without any.
-    """
-
-    identifiers: np.ndarray
-    poses_cw: Tensor
-    patches: Tensor
-    intrinsics: Tensor
-    targets: Tensor
-    weights: Tensor
-    ii: Tensor
-    jj: Tensor
-    kk: Tensor
-    measured: Tensor | None = None
-
-
 def graph_problem(
     graph: KeyframeGraph, dropped: bool = True, segment: int = 0, first: int = 0, last: int | None = None
-) -> GraphProblem:
+) -> PatchProblem:
     """Bundle adjustment problem of the archived keyframes and edges of a segment; see :meth:`KeyframeGraph.problem`."""
     edges = graph.archive.edges(first, last)
     linked = set(np.unique(np.concatenate([edges.source, edges.target])).tolist()) if first > 0 else set()
@@ -60,8 +34,7 @@ def graph_problem(
     edges = edges.select(np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers))
     ii, jj = np.searchsorted(identifiers, edges.source), np.searchsorted(identifiers, edges.target)
     patches = [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
-    return GraphProblem(
-        identifiers=identifiers,
+    return PatchProblem(
         poses_cw=graph.poses_cw(identifiers),
         patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(len(frames) * m, 3, 1, 1),
         intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(-1, 4)),
@@ -70,7 +43,8 @@ def graph_problem(
         ii=torch.from_numpy(ii),
         jj=torch.from_numpy(jj),
         kk=torch.from_numpy(ii * m + edges.patch),
-        measured=_measured(frames, m),
+        factors=depth_factors(_measured(frames, m)),
+        identifiers=torch.from_numpy(identifiers),
     )
 
 

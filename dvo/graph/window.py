@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.patch_problem import PatchProblem
 from dvo.graph.edges import PatchGraph, build_graph
 
 
@@ -160,6 +161,15 @@ class Window:
     def measured(self) -> Tensor | None:
         """``(n * M, 2)`` measured inverse depths and weights, see :class:`Keyframe`; None if no frame has any."""
         return self._of_patches([frame.measured for frame in self.frames])
+
+    def problem(self) -> PatchProblem:
+        """Bundle adjustment problem of the window, its measurements with their weights.
+
+        Returns:
+            The problem, which shares tensors with the window; measured depths are not part of it.
+        """
+        given = self.poses_cw, self.patches, self.intrinsics, self.targets, self.weights
+        return PatchProblem(*given, self.ii, self.jj, self.kk)
 
     @property
     def slopes(self) -> Tensor | None:

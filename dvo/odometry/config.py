@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from dvo.ba.kernels import Kernel
 from dvo.errors import DvoError
+from dvo.graph.measured_depths import SIGMA
 from dvo.nets.alignment import AlignmentOptions
-from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.final_adjustment import AdjustmentOptions
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.settings import check_names, check_settings, settings_of, shown
@@ -92,7 +92,7 @@ class TrackerConfig:
         covariance_scale: factor of the covariances beyond ``sigma^2``, as errors of measurements are not independent,
             with the shipped weights: fitted by ``python -m eval.benchmarks.covariance`` (docs/uncertainty.md).
         restart: start the window anew, some frames after the initialisation, and the final adjustment, if that leads to
-            a better solution (:mod:`dvo.ba.restart`).
+            a better solution (:mod:`dvo.ba.multistart`).
         initial_frames: keyframes before the first joint optimisation.
         initial_updates, final_updates: updates at initialisation and in ``finish``.
         updates: updates of each frame.

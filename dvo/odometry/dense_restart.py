@@ -10,22 +10,24 @@ residuals of their flow; the network measures anew from there, and the robust co
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from dvo.ba.dense import pixel_grid
-from dvo.ba.global_adjust import GlobalBAOptions, GlobalBAResult, global_bundle_adjust
-from dvo.ba.kernels import Kernel
-from dvo.ba.levenberg import LMOptions
+from dvo.ba.global_adjust import GlobalBAOptions
+from dvo.ba.multistart import ABANDON, OPTIONS, PRESENT, Start, clearly_lower, multistart, present
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.solve import solve
 from dvo.geometry import se3, so3
 from dvo.odometry.dense_window import DenseWindow, FrameEdge
-from dvo.odometry.epipolar_refinement import RefinementOptions, motion_candidates
+from dvo.odometry.epipolar_refinement import RefinementOptions, refine_motion
 from dvo.odometry.two_view import parallax_of
 
+_OPTIONS = replace(OPTIONS, solver=replace(OPTIONS.solver, max_iterations=20))
 _EVERY = 3  # of the rows and columns of a map, one counts
 _REFINEMENT = RefinementOptions(iterations=20, parallax=0.0)
 _LONGEST = 2.0  # step between two keyframes, median depths
@@ -36,38 +38,14 @@ _DIRECTIONS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class DenseRestartOptions:
-    """Options of :func:`better_solution`.
-
-    Attributes:
-        kernel: robust kernel of the costs.
-        max_residual: feature pixels; a longer residual has a constant cost.
-        iterations: of bundle adjustment of the other solution, and of the present one, before their costs are compared.
-        promising: factor of the cost of the present solution, on its own measurements, below which another one is
-            worth being measured anew.
-        margin: factor of the cost of the present solution below which another one is taken; further updates alone lower
-            the cost a little.
-    """
-
-    kernel: Kernel = Kernel("cauchy", 0.1)
-    max_residual: float = 32.0
-    iterations: int = 20
-    promising: float = 1.5
-    margin: float = 0.75
-
-
-def better_solution(
-    window: DenseWindow,
-    measure: Callable[[], object],
-    options: DenseRestartOptions = DenseRestartOptions(),  # noqa: B008 (frozen)
-) -> bool:
+def better_solution(window: DenseWindow, measure: Callable[[], object], abandon: float = ABANDON) -> bool:
     """Solve the window from the other motions of its keyframes too, and keep the better solution.
 
     Args:
         window: with a solution and its measurements; changed in place.
         measure: takes updates of the window.
-        options: kernels and limits.
+        abandon: factor of the cost of the present solution, on its own measurements, above which another one is not
+            measured anew.
 
     Returns:
         True if the other solution was taken.
@@ -75,83 +53,92 @@ def better_solution(
     other = _other_poses(window) if len(window) > 2 else None
     if other is None:
         return False
-    problem = _Problem(window, options)
-    present = problem.solve(problem.poses(), problem.depths())
-    flat = torch.ones_like(problem.depths())
-    depths = problem.solve(other, flat, move_poses=False).patches[:, 2, 0, 0]
-    found = problem.solve(other, depths)
-    if not found.cost < options.promising * present.cost:
+    poses = other
+
+    def turned(problem: PatchProblem, options: GlobalBAOptions) -> PatchProblem:
+        depths = torch.ones_like(problem.inverse_depths)
+        return _with_depths(problem.with_values(poses_cw=poses, inverse_depths=depths), options)
+
+    sampled = window_problem(window)
+    found = {s.start: s for s in multistart(sampled, {PRESENT: present, "turned": turned}, _OPTIONS, abandon)}
+    if "turned" not in found:
         return False
-    kept, first = _Kept(window), problem.poses()
-    before = problem.relative_cost(present)
-    problem.take(found)
+    kept = _Kept(window)
+    take(window, found["turned"].problem)
     for edge in window.edges:
         edge.hidden, edge.positions, edge.confidence, edge.age = edge.source.hidden, None, None, 0
     window.held = []
     measure()
-    problem = _Problem(window, options)
-    after = problem.relative_cost(problem.solve(problem.poses(), problem.depths()))
-    if after < options.margin * before and _turned(first, problem.poses()) > _OTHER:
+    again = window_problem(window)
+    (after,) = multistart(again, {PRESENT: present}, _OPTIONS)
+    turned_by = _turned(sampled.poses_cw, again.poses_cw)
+    if clearly_lower(after.cost, found[PRESENT].cost) and turned_by > _OTHER:
         return True
     kept.restore(window)
     return False
 
 
-class _Problem:
-    """Bundle adjustment of some pixels of the keyframes, in double precision on the CPU.
+def window_problem(window: DenseWindow) -> PatchProblem:
+    """Bundle adjustment problem of some pixels of the keyframes.
 
     Args:
-        window: the keyframes, with measurements.
-        options: kernel.
+        window: with measurements.
+
+    Returns:
+        One patch for each chosen pixel, float64 on the CPU.
     """
+    frames = window.keyframes
+    edges = [edge for edge in (*window.edges, *window.held) if edge.positions is not None]
+    place = {id(frame): k for k, frame in enumerate(frames)}
+    ends = torch.tensor([(place[id(edge.source)], place[id(edge.target)]) for edge in edges])
+    poses, intrinsics = (torch.stack(x).cpu().double() for x in
+                         ([frame.pose_cw for frame in frames], [frame.intrinsics for frame in frames]))  # fmt: skip
+    depths = _sampled([frame.inverse_depth for frame in frames])
+    positions, weights = (_sampled(maps) for maps in
+                          ([edge.positions for edge in edges], [edge.confidence for edge in edges]))  # fmt: skip
+    return _problem(poses, depths, intrinsics, positions, weights, ends, frames[0].inverse_depth.shape)
 
-    def __init__(self, window: DenseWindow, options: DenseRestartOptions) -> None:
-        self.frames, self.options = window.keyframes, options
-        edges = [edge for edge in (*window.edges, *window.held) if edge.positions is not None]
-        place = {id(frame): k for k, frame in enumerate(self.frames)}
-        self.size = self.frames[0].inverse_depth.shape
-        self.rows, self.columns = torch.meshgrid(*(_chosen(length) for length in self.size), indexing="ij")
-        count = self.rows.numel()
-        ends = torch.tensor([(place[id(edge.source)], place[id(edge.target)]) for edge in edges])
-        source, target = (end.repeat_interleave(count) for end in ends.unbind(1))
-        points = source * count + torch.arange(count).repeat(len(edges))
-        positions = self._sampled([edge.positions for edge in edges]).reshape(-1, 2)
-        weights = self._sampled([edge.confidence for edge in edges]).reshape(-1, 2)
-        intrinsics = torch.stack([frame.intrinsics for frame in self.frames]).cpu().double()
-        self.measured = (intrinsics, positions, weights, source, target, points)
 
-    def _sampled(self, maps: list[Tensor | None]) -> Tensor:
-        stacked = torch.stack([each for each in maps if each is not None]).cpu().double()
-        return stacked[:, self.rows, self.columns]
+def take(window: DenseWindow, problem: PatchProblem) -> None:
+    """Give the keyframes a solution; depths of the other pixels are interpolated.
 
-    def poses(self) -> Tensor:
-        """``(N, 7)`` world to camera."""
-        return torch.stack([frame.pose_cw for frame in self.frames]).cpu().double()
+    Args:
+        window: its poses and depths are replaced.
+        problem: of :func:`window_problem`, at the solution.
+    """
+    frames = window.keyframes
+    size = tuple(frames[0].inverse_depth.shape)
+    grids = problem.inverse_depths.view(len(frames), 1, *(len(_chosen(length)) for length in size))
+    depths = F.interpolate(grids, size, mode="bilinear", align_corners=False)[:, 0]
+    for frame, pose, depth in zip(frames, problem.poses_cw, depths, strict=True):
+        frame.pose_cw, frame.inverse_depth = pose.to(frame.pose_cw), depth.to(frame.inverse_depth)
 
-    def depths(self) -> Tensor:
-        """``(K,)`` inverse depths of the pixels."""
-        return self._sampled([frame.inverse_depth for frame in self.frames]).flatten()
 
-    def solve(self, poses_cw: Tensor, depths: Tensor, move_poses: bool = True) -> GlobalBAResult:
-        """Adjust poses (or none) and inverse depths."""
-        grid = torch.stack([self.columns, self.rows], -1).double().reshape(-1, 2).repeat(len(self.frames), 1)
-        patches = torch.cat([grid, depths[:, None]], 1)[..., None, None]
-        settings = GlobalBAOptions(
-            fixed=1, kernel=self.options.kernel, max_residual=self.options.max_residual, move_poses=move_poses,
-            solver=LMOptions(max_iterations=self.options.iterations, tolerance=1e-3),
-        )  # fmt: skip
-        return global_bundle_adjust(poses_cw, patches, *self.measured, settings)
+def _problem(
+    poses_cw: Tensor, depths: Tensor, intrinsics: Tensor, positions: Tensor, weights: Tensor, ends: Tensor,
+    size: torch.Size,
+) -> PatchProblem:  # fmt: skip
+    """Problem of sampled maps: depths ``(N, h, w)``, positions and weights ``(E, h, w, 2)`` of edges ``(E, 2)``."""
+    rows, columns = torch.meshgrid(*(_chosen(length) for length in size), indexing="ij")
+    count, frames = rows.numel(), len(depths)
+    grid = torch.stack([columns, rows], -1).double().reshape(-1, 2).repeat(frames, 1)
+    patches = torch.cat([grid, depths.reshape(-1, 1)], 1)[..., None, None]
+    source, target = (end.repeat_interleave(count) for end in ends.unbind(1))
+    points = source * count + torch.arange(count).repeat(len(ends))
+    measured = positions.reshape(-1, 2), weights.reshape(-1, 2)
+    return PatchProblem(poses_cw, patches, intrinsics, *measured, source, target, points)
 
-    def relative_cost(self, solution: GlobalBAResult) -> float:
-        """Cost over the sum of the weights, so that solutions with other measurements compare."""
-        return solution.cost / max(float(self.measured[2].sum()), 1e-12)
 
-    def take(self, solution: GlobalBAResult) -> None:
-        """Give the keyframes a solution; depths of the other pixels are interpolated."""
-        grids = solution.patches[:, 2].reshape(len(self.frames), 1, *self.rows.shape)
-        depths = F.interpolate(grids, tuple(self.size), mode="bilinear", align_corners=False)[:, 0]
-        for frame, pose, depth in zip(self.frames, se3.normalise(solution.poses_cw), depths, strict=True):
-            frame.pose_cw, frame.inverse_depth = pose.to(frame.pose_cw), depth.to(frame.inverse_depth)
+def _sampled(maps: Sequence[Tensor | None]) -> Tensor:
+    """Chosen pixels of maps ``(h, w, ...)``, float64 on the CPU."""
+    stacked = torch.stack([each for each in maps if each is not None]).cpu().double()
+    rows, columns = torch.meshgrid(*(_chosen(length) for length in stacked.shape[1:3]), indexing="ij")
+    return stacked[:, rows, columns]
+
+
+def _with_depths(problem: PatchProblem, options: GlobalBAOptions) -> PatchProblem:
+    """Depths that suit the poses, which stay."""
+    return problem.with_values(patches=solve(problem, replace(options, move_poses=False)).patches)
 
 
 class _Kept:
@@ -206,17 +193,31 @@ def _other_motion(edge: FrameEdge) -> tuple[Tensor, bool]:
     rotation = so3.exp(torch.tensor([v, -u, 0.0], dtype=torch.float64))  # it moves the image by the median flow
     starts = [torch.cat([torch.tensor(way, dtype=torch.float64), rotation]) for way in _DIRECTIONS]
     now = se3.relative(edge.target.pose_cw, edge.source.pose_cw).cpu().double()
-    found = motion_candidates(flow, [now, *starts], intrinsics, _REFINEMENT, weights=weights)
-    present = found[0][1]
-    others = [
-        (cost, pose)
-        for cost, pose in found[1:]
-        if float(so3.angle(so3.multiply(so3.conjugate(present[3:]), pose[3:]))) > _OTHER
-    ]
-    pose_ab = min(others, key=lambda item: item[0])[1] if others else present
-    parallax = parallax_of(flow.numpy(), pose_ab.numpy(), intrinsics.numpy())
-    side = 1.0 if (parallax.motion * parallax.direction).sum() >= 0 else -1.0
-    return torch.cat([pose_ab[:3] * side * parallax.step(_LONGEST), pose_ab[3:]]), bool(others)
+    size = edge.source.inverse_depth.shape
+    sampled = _sampled([edge.positions]), _sampled([edge.confidence])
+    flat = torch.ones(1, *sampled[0].shape[1:3], dtype=torch.float64)
+    two = _problem(
+        se3.identity(2, dtype=torch.float64), flat, intrinsics.expand(2, 4), *sampled, torch.tensor([[0, 1]]), size
+    )
+
+    def along(start: Tensor) -> Start:
+        pose_ab = refine_motion(flow, [start], intrinsics, _REFINEMENT, weights=weights)
+        parallax = parallax_of(flow.numpy(), pose_ab.numpy(), intrinsics.numpy())
+        side = 1.0 if (parallax.motion * parallax.direction).sum() >= 0 else -1.0
+        pose_ab = torch.cat([pose_ab[:3] * side * parallax.step(_LONGEST), pose_ab[3:]])
+
+        def at(problem: PatchProblem, options: GlobalBAOptions) -> PatchProblem:
+            poses = torch.stack([problem.poses_cw[0], se3.inverse(pose_ab)])
+            return _with_depths(problem.with_values(poses_cw=poses), options)
+
+        return at
+
+    ways = {PRESENT: along(now)} | {str(k): along(start) for k, start in enumerate(starts)}
+    as_they_are = replace(_OPTIONS, solver=replace(_OPTIONS.solver, max_iterations=0))
+    found = [(s, se3.inverse(s.problem.poses_cw[1])) for s in multistart(two, ways, as_they_are, float("inf"))]
+    here = next(pose_ab for solution, pose_ab in found if solution.start == PRESENT)
+    others = [pose for _, pose in found if float(so3.angle(so3.multiply(so3.conjugate(here[3:]), pose[3:]))) > _OTHER]
+    return others[0] if others else here, bool(others)
 
 
 def _chosen(length: int) -> Tensor:

@@ -1,9 +1,7 @@
-"""Measured depths in bundle adjustment: priors of inverse depths, which fix the scale that images leave open.
+"""The scale that measured depths fix in bundle adjustment, which images leave open.
 
-The inverse depth of a patch has the prior ``w (d - d_measured)^2`` with ``w = sigma^2 / var(d_measured)``: weights of
-bundle adjustment are confidences, of which 1 stands for the standard deviation ``sigma`` in feature pixels. A Cauchy
-kernel takes the influence from depths of another surface, which a rough registration gives near the edges of bodies.
-The first pose alone is held, and scale is a free direction of the reprojection error: the priors decide it.
+The first pose alone is held, and scale is a free direction of the reprojection error: the priors of measured depths
+(:mod:`dvo.graph.measured_depths`) decide it.
 """
 
 from __future__ import annotations
@@ -14,44 +12,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.factors import DepthPrior
-from dvo.ba.kernels import Kernel
 from dvo.graph.archive import ArchivedKeyframe
 from dvo.graph.window import Window
 
-SIGMA = 0.061
-"""Standard deviation of a measurement of confidence 1 with the shipped weights, feature pixels (docs/precision.md)."""
-KERNEL = Kernel("cauchy", SIGMA)
-"""Robust kernel of measured depths: one standard deviation, as errors of depths have long tails."""
 MOST = 0.5
 """Share of the patches with a measured depth above which these decide the relief, so that it needs no other start."""
 
 _NEAR = 0.02  # logarithm of a scale that iterations reach without help: beyond it the kernel takes the influence away
 
 
-def depth_factors(measured: Tensor | None) -> tuple[DepthPrior, ...]:
-    """Priors of the patches whose depth was measured.
-
-    Args:
-        measured: ``(K, 2)`` inverse depths and weights, 0 for none; None without a depth camera.
-
-    Returns:
-        One factor of ``inverse_depths (1, K)``; none without measurements.
-    """
-    if measured is None:
-        return ()
-    index = (measured[:, 1] > 0).nonzero()[:, 0]
-    if not len(index):
-        return ()
-    value, weight = measured[index].unbind(1)
-    return (DepthPrior(value[None], weight[None], index, KERNEL),)
-
-
 def measured_share(measured: Tensor | None) -> float:
     """Share of the patches whose depth was measured.
 
     Args:
-        measured: see :func:`depth_factors`.
+        measured: see :func:`dvo.graph.measured_depths.depth_factors`.
 
     Returns:
         In [0, 1].
@@ -64,7 +38,7 @@ def metres_of_unit(depths: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
     Args:
         depths: ``(K,)`` inverse depths in the unit of the map.
-        measured: ``(K, 2)`` see :func:`depth_factors`.
+        measured: ``(K, 2)`` see :func:`dvo.graph.measured_depths.depth_factors`.
 
     Returns:
         ``(P,)`` of the patches with a measured depth, in order.
@@ -91,7 +65,7 @@ def to_measured(poses_cw: Tensor, depths: Tensor, measured: Tensor | None) -> tu
     Args:
         poses_cw: ``(N, 7)``; lengths are scaled from the origin of the world.
         depths: ``(K, ...)`` or ``(N, M)`` inverse depths of patches, of all of their pixels or of the centres.
-        measured: ``(K, 2)`` see :func:`depth_factors`.
+        measured: ``(K, 2)`` see :func:`dvo.graph.measured_depths.depth_factors`.
 
     Returns:
         Poses and inverse depths of the same shapes.

@@ -101,33 +101,6 @@ def refine_motion(
     return torch.cat([-direction if direction @ starts[0][:3].double() < 0 else direction, rotation])
 
 
-def motion_candidates(
-    flow: Tensor,
-    starts: Sequence[Tensor],
-    intrinsics: Tensor,
-    options: RefinementOptions | None = None,
-    *,
-    weights: Tensor | None = None,
-) -> list[tuple[float, Tensor]]:
-    """Minima of the cost of :func:`refine_motion`, one from each start.
-
-    Args:
-        flow, starts, intrinsics, options, weights: see :func:`refine_motion`.
-
-    Returns:
-        Cost and pose ``T_ab`` ``(7,)`` float64 from each start, in their order; translations have length one, and
-        either of both sides.
-    """
-    options = options or RefinementOptions()
-    rays = _rays(flow.double(), intrinsics.double(), options.points, weights)
-    found = []
-    for start in starts:
-        _, rotation, direction = _wide(rays, start, options)
-        cost, rotation, direction = _descend(rays, rotation, direction, options)
-        found.append((cost, torch.cat([direction, rotation])))
-    return found
-
-
 def _wide(rays: _Rays, start: Tensor, options: RefinementOptions) -> tuple[float, Tensor, Tensor]:
     """Descend at the wider scale."""
     rotation, direction = so3.normalise(start[3:].double()), _unit(start[:3].double())

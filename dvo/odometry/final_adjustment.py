@@ -15,17 +15,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
+from dvo.ba.global_adjust import GlobalBAOptions
 from dvo.ba.kernels import Kernel
 from dvo.ba.levenberg import LMOptions
-from dvo.ba.restart import RestartOptions, better_start, restart
+from dvo.ba.multistart import DEPTH_STARTS, PRESENT, RESTARTS, multistart, preferred, present
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.solve import solve
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.correction import rescale
 from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.graph.problem import GraphProblem
+from dvo.graph.measured_depths import measured_depths
 from dvo.graph.recordings import count_earlier, increasing_times
-from dvo.odometry.depth_factor import MOST, depth_factors, far_scale, measured_share, to_measured
+from dvo.odometry.depth_factor import MOST, far_scale, measured_share, to_measured
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.settings import check_settings
 
@@ -76,6 +78,9 @@ class AdjustmentOptions:
         check_settings(self, _RANGES)
         if not self.kernels:
             raise DvoError("no kernel", field="kernels", remedy="give one or more; Kernel() has no influence")
+
+
+_RESTART_ITERATIONS = 20  # of the first frames from each start, at most
 
 
 @dataclass(frozen=True)
@@ -153,7 +158,7 @@ def adjust_segment(
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
         whole = start == held and not (map_size or later)
         part = graph.problem(True, segment, 0 if whole else int(identifiers[start]), int(identifiers[end - 1]))
-        rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))
+        rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
         fixed, new = rows < start, rows >= solved
         now[solved:end] = change(old[solved:end])
         depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1).clone()
@@ -161,7 +166,7 @@ def adjust_segment(
         poses, found = now[rows], depths
         if first:
             poses, found, _ = solve_part(part, poses, found, fixed, replace(options, kernels=first))
-        if start == 1 and not map_size and measured_share(part.measured) < MOST:
+        if start == 1 and not map_size and measured_share(measured_depths(part)) < MOST:
             poses, found = _leave_minimum(part, poses, found, fixed, options)
         for _ in range(options.shutter_rounds if rolling is not None else 0):
             assert rolling is not None
@@ -178,9 +183,9 @@ def adjust_segment(
 
 
 def _leave_minimum(
-    part: GraphProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
+    part: PatchProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
 ) -> tuple[Tensor, Tensor]:
-    """Start the first block anew if that is better for its first frames; see :mod:`dvo.ba.restart`.
+    """Start the first block anew if that is better for its first frames; see :mod:`dvo.ba.multistart`.
 
     Args:
         part, poses_cw, depths, fixed: block with its solution.
@@ -189,36 +194,34 @@ def _leave_minimum(
     Returns:
         Poses ``(N, 7)`` and inverse depths ``(N, M)`` of the better solution.
     """
-    early = (part.ii < options.restart_frames) & (part.jj < options.restart_frames)
-    early &= part.kk % 2 == 0  # half of the patches tell two solutions apart as well
-    if not early.any():
-        return poses_cw, depths
     n, m = min(options.restart_frames, len(depths)), depths.shape[1]
-    patches = torch.cat([part.patches[:, :2], depths.reshape(-1, 1, 1, 1)], 1)
-    measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
-    settings = RestartOptions(options.kernels[0], options.kernels[-1], options.max_residual, resection=8, iterations=20)
-    targets, weights, ii, jj, kk = (x[early] for x in measured[1:])
-    some = (part.intrinsics[:n], targets, weights, ii, jj, kk)
-    better = better_start(poses_cw[:n], patches[: n * m], some, fixed[:n], settings)
-    if better is None:
+    whole = part.with_values(poses_cw=poses_cw, inverse_depths=depths.flatten())
+    first = torch.arange(len(poses_cw)) < n
+    # Half of the patches tell two solutions apart as well, and measured depths have no part in it.
+    early = whole.with_values(factors=()).edges(part.kk % 2 == 0).select(first)
+    if not len(early.kk):
         return poses_cw, depths
+    solver = LMOptions(max_iterations=_RESTART_ITERATIONS, tolerance=options.tolerance)
+    settings = GlobalBAOptions(fixed[:n], options.kernels[-1], options.max_residual, solver=solver)
+    better = preferred(multistart(early, RESTARTS, settings))
+    if better.start == PRESENT:
+        return poses_cw, depths
+
+    def extended(problem: PatchProblem, _: GlobalBAOptions) -> PatchProblem:
+        solved = better.problem.inverse_depths.view(n, m)[:, ::2]
+        poses, found = _extended(poses_cw, depths, better.problem.poses_cw, solved)
+        return problem.with_values(poses_cw=poses, inverse_depths=found.flatten())
+
+    def restarted(problem: PatchProblem, settings: GlobalBAOptions) -> PatchProblem:
+        images = problem.with_values(factors=())  # measured depths hold a solution at the scale of the old one
+        (found,) = multistart(images, {better.start: DEPTH_STARTS[better.start]}, settings)
+        scaled = to_measured(found.problem.poses_cw, found.problem.inverse_depths, measured_depths(problem))
+        return problem.with_values(poses_cw=scaled[0], inverse_depths=scaled[1])
+
     # The whole may be in another minimum than its beginning: both the better beginning, extended, and the better start.
-    known = replace(options, kernels=options.kernels[-1:])
-    poses_cw, depths, cost = solve_part(part, poses_cw, depths, fixed, known)
-    start = _extended(poses_cw, depths, better.poses_cw, better.patches[:, 2, 0, 0].reshape(n, m)[:, ::2])
-    settings = replace(settings, iterations=3 * options.iterations)
-    poses, new_patches, new = restart(poses_cw, patches, measured, fixed, better.start, settings)
-    found = new_patches[:, 2, 0, 0].reshape_as(depths)
-    if measured_share(part.measured) > 0:  # a cost without those of measured depths cannot be compared
-        poses, found = to_measured(poses, found, part.measured)
-        poses, found, new = solve_part(part, poses, found, fixed, known)
-    ways = [
-        (poses_cw, depths, cost),
-        (poses, found, new),
-        solve_part(part, *start, fixed, replace(options, iterations=3 * options.iterations)),
-    ]
-    poses_cw, depths, _ = min(ways, key=lambda way: way[2])
-    return poses_cw, depths
+    settings = replace(settings, fixed=fixed, solver=replace(solver, max_iterations=3 * options.iterations))
+    found = multistart(whole, {PRESENT: present, "extended": extended, better.start: restarted}, settings)[0].problem
+    return found.poses_cw, found.inverse_depths.reshape_as(depths)
 
 
 def _extended(poses_cw: Tensor, depths: Tensor, first_cw: Tensor, solved: Tensor) -> tuple[Tensor, Tensor]:
@@ -244,7 +247,7 @@ def _extended(poses_cw: Tensor, depths: Tensor, first_cw: Tensor, solved: Tensor
 
 
 def solve_part(
-    part: GraphProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
+    part: PatchProblem, poses_cw: Tensor, depths: Tensor, fixed: Tensor, options: AdjustmentOptions
 ) -> tuple[Tensor, Tensor, float]:
     """Solve for poses and inverse depths of a part of a segment.
 
@@ -261,11 +264,9 @@ def solve_part(
     cost = 0.0
     if not len(part.kk) or fixed.all():
         return poses_cw, depths, cost
-    patches = torch.cat([part.patches[:, :2], depths.reshape(-1, 1, 1, 1)], 1)
-    measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
+    part = part.with_values(poses_cw=poses_cw, inverse_depths=depths.flatten())
     solver = LMOptions(max_iterations=options.iterations, tolerance=options.tolerance)
     for kernel in options.kernels:
-        settings = GlobalBAOptions(fixed=fixed, kernel=kernel, max_residual=options.max_residual, solver=solver)
-        found = global_bundle_adjust(poses_cw, patches, *measured, settings, depth_factors(part.measured))
-        poses_cw, patches, cost = se3.normalise(found.poses_cw), found.patches, found.cost
-    return poses_cw, patches[:, 2, 0, 0].reshape_as(depths), cost
+        found = solve(part, GlobalBAOptions(fixed, kernel, options.max_residual, solver=solver))
+        part, cost = part.with_values(poses_cw=se3.normalise(found.poses_cw), patches=found.patches), found.cost
+    return part.poses_cw, part.inverse_depths.reshape_as(depths), cost

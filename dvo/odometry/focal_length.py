@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.graph.problem import GraphProblem
 from dvo.odometry.final_adjustment import AdjustmentOptions, solve_part
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.self_calibration import Minimum, profile_minimum
@@ -104,7 +104,7 @@ def find_focal(
 class _Solver:
     """Cost of the best poses and depths for an intrinsic matrix; begins from those of the nearest one."""
 
-    def __init__(self, part: GraphProblem, times: Tensor, shutter: Shutter, options: AdjustmentOptions) -> None:
+    def __init__(self, part: PatchProblem, times: Tensor, shutter: Shutter, options: AdjustmentOptions) -> None:
         self.part, self.times, self.shutter, self.options = part, times, shutter, options
         self.index = torch.arange(len(part.poses_cw))
         depths = part.patches[:, 2, 0, 0].reshape(len(part.poses_cw), -1)
@@ -114,7 +114,7 @@ class _Solver:
         focal, centre = self.part.intrinsics.split(2, 1)
         wanted = log_factor, right, down
         moved = centre + focal * torch.tensor([[right, down]], dtype=focal.dtype)
-        part = replace(self.part, intrinsics=torch.cat([focal * float(np.exp(log_factor)), moved], 1))
+        part = self.part.with_values(intrinsics=torch.cat([focal * float(np.exp(log_factor)), moved], 1))
         nearest = min(self.known, key=lambda known: (math.dist(known, wanted), known))
         poses, depths = self.known[nearest]
         cost, fixed = 0.0, self.index < 1

@@ -21,15 +21,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
-from dvo.ba.levenberg import LMOptions
+from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3, sim3
 from dvo.graph.correction import apply_similarities, move_window
 from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.graph.problem import GraphProblem
 from dvo.graph.recordings import increasing_times
 from dvo.graph.snapshot import Snapshot
-from dvo.odometry.depth_factor import depth_factors
 from dvo.odometry.final_adjustment import AdjustmentOptions, adjust_segment
 from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
@@ -151,7 +148,7 @@ class Adjustment:
             first = max(first, int((later > self.edges).sum()))
         return int(identifiers[min(first, len(identifiers) - 1)]) if first else 0
 
-    def _cost(self, graph: KeyframeGraph, since: int) -> tuple[GraphProblem, float]:
+    def _cost(self, graph: KeyframeGraph, since: int) -> tuple[PatchProblem, float]:
         """Measurements that are solved for, and their cost under the poses and depths of a graph."""
         part = graph.problem(True, self.world, since)
         if not len(part.kk):
@@ -161,15 +158,11 @@ class Adjustment:
             frames = graph.members(self.world)
             identifiers = np.array([frame.identifier for frame in frames])
             track = PoseTrack.through(increasing_times(graph, frames), graph.poses_cw(identifiers))
-            rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))
+            rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
             depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1)
             seen = as_global_shutter(part, part.poses_cw, depths, rows, track, self.shutter)
-        settings = GlobalBAOptions(
-            kernel=self.options.kernels[-1], max_residual=self.options.max_residual, solver=LMOptions(max_iterations=0)
-        )
-        measured = (seen.intrinsics, seen.targets, seen.weights, seen.ii, seen.jj, seen.kk)
-        found = global_bundle_adjust(seen.poses_cw, seen.patches, *measured, settings, depth_factors(seen.measured))
-        return part, found.cost
+        mean = seen.robust_cost(self.options.kernels[-1], self.options.max_residual)
+        return part, float(mean * seen.weights.sum())
 
 
 def _nothing(started: float) -> Adjusted:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.ba.cold_start import robust_cost
+from dvo.ba.global_adjust import GlobalBAOptions
 from dvo.ba.kernels import Kernel
-from dvo.ba.layer import bundle_adjust
-from dvo.ba.options import BAOptions
-from dvo.geometry import se3
+from dvo.ba.levenberg import LMOptions
+from dvo.ba.multistart import PRESENT, Start, multistart, preferred
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.solve import solve
 from dvo.geometry.projection import reproject
 from dvo.graph.window import Window
 from dvo.models.step import recent_depth
@@ -24,6 +27,7 @@ AGREEMENT = 2.0
 
 _DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a new frame
 _WIDTHS = (8.0, 4.0, 2.0)  # of the kernels, feature pixels: wide ones first, since the pose may be far off
+_ITERATIONS = 4  # with each of them
 _LEAST = 8  # matches that must agree with a pose; six unknowns leave two of them to contradict it
 _SHARE = 1 / 3  # and their share of all
 _ACCURACY = 1.0  # of a match, feature pixels; a prediction that is as close is as good
@@ -97,31 +101,39 @@ def pose_from_nearest(window: Window, seen: Observation, predicted: Tensor) -> T
         predicted: ``(7,)`` pose ``T_cw`` of the motion model.
 
     Returns:
-        ``(7,)`` ``T_cw`` of the lowest robust cost; the prediction if that is as close to the matches as they are
+        ``(7,)`` ``T_cw`` of the preferred solution; the prediction if that is as close to the matches as they are
         accurate, or if too few matches agree with the other.
     """
     nearest, m = len(window) - 1, window.per_frame
     found = best_matches(window.frames[nearest].matching, seen.maps[0, 0])
-    patches = window.patches[None, nearest * m :]
-    intrinsics = torch.stack([window.frames[nearest].intrinsics, seen.intrinsics])[None]
-    targets, weights = found[None], torch.ones_like(found)[None]
+    intrinsics = torch.stack([window.frames[nearest].intrinsics, seen.intrinsics])
     kk = torch.arange(m, device=found.device)
     edges = torch.zeros_like(kk), torch.ones_like(kk), kk
-    starts = [torch.stack([window.poses_cw[nearest], pose])[None] for pose in (predicted, window.poses_cw[nearest])]
-    if float(_distance(starts[0], patches, intrinsics, edges, found).median()) <= _ACCURACY:
+    poses = torch.stack([window.poses_cw[nearest], predicted])
+    problem = PatchProblem(poses, window.patches[nearest * m :], intrinsics, found, torch.ones_like(found), *edges)
+    if float(_distance(problem).median()) <= _ACCURACY:
         return predicted
-    poses, costs = [], []
-    for pair in starts:
-        for width in _WIDTHS:
-            options = BAOptions(
-                fixed=1, iterations=4, motion_only=True, bounds=seen.bounds, kernel=Kernel("cauchy", width), check=False
-            )
-            pair = bundle_adjust(pair, patches, intrinsics, targets, weights, *edges, options).poses_cw
-        poses.append(pair)
-        costs.append(float(robust_cost(pair, patches, intrinsics, targets, weights, *edges)))
-    best = poses[costs.index(min(costs))]
-    agree = int((_distance(best, patches, intrinsics, edges, found) < AGREEMENT).sum())
-    return se3.normalise(best[0, 1]) if agree >= max(_LEAST, _SHARE * m) else predicted
+    options = GlobalBAOptions(
+        kernel=Kernel("cauchy", _WIDTHS[-1]), move_depths=False, solver=LMOptions(max_iterations=_ITERATIONS)
+    )
+    starts = {PRESENT: _at(poses[1]), "nearest": _at(poses[0])}
+    best = preferred(multistart(problem, starts, options, abandon=float("inf"))).problem
+    agree = int((_distance(best) < AGREEMENT).sum())
+    return best.poses_cw[1].to(predicted) if agree >= max(_LEAST, _SHARE * m) else predicted
+
+
+def _at(pose_cw: Tensor) -> Start:
+    """Start from a pose of the frame, which wide kernels bring near the matches."""
+
+    def start(problem: PatchProblem, options: GlobalBAOptions) -> PatchProblem:
+        first = problem.poses_cw[0]
+        problem = problem.with_values(poses_cw=torch.stack([first, pose_cw.to(first)]))
+        for width in _WIDTHS[:-1]:
+            found = solve(problem, replace(options, kernel=Kernel("cauchy", width)))
+            problem = problem.with_values(poses_cw=found.poses_cw)
+        return problem
+
+    return start
 
 
 def best_matches(features: Float[Tensor, "M C p p"], maps: Float[Tensor, "C h w"]) -> Float[Tensor, "M 2"]:
@@ -149,10 +161,9 @@ def best_matches(features: Float[Tensor, "M C p p"], maps: Float[Tensor, "C h w"
     return torch.stack(found, -1).to(maps.dtype)
 
 
-def _distance(
-    poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, edges: tuple[Tensor, Tensor, Tensor], found: Tensor
-) -> Tensor:
+def _distance(problem: PatchProblem) -> Tensor:
     """Distance of the reprojections from the matches, ``(M,)`` feature pixels."""
-    coords = reproject(poses_cw, patches, intrinsics, *edges).coords
+    p = problem.batched()
+    coords = reproject(p.poses_cw, p.patches, p.intrinsics, p.ii, p.jj, p.kk).coords
     centre = coords.shape[2] // 2
-    return (coords[0, :, centre, centre] - found).norm(dim=-1)
+    return (coords[0, :, centre, centre] - problem.targets).norm(dim=-1)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import torch
-
-from dvo.ba.cold_start import damping_at, robust_cost, solve_from_nothing
-from dvo.ba.restart import better_solution, solutions
-from dvo.geometry import se3
+from dvo.ba.cold_start import damping_at
+from dvo.ba.multistart import COLD_STARTS, PRESENT, RESTARTS, Solution, multistart, preferred, present
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
@@ -17,7 +14,7 @@ from dvo.odometry.motion import parallax
 from dvo.odometry.uncertainty import has_second_solution
 from dvo.odometry.window_step import WindowStep
 
-RESTARTS = frozenset({4, 8, 16, 32})
+RESTART_AGES = frozenset({4, 8, 16, 32})
 """Numbers of frames after the initialisation at which its solution is compared with others."""
 AGAIN = 8
 """Frames from one comparison to the next as long as another solution is nearly as good."""
@@ -72,7 +69,7 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
     """Optimise the first window.
 
     After half of the updates the window is also solved from identity poses with the current flow, and the better of the
-    two solutions is kept (:func:`dvo.ba.cold_start.solve_from_nothing`). With measured depths of most patches there is
+    solutions is kept (:data:`dvo.ba.multistart.COLD_STARTS`). With measured depths of most patches there is
     no other solution to look for, and no parallax is needed.
 
     Args:
@@ -99,14 +96,18 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
 
 
 def _solve_again(window: Window, step: WindowStep) -> None:
-    """Replace poses and depths by a solution from identity poses, if its cost for the current flow is lower."""
+    """Replace poses and depths by a solution from one pose for all frames, if it suits the current flow better."""
     revision = step.revise()
-    measured = (revision.targets, revision.weights, window.ii, window.jj, window.kk)
-    intrinsics = window.intrinsics[None]
-    poses, patches, cost = solve_from_nothing(window.patches[None], intrinsics, *measured, bounds=step.bounds)
-    if cost < robust_cost(window.poses_cw[None], window.patches[None], intrinsics, *measured):
-        window.poses_cw = se3.normalise(se3.compose(poses[0], window.poses_cw[0]))
-        window.patches = patches[0]
+    problem = window.problem().with_values(targets=revision.targets[0], weights=revision.weights[0])
+    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}))
+    if best.start != PRESENT:
+        _take(window, best)
+
+
+def _take(window: Window, solution: Solution) -> None:
+    """Give a window the poses and depths of a solution."""
+    problem = solution.problem
+    window.poses_cw, window.patches = problem.poses_cw.to(window.poses_cw), problem.patches.to(window.patches)
 
 
 def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> bool:
@@ -197,13 +198,13 @@ def restart_due(age: int, ambiguous: bool) -> bool:
         ambiguous: another solution was nearly as good the last time.
 
     Returns:
-        True at :data:`RESTARTS`, and each :data:`AGAIN` frames as long as the window is ambiguous.
+        True at :data:`RESTART_AGES`, and each :data:`AGAIN` frames as long as the window is ambiguous.
     """
-    return age in RESTARTS or (ambiguous and age % AGAIN == 0)
+    return age in RESTART_AGES or (ambiguous and age % AGAIN == 0)
 
 
 def leave_minimum(step: WindowStep, config: TrackerConfig) -> bool:
-    """Start the window anew if that leads to a better solution (:mod:`dvo.ba.restart`).
+    """Start the window anew if that leads to a better solution (:mod:`dvo.ba.multistart`).
 
     Args:
         step: of the model on the window of an initialised tracker; its poses and inverse depths are changed in place.
@@ -215,15 +216,9 @@ def leave_minimum(step: WindowStep, config: TrackerConfig) -> bool:
     window = step.window
     if measured_share(window.measured) >= MOST:
         return False
-    measured = (window.intrinsics, window.targets, window.weights)
-    # On the CPU in double precision, which not every accelerator has; the problem is small.
-    real = (x.cpu().double() for x in (window.poses_cw, window.patches, *measured))
-    poses, patches, intrinsics, targets, weights = real
-    edges = (window.ii.cpu(), window.jj.cpu(), window.kk.cpu())
-    found = solutions(poses, patches, (intrinsics, targets, weights, *edges), torch.arange(len(window)) < 1)
-    best = better_solution(found)
-    if best is not None:
-        window.poses_cw, window.patches = best.poses_cw.to(window.poses_cw), best.patches.to(window.patches)
+    found = multistart(window.problem(), RESTARTS)
+    best = preferred(found)
+    if best.start != PRESENT:
+        _take(window, best)
         match_window(window)
-        found = [best, *(other for other in found if other is not best)]
-    return has_second_solution(step, config, found)
+    return has_second_solution(step, config, [best, *(other for other in found if other is not best)])

@@ -20,10 +20,10 @@ import torch
 
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
+from dvo.graph.measured_depths import SIGMA
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.alignment import AlignmentOptions
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.front_end import Observation
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.stereo_depth import measure_stereo

@@ -8,13 +8,13 @@ Adjustment", CVPR 2012, used to correct the measurements instead of extending th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
-from dvo.graph.problem import GraphProblem
 
 _STENCIL = 5  # poses that a polynomial goes through
 _NEAREST = 0.05  # least depth of a point in front of a camera, in the unit of the poses
@@ -98,8 +98,8 @@ class PoseTrack:
 
 
 def as_global_shutter(
-    part: GraphProblem, poses_cw: Tensor, depths: Tensor, frames: Tensor, track: PoseTrack, shutter: Shutter
-) -> GraphProblem:
+    part: PatchProblem, poses_cw: Tensor, depths: Tensor, frames: Tensor, track: PoseTrack, shutter: Shutter
+) -> PatchProblem:
     """Correct patch centres and measurements for the motion during the readout.
 
     Args:
@@ -130,4 +130,4 @@ def as_global_shutter(
     seen = se3.act(se3.relative(poses_cw[ii], poses_cw[jj]), rays * depth[kk, None])
     targets, _ = undo(part.targets, seen[:, 2].clamp(min=_NEAREST), jj)
     patches = torch.cat([xy[:, :, None, None], part.patches[:, 2:]], 1)
-    return replace(part, patches=patches, targets=targets)
+    return part.with_values(patches=patches, targets=targets)

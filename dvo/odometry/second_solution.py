@@ -1,4 +1,4 @@
-"""Second solutions of a window: other motions that its measurements bear out nearly as well (:mod:`dvo.ba.restart`).
+"""Second solutions of a window: other motions that its measurements bear out nearly as well (:mod:`dvo.ba.multistart`).
 
 The curvature of the cost at one minimum says nothing of another one. While the motion is small, or the scene has little
 texture, a window may have two of similar cost, and the tracker may be at the wrong one. Each solution then has a
@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from dvo.ba.restart import Solution, solutions
+from dvo.ba.multistart import PRESENT, RESTARTS, Solution, multistart
+from dvo.ba.patch_problem import PatchProblem
 from dvo.odometry.displacement import TOLERANCE
 from dvo.odometry.window_gauge import Gauge, relative_error
 from dvo.odometry.window_measurements import WindowMeasurements
@@ -45,20 +46,18 @@ class SecondSolution:
 
 
 def window_solutions(window: WindowMeasurements) -> list[Solution]:
-    """Solutions of a window from all starts (:func:`dvo.ba.restart.solutions`), the present one first.
+    """Solutions of a window from all starts (:data:`dvo.ba.multistart.RESTARTS`), the present one first.
 
     Args:
         window: its measurements. Those of depths do not take part.
 
     Returns:
-        The solutions, on the CPU in double precision, which not every accelerator has; the problem is small. Their
-        patches are the centres alone.
+        The solutions. Their patches are the centres alone.
     """
-    real = window.poses_cw, window.centres, torch.stack(window.camera), window.targets, window.confidence
-    poses, centres, camera, targets, confidence = (x.cpu().double() for x in real)
-    jj, kk = window.jj.cpu(), window.kk.cpu()
-    measured = camera, targets, confidence, kk // window.per_frame, jj, kk
-    return solutions(poses, centres[..., None, None], measured, torch.arange(len(poses)) < 1)
+    centres, camera = window.centres[..., None, None], torch.stack(window.camera)
+    ii = window.kk // window.per_frame
+    given = window.poses_cw, centres, camera, window.targets, window.confidence, ii, window.jj, window.kk
+    return sorted(multistart(PatchProblem(*given), RESTARTS), key=lambda solution: solution.start != PRESENT)
 
 
 def second_solutions(
@@ -87,7 +86,7 @@ def second_solutions(
     different: list[tuple[float, np.ndarray, Solution]] = []
     others = (other for other in solved[1:] if math.isfinite(other.cost))
     for other in sorted(others, key=lambda other: other.cost):
-        error = relative_error(now.poses_cw, other.poses_cw, gauge)
+        error = relative_error(now.problem.poses_cw, other.problem.poses_cw, gauge)
         if np.isfinite(error).all() and all(map(differs, [error, *(error - known for _, known, _ in different)])):
             different.append((_likelihood(other.cost, now.cost), error, other))
     total = 1 + sum(weight for weight, _, _ in different)

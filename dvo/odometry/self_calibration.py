@@ -106,7 +106,7 @@ def find_readout(
     first = earlier + _busiest(now[earlier:], float(np.median(own)))
     last = min(first + _FRAMES, len(frames)) - 1
     part = graph.problem(True, segment, int(identifiers[first]) if first else 0, int(identifiers[last]))
-    index = torch.from_numpy(np.searchsorted(identifiers, part.identifiers))
+    index = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
     fixed = index <= first
     depths = part.patches[:, 2, 0, 0].reshape(len(index), -1)
     settings = replace(options, kernels=options.kernels[-1:], iterations=_ITERATIONS)

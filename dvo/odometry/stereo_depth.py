@@ -23,12 +23,12 @@ from dvo.ba.cold_start import COLD_UPDATES, damping_at
 from dvo.data.frame import Frame
 from dvo.geometry import se3
 from dvo.geometry.projection import Reprojection, reproject
+from dvo.graph.measured_depths import SIGMA
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
 from dvo.nets.patchifier import Features, patch_coordinates
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.front_end import Observation, encode_image
 from dvo.odometry.right_view import RightView, right_view
 from dvo.odometry.window_alignment import WindowAlignment

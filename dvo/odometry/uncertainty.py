@@ -28,11 +28,11 @@ from torch import Tensor
 from dvo.ba.blocks import INVERSE_DEPTHS
 from dvo.ba.covariance import marginal_covariance, size_gradient
 from dvo.ba.linearisation import NormalEquations
+from dvo.ba.multistart import Solution
 from dvo.ba.options import BADamping, BAOptions
-from dvo.ba.restart import Solution
 from dvo.ba.window_equations import window_equations
+from dvo.graph.measured_depths import depth_factors
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.depth_factor import depth_factors
 from dvo.odometry.displacement import confidence_of, window_metric
 from dvo.odometry.second_solution import second_solutions, window_solutions
 from dvo.odometry.window_gauge import Gauge, window_gauge
@@ -156,7 +156,7 @@ def _uncertainty(window: WindowMeasurements, config: TrackerConfig, ambiguous: b
     share = 1 - sum(other.probability for other in others)
     mixture = share * covariance
     for other in others:
-        own = _covariance(window.at(other.solution.poses_cw, other.solution.patches), gauge, config)
+        own = _covariance(window.at(other.solution.problem), gauge, config)
         own = covariance if own is None else own
         mixture = mixture + other.probability * (own + np.outer(other.error, other.error))
     return Uncertainty(mixture, reference, share * confidence)

@@ -11,6 +11,7 @@ from weakref import ref
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
+from dvo.ba.patch_problem import PatchProblem
 from dvo.graph.window import Window
 from dvo.odometry.window_step import WindowStep
 
@@ -64,17 +65,18 @@ class WindowMeasurements:
             tuple(frame.timestamp for frame in w.frames), step.bounds, step.kernel,
         )  # fmt: skip
 
-    def at(self, poses_cw: Tensor, patches: Tensor) -> WindowMeasurements:
+    def at(self, problem: PatchProblem) -> WindowMeasurements:
         """Same measurements at another solution.
 
         Args:
-            poses_cw: ``(n, 7)``.
-            patches: ``(n * M, 3, 1, 1)`` patch centres.
+            problem: of the patch centres, at the solution.
 
         Returns:
             The measurements with these poses and centres.
         """
-        return replace(self, poses_cw=poses_cw.to(self.poses_cw), centres=patches[..., 0, 0].to(self.centres))
+        return replace(
+            self, poses_cw=problem.poses_cw.to(self.poses_cw), centres=problem.patches[..., 0, 0].to(self.centres)
+        )
 
 
 class Later(Generic[T]):

@@ -9,9 +9,9 @@ import numpy as np
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
+from dvo.graph.measured_depths import depth_factors
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepModel, StepOptions, UpdateState, revise, step
-from dvo.odometry.depth_factor import depth_factors
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 

@@ -13,7 +13,7 @@ poses whose displacement is below the tolerance that it is the probability of.
 
 The split ``validation`` is that of the suites. ``calibration`` has the same options and other scenes;
 ``TrackerConfig.covariance_scale`` is fitted on it: the present one times the geometric mean, over the sequences, of
-``robust``, their median over that of a chi-square, which poses in a second solution (:mod:`dvo.ba.restart`) do not
+``robust``, their median over that of a chi-square, which poses in a second solution (:mod:`dvo.ba.multistart`) do not
 move.
 
 With ``--scale depth`` or ``stereo`` the tracker has the depth images or the right images of the renderings, and is in

@@ -1,17 +1,24 @@
 """Another start of the dense window: a plane seen by two motions, kept solutions, windows with nothing to compare."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from dvo.ba.dense import dense_patches
+from dvo.ba.global_adjust import GlobalBAOptions
+from dvo.ba.levenberg import LMOptions
+from dvo.ba.patch_problem import KERNEL, MAX_RESIDUAL
+from dvo.ba.solve import solve
 from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
-from dvo.odometry.dense_restart import DenseRestartOptions, _Kept, _other_poses, _Problem, better_solution
+from dvo.odometry.dense_restart import _Kept, _other_poses, better_solution, take, window_problem
 from dvo.odometry.dense_window import DenseWindow, FrameEdge, Keyframe
 from dvo.odometry.frame_edges import neighbours_of
 
 H, W = 24, 32
+EXACT = GlobalBAOptions(kernel=KERNEL, max_residual=MAX_RESIDUAL, solver=LMOptions(60, 1e-3))
 CAMERA = torch.tensor([26.0, 26.0, 15.5, 11.5])
 
 
@@ -78,9 +85,12 @@ def wrong_window(truth):
     window = window_at(*truth)
     measure(window, *truth)
     other = _other_poses(window)
-    problem = _Problem(window, DenseRestartOptions(iterations=60))
-    depths = problem.solve(other, torch.ones_like(problem.depths()), move_poses=False).patches[:, 2, 0, 0]
-    problem.take(problem.solve(other, depths))
+    problem = window_problem(window)
+    problem = problem.with_values(poses_cw=other, inverse_depths=torch.ones_like(problem.inverse_depths))
+    for move_poses in (False, True):
+        found = solve(problem, replace(EXACT, move_poses=move_poses))
+        problem = problem.with_values(poses_cw=found.poses_cw, patches=found.patches)
+    take(window, problem)
     return window
 
 
@@ -95,10 +105,11 @@ def test_the_wrong_motion_of_a_plane_is_left(truth):
         taken.append([(edge.positions, edge.age, edge.hidden is edge.source.hidden) for edge in window.edges])
         measure(window, *truth)
 
-    assert better_solution(window, again, DenseRestartOptions(iterations=60, promising=1e6))
+    assert better_solution(window, again, abandon=1e6)
     assert taken == [[(None, 0, True)] * len(window.edges)]  # the network measures anew
-    problem = _Problem(window, DenseRestartOptions(iterations=60))
-    problem.take(problem.solve(problem.poses(), problem.depths()))
+    problem = window_problem(window)
+    found = solve(problem, EXACT)
+    take(window, problem.with_values(poses_cw=found.poses_cw, patches=found.patches))
     assert turns(window, truth[0]).max() < 0.2
 
 
@@ -109,7 +120,7 @@ def test_the_right_solution_stays_as_it_was(truth):
     edges = [(e.positions, e.confidence, e.hidden, e.age) for e in window.edges]
     calls = []
     assert not better_solution(
-        window, lambda: (calls.append(1), measure(window, *truth)), DenseRestartOptions(promising=float("inf"))
+        window, lambda: (calls.append(1), measure(window, *truth)), float("inf")
     )
     assert calls == [1]  # the other one was tried
     for frame, kept in zip(window.keyframes, frames, strict=True):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import dvo
-from dvo.ba.restart import restart
+from dvo.ba.multistart import multistart, reversed_relief
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.archive import ArchiveConfig
@@ -53,8 +53,8 @@ def test_a_reversed_relief_is_left():
     for restart_frames, exact in ((0, False), (60, True), (3, True)):
         graph, truth = archived_walk(frames=6, interval=0.03)
         part = graph.problem(True, 0)
-        measured = (part.intrinsics, part.targets, part.weights, part.ii, part.jj, part.kk)
-        poses, patches, _ = restart(part.poses_cw, part.patches, measured, torch.arange(6) < 1, "reversed")
+        (wrong,) = multistart(part, {"reversed": reversed_relief})
+        poses, patches = wrong.problem.poses_cw, wrong.problem.patches
         for i in range(6):
             graph.correct(i, poses[i].numpy(), patches[8 * i : 8 * i + 8, 2, 0, 0].numpy())
         adjust_segment(graph, 0, AdjustmentOptions(restart_frames=restart_frames, iterations=30))

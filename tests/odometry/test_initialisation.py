@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import torch
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.restart import restart
+from dvo.ba.multistart import multistart, reversed_relief
 from dvo.geometry import se3
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import MOST, measured_share
 from dvo.odometry.final_adjustment import AdjustmentOptions
-from dvo.odometry.initialisation import RESTARTS, leave_minimum, restart_due
+from dvo.odometry.initialisation import RESTART_AGES, leave_minimum, restart_due
 from tests.support.archived_walk import archived_walk, pose_at
 
 CONFIG = TrackerConfig(sigma=0.2, covariance_scale=1.0)  # of measurements whose weights are not those of a network
@@ -27,9 +27,8 @@ def _reversed_window(unit=0.0):
     window = graph.window
     true = pose_at(0.03 * torch.arange(6, dtype=torch.float64))
     window.poses_cw = true.float()
-    measured = (window.intrinsics, window.targets, window.weights, window.ii, window.jj, window.kk)
-    fixed = torch.arange(6) < 1
-    window.poses_cw, window.patches, _ = restart(window.poses_cw, window.patches, measured, fixed, "reversed")
+    (wrong,) = multistart(window.problem(), {"reversed": reversed_relief})
+    window.poses_cw, window.patches = wrong.problem.poses_cw.float(), wrong.problem.patches.float()
     return window, true.float()
 
 
@@ -56,7 +55,7 @@ def test_a_window_that_the_measurements_do_not_decide_is_ambiguous():
 
 
 def test_frames_at_which_a_second_solution_is_looked_for():
-    assert {age for age in range(1, 200) if restart_due(age, False)} == RESTARTS
+    assert {age for age in range(1, 200) if restart_due(age, False)} == RESTART_AGES
     assert {age for age in range(33, 200) if restart_due(age, True)} == set(range(40, 200, 8))
 
 

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.correction import rescale
+from dvo.graph.measured_depths import depth_factors
 from dvo.metrics import evaluate
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.depth_factor import depth_factors, measured_share, to_measured
+from dvo.odometry.depth_factor import measured_share, to_measured
 from dvo.odometry.final_adjustment import adjust_segment
 from dvo.odometry.ground_plane import ground_height, plane_below
 from dvo.odometry.metric_scale import scale_of_distances, settle_scale

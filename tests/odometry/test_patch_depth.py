@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.graph.measured_depths import SIGMA
 from dvo.nets.alignment import align_patches
-from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.patch_depth import checked_depth, followed_planes, variance_of_inverse
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.odometry.tracker import PatchOdometry

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.restart import Solution, restart
+from dvo.ba.multistart import PRESENT, Solution, multistart, reversed_relief
+from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
 from dvo.odometry import uncertainty
 from dvo.odometry.config import TrackerConfig
@@ -35,30 +36,32 @@ def line(*last):
 
 
 def solution(cost, *last, start="reversed"):
-    return Solution(start, line(*last), torch.zeros(0, 3, 1, 1), cost)
+    none, edges = torch.zeros(0, 2), torch.zeros(0, dtype=torch.long)
+    problem = PatchProblem(line(*last), torch.zeros(0, 3, 1, 1), torch.ones(4, 4), none, none, edges, edges, edges)
+    return Solution(start, problem, cost)
 
 
 def test_probabilities_follow_the_costs():
-    now = solution(1.0, 0, 0, 0, start="")
+    now = solution(1.0, 0, 0, 0, start=PRESENT)
     for cost in (0.5, 1.0, 1.3, 1.7):
         (other,) = second_solutions([now, solution(cost, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
         likelihood = cost ** (-INDEPENDENT / 2)
         assert other.probability == pytest.approx(likelihood / (1 + likelihood))
         truth = se3.exp(torch.from_numpy(other.error))  # T_wc_other = T_wc Exp(xi)
-        there = se3.compose(se3.inverse(now.poses_cw[3]), truth)
+        there = se3.compose(se3.inverse(now.problem.poses_cw[3]), truth)
         np.testing.assert_allclose(there, se3.inverse(line(0.1, 0, 0)[3]), atol=1e-12)
     assert second_solutions([now], GAUGE, COVARIANCE, METRIC) == []
     assert second_solutions([now, solution(2.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC) == []
     (sure,) = second_solutions([now, solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
     (unsure,) = second_solutions([solution(0.0, 0, 0, 0), solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)
     assert sure.probability == pytest.approx(1) and unsure.probability == 0.5
-    huge = solution(1e30, 0, 0, 0, start="")  # the ratio of the costs is not a number that can be stored
+    huge = solution(1e30, 0, 0, 0, start=PRESENT)  # the ratio of the costs is not a number that can be stored
     assert second_solutions([huge, solution(0.0, 0.1, 0, 0)], GAUGE, COVARIANCE, METRIC)[0].probability == 1
 
 
 def test_solutions_that_agree_are_one():
     near, far = 0.8 * TOLERANCE / 100, 4 * TOLERANCE / 100
-    now = solution(1.0, 0, 0, 0, start="")
+    now = solution(1.0, 0, 0, 0, start=PRESENT)
     assert second_solutions([now, solution(1.0, near, 0, 0)], GAUGE, COVARIANCE, METRIC) == []
     close = [now, solution(1.2, far + near, 0, 0), solution(1.1, far, 0, 0)]
     found = second_solutions(close, GAUGE, COVARIANCE, METRIC)
@@ -85,9 +88,8 @@ def ambiguous_step(seed=0):
     window.targets = window.targets + NOISE * torch.randn(window.targets.shape, generator=generator)
     window.confidence = window.weights
     truth = pose_at(0.02 * torch.arange(6, dtype=torch.float64))
-    measured = (window.intrinsics, window.targets, window.weights, window.ii, window.jj, window.kk)
-    fixed = torch.arange(6) < 1
-    window.poses_cw, window.patches, _ = restart(truth.float(), window.patches, measured, fixed, "reversed")
+    (wrong,) = multistart(window.problem().with_values(poses_cw=truth.float()), {"reversed": reversed_relief})
+    window.poses_cw, window.patches = wrong.problem.poses_cw.float(), wrong.problem.patches.float()
     return SimpleNamespace(window=window, bounds=SIZE, kernel=Kernel("cauchy", 0.3)), truth
 
 
@@ -96,11 +98,9 @@ def test_a_window_is_solved_as_its_problem_is():
     step, _ = ambiguous_step()
     w = step.window
     found = {solution.start: solution for solution in window_solutions(WindowMeasurements.of(step))}
-    measured = tuple(x.double() for x in (w.intrinsics, w.targets, w.weights)) + (w.ii, w.jj, w.kk)
-    fixed = torch.arange(len(w)) < 1
-    poses, _, cost = restart(w.poses_cw.double(), w.patches.double(), measured, fixed, "reversed")
-    assert found["reversed"].cost == pytest.approx(cost, rel=1e-2)
-    torch.testing.assert_close(found["reversed"].poses_cw, poses, atol=2e-3, rtol=0)
+    (whole,) = multistart(w.problem(), {"reversed": reversed_relief})
+    assert found["reversed"].cost == pytest.approx(whole.cost, rel=1e-2)
+    torch.testing.assert_close(found["reversed"].problem.poses_cw, whole.problem.poses_cw, atol=2e-3, rtol=0)
 
 
 def test_covariance_and_confidence_are_those_of_the_mixture():
@@ -114,8 +114,8 @@ def test_covariance_and_confidence_are_those_of_the_mixture():
     expected = share * plain.covariance
     for other in others:
         there = SimpleNamespace(**(vars(step) | {"window": replace(
-            step.window, poses_cw=other.solution.poses_cw.float(),
-            patches=other.solution.patches.float().expand_as(step.window.patches))}))  # fmt: skip
+            step.window, poses_cw=other.solution.problem.poses_cw.float(),
+            patches=other.solution.problem.patches.float().expand_as(step.window.patches))}))  # fmt: skip
         own = newest_uncertainty(there, TrackerConfig()).covariance
         expected = expected + other.probability * (own + np.outer(other.error, other.error))
     np.testing.assert_allclose(mixed.covariance, expected, rtol=1e-6)

@@ -13,9 +13,9 @@ from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import invert_poses
+from dvo.graph.measured_depths import SIGMA
 from dvo.metrics import evaluate
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.front_end import observe
 from dvo.odometry.patch_depth import followed_planes
 from dvo.odometry.right_view import right_view

@@ -16,10 +16,10 @@ from dvo.ba.layer import BAOptions, make_problem
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.reference import dense_rows
 from dvo.geometry import se3
+from dvo.graph.measured_depths import SIGMA, depth_factors
 from dvo.odometry import tracker as tracker_module
 from dvo.odometry import uncertainty, window_measurements
 from dvo.odometry.config import TrackerConfig
-from dvo.odometry.depth_factor import SIGMA, depth_factors
 from dvo.odometry.displacement import confidence_of, flow_metric
 from dvo.odometry.protocol import Estimate, Status
 from dvo.odometry.uncertainty import UNKNOWN, newest_uncertainty

@@ -5,8 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from dvo.ba.cold_start import damping_at, solve_from_nothing
+from dvo.ba.cold_start import damping_at
 from dvo.ba.layer import BAOptions, bundle_adjust
+from dvo.ba.multistart import COLD_STARTS, multistart
+from dvo.ba.patch_problem import PatchProblem
 from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
@@ -162,12 +164,10 @@ def test_the_better_of_two_beginnings_finds_the_rotation():
         truth = truth_of(rendered(index), 4)
         _, patches = patches_of(truth, torch.Generator().manual_seed(index))
         coords, valid = true_reprojection(truth, patches, graph, 8, 4.0)
-        h, w = truth.inverse_depth.shape[-2:]
         weights = valid[:, :, 1, 1, None].float().expand(-1, -1, 2)
-        poses, _, _ = solve_from_nothing(
-            patches, truth.intrinsics, coords[:, :, 1, 1], weights, graph.ii, graph.jj, graph.kk, bounds=(w, h)
-        )
-        error = pose_errors(poses, truth.poses_cw).rotation
+        given = se3.identity(8), patches[0], truth.intrinsics[0], coords[0, :, 1, 1], weights[0]
+        best = multistart(PatchProblem(*given, graph.ii, graph.jj, graph.kk), COLD_STARTS)[0]
+        error = pose_errors(best.problem.poses_cw[None].float(), truth.poses_cw).rotation
         good += bool(error < 0.02 * pose_errors(se3.identity(1, 8), truth.poses_cw).rotation)
     assert good >= 19
 

@@ -73,6 +73,11 @@ class PatchProblem:
         centre = self.patches.shape[-1] // 2
         return self.patches[..., :2, centre, centre]
 
+    @property
+    def per_frame(self) -> int:
+        """Patches of a frame, where each has as many."""
+        return self.patches.shape[-4] // self.poses_cw.shape[-2]
+
     def with_values(self, *, inverse_depths: Tensor | None = None, **values: Any) -> PatchProblem:
         """The same problem with other values.
 
@@ -125,8 +130,8 @@ class PatchProblem:
             DvoError: patches that are not as many for each frame, in the order of the frames; or further factors or
                 blocks, which are not known to belong to some frames.
         """
-        n, count = len(frames), self.patches.shape[-4]
-        if count % n or bool((self.kk // max(count // n, 1) != self.ii).any()):
+        count, each = self.patches.shape[-4], self.per_frame
+        if count != each * len(frames) or bool((self.kk // max(each, 1) != self.ii).any()):
             raise DvoError(
                 "patches are not in the order of their frames", field="patches", remedy="give each frame as many"
             )
@@ -135,7 +140,7 @@ class PatchProblem:
                 "cannot be divided among frames", field="factors", remedy="select frames before adding factors"
             )
         chosen = self.edges(frames[self.ii] & frames[self.jj])
-        rows, patches = frames.nonzero()[:, 0], frames.repeat_interleave(count // n)
+        rows, patches = frames.nonzero()[:, 0], frames.repeat_interleave(each)
         place, patch_place = frames.cumsum(0) - 1, patches.cumsum(0) - 1
         intrinsics = self.intrinsics if self.sensors is not None else self.intrinsics.index_select(-2, rows)
         return chosen.with_values(
@@ -183,7 +188,7 @@ class PatchProblem:
         return PatchProblem(
             real(self.poses_cw), real(self.patches), real(self.intrinsics), real(self.targets), real(self.weights),
             ii, jj, kk, sensors,
-            tuple(factor.with_tensors([real(x) for x in factor.tensors()]) for factor in self.factors),
+            tuple(factor.exact() for factor in self.factors),
             {name: block.with_value(real(block.value)) for name, block in self.blocks.items()},
             plan_edges(ii, jj, kk, self.poses_cw.shape[-2], self.patches.shape[-4]), self.identifiers,
         )  # fmt: skip

@@ -64,6 +64,13 @@ class Factor(ABC):
         """The same factor with other :meth:`tensors`."""
         return replace(self, **dict(zip(self._parameters(), tensors, strict=True)))  # type: ignore[type-var]
 
+    def exact(self) -> Factor:
+        """The same factor on the CPU, its parameters detached and in double precision."""
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        tensors = {name: x.detach().cpu() for name, x in tensors.items() if isinstance(x, Tensor)}
+        there: Factor = replace(self, **tensors)  # type: ignore[type-var]
+        return there.with_tensors([x.double() for x in there.tensors()])
+
     def _parameters(self) -> list[str]:
         values = ((f.name, getattr(self, f.name)) for f in fields(self))  # type: ignore[arg-type]
         return [name for name, value in values if isinstance(value, Tensor) and value.is_floating_point()]

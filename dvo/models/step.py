@@ -14,9 +14,10 @@ from typing import Literal, Protocol
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.ba.layer import bundle_adjust
 from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor
+from dvo.ba.solve import solve
 from dvo.geometry.projection import reproject
 from dvo.graph.edges import PatchGraph
 from dvo.nets.correlation import CorrelationLookup
@@ -224,15 +225,9 @@ def step(
     )  # fmt: skip
     if options.mode == "flow":
         return replace(state, coords=revision.coords + revision.delta[:, :, None, None])
-    solved = bundle_adjust(
-        state.poses_cw,
-        state.patches,
-        state.intrinsics,
-        measured.targets,
-        measured.weights,
-        graph.ii,
-        graph.jj,
-        graph.kk,
+    given = state.poses_cw, state.patches, state.intrinsics, measured.targets, measured.weights
+    solved = solve(
+        PatchProblem(*given, graph.ii, graph.jj, graph.kk, factors=options.factors),
         BAOptions(
             fixed=options.fixed,
             iterations=options.iterations,
@@ -242,7 +237,6 @@ def step(
             check=options.check,
             kernel=options.kernel,
         ),
-        factors=options.factors,
     )
     return replace(state, poses_cw=solved.poses_cw, patches=solved.patches)
 

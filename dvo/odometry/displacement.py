@@ -26,8 +26,9 @@ def window_metric(window: WindowMeasurements) -> np.ndarray:
     Returns:
         ``(6, 6)`` float64.
     """
-    depths = window.centres[-_DEPTH_FRAMES * window.per_frame :, 2]
-    return flow_metric(window.camera[-1].double().cpu().numpy(), window.bounds, float(depths.median()))
+    problem = window.problem
+    depths = problem.inverse_depths[-_DEPTH_FRAMES * problem.per_frame :]
+    return flow_metric(problem.intrinsics[-1].double().cpu().numpy(), window.bounds, float(depths.median()))
 
 
 def flow_metric(intrinsics: np.ndarray, size: tuple[int, int], inverse_depth: float) -> np.ndarray:

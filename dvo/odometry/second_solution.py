@@ -12,13 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from dvo.ba.multistart import PRESENT, RESTARTS, Solution, multistart
 from dvo.ba.patch_problem import PatchProblem
 from dvo.odometry.displacement import TOLERANCE
 from dvo.odometry.window_gauge import Gauge, relative_error
-from dvo.odometry.window_measurements import WindowMeasurements
 
 INDEPENDENT = 10.0
 """Number of independent residuals that the probability of a solution is computed for. A window has a thousand, but
@@ -45,19 +43,17 @@ class SecondSolution:
     solution: Solution
 
 
-def window_solutions(window: WindowMeasurements) -> list[Solution]:
+def window_solutions(problem: PatchProblem) -> list[Solution]:
     """Solutions of a window from all starts (:data:`dvo.ba.multistart.RESTARTS`), the present one first.
 
     Args:
-        window: its measurements. Those of depths do not take part.
+        problem: of the window. Measured depths do not take part.
 
     Returns:
-        The solutions. Their patches are the centres alone.
+        The solutions.
     """
-    centres, camera = window.centres[..., None, None], torch.stack(window.camera)
-    ii = window.kk // window.per_frame
-    given = window.poses_cw, centres, camera, window.targets, window.confidence, ii, window.jj, window.kk
-    return sorted(multistart(PatchProblem(*given), RESTARTS), key=lambda solution: solution.start != PRESENT)
+    found = multistart(problem.with_values(factors=()), RESTARTS)
+    return sorted(found, key=lambda solution: solution.start != PRESENT)
 
 
 def second_solutions(

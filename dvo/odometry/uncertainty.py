@@ -30,8 +30,8 @@ from dvo.ba.covariance import marginal_covariance, size_gradient
 from dvo.ba.linearisation import NormalEquations
 from dvo.ba.multistart import Solution
 from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.window_equations import window_equations
-from dvo.graph.measured_depths import depth_factors
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.displacement import confidence_of, window_metric
 from dvo.odometry.second_solution import second_solutions, window_solutions
@@ -132,7 +132,7 @@ def has_second_solution(step: WindowStep, config: TrackerConfig, solved: Sequenc
         True if covariance and confidence have to take another one into account.
     """
     window = WindowMeasurements.of(step)
-    gauge = window_gauge(window)
+    gauge = window_gauge(window.problem)
     if gauge is None or len(solved) < 2:
         return False
     covariance = _covariance(window, gauge, config)
@@ -141,7 +141,7 @@ def has_second_solution(step: WindowStep, config: TrackerConfig, solved: Sequenc
 
 @torch.no_grad()
 def _uncertainty(window: WindowMeasurements, config: TrackerConfig, ambiguous: bool) -> Uncertainty:
-    gauge = window_gauge(window)
+    gauge = window_gauge(window.problem)
     if gauge is None:
         return UNKNOWN
     reference = window.timestamps[gauge.reference]
@@ -150,7 +150,7 @@ def _uncertainty(window: WindowMeasurements, config: TrackerConfig, ambiguous: b
         return Uncertainty(None, reference)
     metric = window_metric(window)
     confidence = confidence_of(covariance, metric)
-    others = second_solutions(window_solutions(window), gauge, covariance, metric) if ambiguous else []
+    others = second_solutions(window_solutions(window.problem), gauge, covariance, metric) if ambiguous else []
     if not others:
         return Uncertainty(covariance, reference, confidence)
     share = 1 - sum(other.probability for other in others)
@@ -174,20 +174,17 @@ def _marginal(w: WindowMeasurements, gauge: Gauge) -> np.ndarray:
     The problem is that of the frames from the reference on. The weights are the confidence also where measurements are
     aligned: ``sigma`` belongs to it.
     """
-    n, first, m = len(w.poses_cw), gauge.reference, w.per_frame
-    kk = w.kk.cpu()
+    p, first, m = w.problem, gauge.reference, w.problem.per_frame
+    n, kk = len(p.poses_cw), p.kk.cpu()
     source = int(kk.min()) // m  # frame of the oldest patches with a measurement
-    centres = w.centres[source * m :].cpu()
-    prior = _depth_information(w.depths[source:], centres[:, 2], m)
+    prior = _depth_information(p)
     # A scale that weak priors determine is a small difference of large sums.
-    kind = centres.dtype if prior is None else torch.float64
-    patches = centres.to(kind).unflatten(0, (-1, m))
-    intrinsics = torch.stack(w.camera[first:])
-    poses, intrinsics, targets, confidence = (
-        x.cpu().to(kind) for x in (w.poses_cw[first:], intrinsics, w.targets, w.confidence)
-    )
+    kind = p.patches.dtype if prior is None else torch.float64
+    real = p.poses_cw[first:], p.intrinsics[first:], p.targets, p.weights, p.patches[source * m :, :, 0, 0]
+    poses, intrinsics, targets, confidence, centres = (x.cpu().to(kind) for x in real)
+    patches = centres.unflatten(0, (-1, m))
     equations = window_equations(
-        poses, patches[..., :2], patches[..., 2], intrinsics, targets, confidence, w.jj.cpu() - first,
+        poses, patches[..., :2], patches[..., 2], intrinsics, targets, confidence, p.jj.cpu() - first,
         kk - source * m, source - first, BAOptions(bounds=w.bounds, kernel=w.kernel),
     )  # fmt: skip
     free = torch.tensor([*gauge.members, n - 1]) - first
@@ -198,17 +195,17 @@ def _marginal(w: WindowMeasurements, gauge: Gauge) -> np.ndarray:
     if prior is None:
         size = size_gradient(poses[None], 0, free[:-1].tolist())[:, free].flatten(1)
     else:
-        h_ll = h_ll + prior
+        h_ll = h_ll + prior[:, source * m :]
     equations = NormalEquations(h_pp, h_pl, h_ll, equations.g_p[:, rows], equations.g_l)
     found = marginal_covariance(equations, torch.arange(len(rows) - 6, len(rows)), DAMPING, size)[0]
     return ((found + found.T) / 2).numpy()
 
 
-def _depth_information(depths: tuple[Tensor | None, ...], inverse_depth: Tensor, m: int) -> Tensor | None:
+def _depth_information(problem: PatchProblem) -> Tensor | None:
     """Weights ``(1, K)`` of the priors of measured depths, the robust kernel included; None without a measured one."""
-    known = [torch.zeros(m, 2) if one is None else one.cpu() for one in depths]
-    prior = torch.zeros(1, len(inverse_depth), dtype=torch.float64)
-    for factor in depth_factors(torch.cat(known).double()):
-        linear = factor.linearise({INVERSE_DEPTHS: inverse_depth[None].double()})
+    depths = problem.inverse_depths.cpu().double()[None]
+    prior = torch.zeros_like(depths)
+    for factor in problem.factors:
+        linear = factor.exact().linearise({INVERSE_DEPTHS: depths})
         prior[:, linear.indices[0]] += linear.weight[..., 0]
     return prior if bool((prior > 0).any()) else None

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
-from dvo.graph.window import Window
-from dvo.odometry.window_measurements import WindowMeasurements
 
 
 @dataclass(frozen=True)
@@ -31,17 +30,17 @@ class Gauge:
     members: tuple[int, ...]
 
 
-def window_gauge(window: Window | WindowMeasurements) -> Gauge | None:
+def window_gauge(problem: PatchProblem) -> Gauge | None:
     """Gauge of the covariance of the newest frame.
 
     Args:
-        window: keyframes and edges.
+        problem: of a window.
 
     Returns:
         The gauge; None if the newest frame has no measurements, or fewer than two other frames have.
     """
-    n = len(window.poses_cw)
-    counts = torch.bincount(torch.cat([window.kk // window.per_frame, window.jj]), minlength=n)
+    n = len(problem.poses_cw)
+    counts = torch.bincount(torch.cat([problem.ii, problem.jj]), minlength=n)
     found = [k for k, count in enumerate(counts.tolist()) if count]
     if len(found) < 3 or found[-1] != n - 1:
         return None

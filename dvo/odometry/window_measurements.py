@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 from weakref import ref
 
-from torch import Tensor
-
 from dvo.ba.kernels import Kernel
 from dvo.ba.patch_problem import PatchProblem
+from dvo.graph.measured_depths import depth_factors
 from dvo.graph.window import Window
 from dvo.odometry.window_step import WindowStep
 
@@ -23,26 +22,16 @@ MOST_WAITING = 16
 
 @dataclass(frozen=True)
 class WindowMeasurements:
-    """Poses, depths and measurements of a window. It shares tensors with the window, which replaces its own.
+    """Measurements of a window at a moment.
 
     Attributes:
-        per_frame, poses_cw, targets, confidence, jj, kk: as in :class:`dvo.graph.window.Window`.
-        centres: ``(n * M, 3)`` x, y and inverse depth of the patch centres.
-        camera: ``(4,)`` fx fy cx cy of each frame.
-        depths: ``(M, 2)`` measured inverse depths and weights of each frame, None without any.
+        problem: of the patch centres, weighted by the confidence of the network, with measured depths as factors. It
+            shares tensors with the window, which replaces its own.
         timestamps: of the frames, seconds.
         bounds, kernel: of bundle adjustment.
     """
 
-    per_frame: int
-    poses_cw: Tensor
-    centres: Tensor
-    targets: Tensor
-    confidence: Tensor
-    jj: Tensor
-    kk: Tensor
-    camera: tuple[Tensor, ...]
-    depths: tuple[Tensor | None, ...]
+    problem: PatchProblem
     timestamps: tuple[float, ...]
     bounds: tuple[int, int]
     kernel: Kernel
@@ -57,26 +46,25 @@ class WindowMeasurements:
         Returns:
             What no later step changes.
         """
-        w: Window = step.window
-        middle = w.patches.shape[-1] // 2
-        return cls(
-            w.per_frame, w.poses_cw, w.patches[:, :, middle, middle].clone(), w.targets, w.confidence, w.jj, w.kk,
-            tuple(frame.intrinsics for frame in w.frames), tuple(frame.measured for frame in w.frames),
-            tuple(frame.timestamp for frame in w.frames), step.bounds, step.kernel,
-        )  # fmt: skip
+        window: Window = step.window
+        middle = window.patches.shape[-1] // 2
+        centres = window.patches[:, :, middle : middle + 1, middle : middle + 1].clone()
+        depths = depth_factors(window.measured)
+        problem = window.problem().with_values(patches=centres, weights=window.confidence, factors=depths)
+        return cls(problem, tuple(frame.timestamp for frame in window.frames), step.bounds, step.kernel)
 
     def at(self, problem: PatchProblem) -> WindowMeasurements:
         """Same measurements at another solution.
 
         Args:
-            problem: of the patch centres, at the solution.
+            problem: at the solution.
 
         Returns:
-            The measurements with these poses and centres.
+            The measurements with its poses and patches.
         """
-        return replace(
-            self, poses_cw=problem.poses_cw.to(self.poses_cw), centres=problem.patches[..., 0, 0].to(self.centres)
-        )
+        own = self.problem
+        now = own.with_values(poses_cw=problem.poses_cw.to(own.poses_cw), patches=problem.patches.to(own.patches))
+        return replace(self, problem=now)
 
 
 class Later(Generic[T]):

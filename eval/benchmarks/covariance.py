@@ -159,7 +159,7 @@ def measure(
     for frame in frames_of(sequence, scale, baseline):
         estimate = odometry.track(frame)
         errors.poses += estimate.pose_wc is not None
-        gauge = window_gauge(window)
+        gauge = None if estimate.covariance is None else window_gauge(window.problem())
         if estimate.covariance is None or gauge is None:
             continue
         stamps = np.array([keyframe.timestamp for keyframe in window.frames])

@@ -97,7 +97,7 @@ def test_a_window_is_solved_as_its_problem_is():
     """The solution from the reversed relief is that of the whole patches."""
     step, _ = ambiguous_step()
     w = step.window
-    found = {solution.start: solution for solution in window_solutions(WindowMeasurements.of(step))}
+    found = {solution.start: solution for solution in window_solutions(WindowMeasurements.of(step).problem)}
     (whole,) = multistart(w.problem(), {"reversed": reversed_relief})
     assert found["reversed"].cost == pytest.approx(whole.cost, rel=1e-2)
     torch.testing.assert_close(found["reversed"].problem.poses_cw, whole.problem.poses_cw, atol=2e-3, rtol=0)
@@ -105,10 +105,10 @@ def test_a_window_is_solved_as_its_problem_is():
 
 def test_covariance_and_confidence_are_those_of_the_mixture():
     step, _ = ambiguous_step()
-    window, gauge = WindowMeasurements.of(step), window_gauge(step.window)
+    window, gauge = WindowMeasurements.of(step), window_gauge(step.window.problem())
     plain = newest_uncertainty(step, TrackerConfig())
     mixed = newest_uncertainty(step, TrackerConfig(), ambiguous=True)
-    others = second_solutions(window_solutions(window), gauge, plain.covariance, window_metric(window))
+    others = second_solutions(window_solutions(window.problem), gauge, plain.covariance, window_metric(window))
     assert others and mixed.reference == plain.reference
     share = 1 - sum(other.probability for other in others)
     expected = share * plain.covariance
@@ -127,7 +127,7 @@ def test_covariance_and_confidence_are_those_of_the_mixture():
 @pytest.mark.parametrize("seed", range(3))
 def test_the_true_pose_is_within_the_covariance_of_a_wrong_solution(seed):
     step, truth = ambiguous_step(seed)
-    error = relative_error(step.window.poses_cw, truth, window_gauge(step.window))
+    error = relative_error(step.window.poses_cw, truth, window_gauge(step.window.problem()))
     config = TrackerConfig(sigma=NOISE, covariance_scale=1.0)
     plain, mixed = (newest_uncertainty(step, config, ambiguous) for ambiguous in (False, True))
     before, after = (float(error @ np.linalg.solve(x.covariance, error)) / 6 for x in (plain, mixed))

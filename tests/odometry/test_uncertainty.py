@@ -74,7 +74,7 @@ def test_every_pose_has_a_covariance_and_nothing_else_has(tracked):
 
 def information(step, factors=()):
     """Dense information matrix of the poses after the reference and all depths, float64, and the rows of the poses."""
-    window, gauge = step.window, window_gauge(step.window)
+    window, gauge = step.window, window_gauge(step.window.problem())
     options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, kernel=step.kernel)
     tensors = window.poses_cw, window.patches, window.intrinsics, window.targets, window.confidence
     edges = window.ii, window.jj, window.kk
@@ -90,7 +90,7 @@ def information(step, factors=()):
 def test_it_is_the_marginal_of_the_whole_information_matrix(tracked):
     """The dense inverse, bordered with the gauge, in place of the eliminated depths."""
     _, step, estimates = tracked
-    window, gauge = step.window, window_gauge(step.window)
+    window, gauge = step.window, window_gauge(step.window.problem())
     constraint = size_gradient(window.poses_cw[None].double(), gauge.reference, gauge.members)
     hessian, rows = information(step)
     column = torch.zeros(len(hessian), 1, dtype=torch.float64)
@@ -198,12 +198,13 @@ def test_the_gauge_leaves_out_frames_without_measurements(tracked):
     window = copied(step).window
     n = len(window)
     window.keep((window.ii > 1) & (window.jj > 1))
-    assert window_gauge(window).reference == 2 and window_gauge(window).members == tuple(range(3, n - 1))
+    gauge = window_gauge(window.problem())
+    assert gauge.reference == 2 and gauge.members == tuple(range(3, n - 1))
     gradient = size_gradient(window.poses_cw[None], 2, range(3, n - 1))[0]
     assert (gradient[[0, 1, 2, n - 1]] == 0).all() and (gradient[3 : n - 1, :3] != 0).any(-1).all()
     window.keep(window.touching(n - 2) & window.touching(n - 1))
     step = SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
-    assert window_gauge(window) is None and newest_uncertainty(step, TrackerConfig()) is UNKNOWN
+    assert window_gauge(window.problem()) is None and newest_uncertainty(step, TrackerConfig()) is UNKNOWN
 
 
 def test_no_pose_depends_on_it(tracked, monkeypatch):

@@ -87,7 +87,23 @@ def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> 
     patches = window.patches.clone()
     patches[:, 2] *= scale
     window.patches = patches
-    _rescale_relative(graph, {frame.identifier: scale for frame in window.frames})
+    _rescale_relative(graph, {frame.identifier: scale for frame in window.frames if not frame.guest})
+
+
+def window_carrier(graph: KeyframeGraph, identifiers: np.ndarray) -> int | None:
+    """Keyframe outside of the window that the window moves along with: the last of its segment, or the one by which its
+    segment was located.
+
+    Args:
+        graph: with a window.
+        identifiers: ``(N,)`` increasing, of the keyframes that move.
+
+    Returns:
+        Its row in ``identifiers``; None if it is not among them.
+    """
+    own = [row for row, k in enumerate(identifiers) if graph.segment_of(int(k)) == graph.segment]
+    found = np.flatnonzero(identifiers == graph.located) if graph.located is not None else own
+    return own[-1] if own else int(found[0]) if len(found) else None
 
 
 def similarity_between(poses_cw: Tensor, found_cw: Tensor, scale: float) -> Tensor:

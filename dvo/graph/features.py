@@ -40,6 +40,15 @@ class FeatureCache:
         """Return True if the maps of a keyframe are in the cache."""
         return keyframe.identifier in self._maps
 
+    def put(self, keyframe: ArchivedKeyframe, maps: Tensor) -> None:
+        """Give the maps of a keyframe that are known already.
+
+        Args:
+            keyframe: in the form of an archived one.
+            maps: output of ``encode`` for its working image.
+        """
+        self._maps[keyframe.identifier] = maps
+
     def maps(self, keyframe: ArchivedKeyframe) -> Tensor | None:
         """Feature maps of a keyframe, from the cache or computed.
 

@@ -54,6 +54,8 @@ class KeyframeGraph:
         worlds: number of the earliest segment with the same world, of segments that have been joined.
         loops: number of loops whose measurements are archived.
         metric: by world in metres, what its scale came from; other worlds are up to scale.
+        located: archived keyframe that the segment was located by, whose world and scale it has; None for one that
+            began a world of its own.
         recordings: beginnings of the sequences that were tracked in this graph, of which there is mostly one.
 
     Example:
@@ -85,6 +87,7 @@ class KeyframeGraph:
         self.worlds: dict[int, int] = {}
         self.loops = 0
         self.metric: dict[int, str] = {}
+        self.located: int | None = None
         self.recordings = [Recording()]
 
     def copy(self) -> KeyframeGraph:
@@ -120,6 +123,7 @@ class KeyframeGraph:
                     record.lost, record.reason = True, record.reason or reason
             self.starts[-1] = (self.starts[-1][0], -1)
         self.segment += int(keep)
+        self.located = None
         self.starts.append((first, self.segment))
 
     def split_segment(self, first: int) -> None:
@@ -201,13 +205,25 @@ class KeyframeGraph:
         self.log.reanchor(identifier, anchor, self.archive[identifier].pose_cw)
 
     def archive_oldest(self) -> None:
-        """Move the oldest keyframe of the window to the archive."""
-        window = self.window
-        pose_cw = window.poses_cw[0].double().cpu().numpy()
-        self._archive_edges(window.touching(0))
-        self._archive_keyframe(0, pose_cw, None)
-        identifier = window.remove(0).identifier
+        """Move the oldest keyframe of the window to the archive; if there are guests alone, the measurements of one."""
+        window, oldest = self.window, self.window.guests
+        if oldest == len(window):
+            self.release(0)
+            return
+        pose_cw = window.poses_cw[oldest].double().cpu().numpy()
+        self._archive_edges(window.touching(oldest))
+        self._archive_keyframe(oldest, pose_cw, None)
+        identifier = window.remove(oldest).identifier
         self.log.set_pose(identifier, self.archive[identifier].pose_cw)
+
+    def release(self, position: int) -> None:
+        """Remove a guest from the window, and archive its measurements.
+
+        Args:
+            position: of the guest in the window.
+        """
+        self._archive_edges(self.window.touching(position))
+        self.window.remove(position)
 
     def discard(self, position: int) -> Keyframe:
         """Remove a frame from the window, and its measurements, without archiving them.

@@ -41,6 +41,10 @@ class Keyframe:
             adjustment, both 0 for a patch without one; None if no depth camera is used.
         slopes: ``(M, 2)`` derivatives of the inverse depth by x and y, over the inverse depth, of the surfaces of its
             patches, 1 / feature-map pixel; 0 where the surface is not known; None: that of no patch is.
+        prior: ``(M, 2)`` inverse depths of its patches in the unit of the window, known from elsewhere, and their
+            weights in bundle adjustment, 0 for none; None: of no patch.
+        guest: it is archived already, and takes part because the window was located by it: its pose is held, and of
+            what leaves the window only its measurements are archived. Guests are the first keyframes of a window.
     """
 
     identifier: int
@@ -55,6 +59,8 @@ class Keyframe:
     visible: Tensor | None = None
     measured: Tensor | None = None
     slopes: Tensor | None = None
+    prior: Tensor | None = None
+    guest: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,6 +130,19 @@ class Window:
         return len(self.frames)
 
     @property
+    def guests(self) -> int:
+        """Number of archived keyframes that the window was located by, its first ones."""
+        return sum(frame.guest for frame in self.frames)
+
+    def fixed(self, optimised: int) -> int:
+        """Number of leading poses that bundle adjustment holds: guests, all but the newest, and one at least.
+
+        Args:
+            optimised: number of newest frames whose poses move, at most.
+        """
+        return max(1, self.guests, len(self) - optimised)
+
+    @property
     def ii(self) -> Tensor:
         """``(E,)`` source frame of each edge."""
         return self.kk // self.per_frame
@@ -175,6 +194,11 @@ class Window:
     def slopes(self) -> Tensor | None:
         """``(n * M, 2)`` slopes of the surfaces of the patches, see :class:`Keyframe`; None if no frame has any."""
         return self._of_patches([frame.slopes for frame in self.frames])
+
+    @property
+    def prior(self) -> Tensor | None:
+        """``(n * M, 2)`` inverse depths known from elsewhere and weights, see :class:`Keyframe`; None without any."""
+        return self._of_patches([frame.prior for frame in self.frames])
 
     def _of_patches(self, values: list[Tensor | None]) -> Tensor | None:
         """Values ``(M, 2)`` of each frame one after the other, with 0 for a frame without; None if no frame has any."""
@@ -270,7 +294,7 @@ class Window:
 
         Args:
             position: of the frame in the window; it has no edges yet.
-            lifetime: number of frames on either side of it that take part.
+            lifetime: number of frames on either side of it that take part, beside guests.
             own: also from its patches to itself.
 
         Returns:
@@ -278,6 +302,7 @@ class Window:
         """
         m, device = self.per_frame, self.jj.device
         near = torch.arange(max(0, position - lifetime), min(len(self), position + lifetime + 1), device=device)
+        near = torch.cat([torch.arange(min(self.guests, int(near[0])), device=device), near])
         others = near[near != position]
         old = (others[:, None] * m + torch.arange(m, device=device)).flatten()
         slots = [self.connect(old, torch.full_like(old, position))]

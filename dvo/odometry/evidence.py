@@ -229,6 +229,8 @@ def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
     for position in range(1, len(window)):
         pair = (window.ii == position - 1) & (window.jj == position)
         pair |= (window.ii == position) & (window.jj == position - 1)
+        if not bool(pair.any()):  # its edges have left the window: nothing speaks against the two any more
+            continue
         pair = measured(window, window.confidence, pair)
         confidence, inliers = float(window.confidence[pair].mean()), _inliers(step, pair)
         if not (confidence >= config.lost_confidence and inliers >= config.initial_inliers):  # NaN fails too

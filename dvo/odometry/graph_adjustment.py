@@ -23,7 +23,7 @@ from torch import Tensor
 
 from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3, sim3
-from dvo.graph.correction import apply_similarities, move_window
+from dvo.graph.correction import apply_similarities, move_window, window_carrier
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.recordings import increasing_times
 from dvo.graph.snapshot import Snapshot
@@ -214,8 +214,9 @@ def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> dict[int, flo
     found = torch.where((own >= 0)[:, None], adjusted.similarities[own], carried)
     apply_similarities(graph, moving, found)
     _set_exactly(graph, adjusted)
-    if graph.world_of(graph.segment) == world and graph.segment_of(int(moving[-1])) == graph.segment:
-        move_window(graph, before[-1], found[-1])
+    carrier = window_carrier(graph, moving)
+    if carrier is not None:
+        move_window(graph, before[carrier], found[carrier])
     return dict(zip(moving.tolist(), found[:, 7].tolist(), strict=True))
 
 

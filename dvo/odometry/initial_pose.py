@@ -46,7 +46,9 @@ def first_pose(window: Window, seen: Observation, time: float, config: TrackerCo
     Returns:
         ``(7,)`` ``T_cw``.
     """
-    predicted = predict_pose(window.poses_cw, [f.timestamp for f in window.frames], time, config.motion_damping)
+    own = min(window.guests, max(0, len(window) - 1))  # guests are of another time
+    times = [frame.timestamp for frame in window.frames[own:]]
+    predicted = predict_pose(window.poses_cw[own:], times, time, config.motion_damping)
     return initial_pose(window, seen, predicted, config.initial_pose) if initialised else predicted
 
 

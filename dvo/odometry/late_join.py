@@ -74,7 +74,7 @@ def _join(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, view: V
     pose = initial_pose(window, seen, _interpolated(window, keyframe.timestamp), config.initial_pose)
     window.insert(position, keyframe, pose, patch_coordinates(seen.centres, depth, c.patch_size)[0])
     step.forget(window.connect_frame(position, config.lifetime, c.self_edges))
-    options = StepOptions(fixed=max(1, len(window) - config.optimisation), damping=damping_at(COLD_UPDATES))
+    options = StepOptions(fixed=window.fixed(config.optimisation), damping=damping_at(COLD_UPDATES))
     for _ in range(config.search_updates):
         step(options, align=True)
     if all(evidence_of(step, k).supports(config, joining=True) for k in (position, position + 1)):

@@ -99,14 +99,32 @@ def overlap(graph: KeyframeGraph, new: int, pose_cw: Tensor, scale: float, other
         scale: of its lengths in that world.
         others: ``(N,)`` identifiers of the others.
     """
-    frame, poses_cw = graph.archive[new], graph.poses_cw(others)
-    fx, fy, cx, cy = torch.from_numpy(frame.intrinsics).double()
+    frame = graph.archive[new]
+    centres, depth = (torch.from_numpy(x).double() for x in (frame.centres, frame.inverse_depth))
+    rays = rays_of(centres, torch.from_numpy(frame.intrinsics).double())
+    return share_in_view(graph, rays * (scale / depth.clamp(min=1e-6))[:, None], pose_cw, others)
+
+
+def rays_of(centres: Tensor, intrinsics: Tensor) -> Tensor:
+    """Rays ``(M, 3)`` with z = 1 through the pixels ``(M, 2)`` of a camera with ``(4,)`` fx fy cx cy."""
+    fx, fy, cx, cy = intrinsics
+    x, y = centres.unbind(-1)
+    return torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1)
+
+
+def share_in_view(graph: KeyframeGraph, points: Tensor, pose_cw: Tensor, others: np.ndarray) -> np.ndarray:
+    """Share ``(N,)`` of the points that a camera sees that lie in the view of keyframes at a similar depth.
+
+    Args:
+        graph: holds the keyframes.
+        points: ``(M, 3)`` float64 in the camera, in the unit of the world of the keyframes.
+        pose_cw: ``(7,)`` float64 of the camera in this world.
+        others: ``(N,)`` identifiers of the keyframes.
+    """
+    depth, poses_cw = points[:, 2], graph.poses_cw(others)
     cameras = np.stack([graph.archive[int(k)].intrinsics for k in others])  # a map may be of another camera
     fu, fv, cu, cv = torch.from_numpy(cameras).double().T[:, :, None]
-    x, y = torch.from_numpy(frame.centres).double().unbind(-1)
-    rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1)
-    depth = scale / torch.from_numpy(frame.inverse_depth).double().clamp(min=1e-6)
-    world = se3.act(se3.inverse(pose_cw), rays * depth[:, None])
+    world = se3.act(se3.inverse(pose_cw), points)
     seen = se3.act(poses_cw[:, None], world[None])
     z = seen[..., 2].clamp(min=1e-9)
     u, v = fu * seen[..., 0] / z + cu, fv * seen[..., 1] / z + cv

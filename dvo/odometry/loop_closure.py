@@ -39,12 +39,14 @@ from dvo.odometry import loop_correction
 from dvo.odometry.adjuster import Adjuster, Adjusting
 from dvo.odometry.background import Background, Steps, all_steps
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.front_end import View
 from dvo.odometry.graph_adjustment import AdjustmentRecord
 from dvo.odometry.loop_check import median_inverse_depth
 from dvo.odometry.loop_window import GroupMatcher
 from dvo.odometry.loop_work import Correcting, Searching, is_due
 from dvo.odometry.loops import Loop, LoopFinder
 from dvo.odometry.place_descriptors import shipped_descriptor
+from dvo.odometry.relocalisation import Located, locate
 from dvo.odometry.tracker_state import TrackerState
 
 # A loop whose correction is smaller (in the same units) leaves the poses to the final adjustment.
@@ -113,6 +115,29 @@ class LoopCloser:
         """Describe a new keyframe of the window; see :meth:`dvo.odometry.loops.LoopFinder.see`."""
         if self.enabled:
             self.finder.see(identifier, image, maps)
+
+    def locate(self, view: View, identifier: int) -> Located | None:
+        """Find a frame among the archived keyframes; see :func:`dvo.odometry.relocalisation.locate`.
+
+        Args:
+            view: the frame.
+            identifier: of the keyframe that it becomes.
+        """
+        if not self.enabled or not self.finder.kept:
+            return None
+        if self.real_time and self.work is not None and not self.work.task.done:
+            return None
+        self._drain()
+        return locate(self.finder, view, identifier)
+
+    def relocalised(self, loop: Loop) -> None:
+        """Take the measurements of a frame that was located, and begins a segment in the world of the earlier visit.
+
+        Args:
+            loop: of the frame.
+        """
+        self._accept(loop)
+        self.pending = None
 
     def advance(self, segments: Collection[int], at_once: bool = False) -> bool:
         """Look at the keyframes that have been archived since the last call, once a frame.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
 from dvo.geometry import se3, sim3
-from dvo.graph.correction import apply_similarities, move_window, similarity_between
+from dvo.graph.correction import apply_similarities, move_window, similarity_between, window_carrier
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.odometry.loop_check import median_inverse_depth
 from dvo.odometry.loops import Loop
@@ -120,10 +120,10 @@ def apply(
     now = members(graph, kept, loop)
     found = _carried(graph, identifiers, found, now)
     before, held = graph.poses_cw(now), held_keyframes(graph, now)
-    here = [row for row, k in enumerate(now) if graph.segment_of(int(k)) == graph.segment]
+    carrier = window_carrier(graph, now)
     apply_similarities(graph, now[~held], found[torch.from_numpy(~held)])
-    if here:
-        move_window(graph, before[here[-1]], found[here[-1]])
+    if carrier is not None:
+        move_window(graph, before[carrier], found[carrier])
     if loop.joins:
         graph.join(graph.segment_of(loop.new), graph.segment_of(loop.old))
     return dict(zip(now.tolist(), found[:, 7].tolist(), strict=True))

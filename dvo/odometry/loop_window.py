@@ -48,12 +48,14 @@ class Match:
         inliers: share of the edges between the groups whose measurement is confident and agrees with bundle adjustment.
         poses_cw: ``(n, 7)`` float64 ``T_cw`` of the older and the newer group, in the world and the scale of the older.
         scale: of the lengths of the newer group, after over before.
+        depths: ``(K,)`` inverse depths of the patches of the newer group, in the scale of the older.
         edges: measurements between the groups, aligned to a fraction of a pixel where that is possible.
     """
 
     inliers: float
     poses_cw: Tensor
     scale: float
+    depths: Tensor
     edges: ArchivedEdges
 
 
@@ -123,7 +125,7 @@ class GroupMatcher:
         poses = se3.normalise(window.poses_cw.double().cpu())
         if not (np.isfinite(scale) and scale > 0 and bool(torch.isfinite(poses).all())):
             return None
-        return Match(share, poses, scale, self._edges((*old, *new), window, across))
+        return Match(share, poses, scale, after.float().cpu(), self._edges((*old, *new), window, across))
 
     def _joint(self, old: Group, new: Group, poses_cw: Tensor) -> WindowStep:
         """Window of both groups with all edges but those within the older one."""

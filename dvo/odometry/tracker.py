@@ -48,6 +48,7 @@ from dvo.odometry.motion import flow_magnitude
 from dvo.odometry.new_recording import begin_in_map
 from dvo.odometry.patch_depth import measure_depth
 from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.relocalisation import REFRESH, Located, hold_to_map, invite
 from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
@@ -224,6 +225,8 @@ class PatchOdometry:
     def _take(self, view: View) -> Estimate:
         """Add a frame with content to the window, and estimate its pose."""
         window, config, state, record = self.window, self.config, self.state, view.records[0]
+        if not state.initialised and (estimate := self._relocalise(view)):
+            return estimate
         keyframe = self._append(view)
         self.step.forget(window.connect_newest(config.lifetime, self.model.config.self_edges))
         if not state.initialised:
@@ -237,16 +240,40 @@ class PatchOdometry:
         if not supported:
             window.restore(before)
             self.graph.discard(len(window) - 1)  # so that the next frames are joined with those before it
+            if estimate := self._relocalise(view):
+                return estimate
             state.waiting.append(view)
             return self._lose(record, NO_MATCH)
         record.place(keyframe.identifier, self.graph.segment, state.joining if state.skipped else "")
         state.joining, state.skipped = "", False
         state.tracked += 1
-        if config.restart and restart_due(state.tracked, state.ambiguous):
+        if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
             state.ambiguous = leave_minimum(self.step, config)
         join_waiting(self.graph, self.step, state, config, record)
+        if self.graph.located is not None and state.tracked % REFRESH == 0:
+            hold_to_map(self.graph, self.step, self.loops.finder)
         self._reduce()  # may correct the window
         return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
+
+    def _relocalise(self, view: View) -> Estimate | None:
+        """Begin a segment with a frame that shows a known place, in its world and scale; None if it shows none."""
+        graph, state, record = self.graph, self.state, view.records[0]
+        found = self.loops.locate(view, state.keyframes)
+        if found is None:
+            return None
+        reason = state.joining or record.reason
+        self._close_segment()
+        state.waiting, state.initialised = [], True
+        graph.join(graph.segment, graph.segment_of(found.loop.old))
+        invite(self.step, found.guests)
+        keyframe = self._append(view, found)
+        graph.located = found.loop.old
+        self.loops.relocalised(found.loop)
+        state.adjustable.append(graph.segment)
+        self.step.forget(self.window.connect_newest(self.config.lifetime, self.model.config.self_edges))
+        self._updated(self.config.search_updates)
+        record.place(keyframe.identifier, graph.segment, reason)
+        return self._estimate(record, self._pose_wc(len(self.window) - 1), Status.TRACKING)
 
     def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
@@ -313,22 +340,25 @@ class PatchOdometry:
         self.graph.begin_segment(self.state.keyframes, keep, "too few frames with content")
         self.state.begin_segment()
 
-    def _append(self, view: View) -> Keyframe:
-        """Add a frame to the window, with predicted pose and the median depth of the frames before it."""
+    def _append(self, view: View, found: Located | None = None) -> Keyframe:
+        """Add a frame to the window: with predicted pose and the median depth of the frames before it, or as found."""
         config, window, seen = self.config, self.window, view.seen
         slot = window.free_map_slot()
         self.step.keep_frame(slot, seen.image, seen.maps, seen.fine_maps)
         keyframe = keyframe_of(view, self.state.keyframes, slot)
         self.state.keyframes += 1
         self.loops.see(keyframe.identifier, seen.image, seen.maps)
-        depth = first_depth(window, config, self.state.initialised, seen.measured)
-        pose = first_pose(window, seen, keyframe.timestamp, config, self.state.initialised)
+        if found is None:
+            depth = first_depth(window, config, self.state.initialised, seen.measured)
+            pose = first_pose(window, seen, keyframe.timestamp, config, self.state.initialised)
+        else:
+            depth, pose = found.depths[None].to(self.device), found.pose_cw.to(self.device, torch.float32)
         window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
         return keyframe
 
     def _update(self) -> None:
         """Take a step on the window of an initialised segment."""
-        fixed = max(1, len(self.window) - self.config.optimisation)
+        fixed = self.window.fixed(self.config.optimisation)
         self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)), align=True)
 
     def _updated(self, count: int) -> Evidence:
@@ -340,13 +370,14 @@ class PatchOdometry:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
         window, config = self.window, self.config
         n, back = len(window), config.keyframe_index
-        if self.state.initialised and n > back + 1:
+        if self.state.initialised and n > back + max(1, window.guests):
             i, j = n - back - 1, n - back + 1
             if (flow_magnitude(window, i, j) + flow_magnitude(window, j, i)) / 2 < config.keyframe_motion:
                 self.graph.drop(n - back)
-        self.graph.keep_edges(window.ii >= len(window) - config.removal)
+        newest, guests = len(window) - config.removal, window.guests
+        self.graph.keep_edges((window.ii >= newest) | ((window.ii < guests) & (window.jj >= newest)))
         limit = config.removal + config.lifetime if self.state.initialised else config.initial_frames + 4
-        while len(window) > limit:
+        while len(window) - window.guests > limit:
             self.graph.archive_oldest()
         self.loops.advance(self.state.adjustable)
 

@@ -126,7 +126,7 @@ class WindowStep:
                 solution of a window from leaving a wrong minimum.
         """
         refine = self.align if align and not self.final else None
-        factors = *options.factors, *depth_factors(self.window.measured)
+        factors = *options.factors, *depth_factors(self.window.measured), *depth_factors(self.window.prior)
         options = replace(options, bounds=self.bounds, kernel=self.kernel, factors=factors)
         after = step(self.model, self.state(), self.lookup, options, refine)
         assert after.targets is not None and after.weights is not None and after.confidence is not None

@@ -54,6 +54,11 @@ class Steps(Generic[T]):
         self._generator = generator
         self._outcome: list[T] = []  # empty until it is known
 
+    @property
+    def done(self) -> bool:
+        """True if :meth:`result` returns at once."""
+        return bool(self._outcome)
+
     def step(self) -> bool:
         """Take a step.
 

@@ -192,7 +192,9 @@ class LoopCloser:
         return corrected
 
     def complete(self, segments: Collection[int], searches: int = 100) -> bool:
-        """Search once more with the corrected poses, where no loop has been found so far; for the end of a sequence.
+        """Search once more, where no loop has been found so far; for the end of a sequence.
+
+        First for places that segments with worlds of their own have in common, then with the corrected poses.
 
         Args:
             segments: those that were initialised.
@@ -203,7 +205,7 @@ class LoopCloser:
         """
         if self.adjuster is not None:
             self.adjuster.end()
-        corrected = self.advance(segments, at_once=True)
+        corrected = self.advance(segments, at_once=True) | self._join_worlds(searches)
         loops = self._own_loops()
         if not loops:
             return corrected
@@ -221,6 +223,19 @@ class LoopCloser:
             loop = self.finder.find(kept[row])
             if loop is not None and not loop.joins and self._is_within(loop, agreement):
                 self._accept(loop)
+        return corrected
+
+    def _join_worlds(self, searches: int) -> bool:
+        """Look in each world of the recording for the places of earlier ones; True if some were joined."""
+        graph, kept, margin = self.graph, self.finder.kept, self.finder.options.neighbours
+        rows = range(bisect_left(kept, graph.recording.keyframe) + margin, len(kept) - margin)
+        corrected = False
+        for row in (rows[k] for k in range(0, len(rows), max(1, -(-len(rows) // searches)))):
+            worlds = {graph.world_of(graph.segment_of(k)) for k in kept[: row + 1] if graph.segment_of(k) >= 0}
+            loop = self.finder.find(kept[row], self.pending) if len(worlds) > 1 else None
+            if loop is not None and loop.joins:
+                self._found(loop)
+                corrected |= self._drain()
         return corrected
 
     def information(self) -> dict[str, Any]:

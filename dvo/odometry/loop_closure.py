@@ -205,7 +205,10 @@ class LoopCloser:
         """
         if self.adjuster is not None:
             self.adjuster.end()
-        corrected = self.advance(segments, at_once=True) | self._join_worlds(searches)
+        corrected = self.advance(segments, at_once=True)
+        if not self.enabled:
+            return corrected
+        corrected |= self._join_worlds(searches)
         loops = self._own_loops()
         if not loops:
             return corrected

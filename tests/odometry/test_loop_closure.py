@@ -9,7 +9,6 @@ import pytest
 import torch
 
 import dvo
-from dvo.data.trajectory import Trajectory
 from dvo.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.metrics import evaluate
@@ -301,30 +300,6 @@ def test_without_loops_nothing_is_searched_or_kept(film, closed):
 def test_a_loop_that_is_far_too_recent_is_none(film):
     _, _, result = track(film[0], replace(OPTIONS, seconds=60.0))
     assert result.info["loops"] == []
-
-
-def test_segments_that_show_the_same_place_are_joined(film):
-    """Darkness in the middle; afterwards the camera looks back at what it saw before."""
-    frames, truth = film
-    order = [*range(34), *[34] * 10, *range(20, -1, -1), *range(1, 20)]
-    times = np.arange(len(order)) / 15.0
-    views = [replace(frames[k], timestamp=float(t)) for k, t in zip(order, times, strict=True)]
-    dark = [replace(f, image=np.zeros_like(f.image)) if k == 34 else f for k, f in zip(order, views, strict=True)]
-    truth = Trajectory(times, truth.poses_wc[order])
-    alone = {"join_inliers": 1.0}  # no frame is joined with the window across the darkness
-    _, estimates, result = track(dark, **alone)
-    assert [segment.joined_to for segment in result.segments] == [None, 0]
-    assert any(loop["joins_segments"] for loop in result.info["loops"])
-    assert len(result.trajectory) == sum(map(len, result.segments)) >= 70
-    assert evaluate(result.trajectory, truth).ate_percent < 0.5
-    assert {estimate.segment for estimate in estimates} == {0, 1}
-    # From the estimate that tells of it on, poses are in the world of the first segment.
-    (first,) = [k for k, estimate in enumerate(estimates) if estimate.recovered]
-    told = [e for e in (*estimates[:34], *estimates[first:]) if e.status is dvo.Status.TRACKING]
-    rows = Trajectory(np.array([e.timestamp for e in told]), np.stack([e.pose_wc for e in told]))
-    assert estimates[first].segment == 1 and evaluate(rows, truth).ate_percent < 3.0
-    _, _, apart = track(dark, loops=False, **alone)
-    assert [segment.joined_to for segment in apart.segments] == [None, None]
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ import dvo
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
-from dvo.metrics import align_trajectory, associate
+from dvo.metrics import associate, fit_alignment, transform
 from eval.suites.selection import load_suites
 from eval.suites.suite import open_sequence, reference_for
 
@@ -76,13 +76,12 @@ def found_after(file: Path, frames: Iterable[Frame], seed: int) -> tuple[int | N
 def error_percent(estimate: dvo.Estimate, known: Trajectory, truth: Trajectory) -> float:
     """Distance of a pose from the truth, in percent of the way in the map."""
     own, true = associate(known, truth)
-    both = Trajectory(known.timestamps[own], known.poses_wc[own]), Trajectory(truth.timestamps[true], truth.poses_wc[true])
     assert estimate.pose_wc is not None
-    pose = Trajectory(np.array([0.0]), estimate.pose_wc[None])
-    aligned = align_trajectory(pose, *both)
+    pose = Trajectory(np.array([estimate.timestamp]), estimate.pose_wc[None])
+    aligned = transform(pose, *fit_alignment(known.positions[own], truth.positions[true], "sim3"))
     at = int(np.abs(truth.timestamps - estimate.timestamp).argmin())
-    way = float(np.linalg.norm(np.diff(both[1].poses_wc[:, :3], axis=0), axis=1).sum())
-    return 100 * float(np.linalg.norm(aligned.poses_wc[0, :3] - truth.poses_wc[at, :3])) / way
+    way = float(np.linalg.norm(np.diff(truth.positions[true], axis=0), axis=1).sum())
+    return 100 * float(np.linalg.norm(aligned.positions[0] - truth.positions[at])) / way
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -96,7 +95,8 @@ def main(arguments: list[str] | None = None) -> None:
     for suite in load_suites(options.suites, options.sequences):
         for sequence in suite.sequences:
             source, truth = open_sequence(sequence, Path(), suite.stride)
-            recorded.append(Recorded(sequence.name, source, reference_for(truth, np.array([f.timestamp for f in source]))))
+            stamps = np.array([frame.timestamp for frame in source])
+            recorded.append(Recorded(sequence.name, source, reference_for(truth, stamps)))
     within = {"goes on": 0, "comes back": 0}
     elsewhere = wrong = 0
     print("| sequence | seed | frames, goes on | error % | frames, comes back | error % |\n|---|--:|--:|--:|--:|--:|")

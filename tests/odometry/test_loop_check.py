@@ -48,7 +48,7 @@ def judged(inliers, turn=0.0, shift=0.0, scale=1.0, other_world=False, present=(
     angle = torch.tensor([0, 0, 0, 0, math.radians(turn), 0], dtype=torch.float64)
     poses = se3.identity(6, dtype=torch.float64).clone()
     poses[4] = se3.compose(se3.exp(change), se3.compose(se3.exp(angle), present))  # the second of the newer group
-    return is_loop(Match(inliers, poses, scale, None), Visits(None if other_world else present), OPTIONS)
+    return is_loop(Match(inliers, poses, scale, None, None), Visits(None if other_world else present), OPTIONS)
 
 
 def test_many_inliers_suffice():

@@ -21,10 +21,10 @@ from torch import Tensor
 from dvo.geometry import se3
 from dvo.graph.archive import ArchivedKeyframe, encode_jpeg
 from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.measured_depths import SIGMA
 from dvo.graph.window import Keyframe, Window
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.background import all_steps
-from dvo.odometry.depth_factor import SIGMA
 from dvo.odometry.front_end import View
 from dvo.odometry.loop_candidates import rays_of, share_in_view
 from dvo.odometry.loop_guess import guess_pose

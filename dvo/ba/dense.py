@@ -12,8 +12,9 @@ from torch import Tensor
 
 from dvo.ba.edges import EdgePlan
 from dvo.ba.factors import DepthDamping
-from dvo.ba.layer import bundle_adjust
 from dvo.ba.options import BAOptions
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.solve import solve
 
 _DEFAULT = BAOptions()
 
@@ -108,8 +109,6 @@ def dense_bundle_adjust(
     patches = dense_patches(inverse_depth).permute(0, 1, 3, 4, 2).reshape(b, n * h * w, 3, 1, 1)
     factors = () if damping is None else (DepthDamping(damping.reshape(b, -1)),)
     source, target = (end[:, None].expand(-1, h * w).reshape(-1) for end in (ii, jj))
-    solved = bundle_adjust(
-        poses_cw, patches, intrinsics, targets.reshape(b, -1, 2), weights.reshape(b, -1, 2), source, target, plan.kk,
-        options, factors=factors, plan=plan,
-    )  # fmt: skip
+    measured = targets.reshape(b, -1, 2), weights.reshape(b, -1, 2), source, target, plan.kk
+    solved = solve(PatchProblem(poses_cw, patches, intrinsics, *measured, factors=factors, plan=plan), options)
     return solved.poses_cw, solved.patches[:, :, 2, 0, 0].view(b, n, h, w)

@@ -32,6 +32,8 @@ def archive_old_window(source: MapReader, graph: KeyframeGraph) -> None:
 
     identifiers = source.array("window/keyframes", np.int64, (None,), 0, _LAST)
     n = len(identifiers)
+    if not n:  # of a finished sequence
+        return
     times = source.array("window/times", np.float64, (n,))
     rising = (np.diff(identifiers) > 0).all() and (np.diff(times) > 0).all()
     source.require(rising, "holds keyframes that are not in order of time", "window/times")

@@ -9,6 +9,7 @@ from dvo.graph.map_file import MapReader
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.finishing import run_information
 from dvo.odometry.map_tables import LoopTable, MapTable
+from dvo.odometry.metric_scale import settle_scale
 
 if TYPE_CHECKING:
     from dvo.odometry.tracker import PatchOdometry
@@ -97,14 +98,15 @@ def close_old_sequence(source: MapReader, odometry: PatchOdometry, tracker: OldT
     Raises:
         DvoError: fewer keyframes than there are.
     """
-    graph, config = odometry.graph, tracker.config
+    graph, config, scale = odometry.graph, tracker.config, {}
     if not tracker.finished:
         first = max((frame.identifier for frame in graph.archive), default=-1) + 1
         source.require(tracker.keyframes >= first, "fewer keyframes than there are", "tracker: keyframes")
         graph.begin_segment(tracker.keyframes, tracker.initialised, "too few frames with content")
+        scale = settle_scale(graph, tracker.adjustable, config.scale, odometry.loops)
     state = replace(odometry.state, adjustable=list(tracker.adjustable), info=tracker.info)
     closer = replace(odometry.loops, enabled=config.loops, corrections=loops.corrections)
-    info = run_information(graph, state, config, closer, tracker.seed)
+    info = run_information(graph, state, config, closer, tracker.seed) | scale
     records = (loops.adjuster or {}).get("records")
     info |= {"adjustments": records} if records else {}
     return replace(tracker.table(), info={k: value for k, value in info.items() if k not in ("seed", "config")})

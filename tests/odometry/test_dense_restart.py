@@ -119,9 +119,7 @@ def test_the_right_solution_stays_as_it_was(truth):
     frames = [(f.pose_cw, f.inverse_depth, f.confidence) for f in window.keyframes]
     edges = [(e.positions, e.confidence, e.hidden, e.age) for e in window.edges]
     calls = []
-    assert not better_solution(
-        window, lambda: (calls.append(1), measure(window, *truth)), float("inf")
-    )
+    assert not better_solution(window, lambda: (calls.append(1), measure(window, *truth)), float("inf"))
     assert calls == [1]  # the other one was tried
     for frame, kept in zip(window.keyframes, frames, strict=True):
         assert all(a is b for a, b in zip((frame.pose_cw, frame.inverse_depth, frame.confidence), kept, strict=True))

@@ -16,6 +16,10 @@ FILE = Path(__file__).with_name("version_2.dvo")
 LAST = [-0.142333, 0.153711, 0.074020, 0.118075, 0.035928, 0.036177, 0.991695]  # pose of the last of its 9 frames
 
 
+def cut(rows):
+    return lambda array: array[:rows]
+
+
 @pytest.fixture
 def old(tmp_path):
     """The file, as if the network of these tests had made it."""
@@ -37,6 +41,7 @@ def test_its_window_is_closed(old, tmp_path):
     np.testing.assert_allclose(result.trajectory.poses_wc[-1], LAST, atol=1e-5)
     assert result.info["keyframes"] == 9 and result.info["initialised"] and result.info["loops"] == []
     assert result.info["config"]["patches"] == 4
+    assert result.metric and result.info["scale"]["source"] == "depth"
     found.save(tmp_path / "b.dvo")
     again = dvo.load_map(tmp_path / "b.dvo", weights=network()).finish()
     assert np.array_equal(again.trajectory.poses_wc, result.trajectory.poses_wc) and again.info == result.info
@@ -54,13 +59,21 @@ def test_a_segment_that_was_not_initialised_has_no_rows(old):
     assert found.finish().frames_lost == 9 and not found.loops.finder.kept
 
 
+def test_a_finished_sequence_has_an_empty_window(old):
+    """Its arrays have no channels."""
+    empty = {name: cut(0) for name in np.load(old).files if name.startswith("window/")}
+    empty |= {name: lambda a: a[:0, :, :0] for name in ("window/matching", "window/context")}
+    empty = {name.removesuffix(".npy"): change for name, change in empty.items()}
+    empty["segments"] = lambda a: np.array([[0, 0], [9, 1]])
+    rewritten(old, {"tracker.finished": True, "tracker.initialised": False, "graph.segment": 1}, empty)
+    found = dvo.load_map(old, weights=network())
+    assert len(found.graph.archive) == 4 and found.finish().frames_read == 9
+    assert len(load_graph(old).archive) == 4
+
+
 def test_settings_that_are_gone_are_left_out(old):
     rewritten(old, {"tracker.config": {"patches": 4, "gone": 1}}, {})
     assert dvo.load_map(old, weights=network()).config.patches == 4
-
-
-def cut(rows):
-    return lambda array: array[:rows]
 
 
 WRONG = [

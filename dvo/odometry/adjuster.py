@@ -9,8 +9,7 @@ from typing import Any
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.odometry.background import Background, Task
 from dvo.odometry.final_adjustment import AdjustmentOptions
-from dvo.odometry.graph_adjustment import Adjusted, AdjustmentRecord, Cause, apply, prepare
-from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.graph_adjustment import Adjusted, AdjustmentLimits, AdjustmentRecord, Cause, apply, prepare
 from dvo.odometry.tracker_state import TrackerState
 
 
@@ -42,6 +41,7 @@ class Adjuster:
         state: of the tracker, whose shutter is that of the camera.
         options: of the final adjustment.
         after_loop: adjust a world after each correction by a loop.
+        limits: of the work beside tracking.
 
     Attributes:
         records: adjustments of the recording, in the order of their application.
@@ -53,12 +53,13 @@ class Adjuster:
     state: TrackerState
     options: AdjustmentOptions
     after_loop: bool = False
+    limits: AdjustmentLimits = AdjustmentLimits()
     records: list[AdjustmentRecord] = field(default_factory=list)
     wanted: list[int] = field(default_factory=list)
     ended: bool = False
 
     def begin(
-        self, background: Background, world: int, cause: Cause, delay: int, limits: LoopOptions | None
+        self, background: Background, world: int, cause: Cause, delay: int, limits: AdjustmentLimits | None
     ) -> Adjusting:
         """Begin the adjustment of a world, from a snapshot.
 
@@ -72,20 +73,19 @@ class Adjuster:
         work = prepare(self.graph, world, self.state.shutter, self.options, limits)
         return Adjusting(background.start(work.solve), delay, world, cause, self._time())
 
-    def begin_next(self, background: Background, options: LoopOptions, corrected: int | None) -> Adjusting | None:
+    def begin_next(self, background: Background, corrected: int | None) -> Adjusting | None:
         """Begin the next adjustment beside tracking, if there is one.
 
         Args:
             background: thread of the work.
-            options: bounds of the work, and the frames until the solution is taken.
             corrected: world that a loop has just corrected, if one has.
         """
         if self.ended:
             return None
         if corrected is not None and self.after_loop:
-            return self.begin(background, corrected, "loop", options.adjust_delay, options)
+            return self.begin(background, corrected, "loop", self.limits.delay, self.limits)
         if self.wanted:
-            return self.begin(background, self.wanted.pop(0), "request", options.adjust_delay, options)
+            return self.begin(background, self.wanted.pop(0), "request", self.limits.delay, self.limits)
         return None
 
     def take(self, work: Adjusting) -> dict[int, float]:

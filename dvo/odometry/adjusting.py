@@ -19,7 +19,7 @@ def adjust(odometry: PatchOdometry) -> tuple[AdjustmentRecord, ...]:
     All worlds of the recording are adjusted one after the other, by the measurements of archived keyframes and loops
     (:mod:`dvo.odometry.graph_adjustment`); the window moves along. A solution that does not lower the robust
     cost is not taken. Work in progress for loops is waited for. With the setting ``real_time`` nothing is waited for:
-    the adjustments are done beside tracking, within the bounds of ``LoopOptions``, and applied when they are there.
+    the adjustments are done beside tracking, within bounds, and applied when they are there.
 
     Args:
         odometry: before, or between, any two frames of its sequence; its poses and depths may change, and the scale.

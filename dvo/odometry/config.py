@@ -12,6 +12,7 @@ from dvo.errors import DvoError
 from dvo.graph.measured_depths import SIGMA
 from dvo.nets.alignment import AlignmentOptions
 from dvo.odometry.final_adjustment import AdjustmentOptions
+from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.scale_options import ScaleOptions
 from dvo.settings import check_names, check_settings, settings_of, shown
 
@@ -79,6 +80,8 @@ class TrackerConfig:
         estimate_readout: look for a rolling shutter in the final adjustment if the camera states no readout time
             (:mod:`dvo.odometry.self_calibration`).
         loops: close loops, and join segments that show the same place (:mod:`dvo.odometry.loop_closure`).
+        loop: how loops are searched for, a
+            :class:`dvo.odometry.loop_options.LoopOptions`; a table of its values will do.
         real_time: never wait in ``track`` for a search for loops or a correction by one. Results are then taken when
             they are there, which depends on the load of the machine: the same frames need not give the same bytes.
             ``save`` and ``finish`` wait.
@@ -142,6 +145,7 @@ class TrackerConfig:
     final_adjustment: bool = True
     estimate_readout: bool = True
     loops: bool = True
+    loop: LoopOptions = LoopOptions()  # noqa: RUF009 (frozen)
     real_time: bool = False
     adjust_after_loop: bool = False
     robust: float = 0.3
@@ -167,6 +171,7 @@ class TrackerConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "scale", settings_of(ScaleOptions, self.scale, "scale"))
+        object.__setattr__(self, "loop", settings_of(LoopOptions, self.loop, "loop"))
         check_settings(self, _RANGES)
 
     @property

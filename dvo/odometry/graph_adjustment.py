@@ -7,8 +7,7 @@ Schur complement, robust kernels, first keyframe or map held. It works on a copy
 are archived meanwhile, and the window, are moved along with the last keyframe before them. A solution that does not
 lower the robust cost of the measurements is not taken.
 
-The work is bounded by ``LoopOptions``: ``adjust_iterations`` steps with each kernel for the newest ``adjust_frames``
-keyframes, and measurements between them up to ``adjust_edges``; earlier keyframes are held.
+Beside tracking the work is bounded (:class:`AdjustmentLimits`); earlier keyframes are held.
 """
 
 from __future__ import annotations
@@ -28,12 +27,27 @@ from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.recordings import increasing_times
 from dvo.graph.snapshot import Snapshot
 from dvo.odometry.final_adjustment import AdjustmentOptions, adjust_segment
-from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
 Cause = Literal["loop", "request"]
 
 _FEWEST = 3  # keyframes below which nothing is adjusted
+
+
+@dataclass(frozen=True)
+class AdjustmentLimits:
+    """Bounds of a global adjustment beside tracking.
+
+    Attributes:
+        iterations: steps with each kernel, at most.
+        frames, edges: newest keyframes of a world, and measurements between them, that are solved for, at most.
+        delay: frames between its beginning and the frame that takes the solution.
+    """
+
+    iterations: int = 5
+    frames: int = 600
+    edges: int = 300_000
+    delay: int = 40
 
 
 @dataclass(frozen=True)
@@ -171,7 +185,11 @@ def _nothing(started: float) -> Adjusted:
 
 
 def prepare(
-    graph: KeyframeGraph, world: int, shutter: Shutter, options: AdjustmentOptions, limits: LoopOptions | None = None
+    graph: KeyframeGraph,
+    world: int,
+    shutter: Shutter,
+    options: AdjustmentOptions,
+    limits: AdjustmentLimits | None = None,
 ) -> Adjustment:
     """Global adjustment of a world from its present state.
 
@@ -185,8 +203,8 @@ def prepare(
     options = replace(options, restart_frames=0)
     if limits is None:
         return Adjustment(Snapshot.of(graph), world, options, shutter)
-    options = replace(options, iterations=limits.adjust_iterations)
-    return Adjustment(Snapshot.of(graph), world, options, shutter, limits.adjust_frames, limits.adjust_edges)
+    options = replace(options, iterations=limits.iterations)
+    return Adjustment(Snapshot.of(graph), world, options, shutter, limits.frames, limits.edges)
 
 
 def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> dict[int, float]:

@@ -12,8 +12,18 @@ from torch import Tensor
 from dvo.geometry import se3
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.places import PlaceIndex
-from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.place_descriptors import PlaceDescriptor
+
+LIKENESS = 0.3
+"""Smallest similarity of the descriptors of a candidate by retrieval, in [-1, 1]."""
+RETRIEVED = 8
+"""Candidates by retrieval, at most."""
+APART = 6
+"""Identifiers of two such candidates differ by more than this."""
+OVERLAP = 0.3
+"""Smallest share of the patches in view of a candidate by proximity."""
+NEAREST = 2
+"""Candidates by proximity, at most; as far apart in time as two visits."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,6 @@ def by_likeness(
     descriptor: PlaceDescriptor | None,
     new: int,
     earlier: np.ndarray,
-    options: LoopOptions,
 ) -> Iterator[Candidate]:
     """Candidates whose descriptors are like that of a keyframe, the most alike first.
 
@@ -48,19 +57,18 @@ def by_likeness(
         descriptor: that made them; None for none.
         new: identifier of the keyframe.
         earlier: ``(N,)`` identifiers of the keyframes to choose from, increasing.
-        options: number and likeness.
     """
     row = places.descriptor(new)
     if row is None or descriptor is None:
         return
-    found = places.query(descriptor.views(row), options.retrieved, before=int(earlier[-1]) + 1, apart=options.apart)
+    found = places.query(descriptor.views(row), RETRIEVED, before=int(earlier[-1]) + 1, apart=APART)
     for old, score in zip(found.identifiers.tolist(), found.scores.tolist(), strict=True):
-        if score >= options.likeness and graph.segment_of(old) >= 0:
+        if score >= LIKENESS and graph.segment_of(old) >= 0:
             yield Candidate(old, new, "retrieval", graph.poses_cw(np.array([old]))[0])
 
 
 def by_proximity(
-    graph: KeyframeGraph, new: int, similarity: Tensor, earlier: np.ndarray, options: LoopOptions
+    graph: KeyframeGraph, new: int, similarity: Tensor, earlier: np.ndarray, seconds: float, count: int = NEAREST
 ) -> Iterator[Candidate]:
     """Candidates that have the patches of a keyframe in view, as far as the poses tell: the best of different visits.
 
@@ -71,7 +79,8 @@ def by_proximity(
         new: identifier of the keyframe.
         similarity: ``(8,)`` from the world of the earlier keyframes to its camera, in the unit of its segment.
         earlier: ``(N,)`` identifiers of the keyframes to choose from, of one world.
-        options: number and overlap.
+        seconds: smallest time between two candidates.
+        count: candidates, at most.
     """
     if not len(earlier):
         return
@@ -81,9 +90,9 @@ def by_proximity(
     times = np.array([graph.archive[int(k)].timestamp for k in earlier])
     chosen: list[int] = []
     for row in np.lexsort((earlier, -shares)):
-        if shares[row] < options.overlap or len(chosen) >= options.near:
+        if shares[row] < OVERLAP or len(chosen) >= count:
             break
-        if all(abs(times[row] - times[other]) >= options.seconds for other in chosen):
+        if all(abs(times[row] - times[other]) >= seconds for other in chosen):
             chosen.append(int(row))
     for row in sorted(chosen):
         yield Candidate(int(earlier[row]), new, "proximity", pose_cw)

@@ -49,6 +49,8 @@ from dvo.odometry.place_descriptors import shipped_descriptor
 from dvo.odometry.relocalisation import Located, locate
 from dvo.odometry.tracker_state import TrackerState
 
+PATIENCE = 4
+"""Searches after a loop within which a second one has to confirm it."""
 # A loop whose correction is smaller (in the same units) leaves the poses to the final adjustment.
 _SMALL = (0.01, 0.003, 0.01)
 
@@ -67,7 +69,7 @@ def loop_closer(
     """
     described = shipped_descriptor(model.config.feature_channels)
     places = PlaceIndex(1 if described is None else described.dimensions)
-    finder = LoopFinder(graph, GroupMatcher(model, config, device), places, described)
+    finder = LoopFinder(graph, GroupMatcher(model, config, device), places, described, config.loop)
     enabled = config.loops and not model.config.fine_channels
     adjuster = Adjuster(graph, state, config.adjustment, config.adjust_after_loop)
     return LoopCloser(graph, finder, enabled, config.real_time, adjuster)
@@ -212,9 +214,9 @@ class LoopCloser:
         loops = self._own_loops()
         if not loops:
             return corrected
-        options, kept = self.finder.options, self.finder.kept
+        options, kept, limits = self.finder.options, self.finder.kept, self.finder.limits
         # The poses, which confirmed loops have corrected, confirm another one as a second loop would.
-        agreement = options.translation, math.radians(options.rotation), options.scale
+        agreement = limits.translation, math.radians(limits.rotation), limits.scale
         first = bisect_left(kept, self.graph.recording.keyframe)
         known = np.array([kept.index(loop.new) for loop in loops])
         rows = np.arange(first + options.neighbours, len(kept) - options.neighbours)
@@ -312,7 +314,7 @@ class LoopCloser:
     def _adjust_next(self, corrected: int | None = None) -> None:
         """Begin the next global adjustment unless there is other work: of a world that was corrected, or is wanted."""
         if self.adjuster is not None and self.work is None:
-            self.work = self.adjuster.begin_next(self._background, self.finder.options, corrected)
+            self.work = self.adjuster.begin_next(self._background, corrected)
 
     def _found(self, loop: Loop | None) -> None:
         """Take the outcome of a search."""
@@ -320,7 +322,7 @@ class LoopCloser:
         soon = 2 - (options.every - self.wait)  # keyframes from the beginning of the search on
         if loop is None:
             if pending is not None:
-                self.wait, self.pending = (soon, pending) if self.searches < options.patience else (options.every, None)
+                self.wait, self.pending = (soon, pending) if self.searches < PATIENCE else (options.every, None)
             return
         if self._needs_confirmation(loop):
             if pending is None or not self.finder.agree(pending, loop):

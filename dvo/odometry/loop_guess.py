@@ -23,6 +23,10 @@ from dvo.graph.archive import ArchivedKeyframe
 from dvo.odometry.loop_candidates import Candidate
 from dvo.odometry.loop_window import Group
 
+GUESSED = 8
+"""Least number of patches that agree on the pose of a candidate."""
+MATCHED = 3
+"""Candidates that are verified by the network, at most."""
 _REACH = 1.5  # largest distance of an inlier from its reprojection, feature pixels
 _TRIALS = 300  # of RANSAC
 _LEAD = 0.01  # least lead of the best place of a patch over the next one, in mean cosines
@@ -116,7 +120,9 @@ class Pair:
         return torch.cat([self.old_cw, se3.compose(self.moved, self.candidate.pose_cw.expand(len(self.moved), 7))])
 
 
-def order_pairs(maps: Tensor, pairs: Sequence[Pair], inliers: int, count: int) -> Generator[None, None, list[Pair]]:
+def order_pairs(
+    maps: Tensor, pairs: Sequence[Pair], inliers: int = GUESSED, count: int = MATCHED
+) -> Generator[None, None, list[Pair]]:
     """Choose the pairs to match, in steps.
 
     Those with nearly as many inliers as the best one come first, the earliest visit before the others, since a loop

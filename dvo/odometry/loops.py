@@ -23,12 +23,17 @@ from dvo.graph.measurements import ArchivedEdges
 from dvo.graph.places import PlaceIndex
 from dvo.odometry.background import all_steps
 from dvo.odometry.loop_candidates import Candidate, by_likeness, by_proximity
-from dvo.odometry.loop_check import is_loop, median_inverse_depth
+from dvo.odometry.loop_check import Limits, is_loop, median_inverse_depth
 from dvo.odometry.loop_guess import Pair, order_pairs
 from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.loop_window import Group, GroupMatcher, Match
 from dvo.odometry.place_descriptors import PlaceDescriptor
 
+UPDATES = (2, 2, 8)
+"""Updates of the network before a candidate with fewer than :data:`HOPEFUL` inliers is refused, further ones before one
+with too few for a loop is, and further ones of a loop."""
+HOPEFUL = 0.03
+"""Share of inliers among all patches of both visits."""
 _RECENT = 256  # descriptors beside the index above which those without a keyframe are dropped
 
 
@@ -94,7 +99,9 @@ class LoopFinder:
         matcher: of two groups of keyframes.
         places: descriptors of the kept keyframes.
         descriptor: of images; None for a network without one, whose candidates come from the poses alone.
-        options: thresholds.
+        options: when to search.
+        limits: thresholds of the decision.
+        pace: seconds between two kept keyframes above which the later one counts as several towards the next search.
 
     Attributes:
         kept: identifiers of the keyframes that were archived and not dropped, increasing.
@@ -105,6 +112,8 @@ class LoopFinder:
     places: PlaceIndex
     descriptor: PlaceDescriptor | None = None
     options: LoopOptions = LoopOptions()
+    limits: Limits = Limits()
+    pace: float = 0.5
     kept: list[int] = field(default_factory=list)
     _recent: dict[int, np.ndarray] = field(default_factory=dict)  # descriptors of keyframes that are not archived yet
 
@@ -159,7 +168,7 @@ class LoopFinder:
         """
         archive = self.graph.archive
         times = np.array([archive[identifier].timestamp for identifier in (self.kept if kept is None else kept)])
-        return np.concatenate([[0], np.maximum(1, (np.diff(times) / self.options.pace).astype(int)).cumsum()])
+        return np.concatenate([[0], np.maximum(1, (np.diff(times) / self.pace).astype(int)).cumsum()])
 
     def find(self, new: int, pending: Loop | None = None) -> Loop | None:
         """Look for an earlier visit of the place of a keyframe.
@@ -206,15 +215,14 @@ class LoopFinder:
         Returns:
             The loop; None if no candidate is one.
         """
-        o = self.options
-        least = min(o.weak_inliers, o.inliers)
-        decisions = tuple(zip(o.updates, (o.hopeful, least, least), strict=True))
+        least = min(self.limits.weak_inliers, self.limits.inliers)
+        decisions = tuple(zip(UPDATES, (HOPEFUL, least, least), strict=True))
         ahead, others = search.pairs[: search.predicted], search.pairs[search.predicted :]
         try:
             for chosen in (_given(ahead), self._promising(others)):
                 for pair in (yield from chosen):
                     match = yield from self.matcher.match(pair.old, pair.new, pair.start, decisions)
-                    if match is not None and is_loop(match, pair, o):
+                    if match is not None and is_loop(match, pair, self.limits):
                         return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
             return None
         finally:
@@ -226,8 +234,8 @@ class LoopFinder:
             return ()
         if not self.matcher.maps.has(pairs[0].later):
             yield
-        maps, o = self.matcher.maps.maps(pairs[0].later), self.options
-        return () if maps is None else (yield from order_pairs(maps, pairs, o.guessed, o.matched))
+        maps = self.matcher.maps.maps(pairs[0].later)
+        return () if maps is None else (yield from order_pairs(maps, pairs))
 
     def agree(self, first: Loop, second: Loop) -> bool:
         """Find out if two loops ask for the same correction.
@@ -236,9 +244,9 @@ class LoopFinder:
             first, second: loops, with the poses of the graph as they were when these were found.
 
         Returns:
-            True if they do, within the options; False if the patches of the keyframe were released meanwhile.
+            True if they do, within the limits; False if the patches of the keyframe were released meanwhile.
         """
-        o, middle = self.options, self.graph.poses_cw(np.array([second.new]))[0]
+        o, middle = self.limits, self.graph.poses_cw(np.array([second.new]))[0]
         a, b = (self._moved(loop, middle) for loop in (first, second))
         difference = sim3.compose(a, sim3.inverse(b))
         scale = float(difference[7])
@@ -282,21 +290,20 @@ class LoopFinder:
 
     def _candidates(self, new: int, pending: Loop | None) -> Iterator[tuple[Candidate, bool]]:
         """Candidates, and whether the loop that waits for its confirmation predicts them; these come first."""
-        earlier, graph, options = self._earlier(new), self.graph, self.options
+        earlier, graph, seconds = self._earlier(new), self.graph, self.options.seconds
         if not len(earlier):
             return
         worlds = np.array([graph.world_of(graph.segment_of(int(k))) for k in earlier])
         pose_cw = graph.poses_cw(np.array([new]))[0]
         if pending is not None:
             there = earlier[worlds == graph.world_of(graph.segment_of(pending.old))]
-            predicted = replace(options, near=1)
-            for candidate in by_proximity(graph, new, self._moved(pending, pose_cw), there, predicted):
+            for candidate in by_proximity(graph, new, self._moved(pending, pose_cw), there, seconds, 1):
                 yield candidate, True
         here, seen = earlier[worlds == graph.world_of(graph.segment_of(new))], set()
-        for candidate in by_proximity(graph, new, sim3.from_se3(pose_cw), here, options):
+        for candidate in by_proximity(graph, new, sim3.from_se3(pose_cw), here, seconds):
             seen.add(candidate.old)
             yield candidate, False
-        for candidate in by_likeness(graph, self.places, self.descriptor, new, earlier, options):
+        for candidate in by_likeness(graph, self.places, self.descriptor, new, earlier):
             if candidate.old not in seen:
                 yield candidate, False
 

@@ -26,8 +26,8 @@ from dvo.graph.window import Keyframe, Window
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.background import all_steps
 from dvo.odometry.front_end import View
-from dvo.odometry.loop_candidates import rays_of, share_in_view
-from dvo.odometry.loop_guess import guess_pose
+from dvo.odometry.loop_candidates import APART, LIKENESS, RETRIEVED, rays_of, share_in_view
+from dvo.odometry.loop_guess import MATCHED, guess_pose
 from dvo.odometry.loop_window import Group, Match
 from dvo.odometry.loops import Loop, LoopFinder
 from dvo.odometry.window_step import WindowStep
@@ -104,7 +104,7 @@ def locate(finder: LoopFinder, view: View, identifier: int) -> Located | None:
         if guess is not None and guess.inliers >= MIN_GUESSED * sum(len(member.centres) for member in group):
             guesses.append((guess, old, group, poses_cw))
     guesses.sort(key=lambda found: -found[0].inliers)
-    for guess, old, group, poses_cw in guesses[: finder.options.matched]:
+    for guess, old, group, poses_cw in guesses[:MATCHED]:
         start = torch.cat([poses_cw, guess.pose_cw[None]])
         match = all_steps(finder.matcher.match(group, (_seen_from(frame, group, start),), start, DECISIONS))
         if match is not None:
@@ -188,12 +188,12 @@ def _as_keyframe(view: View, identifier: int) -> ArchivedKeyframe:
 
 def _groups(finder: LoopFinder, view: View) -> Iterator[tuple[int, Group]]:
     """Keyframes that may show what a frame shows, each with others that look at the same from elsewhere."""
-    o, seen, known = finder.options, view.seen, set[tuple[int, ...]]()
+    seen, known = view.seen, set[tuple[int, ...]]()
     if finder.descriptor is None or not finder.kept:
         return
     row = finder.descriptor(seen.image, seen.maps)
-    found = finder.places.query(finder.descriptor.views(row), o.retrieved, apart=o.apart)
-    alike = [int(k) for k, score in zip(found.identifiers, found.scores, strict=True) if score >= o.likeness]
+    found = finder.places.query(finder.descriptor.views(row), RETRIEVED, apart=APART)
+    alike = [int(k) for k, score in zip(found.identifiers, found.scores, strict=True) if score >= LIKENESS]
     for old in dict.fromkeys([*alike, finder.kept[-1]]):
         group = _group(finder, old)
         if group is not None and (members := tuple(frame.identifier for frame in group)) not in known:

@@ -9,8 +9,9 @@ import pytest
 import dvo
 from dvo.metrics import evaluate
 from dvo.odometry.adjuster import Adjusting
+from dvo.odometry.graph_adjustment import AdjustmentLimits
 from dvo.odometry.loop_work import Correcting, Searching
-from tests.support.loop_walk import OPTIONS, there_and_back, track, until
+from tests.support.loop_walk import there_and_back, track, until
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +22,7 @@ def film():
 def adjusting(film, state):
     """Tracker in a state that searches no further, and adjusts nine frames after a correction; the frames by then."""
     odometry, count = until(film, state)
-    odometry.loops.finder.options = replace(OPTIONS, adjust_delay=9)
+    odometry.loops.adjuster.limits = AdjustmentLimits(delay=9)
     odometry.loops.wait, odometry.loops.adjuster.after_loop = 1000, True
     return odometry, count
 
@@ -83,8 +84,7 @@ def test_an_adjustment_on_request(film):
 
 @pytest.mark.slow
 def test_adjustments_after_loops_are_the_same_each_time(film):
-    options = replace(OPTIONS, adjust_delay=6)
-    one, two = (track(film[0], options, adjust_after_loop=True)[2] for _ in range(2))
+    one, two = (track(film[0], adjust_after_loop=True)[2] for _ in range(2))
     assert len(one.info["adjustments"]) >= 2 and all(entry["accepted"] for entry in one.info["adjustments"])
     assert one.trajectory.poses_wc.tobytes() == two.trajectory.poses_wc.tobytes()
     assert evaluate(one.trajectory, film[1]).ate_percent < 0.5

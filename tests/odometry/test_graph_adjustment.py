@@ -17,14 +17,13 @@ from dvo.metrics import evaluate
 from dvo.odometry.adjuster import Adjuster, Adjusting
 from dvo.odometry.background import Background
 from dvo.odometry.final_adjustment import AdjustmentOptions
-from dvo.odometry.graph_adjustment import apply, prepare
-from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.graph_adjustment import AdjustmentLimits, apply, prepare
 from dvo.odometry.rolling_shutter import Shutter
 from tests.support.archived_walk import M, archived_walk
 
 GLOBAL = Shutter(0.0, 60.0)
 DROPPED = (7, 8, 20)
-LIMITS = LoopOptions(adjust_iterations=20)
+LIMITS = AdjustmentLimits(iterations=20)
 
 
 def prepared(graph, limits=LIMITS, shutter=GLOBAL):
@@ -39,7 +38,7 @@ def state(graph):
 
 
 def cost(graph):
-    return prepared(graph, LoopOptions(adjust_iterations=1)).solve().cost_before
+    return prepared(graph, AdjustmentLimits(iterations=1)).solve().cost_before
 
 
 def test_poses_and_depths_are_found_from_a_snapshot():
@@ -65,7 +64,7 @@ def test_poses_and_depths_are_found_from_a_snapshot():
 def test_the_cost_never_increases(wrong, iterations, frames):
     graph, _ = archived_walk(frames=frames, wrong=wrong)
     before = cost(graph)
-    limits = LoopOptions(adjust_iterations=iterations)
+    limits = AdjustmentLimits(iterations=iterations)
     adjuster = Adjuster(graph, None, AdjustmentOptions())
     adjuster.take(Adjusting(Background().start(prepared(graph, limits).solve), 0, 0, "loop", 0.0))
     assert cost(graph) <= before * (1 + 1e-6)
@@ -85,14 +84,14 @@ def test_a_solution_that_is_no_better_changes_nothing():
     assert not entry["accepted"] and entry["begun"] == 1.5 and entry["keyframes"] == 39
 
 
-@pytest.mark.parametrize("limits", [{"adjust_frames": 15}, {"adjust_edges": 15 * M * 10}])
+@pytest.mark.parametrize("limits", [{"frames": 15}, {"edges": 15 * M * 10}])
 def test_keyframes_beyond_the_bounds_are_held(limits):
     graph, _ = archived_walk(dropped=DROPPED)
     before = state(graph)
     found = prepared(graph, replace(LIMITS, **limits)).solve()
     assert found.better and 5 < len(found.identifiers) <= 25 and found.identifiers[-1] == 39
-    if "adjust_edges" in limits:
-        assert found.edges <= limits["adjust_edges"]
+    if "edges" in limits:
+        assert found.edges <= limits["edges"]
     else:
         assert len(found.identifiers) == 15
     apply(graph, 0, found)

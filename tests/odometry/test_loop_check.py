@@ -12,11 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dvo.geometry import se3
-from dvo.odometry.loop_check import is_loop, median_inverse_depth
-from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.loop_check import Limits, is_loop, median_inverse_depth
 from dvo.odometry.loop_window import Match
 
-OPTIONS = LoopOptions(inliers=0.4, weak_inliers=0.12, translation=0.2, rotation=3.0, scale=0.1)
+OPTIONS = Limits(inliers=0.4, weak_inliers=0.12, translation=0.2, rotation=3.0, scale=0.1)
 DEPTH = 5.0
 
 

@@ -14,7 +14,7 @@ from dvo.geometry import se3, so3
 from dvo.metrics import evaluate
 from dvo.odometry import loop_correction, loop_window
 from dvo.odometry.background import Steps, all_steps
-from dvo.odometry.loop_check import median_inverse_depth
+from dvo.odometry.loop_check import Limits, median_inverse_depth
 from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.loop_options import LoopOptions
 from dvo.odometry.loop_work import Correcting, Searching
@@ -41,7 +41,7 @@ def test_loops_are_found_where_the_way_is_repeated(film, closed):
     assert sum(loop["to"] < turn < loop["from"] for loop in loops) >= 2
     for loop in loops:
         assert loop["from"] - loop["to"] >= OPTIONS.seconds
-        assert loop["inliers"] >= OPTIONS.weak_inliers and loop["edges"] > 0 and not loop["joins_segments"]
+        assert loop["inliers"] >= Limits().weak_inliers and loop["edges"] > 0 and not loop["joins_segments"]
     scale = evaluate(result.trajectory, rows).scale
     for loop in odometry.loops.loops:  # what was measured is the true motion between the visits
         old, new = (
@@ -75,11 +75,11 @@ def test_a_place_is_recognised_from_a_wrong_start(closed):
     finder = closed[0].loops.finder
     search = turned_away(finder)
     (pair,) = search.pairs
-    decisions = ((2, 0.0), (2, OPTIONS.inliers), (8, OPTIONS.inliers))
+    decisions = ((2, 0.0), (2, Limits().inliers), (8, Limits().inliers))
     with torch.inference_mode():
         assert all_steps(finder.matcher.match(pair.old, pair.new, pair.start, decisions)) is None
         loop = all_steps(finder.verify(search))
-        assert loop is not None and loop.inliers > 2 * OPTIONS.inliers
+        assert loop is not None and loop.inliers > 2 * Limits().inliers
         assert finder._moved(loop, finder.graph.poses_cw(np.array([loop.new]))[0])[3:7].abs()[3] > 0.99
         predicted = replace(search, predicted=1)  # is matched from where it is predicted, without a guess
         assert all_steps(finder.verify(predicted)) is None
@@ -110,14 +110,14 @@ def test_a_match_with_few_inliers_has_to_agree_with_the_poses(closed, monkeypatc
     finder = closed[0].loops.finder
     search = turned_away(finder)
     with torch.inference_mode():
-        weak = replace(finder.options, inliers=1.0)  # no match is sure
-        monkeypatch.setattr(finder, "options", weak)
+        weak = replace(finder.limits, inliers=1.0)  # no match is sure
+        monkeypatch.setattr(finder, "limits", weak)
         assert all_steps(finder.verify(search)) is not None
         moved = search.pairs[0].present_cw.clone()
         moved[0] += 2 * weak.translation / median_inverse_depth(search.pairs[0].later)
         drifted = replace(search, pairs=(replace(search.pairs[0], present_cw=moved),))
         assert all_steps(finder.verify(drifted)) is None
-        monkeypatch.setattr(finder, "options", replace(weak, inliers=0.4))
+        monkeypatch.setattr(finder, "limits", replace(weak, inliers=0.4))
         assert all_steps(finder.verify(drifted)) is not None
 
 
@@ -126,13 +126,13 @@ def test_a_keyframe_long_after_the_one_before_counts_more(closed):
     times = np.array([finder.graph.archive[k].timestamp for k in finder.kept])
 
     def counts(pace):
-        fresh = replace(finder, kept=[], options=replace(OPTIONS, pace=pace))
+        fresh = replace(finder, kept=[], pace=pace)
         return [fresh.keep(k) for k in finder.kept]
 
     assert counts(1e6) == [1] * len(times)
     found = counts(0.125)
     assert found == [1, *np.maximum(1, np.floor(np.diff(times) / 0.125)).astype(int).tolist()] and max(found) > 1
-    assert (np.diff(replace(finder, options=replace(OPTIONS, pace=0.125)).counted()) == found[1:]).all()
+    assert (np.diff(replace(finder, pace=0.125).counted()) == found[1:]).all()
 
 
 def test_at_the_end_keyframes_that_are_far_apart_are_all_searched(closed, monkeypatch):
@@ -140,7 +140,8 @@ def test_at_the_end_keyframes_that_are_far_apart_are_all_searched(closed, monkey
     finder = closer.finder
     monkeypatch.setattr(closer, "loops", closer.loops[:1])
     for pace in (1e6, 0.01):
-        monkeypatch.setattr(finder, "options", replace(OPTIONS, every=12, pace=pace))
+        monkeypatch.setattr(finder, "options", replace(OPTIONS, every=12))
+        monkeypatch.setattr(finder, "pace", pace)
         found[pace] = []
         monkeypatch.setattr(finder, "find", lambda new, pending=None, looked=found[pace]: looked.append(new))
         assert not closer.complete(closed[0].state.adjustable)
@@ -163,8 +164,7 @@ def test_saving_leaves_work_in_progress_alone(film, closed, tmp_path):
         "correcting": lambda loops: isinstance(loops.work, Correcting),
         "closed": lambda loops: loops.corrections > 0 and loops.work is None,
     }
-    odometry, saved = dvo.load("small", device="cpu", **SHORT), {}
-    odometry.loops.finder.options = OPTIONS
+    odometry, saved = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT), {}
     for frame in film[0]:
         odometry.track(frame)
         for name in [name for name, state in states.items() if name not in saved and state(odometry.loops)]:
@@ -254,8 +254,7 @@ def test_a_search_at_once_finds_the_same_places(film, closed):
 
 def test_in_real_time_a_frame_does_not_wait_for_a_search(film, monkeypatch):
     """A search that never ends until the end of the sequence holds up no frame."""
-    odometry = dvo.load("small", device="cpu", **SHORT, real_time=True)
-    odometry.loops.finder.options = OPTIONS
+    odometry = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT, real_time=True)
     release, real = threading.Event(), odometry.loops.finder.verify
 
     def slow(search):
@@ -271,8 +270,7 @@ def test_in_real_time_a_frame_does_not_wait_for_a_search(film, monkeypatch):
 
 
 def test_a_search_that_fails_ends_the_frame_that_takes_its_result(film, monkeypatch):
-    odometry = dvo.load("small", device="cpu", **SHORT)
-    odometry.loops.finder.options = OPTIONS
+    odometry = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT)
 
     def broken(search):
         yield
@@ -314,8 +312,7 @@ def test_a_scene_never_seen_before_is_no_loop(film):
 
 def test_a_wrong_loop_is_not_confirmed(film, monkeypatch):
     """A single false match, by whatever likeness, does not change the map."""
-    odometry = dvo.load("small", device="cpu", **SHORT)
-    odometry.loops.finder.options = OPTIONS
+    odometry = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT)
     real, calls = odometry.loops.finder.verify, []
 
     def once(search):
@@ -338,10 +335,12 @@ def test_keyframes_of_a_segment_that_is_not_initialised_are_left_alone(closed):
     assert not fresh.advance([]) and not fresh.advance([1]) and not fresh.finder.kept
 
 
-@pytest.mark.parametrize("wrong", [{"inliers": 2.0}, {"every": 0}, {"seconds": "x"}, {"patience": 0}])
+@pytest.mark.parametrize("wrong", [{"delay": -1}, {"every": 0}, {"seconds": "x"}])
 def test_options_are_checked(wrong):
     with pytest.raises(DvoError, match=next(iter(wrong))):
         LoopOptions(**wrong)
+    with pytest.raises(DvoError, match=next(iter(wrong))):
+        dvo.load("small", loop=wrong)
 
 
 def test_a_network_with_a_fine_level_closes_no_loops():

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 import dvo
-from dvo.odometry.loop_options import LoopOptions
 from dvo.synth.sequence import make_sequence
 
 THERE = 32
@@ -63,8 +62,7 @@ def test_a_keyframe_takes_less_than_its_share_of_memory():
         63, frames=THERE, family="room", kind="handheld", speed=5.0, height=120, width=160, fps=15.0, sensor=False
     )
     clip, order = list(walk), [*range(THERE), *range(THERE - 2, -1, -1)]
-    odometry = dvo.load("small", device="cpu", **SHORT)
-    odometry.loops.finder.options = LoopOptions(seconds=1.0, every=2, neighbours=1, steps=4, delay=4)
+    odometry = dvo.load("small", device="cpu", loop={"seconds": 1.0, "every": 2, "steps": 4, "delay": 4}, **SHORT)
     held = {}
     for number, index in enumerate(order):
         odometry.track(replace(clip[index], timestamp=number / 15.0))

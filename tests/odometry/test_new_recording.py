@@ -39,9 +39,7 @@ def old(walk, tmp_path_factory):
 
 
 def begin(file, **settings):
-    odometry = dvo.load_map(file, **settings)
-    odometry.loops.finder.options = OPTIONS
-    return odometry
+    return dvo.load_map(file, loop=OPTIONS, **settings)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +59,7 @@ def test_it_is_localised_in_the_world_and_the_scale_of_the_map(walk, old, back):
     odometry, estimates, *_ = back
     result, frames = odometry.finish(), way_back(walk[0])
     found = result.info["localised"]
-    assert found["in_map"] and found["joins_segments"] and found["inliers"] >= OPTIONS.inliers and found["edges"] > 0
+    assert found["in_map"] and found["joins_segments"] and found["inliers"] >= 0.25 and found["edges"] > 0
     assert 0 <= found["from"] < COUNT / 15 and found["to"] >= 100
     assert [(segment.in_map, segment.joined_to) for segment in result.segments] == [(True, None)]
     assert set(result.trajectory.timestamps) <= {frame.timestamp for frame in frames} | {

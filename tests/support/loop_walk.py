@@ -30,16 +30,14 @@ def there_and_back():
 
 
 def track(frames, options=OPTIONS, **settings):
-    odometry = dvo.load("small", device="cpu", **SHORT, **settings)
-    odometry.loops.finder.options = options
+    odometry = dvo.load("small", device="cpu", loop=options, **SHORT, **settings)
     estimates = [odometry.track(frame) for frame in frames]
     return odometry, estimates, odometry.finish()
 
 
 def until(film, state, **settings):
     """Tracker of the walk as soon as its loop closure is in a state, and the frames tracked by then."""
-    odometry = dvo.load("small", device="cpu", **SHORT, **settings)
-    odometry.loops.finder.options = OPTIONS
+    odometry = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT, **settings)
     for count, frame in enumerate(film[0], 1):
         odometry.track(frame)
         if state(odometry.loops):

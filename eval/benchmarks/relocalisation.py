@@ -1,7 +1,7 @@
 """Places that are found again: `python -m eval.benchmarks.relocalisation [maps|dark] [--seeds 3]`.
 
-`maps`: maps that are loaded. Each sequence of the suites `revisit` and `revisit/test` is tracked to a third and saved. The map is loaded, and frames
-are tracked in it: those that follow, and those of the second lap from 0.8 of the sequence on, which show the first
+`maps`: each sequence of the suites `revisit` and `revisit/test` is tracked to a third and saved; the map is loaded, and
+frames are tracked in it: those that follow, and those of the second lap from 0.8 of the sequence on, which show the first
 third again. The table has the number of frames until the camera was found in the map (at most 3 wanted) and the error
 of its pose then, in percent of the way in the map, under the similarity that aligns the map with the truth. Last, each
 map meets frames of the other sequences, in which the camera must not be found.
@@ -97,7 +97,7 @@ LOOP = {"seconds": 1.0, "every": 2, "steps": 4, "delay": 4}
 
 
 def interrupted(room: int, other: int | None = None) -> tuple[list[Frame], Trajectory]:
-    """Frames of a room, darkness, and the way back there or frames of another room; and the truth for the first case."""
+    """Frames of a room, darkness, and the way back there or another room; and the truth for the first case."""
     walks = [
         make_sequence(
             seed, frames=40, family="room", kind="handheld", speed=5.0, height=120, width=160, fps=FPS, sensor=False

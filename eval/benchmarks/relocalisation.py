@@ -1,8 +1,8 @@
 """Places that are found again: `python -m eval.benchmarks.relocalisation [maps|dark] [--seeds 3]`.
 
 `maps`: each sequence of the suites `revisit` and `revisit/test` is tracked to a third and saved; the map is loaded, and
-frames are tracked in it: those that follow, and those of the second lap from 0.8 of the sequence on, which show the first
-third again. The table has the number of frames until the camera was found in the map (at most 3 wanted) and the error
+frames are tracked in it: those that follow, and those of the second lap from 0.8 of the sequence on, which show the
+first third again. The table has the number of frames until the camera was found (at most 3 wanted) and the error
 of its pose then, in percent of the way in the map, under the similarity that aligns the map with the truth. Last, each
 map meets frames of the other sequences, in which the camera must not be found.
 

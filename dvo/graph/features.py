@@ -49,6 +49,10 @@ class FeatureCache:
         """
         self._maps[keyframe.identifier] = maps
 
+    def drop(self, keyframe: ArchivedKeyframe) -> None:
+        """Release the maps of a keyframe, if they are there."""
+        self._maps.pop(keyframe.identifier, None)
+
     def maps(self, keyframe: ArchivedKeyframe) -> Tensor | None:
         """Feature maps of a keyframe, from the cache or computed.
 

@@ -3,9 +3,9 @@
 A tracker that is lost, or that begins a recording in a map, compares each frame with the places it knows. Candidates
 are the keyframes whose images are most alike, and the newest ones; pose from points (:mod:`dvo.odometry.loop_guess`)
 orders them, and the network measures the best in a joint window (:mod:`dvo.odometry.loop_window`), as it does for a
-loop. The frame that is found begins a segment in the world and the scale of these keyframes: its pose is known, and the
-inverse depths of its patches with the information that the measurements give (a marginal prior without correlations),
-so that tracking goes on from a single frame.
+loop. The frame that is found begins a segment in the world and the scale of these keyframes, which are guests of its
+window: their poses are held and their depths have a prior, so that tracking goes on from a single frame and, as long as
+the camera sees them, does not drift away.
 """
 
 from __future__ import annotations
@@ -95,12 +95,19 @@ def locate(finder: LoopFinder, view: View, identifier: int) -> Located | None:
     Returns:
         Its pose; None if it shows no known place.
     """
-    maps, frame = view.seen.maps, _as_keyframe(view, identifier)
-    finder.matcher.maps.put(frame, maps)
+    frame = _as_keyframe(view, identifier)
+    finder.matcher.maps.put(frame, view.seen.maps)
+    try:
+        return _found_among(finder, view, frame)
+    finally:  # the identifier may become that of another keyframe
+        finder.matcher.maps.drop(frame)
+
+
+def _found_among(finder: LoopFinder, view: View, frame: ArchivedKeyframe) -> Located | None:
     guesses = []
     for old, group in _groups(finder, view):
         poses_cw = finder.graph.poses_cw(np.array([member.identifier for member in group]))
-        guess = guess_pose(maps, frame.intrinsics, group, poses_cw)
+        guess = guess_pose(view.seen.maps, frame.intrinsics, group, poses_cw)
         if guess is not None and guess.inliers >= MIN_GUESSED * sum(len(member.centres) for member in group):
             guesses.append((guess, old, group, poses_cw))
     guesses.sort(key=lambda found: -found[0].inliers)
@@ -144,8 +151,9 @@ def hold_to_map(graph: KeyframeGraph, step: WindowStep, finder: LoopFinder) -> N
     missing = [k for k in wanted if k not in here]
     poses_cw = graph.poses_cw(np.array(missing, dtype=np.int64))
     before = window.guests
-    invite(step, [_guest(finder, graph.archive[k], pose) for k, pose in zip(missing, poses_cw, strict=True)])
-    if missing:
+    guests = [_guest(finder, graph.archive[k], pose) for k, pose in zip(missing, poses_cw, strict=True)]
+    invite(step, [guest for guest in guests if guest is not None])
+    if window.guests > before:
         step.forget(_connect(window, range(before, window.guests)))
 
 
@@ -256,16 +264,18 @@ def _located(finder: LoopFinder, group: Group, frame: ArchivedKeyframe, old: int
     )  # fmt: skip
     distance = (se3.inverse(match.poses_cw[:-1])[:, :3] - se3.inverse(pose_cw)[:3]).norm(dim=1)
     order = distance.argsort(descending=True).tolist()
-    guests = tuple(_guest(finder, group[k], match.poses_cw[k]) for k in order)
-    return Located(loop, pose_cw, match.depths, guests)
+    guests = (_guest(finder, group[k], match.poses_cw[k]) for k in order)
+    return Located(loop, pose_cw, match.depths, tuple(guest for guest in guests if guest is not None))
 
 
-def _guest(finder: LoopFinder, frame: ArchivedKeyframe, pose_cw: Tensor) -> Guest:
+def _guest(finder: LoopFinder, frame: ArchivedKeyframe, pose_cw: Tensor) -> Guest | None:
+    """Archived keyframe in the form of the window; None if its image cannot be read."""
     image, maps = frame.image(), finder.matcher.maps.maps(frame)
-    assert image is not None and maps is not None and frame.matching is not None and frame.context is not None
+    if image is None or maps is None or frame.matching is None or frame.context is None:
+        return None
     device = maps.device
     matching, context = (torch.from_numpy(x).float().to(device) for x in (frame.matching, frame.context))
-    depth = torch.from_numpy(frame.inverse_depth).to(device)
+    depth = torch.from_numpy(frame.inverse_depth).to(device).clamp(min=1e-6)
     prior = torch.stack([depth, (SIGMA / (ACCURACY * depth)).square()], 1)
     intrinsics = torch.from_numpy(frame.intrinsics).to(device)
     keyframe = Keyframe(

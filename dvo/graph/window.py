@@ -35,7 +35,6 @@ class Keyframe:
         colors: ``(M, 3)`` uint8 RGB at the patch centres.
         intrinsics: ``(4,)`` fx fy cx cy of the feature map.
         image: ``(H, W, 3)`` uint8 RGB working image, None if it is not kept.
-        fine: ``(M, c, p, p)`` features of its patches at the fine level of the correlation, None without one.
         visible: ``(h, w)`` bool, pixels of its feature map that measurements may lie in, None for all.
         measured: ``(M, 2)`` inverse depths (1/m) of its patches by a depth camera, and their weights in bundle
             adjustment, both 0 for a patch without one; None if no depth camera is used.
@@ -55,7 +54,6 @@ class Keyframe:
     colors: Tensor
     intrinsics: Tensor
     image: np.ndarray | None = None
-    fine: Tensor | None = None
     visible: Tensor | None = None
     measured: Tensor | None = None
     slopes: Tensor | None = None
@@ -170,11 +168,6 @@ class Window:
     def matching(self) -> Tensor:
         """``(n * M, C, p, p)`` matching features of the patches."""
         return torch.cat([frame.matching for frame in self.frames])
-
-    @property
-    def fine(self) -> Tensor:
-        """``(n * M, c, p, p)`` features of its patches at the fine level, for a network that has one."""
-        return torch.cat([frame.fine for frame in self.frames if frame.fine is not None])
 
     @property
     def measured(self) -> Tensor | None:

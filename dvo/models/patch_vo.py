@@ -8,7 +8,7 @@ adjustment of the revised flow.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import torch
@@ -24,9 +24,8 @@ from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.config import PRESETS, ModelConfig
 from dvo.nets.correlation import Correlation, CorrelationVolume
 from dvo.nets.frame_encoder import FrameEncoder
-from dvo.nets.patchifier import Features, Patchifier, cut_fine, normalise_images, patch_coordinates
-from dvo.nets.score import ScoreHead
-from dvo.nets.selection import SELECTIONS, PatchSelection, needs_score, no_score
+from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates
+from dvo.nets.selection import SELECTIONS, PatchSelection
 from dvo.nets.update import UPDATE_OPERATORS
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
@@ -58,7 +57,6 @@ class PatchVO(nn.Module):
         super().__init__()
         self.config = config
         self.patchify = Patchifier(config)
-        self.score = ScoreHead(config.feature_channels) if config.score_head else None
         self.select = self.selection()
         self.update = UPDATE_OPERATORS.resolve(config.update_operator)(config)
 
@@ -74,31 +72,10 @@ class PatchVO(nn.Module):
             name: in :data:`dvo.nets.selection.SELECTIONS`; empty for that of the configuration.
 
         Raises:
-            DvoError: no such selection, or one by a score that this network does not have.
+            DvoError: no such selection.
         """
         select: PatchSelection = SELECTIONS.resolve(name or self.config.selection)
-        if needs_score(select) and self.score is None:
-            raise no_score()
         return select
-
-    def centres(
-        self, images: Float[Tensor, "B N 3 H W"], features: Features | None, select: Callable[..., Tensor]
-    ) -> Float[Tensor, "B N M 2"]:
-        """Choose the centres of the patches.
-
-        Args:
-            images: RGB, uint8 or float in [0, 255].
-            features: of these images; only a selection by score needs them.
-            select: a :class:`dvo.nets.selection.PatchSelection` with the number of patches and the generator given.
-
-        Returns:
-            Feature pixels ``x, y``.
-        """
-        if not needs_score(select):
-            return select(images)
-        if self.score is None or features is None:
-            raise no_score()
-        return select(images, score=partial(self.score, features.matching))
 
     def forward(
         self,
@@ -173,14 +150,10 @@ class PatchVO(nn.Module):
         features = self.patchify.encode(normalise_images(images))
         height, width = features.matching.shape[-2:]
         if centres is None:
-            centres = self.draw_centres(images, generator, features, select)
+            centres = self.draw_centres(images, generator, select)
         m = centres.shape[2]
-        scores = None if self.score is None else self.score(features.matching, centres).flatten(1)
         matching, context = self.patchify.cut(features, centres)
         volume = CorrelationVolume(matching, features.matching, config.pyramid, config.radius)
-        cut, fine = cut_fine(features, centres, config.patch_size), None
-        if cut is not None and features.fine is not None:
-            fine = CorrelationVolume(cut, features.fine, (1,), config.fine_radius)
         scaled = intrinsics / config.STRIDE
         if inverse_depth is None:
             inverse_depth = torch.ones(b, n * m, device=images.device)
@@ -188,15 +161,13 @@ class PatchVO(nn.Module):
         frames, graph = stages[0].frames, stages[0].graph
         hidden = context.new_zeros(b, len(graph), config.hidden_channels)
         start = poses_cw[:, :frames], all_patches[:, : frames * m], scaled[:, :frames]
-        state = UpdateState(graph, *start, context, hidden, scores=scores)
+        state = UpdateState(graph, *start, context, hidden)
 
         def lookup(coords: Tensor, graph: PatchGraph) -> Correlation:
             learn = None
             if correlation_gradient < 1 and torch.is_grad_enabled():
                 learn = _draw_edges(b, len(graph), correlation_gradient, generator).to(images.device)
-            where = (graph.kk, graph.jj, learn)
-            closer = None if fine is None else fine.lookup(config.FINE * coords, *where)[0]
-            return Correlation(volume.lookup(coords, *where), fine=closer)
+            return Correlation(volume.lookup(coords, graph.kk, graph.jj, learn))
 
         refine = ClipAlignment(images) if align_last > 0 else None
         for update, stage in enumerate(stages):
@@ -211,7 +182,7 @@ class PatchVO(nn.Module):
                 hidden = hidden.index_select(1, stage.carry.clamp(min=0)) * (stage.carry >= 0)[:, None]
                 frames, coords = stage.frames, None
             present = scaled[:, :frames]
-            state = UpdateState(stage.graph, poses, patches, present, context, hidden, coords, scores=scores)
+            state = UpdateState(stage.graph, poses, patches, present, context, hidden, coords)
             options = StepOptions(mode, 1, ba_iterations, damping_at(update), (width, height))
             state = step(self, state, lookup, options, refine if update >= len(stages) - align_last else None)
             if state.coords is None:
@@ -222,7 +193,6 @@ class PatchVO(nn.Module):
         self,
         images: Float[Tensor, "B N 3 H W"],
         generator: torch.Generator | list[torch.Generator] | None = None,
-        features: Features | None = None,
         select: PatchSelection | None = None,
     ) -> Int[Tensor, "B N M 2"]:
         """Draw the patch centres of training clips.
@@ -230,23 +200,16 @@ class PatchVO(nn.Module):
         Args:
             images: uint8 RGB (or float in the same range).
             generator: on the CPU; one for each clip, or one for all.
-            features: of the images; None: they are computed if the selection needs them.
             select: selection of the patches, None for that of the configuration.
 
         Returns:
             Integer ``x, y`` in feature pixels, ``training_patches`` a frame.
         """
         select = select or self.select
-        if features is None and needs_score(select):
-            features = self.patchify.encode(normalise_images(images))
         draw = partial(select, patches=self.config.training_patches)
         if not isinstance(generator, list):
-            return self.centres(images, features, partial(draw, generator=generator))
-        parts = []
-        for i, one in enumerate(generator):
-            own = None if features is None else features.clip(i)
-            parts.append(self.centres(images[i : i + 1], own, partial(draw, generator=one)))
-        return torch.cat(parts)
+            return draw(images, generator=generator)
+        return torch.cat([draw(images[i : i + 1], generator=one) for i, one in enumerate(generator)])
 
 
 def _draw_edges(

@@ -46,7 +46,6 @@ class UpdateState:
             changed it; None before the first step.
         confidence: ``(B, E, 2)`` of the network, in (0, 1); None before the first step.
         visible: ``(N, h, w)`` bool, pixels of the feature maps that measurements may lie in; None: all.
-        scores: ``(B, K)`` of the patches by :class:`dvo.nets.score.ScoreHead`, for training; None without one.
     """
 
     graph: PatchGraph
@@ -59,7 +58,6 @@ class UpdateState:
     targets: Tensor | None = None
     weights: Tensor | None = None
     confidence: Tensor | None = None
-    scores: Tensor | None = None
     visible: Tensor | None = None
 
     @property

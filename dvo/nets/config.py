@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 from dvo.errors import DvoError
 from dvo.nets.sizes import Sizes, check_sizes, named_preset
-from dvo.settings import check_settings
+from dvo.settings import check_settings, shown
 
 # Smallest and largest sizes; the largest are far beyond networks of use, and keep a file from claiming the memory.
 RANGES = {
@@ -17,9 +18,9 @@ RANGES = {
     "patch_size": (1, 9),
     "radius": (1, 16),
     "training_patches": (1, 100_000),
-    "fine_channels": (0, 256),
-    "fine_radius": (1, 8),
 }
+RETIRED = {"fine_channels": 0, "score_head": False}
+"""Options in the metadata of older weights, with the value that loads."""
 LEVELS, COARSEST, CORRELATIONS = 8, 64, 16_384  # of the pyramid: levels and largest factor; channels of an edge
 
 
@@ -39,10 +40,6 @@ class ModelConfig(Sizes):
         self_edges: join patches with their own frame too, as DPVO does.
         selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`.
-        fine_channels: features of a further, fine level of the correlation, at half the image resolution
-            (:class:`dvo.nets.update.FineLayer`); 0 for none.
-        fine_radius: correlation radius of that level in its pixels.
-        score_head: whether there is a :class:`dvo.nets.score.ScoreHead`, which the selection ``learned`` needs.
 
     Raises:
         DvoError: a size of another type or out of :data:`RANGES`, or an even patch.
@@ -60,12 +57,8 @@ class ModelConfig(Sizes):
     self_edges: bool = True
     selection: str = field(default="random", compare=False)  # no size: a preset stays one
     update_operator: str = "gated"
-    fine_channels: int = 0
-    fine_radius: int = 1
-    score_head: bool = field(default=False, compare=False)  # beside the network: a preset stays one
 
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
-    FINE = 2  # pixels of the fine level to a feature pixel; its pixel (u, v) is centred on image pixel (2u, 2v)
 
     def __post_init__(self) -> None:
         check_settings(self, RANGES)
@@ -76,15 +69,24 @@ class ModelConfig(Sizes):
         if self.patch_size % 2 == 0:
             raise DvoError(f"must be odd, got {self.patch_size}", field="patch_size", remedy="give 1, 3 or 5")
 
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Build from plain values; see :meth:`dvo.nets.sizes.Sizes.from_dict`. Parts that networks had once may be off.
+
+        Raises:
+            DvoError: an unknown attribute, an invalid size, or a part that networks do not have.
+        """
+        for name, off in RETIRED.items():
+            if values.get(name, off) not in (off, None):
+                message = f"is {shown(values[name])}, a part that networks do not have"
+                raise DvoError(message, field=name, remedy="use weights without it, such as small")
+        gone = {*RETIRED, "fine_radius"}
+        return super().from_dict({name: value for name, value in values.items() if name not in gone})
+
     @property
     def correlation_channels(self) -> int:
         """Number of correlation channels of an edge: levels x offsets x patch pixels."""
         return len(self.pyramid) * (2 * self.radius + 1) ** 2 * self.patch_size**2
-
-    @property
-    def fine_correlation_channels(self) -> int:
-        """Number of correlation channels of an edge at the fine level: offsets x patch pixels."""
-        return (2 * self.fine_radius + 1) ** 2 * self.patch_size**2
 
 
 PRESETS: dict[str, ModelConfig] = {

@@ -42,13 +42,10 @@ class Correlation:
         levels: ``(B, E, (2r+1)^2 * p^2)`` a level of the pyramid. DPVO interleaves the levels (level fastest);
             :class:`dvo.nets.update.Update` undoes that on the weights of its first layer rather than on every edge.
         order: order of the channels of a level.
-        fine: ``(B, E, (2r+1)^2 * p^2)`` at the fine level, in the same order; None without one. It is
-            :func:`correlate_reference` of the fine features at ``ModelConfig.FINE`` times the positions.
     """
 
     levels: list[Tensor]
     order: ChannelOrder = "offsets_first"
-    fine: Tensor | None = None
 
 
 class CorrelationLookup(Protocol):

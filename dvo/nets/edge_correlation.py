@@ -27,7 +27,7 @@ class EdgeCorrelation:
     (:class:`dvo.odometry.window_correlation.WindowCorrelation`).
 
     Args:
-        scale: down-sampling of the level relative to the features; below 1 for the fine level.
+        scale: down-sampling of the level relative to the features.
         pixels: patch pixels ``p * p``.
         radius: correlation radius in pixels of the level.
         side: side of the cached window, pixels of the level; at least ``2 * radius + 2``.

@@ -16,13 +16,13 @@ class FrameEncoder(nn.Module):
         patchify: the encoders, whose parameters are shared.
 
     Attributes:
-        names: of the outputs: ``matching``, ``context`` and, with a fine level, ``fine``.
+        names: of the outputs: ``matching``, ``context``.
     """
 
     def __init__(self, patchify: Patchifier) -> None:
         super().__init__()
         self.patchify = patchify
-        self.names = ("matching", "context") + (("fine",) if patchify.fine is not None else ())
+        self.names = ("matching", "context")
 
     def forward(self, images: Float[Tensor, "n 3 H W"]) -> tuple[Tensor, ...]:
         """Encode images.
@@ -32,13 +32,11 @@ class FrameEncoder(nn.Module):
 
         Returns:
             ``matching``, ``(n, C, H / 4, W / 4)``, compared by correlation; ``context``, ``(n, D, H / 4, W / 4)``, read
-            at the centres of patches; ``fine``, ``(n, c, H / 2, W / 2)``. Pixel ``(u, v)`` is centred on image pixel
-            ``(4u, 4v)``, of ``fine`` on ``(2u, 2v)``.
+            at the centres of patches. Pixel ``(u, v)`` is centred on image pixel ``(4u, 4v)``.
         """
         features = self.patchify.encode(normalise_images(images)[None])
         shared, config = self.patchify.config.shared_encoder, self.patchify.config
         encoder = self.patchify.fnet if shared else self.patchify.inet
         weight, bias = encoder.head(slice(config.feature_channels if shared else 0, None))
         context = F.conv2d(features.trunk[0], weight[..., None, None], bias) / 4.0
-        found = (features.matching[0], context)
-        return found if features.fine is None else (*found, features.fine[0])
+        return features.matching[0], context

@@ -31,7 +31,7 @@ from dvo.graph.edges import Groups, PatchGraph, ordered
 from dvo.nets.config import ModelConfig
 from dvo.nets.correlation import Correlation
 from dvo.nets.selective_scan import selective_scan, selective_step
-from dvo.nets.update import confidence_head, correlation_layers, encode_correlation, fine_layer, revision_head
+from dvo.nets.update import confidence_head, correlation_layers, encode_correlation, revision_head
 
 GROUP_STATES = 4
 """States of a channel in a scan over a group; sequences are short (the lifetime of a patch, the patches of a frame)."""
@@ -236,7 +236,7 @@ class MambaUpdate(nn.Module):
             message = f"must be even for this update operator, got {dim}"
             raise DvoError(message, field="hidden_channels", remedy="give an even number")
         self.window = 2 * config.radius + 1
-        self.corr, self.fine = correlation_layers(config), fine_layer(config)
+        self.corr = correlation_layers(config)
         self.recall = nn.Linear(dim, dim, bias=False)
         self.norm = nn.LayerNorm(dim, eps=1e-3)
         self.patch_scan = GroupScan(dim, convolution=True)
@@ -263,7 +263,7 @@ class MambaUpdate(nn.Module):
         Returns:
             New state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
         """
-        found = encode_correlation(self.corr, correlation, self.window, self.fine)
+        found = encode_correlation(self.corr, correlation, self.window)
         net = self.norm(self.recall(hidden) + context + found)
         net = self.patch_scan(net, graph.by_patch, graph.jj, graph)
         net = self.pair_scan(net, graph.by_pair, graph.kk, graph)

@@ -20,17 +20,10 @@ class Features:
     Attributes:
         matching: ``(B, N, C, h, w)`` features for correlation.
         trunk: ``(B, N, t, h, w)`` trunk features, from which context features are computed at the patch centres alone.
-        fine: ``(B, N, c, H / 2, W / 2)`` features of the fine level of the correlation, None without one.
     """
 
     matching: Tensor
     trunk: Tensor
-    fine: Tensor | None = None
-
-    def clip(self, index: int) -> Features:
-        """Features of one clip, as a batch of one."""
-        parts = (self.matching, self.trunk, self.fine)
-        return Features(*(None if part is None else part[index : index + 1] for part in parts))  # type: ignore[arg-type]
 
 
 def normalise_images(images: Tensor) -> Tensor:
@@ -84,29 +77,25 @@ class Patchifier(nn.Module):
         self.fnet = Encoder(*sizes, config.feature_channels + extra, "instance")
         if not config.shared_encoder:
             self.inet = Encoder(*sizes, config.hidden_channels, "none")
-        fine = config.fine_channels
-        self.fine = nn.Conv2d(config.stem_channels, fine, 3, padding=1) if fine else None
 
     def encode(self, images: Float[Tensor, "B N 3 H W"]) -> Features:
-        """Encode normalised images; matching features, and those of the fine level, are divided by 4 as in DPVO.
+        """Encode normalised images; matching features are divided by 4 as in DPVO.
 
         Args:
             images: output of :func:`normalise_images`.
 
         Returns:
-            Matching and trunk features at a quarter of the image resolution, fine ones at half of it.
+            Matching and trunk features at a quarter of the image resolution.
         """
         b, n = images.shape[:2]
         flat = images.flatten(0, 1)
-        stem = self.fnet.stem(flat)
-        trunk = self.fnet.layer2(stem)
-        fine = None if self.fine is None else self.fine(stem).unflatten(0, (b, n)) / 4.0
+        trunk = self.fnet.trunk(flat)
         weight, bias = self.fnet.head(slice(self.config.feature_channels))
         matching = torch.matmul(weight / 4.0, trunk.flatten(2)) + (bias / 4.0)[:, None]
         matching = matching.unflatten(2, trunk.shape[-2:])
         if not self.config.shared_encoder:
             trunk = self.inet.trunk(flat)
-        return Features(matching.unflatten(0, (b, n)), trunk.unflatten(0, (b, n)), fine)
+        return Features(matching.unflatten(0, (b, n)), trunk.unflatten(0, (b, n)))
 
     def cut(self, features: Features, centres: Tensor) -> tuple[Tensor, Tensor]:
         """Matching and context features of patches.
@@ -125,23 +114,6 @@ class Patchifier(nn.Module):
         else:
             weight, bias = self.inet.head(slice(None))
         return matching, F.linear(trunk, weight, bias) / 4.0
-
-
-def cut_fine(features: Features, centres: Tensor, size: int) -> Tensor | None:
-    """Fine features of the pixels of patches.
-
-    Args:
-        features: output of :meth:`Patchifier.encode`.
-        centres: ``(B, N, M, 2)`` in feature pixels.
-        size: side ``p`` of a patch in feature pixels, odd.
-
-    Returns:
-        ``(B, N*M, c, p, p)``; None without a fine level.
-    """
-    if features.fine is None:
-        return None
-    scale = ModelConfig.FINE
-    return crop_patches(features.fine, scale * centres, size, scale).flatten(1, 2)
 
 
 def patch_coordinates(centres: Tensor, inverse_depth: Tensor, size: int) -> Float[Tensor, "B K 3 p p"]:

@@ -6,18 +6,14 @@ A selection gives the centres of the patches from the images; a network names th
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable
-from functools import lru_cache, partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.errors import DvoError
 from dvo.registry import Registry
 
 SELECTIONS = Registry(
@@ -27,25 +23,18 @@ SELECTIONS = Registry(
         "random": "dvo.nets.selection:random_selection",
         "grid": "dvo.nets.selection:grid_selection",
         "structure": "dvo.nets.selection:structure_selection",
-        "learned": "dvo.nets.selection:learned_selection",
     },
 )
 """Names to ``"module:function"`` of a :class:`PatchSelection`."""
 
 CANDIDATES = 4
-"""Random positions in a cell of the grid, of which ``structure`` and ``learned`` take the best."""
-PointScore = Callable[[Tensor], Tensor]
-"""Score of positions ``(B, N, P, 2)`` in feature pixels as ``(B, N, P)``, larger for better ones."""
+"""Random positions in a cell of the grid, of which ``structure`` takes the best."""
 _STRIDE = 4  # image pixels to a feature pixel
 _BOX = 7  # side of the window of the structure tensor, image pixels
 
 
 class PatchSelection(Protocol):
-    """Interface of a patch selection.
-
-    One with a further keyword ``score``, a :data:`PointScore`, is given that of the network (:func:`needs_score`).
-    It is hashable, as functions are.
-    """
+    """Interface of a patch selection."""
 
     def __call__(self, images: Tensor, patches: int, generator: torch.Generator | None) -> Tensor:
         """Choose the centres of the patches.
@@ -116,54 +105,6 @@ def structure_selection(
     points = _positions(b, n, patches, CANDIDATES, height, width, generator).to(images.device)
     index = (points[..., 1] * width + points[..., 0]).flatten(2)
     return _best(points, structure_score(images).flatten(2).gather(2, index))
-
-
-def learned_selection(
-    images: Float[Tensor, "B N 3 H W"],
-    patches: int,
-    generator: torch.Generator | None = None,
-    *,
-    score: PointScore | None = None,
-) -> Float[Tensor, "B N M 2"]:
-    """Best of four uniform positions in each cell of a grid, by the score that the network has learned.
-
-    The positions are those of ``structure`` for the same random numbers. For arguments and result see
-    :class:`PatchSelection`.
-
-    Args:
-        score: of the network, see :class:`dvo.nets.score.ScoreHead`.
-
-    Raises:
-        DvoError: no score.
-    """
-    if score is None:
-        raise no_score()
-    b, n, height, width = _feature_size(images)
-    points = _positions(b, n, patches, CANDIDATES, height, width, generator).to(images.device)
-    return _best(points, score(points.flatten(2, 3)))
-
-
-def needs_score(select: Callable[..., Any]) -> bool:
-    """Return True if a selection takes the score of the network.
-
-    Args:
-        select: a :class:`PatchSelection`, or a ``functools.partial`` of one by keywords.
-    """
-    while isinstance(select, partial):  # new ones may be made for every frame, of the same selection
-        select = select.func
-    return _takes_score(select)
-
-
-@lru_cache(maxsize=64)
-def _takes_score(select: Callable[..., Any]) -> bool:
-    """Return True if a function has the keyword; the look-up takes longer than some selections."""
-    return "score" in inspect.signature(select).parameters
-
-
-def no_score() -> DvoError:
-    """Error of a network without the head that a selection needs."""
-    remedy = "choose another selection, or train a head (python -m train fit --model.train_only score)"
-    return DvoError("the network has no head that scores patches", field="selection", remedy=remedy)
 
 
 def structure_score(images: Float[Tensor, "B N 3 H W"]) -> Float[Tensor, "B N h w"]:

@@ -176,58 +176,20 @@ def first_layer(layer: nn.Linear, correlation: Correlation, taps: int) -> Tensor
     return out
 
 
-class FineLayer(nn.Module):
-    """Linear layer from the fine level of the correlation to the first features of an edge, zero at first.
-
-    So the operator begins as it is without the level; as the level has weights of its own, it can be added to a network
-    that is trained already.
-
-    Args:
-        config: sizes of the network.
-    """
-
-    def __init__(self, config: ModelConfig) -> None:
-        super().__init__()
-        self.taps = 2 * config.fine_radius + 1
-        self.layer = nn.Linear(config.fine_correlation_channels, config.hidden_channels, bias=False)
-        nn.init.zeros_(self.layer.weight)
-
-    def forward(self, correlation: Correlation) -> Tensor:
-        """Apply the layer.
-
-        Args:
-            correlation: with a fine level.
-
-        Returns:
-            ``(B, E, D)``.
-        """
-        assert correlation.fine is not None, "the look-up has no fine level"
-        return first_layer(self.layer, Correlation([correlation.fine], correlation.order), self.taps)
-
-
-def fine_layer(config: ModelConfig) -> FineLayer | None:
-    """Layer of the fine level; None if the network has none."""
-    return FineLayer(config) if config.fine_channels else None
-
-
-def encode_correlation(
-    layers: nn.Sequential, correlation: Correlation, taps: int, fine: FineLayer | None = None
-) -> Tensor:
+def encode_correlation(layers: nn.Sequential, correlation: Correlation, taps: int) -> Tensor:
     """Encode the correlation of every edge.
 
     Args:
         layers: see :func:`correlation_layers`.
         correlation: see :mod:`dvo.nets.correlation`.
         taps: see :func:`first_layer`.
-        fine: layer of the fine level, None for none.
 
     Returns:
         ``(B, E, D)``.
     """
     first = layers[0]
     assert isinstance(first, nn.Linear)
-    found = first_layer(first, correlation, taps)
-    return layers[1:](found if fine is None else found + fine(correlation))
+    return layers[1:](first_layer(first, correlation, taps))
 
 
 def revision_head(channels: int) -> nn.Sequential:
@@ -278,7 +240,7 @@ class Update(nn.Module):
         self.gru = nn.Sequential(
             nn.LayerNorm(dim, eps=1e-3), GatedResidual(dim), nn.LayerNorm(dim, eps=1e-3), GatedResidual(dim)
         )
-        self.corr, self.fine = correlation_layers(config), fine_layer(config)
+        self.corr = correlation_layers(config)
         self.d, self.w = revision_head(dim), confidence_head(dim)
 
     def forward(
@@ -299,7 +261,7 @@ class Update(nn.Module):
         Returns:
             New state ``(B, E, D)``, flow revision ``(B, E, 2)`` in feature pixels, confidence ``(B, E, 2)`` in (0, 1).
         """
-        net = self.norm(hidden + context + encode_correlation(self.corr, correlation, self.taps, self.fine))
+        net = self.norm(hidden + context + encode_correlation(self.corr, correlation, self.taps))
         # The mask multiplies the input, so an edge without a neighbour still receives c(0) (as DPVO's weights expect).
         net = net + self.c1(net.index_select(1, graph.previous) * graph.has_previous)
         net = net + self.c2(net.index_select(1, graph.following) * graph.has_following)

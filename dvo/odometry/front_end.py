@@ -15,7 +15,7 @@ from dvo.graph.keyframe_log import FrameRecord
 from dvo.graph.window import Keyframe
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.masks import places_of_patches, unmasked_centres, visible_features
-from dvo.nets.patchifier import Features, cut_fine, normalise_images
+from dvo.nets.patchifier import Features, normalise_images
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,6 @@ class Observation:
         matching: ``(M, C, p, p)`` matching features of the patches.
         context: ``(M, D)`` context features of the patches.
         colors: ``(M, 3)`` uint8 RGB at the patch centres.
-        fine_maps: ``(1, 1, c, H / 2, W / 2)`` features of the fine level of the correlation, None without one.
-        fine: ``(M, c, p, p)`` those of the patches, None without one.
         visible: ``(h, w)`` bool, pixels of the feature map that a measurement may lie in; None: all.
         measured: ``(M, 2)`` inverse depths of the patches by a depth camera (1/m) and their weights in bundle
             adjustment, both 0 for a patch without one; None if depth is not used.
@@ -47,8 +45,6 @@ class Observation:
     matching: Tensor
     context: Tensor
     colors: Tensor
-    fine_maps: Tensor | None = None
-    fine: Tensor | None = None
     visible: Tensor | None = None
     measured: Tensor | None = None
     slopes: Tensor | None = None
@@ -83,7 +79,7 @@ def keyframe_of(view: View, identifier: int, map_slot: int) -> Keyframe:
         The keyframe.
     """
     s = view.seen
-    features = s.matching, s.context, s.colors, s.intrinsics, s.image, s.fine, s.visible, s.measured, s.slopes
+    features = s.matching, s.context, s.colors, s.intrinsics, s.image, s.visible, s.measured, s.slopes
     return Keyframe(identifier, view.records[0].timestamp, map_slot, *features)
 
 
@@ -125,12 +121,11 @@ def observe(
     """
     rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
     features = encode_image(model, image, device)
-    centres = model.centres(rgb[None, None], features, select)
+    centres = select(rgb[None, None])
     if mask is not None:
-        again = partial(model.centres, rgb[None, None], features, select)
+        again = partial(select, rgb[None, None])
         centres = unmasked_centres(centres, again, places_of_patches(mask, model.config.patch_size, device))
     matching, context = model.patchify.cut(features, centres)
-    fine = cut_fine(features, centres, model.config.patch_size)
     stride = model.config.STRIDE
     x, y = (centres[0, 0] * stride).unbind(-1)
     return Observation(
@@ -142,7 +137,5 @@ def observe(
         matching=matching[0],
         context=context[0],
         colors=rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu(),
-        fine_maps=features.fine,
-        fine=None if fine is None else fine[0],
         visible=None if mask is None else visible_features(mask, model.config.patch_size, device),
     )

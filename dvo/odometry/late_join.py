@@ -68,7 +68,7 @@ def _join(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, view: V
     window, seen, before = graph.window, view.seen, _Before.of(step)
     assert isinstance(step.model, PatchVO)
     position, slot, c = len(window) - 1, window.free_map_slot(), step.model.config
-    step.keep_frame(slot, seen.image, seen.maps, seen.fine_maps)
+    step.keep_frame(slot, seen.image, seen.maps)
     depth = first_depth(window, config, True, seen.measured)
     keyframe = keyframe_of(view, identifier, slot)
     pose = initial_pose(window, seen, _interpolated(window, keyframe.timestamp), config.initial_pose)

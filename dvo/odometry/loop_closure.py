@@ -61,7 +61,7 @@ def loop_closer(
     """Loop closure of a tracker.
 
     Args:
-        model: the network. One with a fine level, whose features are not archived, finds no loops.
+        model: the network.
         config: of the tracker.
         graph: of the tracker.
         device: of the computation.
@@ -70,9 +70,8 @@ def loop_closer(
     described = shipped_descriptor(model.config.feature_channels)
     places = PlaceIndex(1 if described is None else described.dimensions)
     finder = LoopFinder(graph, GroupMatcher(model, config, device), places, described, config.loop)
-    enabled = config.loops and not model.config.fine_channels
     adjuster = Adjuster(graph, state, config.adjustment, config.adjust_after_loop)
-    return LoopCloser(graph, finder, enabled, config.real_time, adjuster)
+    return LoopCloser(graph, finder, config.loops, config.real_time, adjuster)
 
 
 @dataclass

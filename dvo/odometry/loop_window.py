@@ -148,7 +148,7 @@ class GroupMatcher:
         centres = torch.from_numpy(frame.centres)[None, None].to(device)
         matching, context = (torch.from_numpy(x).float().to(device) for x in (frame.matching, frame.context))
         intrinsics, colors = torch.from_numpy(frame.intrinsics).to(device), torch.from_numpy(frame.colors)
-        step.keep_frame(slot, image, maps, None)
+        step.keep_frame(slot, image, maps)
         keyframe = Keyframe(frame.identifier, frame.timestamp, slot, matching, context, colors, intrinsics)
         depth = torch.from_numpy(frame.inverse_depth)[None].to(device)
         patches = patch_coordinates(centres, depth, self.model.config.patch_size)[0]

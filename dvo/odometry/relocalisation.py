@@ -130,7 +130,7 @@ def invite(step: WindowStep, guests: Sequence[Guest]) -> None:
     for guest in guests:
         keyframe = replace(guest.keyframe, map_slot=window.free_map_slot())
         assert keyframe.image is not None
-        step.keep_frame(keyframe.map_slot, keyframe.image, guest.maps, None)
+        step.keep_frame(keyframe.map_slot, keyframe.image, guest.maps)
         window.insert(window.guests, keyframe, guest.pose_cw.to(window.poses_cw), guest.patches)
 
 

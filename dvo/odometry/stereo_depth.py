@@ -201,11 +201,11 @@ def _pair(
     align = WindowAlignment(window, replace(config.alignment, slope=_SLOPE), device)
     step = WindowStep(model, window, WindowCorrelation(window, c, device), align, True, config.kernel)
     patches = patch_coordinates(seen.centres, depth, c.patch_size)[0]
-    maps = (seen.maps, features.matching), (seen.fine_maps, features.fine)
+    maps = seen.maps, features.matching
     both = (seen.image, seen.intrinsics, se3.identity().to(pose)), (image, intrinsics, pose)
     for slot, (picture, focal, at) in enumerate(both):  # patches of the right image have no edges
-        step.keep_frame(slot, picture, maps[0][slot], maps[1][slot])
-        keyframe = Keyframe(slot, float(slot), slot, seen.matching, seen.context, seen.colors, focal, fine=seen.fine)
+        step.keep_frame(slot, picture, maps[slot])
+        keyframe = Keyframe(slot, float(slot), slot, seen.matching, seen.context, seen.colors, focal)
         window.append(keyframe, at, patches)
     kk = torch.arange(window.per_frame, device=device)
     step.forget(window.connect(kk, torch.ones_like(kk)))

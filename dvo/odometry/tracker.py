@@ -344,7 +344,7 @@ class PatchOdometry:
         """Add a frame to the window: with predicted pose and the median depth of the frames before it, or as found."""
         config, window, seen = self.config, self.window, view.seen
         slot = window.free_map_slot()
-        self.step.keep_frame(slot, seen.image, seen.maps, seen.fine_maps)
+        self.step.keep_frame(slot, seen.image, seen.maps)
         keyframe = keyframe_of(view, self.state.keyframes, slot)
         self.state.keyframes += 1
         self.loops.see(keyframe.identifier, seen.image, seen.maps)

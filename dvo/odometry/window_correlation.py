@@ -14,7 +14,6 @@ from dvo.nets.patchifier import pool_levels
 
 # Sides allow several pixels of motion before the products of a window must be computed again.
 _SIDE_FINE, _SIDE_COARSE = 14, 12
-_SPARE = 10  # of the level at half the image resolution, beside the reach of its look-ups
 
 
 class WindowCorrelation:
@@ -34,26 +33,19 @@ class WindowCorrelation:
             )
             for scale in config.pyramid
         ]
-        self.fine = None
-        if config.fine_channels:
-            side = 2 * config.fine_radius + config.FINE * (config.patch_size - 1) + _SPARE
-            self.fine = EdgeCorrelation(1 / config.FINE, config.patch_size**2, config.fine_radius, side, device)
 
     @property
     def capacity(self) -> int:
         """Number of edge slots that memory is reserved for."""
         return max(len(level) for level in self.levels)
 
-    def keep_maps(self, map_slot: int, maps: Tensor, fine: Tensor | None = None) -> None:
+    def keep_maps(self, map_slot: int, maps: Tensor) -> None:
         """Store the feature maps of a frame.
 
         Args:
             map_slot: slot of the frame; its content is overwritten.
             maps: ``(1, 1, C, h, w)`` matching features.
-            fine: ``(1, 1, c, H / 2, W / 2)`` features of the fine level, for a network that has one.
         """
-        if self.fine is not None and fine is not None:
-            self.fine.keep_map(map_slot, fine[0, 0])
         for level, pooled in zip(self.levels, pool_levels(maps, self.pyramid), strict=True):
             level.keep_map(map_slot, pooled[0, 0])
 
@@ -63,16 +55,16 @@ class WindowCorrelation:
         Args:
             edge_slots: ``(e,)``.
         """
-        for level in self._all:
+        for level in self.levels:
             level.forget(edge_slots)
 
     def origins(self) -> Tensor:
         """Positions of the cached windows of the edges, for :meth:`restore`.
 
         Returns:
-            ``(L, E, 2)`` for each level, the fine one last.
+            ``(L, E, 2)`` for each level.
         """
-        return torch.stack([level.origins(self.window.edge_slots) for level in self._all])
+        return torch.stack([level.origins(self.window.edge_slots) for level in self.levels])
 
     def restore(self, origins: Tensor) -> None:
         """Compute the cached windows of all edges at given positions; the maps of the frames are stored already.
@@ -85,13 +77,8 @@ class WindowCorrelation:
         """
         window = self.window
         maps = window.map_slots[window.jj]
-        for level, part in zip(self._all, origins, strict=True):
-            features = window.fine if level is self.fine else window.matching
-            level.restore(part, window.edge_slots, features.flatten(2), window.kk, maps)
-
-    @property
-    def _all(self) -> list[EdgeCorrelation]:
-        return [*self.levels, *([self.fine] if self.fine is not None else [])]
+        for level, part in zip(self.levels, origins, strict=True):
+            level.restore(part, window.edge_slots, window.matching.flatten(2), window.kk, maps)
 
     def __call__(self, coords: Tensor, graph: PatchGraph) -> Correlation:
         """Look up the edges of the window, see :class:`dvo.nets.correlation.CorrelationLookup`.
@@ -107,7 +94,4 @@ class WindowCorrelation:
         matching = window.matching.flatten(2)
         maps = window.map_slots[graph.jj]
         found = [level.lookup(coords[0], window.edge_slots, matching, graph.kk, maps)[None] for level in self.levels]
-        closer = None
-        if self.fine is not None:
-            closer = self.fine.lookup(coords[0], window.edge_slots, window.fine.flatten(2), graph.kk, maps)[None]
-        return Correlation(found, "pixels_first", closer)
+        return Correlation(found, "pixels_first")

@@ -54,16 +54,16 @@ class WindowStep:
         shared = {id(self.model): self.model, id(self.window): window}
         return deepcopy(self, shared | ({id(self.lookup): self.lookup} if last else {}))
 
-    def keep_frame(self, map_slot: int, image: np.ndarray, maps: Tensor, fine_maps: Tensor | None) -> None:
+    def keep_frame(self, map_slot: int, image: np.ndarray, maps: Tensor) -> None:
         """Store feature maps and image of a frame.
 
         Args:
             map_slot: slot of the frame; its content is overwritten.
             image: ``(H, W, 3)`` uint8 RGB working image.
-            maps, fine_maps: see :class:`dvo.odometry.front_end.Observation`.
+            maps: see :class:`dvo.odometry.front_end.Observation`.
         """
         self.bounds = maps.shape[-1], maps.shape[-2]
-        self.lookup.keep_maps(map_slot, maps, fine_maps)
+        self.lookup.keep_maps(map_slot, maps)
         if self.align is not None:
             self.align.keep_image(map_slot, image)
 

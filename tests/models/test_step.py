@@ -13,9 +13,9 @@ from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
 from dvo.models.step import StepOptions, UpdateState, recent_depth, revise, step
-from dvo.nets.config import ModelConfig, preset
+from dvo.nets.config import preset
 from dvo.nets.correlation import Correlation, correlate_reference
-from dvo.nets.patchifier import cut_fine, normalise_images, patch_coordinates
+from dvo.nets.patchifier import normalise_images, patch_coordinates
 from dvo.nets.selection import random_centres
 from dvo.nets.update import UPDATE_OPERATORS
 from dvo.odometry.window_correlation import WindowCorrelation
@@ -31,17 +31,11 @@ def clip():
 
 
 def network(name):
-    """Small network; with ``fine`` in its name it has the fine level of the correlation, with weights at random."""
     torch.manual_seed(0)
-    operator, fine = name.split()[0], 6 * ("fine" in name)
-    config = replace(preset("tiny"), training_patches=PATCHES, update_operator=operator, fine_channels=fine)
-    model = PatchVO(config).eval()
-    if fine:
-        torch.nn.init.normal_(model.update.fine.layer.weight, std=0.1)
-    return model
+    return PatchVO(replace(preset("tiny"), training_patches=PATCHES, update_operator=name)).eval()
 
 
-@pytest.fixture(scope="module", params=["gated", "mamba", "gated fine", "mamba fine"])
+@pytest.fixture(scope="module", params=["gated", "mamba"])
 def model(request):
     return network(request.param)
 
@@ -52,17 +46,14 @@ def as_window(model, clip, generator):
     h, w = features.matching.shape[-2:]
     centres = random_centres(FRAMES, PATCHES, h, w, generator, 1)
     matching, context = model.patchify.cut(features, centres)
-    fine = cut_fine(features, centres, 3)
     patches = patch_coordinates(centres, torch.ones(1, FRAMES * PATCHES), 3)[0]
     window = Window.empty(PATCHES, 3, model.config.hidden_channels, torch.device("cpu"))
     correlation = WindowCorrelation(window, model.config, torch.device("cpu"))
     for i in range(FRAMES):
         part = slice(i * PATCHES, (i + 1) * PATCHES)
         slot = window.free_map_slot()
-        has = fine is not None
-        correlation.keep_maps(slot, features.matching[:, i : i + 1], features.fine[:, i : i + 1] if has else None)
-        frame = Keyframe(i, 0.1 * i, slot, matching[0, part], context[0, part], torch.zeros(0), clip.intrinsics[i] / 4,
-                         fine=fine[0, part] if has else None)  # fmt: skip
+        correlation.keep_maps(slot, features.matching[:, i : i + 1])
+        frame = Keyframe(i, 0.1 * i, slot, matching[0, part], context[0, part], torch.zeros(0), clip.intrinsics[i] / 4)
         window.append(frame, se3.identity(), patches[part])
     graph = training_schedule(FRAMES, PATCHES, 1, self_edges=False)[0].graph
     correlation.forget(window.connect(graph.kk, graph.jj))
@@ -101,13 +92,9 @@ def test_forward_is_the_last_state_of_an_unroll(model, clip):
     assert torch.equal(found.poses_cw, states[-1].poses_cw) and torch.equal(found.targets, states[-1].targets)
 
 
-def reference_lookup(matching, maps, fine=None, fine_maps=None, radius=1):
+def reference_lookup(matching, maps):
     def lookup(coords, graph):
-        edges = (graph.kk, graph.jj)
-        closer = None
-        if fine is not None:
-            closer = correlate_reference(fine, fine_maps, ModelConfig.FINE * coords, *edges, (1,), radius)[0]
-        return Correlation(correlate_reference(matching, maps, coords, *edges), fine=closer)
+        return Correlation(correlate_reference(matching, maps, coords, graph.kk, graph.jj))
 
     return lookup
 
@@ -121,7 +108,7 @@ def start(model, clip):
     patches = patch_coordinates(centres, torch.ones(1, FRAMES * PATCHES), 3)
     hidden = torch.zeros(1, len(graph), model.config.hidden_channels)
     state = UpdateState(graph, se3.identity(1, FRAMES), patches, clip.intrinsics[None] / 4, context, hidden)
-    lookup = reference_lookup(matching, features.matching, cut_fine(features, centres, 3), features.fine)
+    lookup = reference_lookup(matching, features.matching)
     return state, lookup, (float(w), float(h))
 
 

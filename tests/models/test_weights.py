@@ -111,6 +111,25 @@ def test_sizes_without_an_update_operator_are_of_the_gated_one(tmp_path):
     assert torch.equal(states[0].targets, states[1].targets) and torch.equal(states[0].poses_cw, states[1].poses_cw)
 
 
+def test_parts_that_networks_do_not_have_may_be_off_in_a_file(tmp_path):
+    model, file = PatchVO(preset("tiny")), tmp_path / "older.safetensors"
+    save_weights(file, model, {})
+    with safe_open(file, "pt") as opened:
+        metadata, tensors = opened.metadata(), {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    for parts, loads in (
+        ({"fine_channels": 0, "fine_radius": 1, "score_head": False}, True),
+        ({"fine_channels": 6}, False),
+        ({"score_head": True}, False),
+    ):
+        config = json.dumps(json.loads(metadata["config"]) | parts)
+        save_file(tensors, file, {**metadata, "config": config})
+        if loads:
+            assert load_weights(file).preset == "tiny"
+            continue
+        with pytest.raises(DvoError, match=f"older.safetensors.*{next(iter(parts))}.*Use weights without it"):
+            load_weights(file)
+
+
 def test_the_state_space_operator_is_carried_by_its_weights(tmp_path):
     save_weights(tmp_path / "m.safetensors", PatchVO(preset("mamba")), {})
     loaded = load_weights(tmp_path / "m.safetensors")

@@ -4,7 +4,7 @@ import torch
 
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.config import ModelConfig, preset
-from dvo.nets.patchifier import cut_fine, normalise_images
+from dvo.nets.patchifier import normalise_images
 
 
 def check(config):
@@ -21,10 +21,6 @@ def check(config):
     x, y = centres.reshape(-1, 2).unbind(1)
     torch.testing.assert_close(found["context"][frame, :, y, x], context[0])
     torch.testing.assert_close(found["matching"][frame, :, y, x], patches[0, :, :, 1, 1])
-    fine = cut_fine(features, centres, config.patch_size)
-    assert ("fine" in found) == (fine is not None)
-    if fine is not None:
-        torch.testing.assert_close(found["fine"][frame, :, 2 * y, 2 * x], fine[0, :, :, 1, 1])
     assert not any(name.startswith("encoder") for name in model.state_dict())
 
 
@@ -32,8 +28,8 @@ def test_shared_encoder():
     check(preset("tiny"))
 
 
-def test_two_encoders_and_a_fine_level():
-    check(ModelConfig(8, 16, 32, 48, shared_encoder=False, training_patches=12, fine_channels=8))
+def test_two_encoders():
+    check(ModelConfig(8, 16, 32, 48, shared_encoder=False, training_patches=12))
 
 
 def test_parameters_are_those_of_the_network():

@@ -1,31 +1,22 @@
 """Patch selections: where they place the patches, and that the seed decides."""
 
-import inspect
-from dataclasses import replace
-from functools import partial
 
 import cv2
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dvo
-from dvo.data.frame import Frame
 from dvo.errors import DvoError
 from dvo.geometry import se3
-from dvo.geometry.camera import Camera
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
-from dvo.models.weights import LoadedWeights, load_weights, save_weights
+from dvo.models.weights import load_weights, save_weights
 from dvo.nets.config import ModelConfig, preset
-from dvo.nets.patchifier import normalise_images
-from dvo.nets.selection import SELECTIONS, needs_score, random_centres, structure_score
+from dvo.nets.selection import SELECTIONS, random_centres, structure_score
 from dvo.odometry.config import TRACKER_PRESETS
-from dvo.odometry.front_end import observe
 from dvo.odometry.load import build_odometry
-from dvo.synth.clip import make_clip
 
 NAMES = list(SELECTIONS)
 
@@ -35,10 +26,8 @@ def noise(height, width, frames=2, batch=1, seed=0):
     return torch.randint(0, 256, (batch, frames, 3, height, width), dtype=torch.uint8, generator=generator)
 
 
-def chosen(name, images, patches, seed=0, **options):
-    if name == "learned":
-        options = {"score": lambda points: (7 * points[..., 0] + points[..., 1]) % 11} | options
-    return SELECTIONS.resolve(name)(images, patches, generator=torch.Generator().manual_seed(seed), **options)
+def chosen(name, images, patches, seed=0):
+    return SELECTIONS.resolve(name)(images, patches, generator=torch.Generator().manual_seed(seed))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -53,7 +42,7 @@ def test_patches_lie_inside_and_the_seed_decides(name, patches, height, width, s
     assert torch.equal(centres, chosen(name, images, patches, seed))
 
 
-@pytest.mark.parametrize("name", ["grid", "structure", "learned"])
+@pytest.mark.parametrize("name", ["grid", "structure"])
 @pytest.mark.parametrize("size", [(232, 320), (152, 504), (320, 240)])
 def test_no_two_patches_share_a_cell(name, size):
     """24 patches of 232x320 lie in 4 rows of 6; more cells than patches leave some empty, elsewhere in each frame."""
@@ -111,85 +100,6 @@ def test_a_network_carries_its_selection_to_the_tracker(tmp_path):
     assert loaded.preset == "tiny" and build_odometry(loaded).config == TRACKER_PRESETS["tiny"]
     assert build_odometry(loaded).select.func is SELECTIONS.resolve("grid")
     assert build_odometry(loaded, selection="structure").select.func is SELECTIONS.resolve("structure")
-
-
-def test_learned_spreads_patches_as_structure_does():
-    """With the score of the structure tensor it takes the same patches."""
-    images = noise(100, 132, frames=3, batch=2)
-    scores = structure_score(images)
-    batch, frame = torch.arange(2)[:, None, None], torch.arange(3)[:, None]
-    learned = chosen("learned", images, 24, score=lambda at: scores[batch, frame, at[..., 1], at[..., 0]])
-    assert torch.equal(learned, chosen("structure", images, 24))
-    assert not torch.equal(learned, chosen("learned", images, 24))
-
-
-def test_learned_is_the_same_in_training_and_tracking():
-    torch.manual_seed(1)
-    values = preset("tiny").to_dict() | {"selection": "learned", "score_head": True, "training_patches": 16}
-    model = PatchVO(ModelConfig.from_dict(values)).eval()
-    images, generator = noise(96, 128), torch.Generator()
-    start = {"poses_cw": se3.identity(1, 2), "generator": generator.manual_seed(4)}
-    unrolled = next(model.unroll(images, torch.ones(1, 2, 4), training_schedule(2, 16, 1, self_edges=False), **start))
-    tracker = build_odometry(LoadedWeights.of(model, "mine"), seed=4, selection="learned", patches=16)
-    assert tracker.select.func is SELECTIONS.resolve("learned")
-    camera = Camera(90.0, 90.0, 64.0, 48.0, 128, 96)
-    seen = observe(model, images[0, 0].permute(1, 2, 0).numpy(), camera, tracker.select, torch.device("cpu"))
-    generator.manual_seed(4)
-    with torch.no_grad():
-        features = model.patchify.encode(normalise_images(images[:, :1]))
-        alone = model.centres(images[:, :1], features, partial(model.select, patches=16, generator=generator))
-        generator.manual_seed(4)
-        features = model.patchify.encode(normalise_images(images))
-        both = model.centres(images, features, partial(model.select, patches=16, generator=generator))
-    assert torch.equal(seen.centres, alone)
-    assert torch.equal(unrolled.patches[0, :, :2, 1, 1].long(), both.flatten(1, 2)[0])
-    torch.testing.assert_close(unrolled.scores, model.score(features.matching, both).flatten(1))
-
-
-def test_learned_needs_a_head():
-    with pytest.raises(DvoError, match="selection: the network has no head that scores patches. Choose another"):
-        dvo.load("small", selection="learned")
-    with pytest.raises(DvoError, match="no head"):
-        PatchVO(ModelConfig(selection="learned"))
-    with pytest.raises(DvoError, match="no head"):
-        SELECTIONS.resolve("learned")(noise(48, 64), 4)
-
-
-def test_a_head_changes_neither_preset_nor_trajectory(tmp_path):
-    """Weights with a head: loaded again they are the preset, and other selections select as before."""
-    shipped = load_weights("small")
-    torch.manual_seed(0)
-    model = PatchVO(replace(shipped.model.config, score_head=True))
-    model.load_state_dict({**model.state_dict(), **shipped.model.state_dict()})
-    save_weights(tmp_path / "mine.safetensors", model, {})
-    loaded = load_weights(tmp_path / "mine.safetensors")
-    assert loaded.preset == "small" and build_odometry(loaded).config == TRACKER_PRESETS["small"]
-    clip = make_clip(1, 4, frames=8, height=120, width=160, flow_range=(2.0, 4.0))
-    camera = Camera(*clip.intrinsics[0].tolist(), 160, 120)
-    frames = [Frame(i, 0.1 * i, image.permute(1, 2, 0).numpy(), camera) for i, image in enumerate(clip.images)]
-
-    def poses(weights, **settings):
-        odometry = build_odometry(weights, **settings)
-        return [estimate.pose_wc for estimate in map(odometry.track, frames) if estimate.pose_wc is not None]
-
-    mine, theirs, learned = poses(loaded), poses(shipped), poses(loaded, selection="learned")
-    assert len(mine) and np.array_equal(mine, theirs) and not np.array_equal(mine, learned)
-
-
-def test_the_signature_of_a_selection_is_read_once(monkeypatch):
-    read, signature = [], inspect.signature
-    monkeypatch.setattr(inspect, "signature", lambda select: read.append(select) or signature(select))
-
-    def scored(images, patches, generator, *, score=None):
-        return None
-
-    def plain(images, patches, generator):
-        return None
-
-    for patches in (1, 2):
-        assert needs_score(scored) and needs_score(partial(partial(scored, patches=patches), generator=None))
-        assert not needs_score(plain) and not needs_score(partial(plain, patches=patches))
-    assert read == [scored, plain]
 
 
 def test_an_unknown_selection_is_named():

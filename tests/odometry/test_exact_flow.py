@@ -26,7 +26,7 @@ class TrueFlow:
     def __init__(self, odometry, clip):
         self.odometry, self.clip = odometry, clip
 
-    def keep_maps(self, map_slot, maps, fine=None):
+    def keep_maps(self, map_slot, maps):
         pass
 
     def forget(self, edge_slots):

@@ -341,8 +341,3 @@ def test_options_are_checked(wrong):
         LoopOptions(**wrong)
     with pytest.raises(DvoError, match=next(iter(wrong))):
         dvo.load("small", loop=wrong)
-
-
-def test_a_network_with_a_fine_level_closes_no_loops():
-    closer = LoopCloser(None, None, enabled=False)
-    assert closer.information() == {} and not closer.advance([0]) and not closer.complete([0])

@@ -289,9 +289,7 @@ class TrainingProgram(L.LightningModule):
                 file=file,
                 remedy="give weights of that network, or name another task",
             )
-        new = self.task.new_tensors()
-        own = {name: value for name, value in self.net.state_dict().items() if name.startswith(new)}
-        tensors = own | weights.model.state_dict()
+        tensors = weights.model.state_dict()
         check_tensors(self.net, tensors, file)
         for module in (self.net, self.average):
             module.load_state_dict(tensors)

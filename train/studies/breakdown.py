@@ -28,7 +28,7 @@ FORWARD: tuple[tuple[str, Any, str], ...] = (
     ("correlation volume", correlation.CorrelationVolume, "__init__"),
     ("correlation look-up", correlation.CorrelationVolume, "lookup"),
     ("update operator", Update, "forward"),
-    ("bundle adjustment", step_module, "bundle_adjust"),
+    ("bundle adjustment", step_module, "solve"),
     ("reprojection", step_module, "reproject"),
 )
 LOSS: tuple[tuple[str, Any, str], ...] = (

@@ -100,10 +100,6 @@ class Task(Protocol):
     def trained_weights_loaded(self, buffers: Mapping[str, Tensor]) -> None:
         """Training starts from trained weights and not from random ones; state in the buffers may say so."""
 
-    def new_tensors(self) -> tuple[str, ...]:
-        """Beginnings of the names of tensors that starting weights may lack; these stay as they are at random."""
-        return ()
-
     def state_dict(self) -> dict[str, Any]:
         """Further state of the task, for checkpoints."""
         return {}

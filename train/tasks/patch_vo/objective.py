@@ -20,7 +20,6 @@ from dvo.losses.pose import PoseErrors, pose_errors
 from dvo.models.patch_vo import Mode, UpdateState
 from dvo.nets.patchifier import crop_patches
 from dvo.settings import check_settings
-from train.tasks.patch_vo.usefulness import score_loss
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,6 @@ class LossConfig:
         balance_every: steps between comparisons.
         balance_window: comparisons in the running mean.
         trend_window: steps in the mean that the losses of a step are compared with.
-        score: of the loss of the patch scores, for a network that has them.
     """
 
     pose: float = 10.0
@@ -62,7 +60,6 @@ class LossConfig:
     balance_every: int = 20
     balance_window: int = 50
     trend_window: int = 4
-    score: float = 1.0
 
     def __post_init__(self) -> None:
         check_settings(self, {"trend_window": (1, 10_000)})
@@ -143,14 +140,12 @@ class Terms:
     Attributes:
         target, flow: scalars.
         translation, rotation: ``(B,)``, one number a clip.
-        score: loss of the patch scores after the last update, a scalar; None for a network without them.
     """
 
     target: list[Tensor] = field(default_factory=list)
     flow: list[Tensor | None] = field(default_factory=list)
     translation: list[Tensor | None] = field(default_factory=list)
     rotation: list[Tensor | None] = field(default_factory=list)
-    score: Tensor | None = None
 
     def total(self, config: LossConfig, beta: float = 1.0, rotation: float = 1.0) -> Tensor:
         """Weighted sum of all terms.
@@ -167,7 +162,7 @@ class Terms:
                 total = total + config.flow * beta * flow
             if tau is not None and phi is not None:
                 total = total + config.pose * (tau + rotation * phi).mean()
-        return total if self.score is None else total + config.score * self.score
+        return total
 
     def sums(self, config: LossConfig) -> dict[str, Tensor]:
         """The terms summed over the updates with the weights of the configuration, those of the balance left out:
@@ -198,15 +193,14 @@ def clip_terms(
 
     Returns:
         the terms, and detached measures of the last update: ``flow``, ``target``, ``translation``,
-        ``rotation_deg``, ``rotation_ratio`` (error over true motion), ``confidence``, the shares of patch flow
-        ``px<0.25`` ..., and for a network with patch scores ``score`` and ``score_correlation``.
+        ``rotation_deg``, ``rotation_ratio`` (error over true motion), ``confidence`` and the shares of patch flow
+        ``px<0.25`` ...
     """
     terms = Terms()
     there: tuple[Tensor, Tensor] | None = None
     graph: PatchGraph | None = None
     measures: dict[str, Tensor] = {}
     measured: Callable[[], dict[str, Tensor]] = dict
-    scored: Callable[[], tuple[Tensor, Tensor]] | None = None
     for update, state in enumerate(states):
         if there is None or state.graph is not graph:
             graph = state.graph
@@ -234,10 +228,6 @@ def clip_terms(
         measures = {"flow": flow, "target": target, "confidence": state.confidence.mean()}
         # Only the last update is measured further.
         measured = partial(_further_measures, truth, state, mode, errors, error, wanted, near)
-        scored = None if state.scores is None else partial(score_loss, state, wanted)
-    if scored is not None:
-        terms.score, correlation = scored()
-        measures |= {"score": terms.score, "score_correlation": correlation}
     return terms, {name: value.detach() for name, value in (measures | measured()).items()}
 
 

@@ -18,16 +18,12 @@ from dvo.losses.trend import TrendPenalty
 from dvo.models.patch_vo import Mode, PatchVO
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.nets.config import preset
-from dvo.nets.selection import random_selection
 from train.data.augment import Augmentation, augment, random_source
 from train.data.clips import Renderings
 from train.engine.ranks import mean_over_ranks, rank
 from train.tasks.patch_vo.objective import LossConfig, Terms, Truth, clip_terms, truth_of
 from train.tasks.patch_vo.variants import HEADS, flow_loss_variants
 from train.tasks.task import Batch, StepContext, StepLoss, Task
-
-SCORE = "score"
-"""Name of the head that :class:`dvo.nets.score.ScoreHead` is, for ``train_only``."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +57,7 @@ class PatchVOTask(Task):
         align_last: updates at the end of a clip whose measurements are aligned to a fraction of a pixel, see
             :meth:`dvo.models.patch_vo.PatchVO.unroll`.
         update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`; None: that of the preset.
-        fine_channels: of the fine level of the correlation, see :class:`dvo.nets.config.ModelConfig`; None: those of
-            the preset. Weights to start from need not have one.
-        train_only: beginning of the names of the parameters that learn, the others are held; None: all. ``score`` adds
-            the head for the selection ``learned`` and trains it alone, on random patches; ``selection`` is then only
-            the one that the network keeps.
+        train_only: beginning of the names of the parameters that learn, the others are held; None: all.
 
     Attributes:
         beta, rotation: weights of the flow and of the rotation, which V2V's balance moves.
@@ -91,15 +83,10 @@ class PatchVOTask(Task):
         selection: str | None = None,
         align_last: int = 0,
         update_operator: str | None = None,
-        fine_channels: int | None = None,
         train_only: str | None = None,
     ) -> None:
         self.model, self.seed, self.train_only = model, seed, train_only
-        self.changes = {
-            "training_patches": patches, "selection": selection, "update_operator": update_operator,
-            "fine_channels": fine_channels,
-            "score_head": True if selection == "learned" or train_only == SCORE else None,
-        }  # fmt: skip
+        self.changes = {"training_patches": patches, "selection": selection, "update_operator": update_operator}
         self.updates, self.initial, self.settle = updates, initial, settle
         self.warmup_mode, self.warmup_until, self.warmup_steps = warmup_mode, warmup_until, warmup_steps
         self.correlation_gradient, self.align_last = correlation_gradient, align_last
@@ -153,11 +140,6 @@ class PatchVOTask(Task):
         """End the warm-up, which is for a network that does not see flow yet."""
         buffers["warming"].fill_(False)
 
-    def new_tensors(self) -> tuple[str, ...]:
-        """The score head and the fine level of the correlation, if they are wanted."""
-        parts = {"score_head": ("score.",), "fine_channels": ("patchify.fine.", "update.fine.")}
-        return tuple(name for part, names in parts.items() if self.changes[part] for name in names)
-
     def state_dict(self) -> dict[str, Any]:
         """State of the balance."""
         parts = {"beta": self.beta, "rotation": self.rotation, "trend": self.trend}
@@ -207,7 +189,6 @@ class PatchVOTask(Task):
             generator=self.generators(context.step, b),
             correlation_gradient=self.correlation_gradient,
             align_last=self.align_last,
-            select=random_selection if self.train_only == SCORE else None,
         )
         terms, measures = clip_terms(states, truth, self.loss, mode)
         return terms, measures, truth

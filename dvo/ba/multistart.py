@@ -42,6 +42,9 @@ OPTIONS = GlobalBAOptions(
 )  # fmt: skip
 """Options of a solution from each start."""
 
+AS_THEY_ARE = replace(OPTIONS, solver=replace(OPTIONS.solver, max_iterations=0))
+"""Options that rank the starts without a further solution."""
+
 _WIDE = 5.0  # width of the kernel over that of the solution while only the poses move, which are far off then
 _FAR = 1e-3  # inverse depth at which translation moves nothing
 _COLD_UPDATES = 10  # calls of bundle adjustment without a starting point

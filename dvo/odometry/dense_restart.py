@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from dvo.ba.dense import pixel_grid
 from dvo.ba.global_adjust import GlobalBAOptions
-from dvo.ba.multistart import ABANDON, OPTIONS, PRESENT, Start, clearly_lower, multistart, present
+from dvo.ba.multistart import ABANDON, AS_THEY_ARE, OPTIONS, PRESENT, Start, clearly_lower, multistart, present
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.solve import solve
 from dvo.geometry import se3, so3
@@ -213,8 +213,7 @@ def _other_motion(edge: FrameEdge) -> tuple[Tensor, bool]:
         return at
 
     ways = {PRESENT: along(now)} | {str(k): along(start) for k, start in enumerate(starts)}
-    as_they_are = replace(_OPTIONS, solver=replace(_OPTIONS.solver, max_iterations=0))
-    found = [(s, se3.inverse(s.problem.poses_cw[1])) for s in multistart(two, ways, as_they_are, float("inf"))]
+    found = [(s, se3.inverse(s.problem.poses_cw[1])) for s in multistart(two, ways, AS_THEY_ARE, float("inf"))]
     here = next(pose_ab for solution, pose_ab in found if solution.start == PRESENT)
     others = [pose for _, pose in found if float(so3.angle(so3.multiply(so3.conjugate(here[3:]), pose[3:]))) > _OTHER]
     return others[0] if others else here, bool(others)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dvo.ba.cold_start import damping_at
-from dvo.ba.multistart import COLD_STARTS, PRESENT, RESTARTS, Solution, multistart, preferred, present
+from dvo.ba.multistart import AS_THEY_ARE, COLD_STARTS, PRESENT, RESTARTS, Solution, multistart, preferred, present
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
@@ -99,7 +99,8 @@ def _solve_again(window: Window, step: WindowStep) -> None:
     """Replace poses and depths by a solution from one pose for all frames, if it suits the current flow better."""
     revision = step.revise()
     problem = window.problem().with_values(targets=revision.targets[0], weights=revision.weights[0])
-    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}))
+    # Not solved further: a narrow kernel would fit the first, coarse flow.
+    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE))
     if best.start != PRESENT:
         _take(window, best)
 

@@ -86,24 +86,32 @@ def test_a_place_is_recognised_from_a_wrong_start(closed):
 
 
 def test_a_match_ends_once_further_updates_change_nothing(closed, monkeypatch):
-    finder = closed[0].loops.finder
-    pair = next(pair for pair in finder.prepare(finder.kept[-2]).pairs if pair.candidate.kind == "proximity")
-    matches, lengths = [], []
-    for limits in (loop_window._SETTLED, (-1.0, -1.0, -1.0)):
-        monkeypatch.setattr(loop_window, "_SETTLED", limits)
-        work = finder.matcher.match(pair.old, pair.new, pair.start, ((2, 0.0), (2, 0.0), (40, 0.0)))
-        steps, count = Steps(work), 1
-        while not steps.step():
-            count += 1
-        matches.append(steps.result())
-        lengths.append(count)
-    quick, whole = matches
-    assert lengths[1] > 44 and lengths[0] < lengths[1] - 20
-    moved = se3.relative(quick.poses_cw, whole.poses_cw)
-    assert abs(quick.inliers - whole.inliers) < 0.05 and quick.scale == pytest.approx(whole.scale, rel=0.01)
-    assert so3.angle(moved[:, 3:]).max() < 0.002
-    depth = 1 / median_inverse_depth(pair.later)
-    assert moved[:, :3].norm(dim=1).max() < 0.01 * depth
+    """Asked of several pairs: how far a single one goes on moving depends on its view."""
+    finder, errors = closed[0].loops.finder, []
+    for new in finder.kept[-2::-3][:5]:
+        pair = next((pair for pair in finder.prepare(new).pairs if pair.candidate.kind == "proximity"), None)
+        if pair is None:
+            continue
+        matches, lengths = [], []
+        for limits in (loop_window._SETTLED, (-1.0, -1.0, -1.0)):
+            monkeypatch.setattr(loop_window, "_SETTLED", limits)
+            steps = 0
+            work = finder.matcher.match(pair.old, pair.new, pair.start, ((2, 0.0), (2, 0.0), (40, 0.0)))
+            task = Steps(work)
+            while not task.step():
+                steps += 1
+            matches.append(task.result())
+            lengths.append(steps)
+        monkeypatch.undo()
+        quick, whole = matches
+        moved = se3.relative(quick.poses_cw, whole.poses_cw)
+        far = float(moved[:, :3].norm(dim=1).max()) * median_inverse_depth(pair.later)
+        angle, scale = float(so3.angle(moved[:, 3:]).max()), abs(quick.scale / whole.scale - 1)
+        errors.append((lengths[0] - lengths[1] + 20, abs(quick.inliers - whole.inliers) / 0.05, scale / 0.01,
+                       angle / 0.002, far / 0.01))  # fmt: skip
+        assert lengths[1] > 40
+    assert len(errors) >= 3
+    assert np.median(errors, axis=0)[0] < 0 and (np.median(errors, axis=0)[1:] < 1).all()
 
 
 def test_a_match_with_few_inliers_has_to_agree_with_the_poses(closed, monkeypatch):

@@ -53,7 +53,7 @@ from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.saving import save_map
 from dvo.odometry.segments import result_of
 from dvo.odometry.tracker_state import TrackerState
-from dvo.odometry.uncertainty import later_uncertainty
+from dvo.odometry.uncertainty import LaterUncertainty
 from dvo.odometry.window_alignment import WindowAlignment
 from dvo.odometry.window_correlation import WindowCorrelation
 from dvo.odometry.window_step import WindowStep
@@ -387,7 +387,7 @@ class PatchOdometry:
         segment = graph.segment - graph.recording.segment
         if pose_wc is None:
             return Estimate(record.timestamp, None, status, 0.0, segment, reason, recovered)
-        sure = later_uncertainty(self.step, self.config, state.ambiguous, state.unread)
+        sure = LaterUncertainty(self.step, self.config, state.ambiguous)
         return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
                         sure.covariance, sure.reference)  # fmt: skip
 

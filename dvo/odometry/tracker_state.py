@@ -12,8 +12,6 @@ from dvo.odometry.front_end import View
 from dvo.odometry.map_tables import MapTable
 from dvo.odometry.protocol import Estimate
 from dvo.odometry.rolling_shutter import Shutter
-from dvo.odometry.uncertainty import Uncertainty
-from dvo.odometry.window_measurements import Waiting
 
 
 @dataclass
@@ -37,7 +35,6 @@ class TrackerState:
         shutter: timing of the rows of the last frame.
         info: metadata for run.json.
         map: of the file that the tracker was loaded from, until the first frame of the new recording.
-        unread: uncertainties of estimates that nobody has read yet.
     """
 
     generator: torch.Generator
@@ -56,7 +53,6 @@ class TrackerState:
     shutter: Shutter = Shutter(0.0, 1.0)
     info: dict[str, object] = field(default_factory=dict)
     map: MapTable | None = None
-    unread: Waiting[Uncertainty] = field(default_factory=Waiting)
 
     def begin_segment(self) -> None:
         """Forget the segment that has been closed."""

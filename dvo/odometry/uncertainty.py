@@ -17,7 +17,7 @@ While a window may have a second solution, covariance and confidence are those o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -36,7 +36,7 @@ from dvo.odometry.config import TrackerConfig
 from dvo.odometry.displacement import confidence_of, window_metric
 from dvo.odometry.second_solution import second_solutions, window_solutions
 from dvo.odometry.window_gauge import Gauge, window_gauge
-from dvo.odometry.window_measurements import Later, Waiting, WindowMeasurements
+from dvo.odometry.window_measurements import WindowMeasurements
 from dvo.odometry.window_step import WindowStep
 
 DAMPING = BADamping(pose=1e-6, relative=0.0)
@@ -63,45 +63,38 @@ UNKNOWN = Uncertainty()
 """Uncertainty without a pose."""
 
 
-@dataclass(frozen=True)
 class LaterUncertainty:
-    """Uncertainty that is computed when a value of it is first read; see :class:`Uncertainty` for the values.
+    """:func:`newest_uncertainty` of the window as it is now, computed when a value of it is first read.
 
-    Attributes:
-        found: the uncertainty.
-    """
-
-    found: Later[Uncertainty]
-
-    def covariance(self) -> np.ndarray | None:
-        """See :attr:`Uncertainty.covariance`."""
-        return self.found().covariance
-
-    def reference(self) -> float | None:
-        """See :attr:`Uncertainty.reference`."""
-        return self.found().reference
-
-    def confidence(self) -> float:
-        """See :attr:`Uncertainty.confidence`."""
-        return self.found().confidence
-
-
-def later_uncertainty(
-    step: WindowStep, config: TrackerConfig, ambiguous: bool = False, waiting: Waiting[Uncertainty] | None = None
-) -> LaterUncertainty:
-    """:func:`newest_uncertainty` of the window as it is now, computed when it is first read, with the same bytes.
+    The bytes are those that it would have had at once. Until then the measurements of the window are held.
 
     Args:
         step, config, ambiguous: see :func:`newest_uncertainty`.
-        waiting: keeps the number of windows bounded that are held for this; None for no bound.
-
-    Returns:
-        The uncertainty.
     """
-    found = Later(partial(_uncertainty, WindowMeasurements.of(step), config, ambiguous))
-    if waiting is not None:
-        waiting.add(found)
-    return LaterUncertainty(found)
+
+    def __init__(self, step: WindowStep, config: TrackerConfig, ambiguous: bool = False) -> None:
+        self._compute: Callable[[], Uncertainty] | None
+        self._compute = partial(_uncertainty, WindowMeasurements.of(step), config, ambiguous)
+        self._found = UNKNOWN
+
+    def _value(self) -> Uncertainty:
+        compute = self._compute  # of two threads that ask at once, both compute the same
+        if compute is not None:
+            self._found = compute()
+            self._compute = None  # with the measurements
+        return self._found
+
+    def covariance(self) -> np.ndarray | None:
+        """See :attr:`Uncertainty.covariance`."""
+        return self._value().covariance
+
+    def reference(self) -> float | None:
+        """See :attr:`Uncertainty.reference`."""
+        return self._value().reference
+
+    def confidence(self) -> float:
+        """See :attr:`Uncertainty.confidence`."""
+        return self._value().confidence
 
 
 def newest_uncertainty(step: WindowStep, config: TrackerConfig, ambiguous: bool = False) -> Uncertainty:

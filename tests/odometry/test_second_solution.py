@@ -16,7 +16,7 @@ from dvo.odometry import uncertainty
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.displacement import TOLERANCE, window_metric
 from dvo.odometry.second_solution import INDEPENDENT, second_solutions, window_solutions
-from dvo.odometry.uncertainty import later_uncertainty, newest_uncertainty
+from dvo.odometry.uncertainty import LaterUncertainty, newest_uncertainty
 from dvo.odometry.window_gauge import Gauge, relative_error, window_gauge
 from dvo.odometry.window_measurements import WindowMeasurements
 from tests.support.archived_walk import archived_walk, pose_at
@@ -120,7 +120,7 @@ def test_covariance_and_confidence_are_those_of_the_mixture():
         expected = expected + other.probability * (own + np.outer(other.error, other.error))
     np.testing.assert_allclose(mixed.covariance, expected, rtol=1e-6)
     assert mixed.confidence == pytest.approx(share * plain.confidence)
-    later = later_uncertainty(step, TrackerConfig(), ambiguous=True)
+    later = LaterUncertainty(step, TrackerConfig(), ambiguous=True)
     assert np.array_equal(later.covariance(), mixed.covariance) and later.confidence() == mixed.confidence
 
 

@@ -1,5 +1,6 @@
 """Covariance and confidence of the newest pose: the plain dense marginal, its gauge, and what they leave alone."""
 
+import gc
 import math
 import pickle
 from dataclasses import replace
@@ -18,13 +19,13 @@ from dvo.ba.reference import dense_rows
 from dvo.geometry import se3
 from dvo.graph.measured_depths import SIGMA, depth_factors
 from dvo.odometry import tracker as tracker_module
-from dvo.odometry import uncertainty, window_measurements
+from dvo.odometry import uncertainty
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.displacement import confidence_of, flow_metric
 from dvo.odometry.protocol import Estimate, Status
-from dvo.odometry.uncertainty import UNKNOWN, newest_uncertainty
+from dvo.odometry.uncertainty import UNKNOWN, LaterUncertainty, newest_uncertainty
 from dvo.odometry.window_gauge import window_gauge
-from dvo.odometry.window_measurements import Later, Waiting
+from dvo.odometry.window_measurements import WindowMeasurements
 from dvo.synth.sequence import make_sequence
 
 FAST = {"pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "initial_updates": 6, "restart": False}
@@ -151,7 +152,7 @@ def test_it_is_computed_when_it_is_read_with_the_same_bytes(tracked, monkeypatch
     odometry.finish()
     assert not calls
     late = [e for e in estimates if e.pose_wc is not None]
-    assert len(known) == len(late) <= window_measurements.MOST_WAITING
+    assert len(known) == len(late)
     for before, after in reversed(list(zip(known, late, strict=True))):
         again = pickle.loads(pickle.dumps(after))
         for found in (after, again, replace(after, recovered=True)):
@@ -160,17 +161,15 @@ def test_it_is_computed_when_it_is_read_with_the_same_bytes(tracked, monkeypatch
     assert len(calls) == len(late), "once each"
 
 
-def test_estimates_that_are_kept_hold_few_windows(monkeypatch):
-    monkeypatch.setattr(window_measurements, "MOST_WAITING", 3)
-    waiting, made = Waiting(), []
-    kept = [Later(lambda k=k: made.append(k) or k) for k in range(5)]
-    for value in kept:
-        waiting.add(value)
-    assert made == [0, 1] and [value.waits for value in kept] == [False, False, True, True, True]
-    for k in range(5, 9):
-        waiting.add(Later(lambda k=k: made.append(k)))  # nobody holds it
-    assert made == [0, 1, 2, 3, 4], "what is gone is not computed"
-    assert [value() for value in kept] == [0, 1, 2, 3, 4] == made
+def test_what_has_been_read_holds_no_window(tracked):
+    def held():
+        gc.collect()
+        return sum(type(one) is WindowMeasurements for one in gc.get_objects())
+
+    before, later = held(), LaterUncertainty(tracked[1], TrackerConfig())
+    assert held() == before + 1
+    assert later.confidence() == newest_uncertainty(tracked[1], TrackerConfig()).confidence
+    assert held() == before
 
 
 def test_scale_and_world_do_not_matter(tracked):
@@ -208,7 +207,7 @@ def test_the_gauge_leaves_out_frames_without_measurements(tracked):
 
 
 def test_no_pose_depends_on_it(tracked, monkeypatch):
-    monkeypatch.setattr(tracker_module, "later_uncertainty", lambda step, config, ambiguous, waiting: UNKNOWN)
+    monkeypatch.setattr(tracker_module, "LaterUncertainty", lambda step, config, ambiguous: UNKNOWN)
     odometry = dvo.load("small", **FAST)
     for frame, estimate in zip(walk(), tracked[2], strict=False):
         found = odometry.track(frame)

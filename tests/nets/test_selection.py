@@ -1,6 +1,5 @@
 """Patch selections: where they place the patches, and that the seed decides."""
 
-
 import cv2
 import pytest
 import torch

@@ -128,7 +128,7 @@ class LoopCloser:
             return None
         if self.real_time and self.work is not None and not self.work.task.done:
             return None
-        self._drain()
+        self.drain()
         return locate(self.finder, view, identifier)
 
     def relocalised(self, loop: Loop) -> None:
@@ -151,14 +151,14 @@ class LoopCloser:
             True if poses were corrected.
         """
         if not self.enabled:
-            return self._drain() if at_once else self._collect(False)
+            return self.drain() if at_once else self._collect(False)
         corrected, at_once = False, at_once or not self.finder.options.delay
         seen = self.finder.kept[-1] if self.finder.kept else -1
         for frame in self.graph.archive.kept_after(seen):
             if self.graph.segment_of(frame.identifier) in segments:
                 self._visit(frame)
-                corrected |= at_once and self._drain()
-        return self._drain() | corrected if at_once else self._collect(False)
+                corrected |= at_once and self.drain()
+        return self.drain() | corrected if at_once else self._collect(False)
 
     def adjust(self, segments: Collection[int], wait: bool) -> list[AdjustmentRecord]:
         """Adjust the worlds of the recording: now, with the bounds of the final adjustment, or beside tracking.
@@ -173,7 +173,7 @@ class LoopCloser:
         if self.adjuster is None:
             return []
         if wait:
-            self._drain()
+            self.drain()
         own = (segment for segment in segments if segment >= self.graph.recording.segment)
         worlds, before = sorted({self.graph.world_of(segment) for segment in own}), len(self.adjuster.records)
         if not wait:
@@ -182,11 +182,15 @@ class LoopCloser:
             return []
         for world in worlds:
             self.work = self.adjuster.begin(self._background, world, "request", 0, None)
-            self._drain()
+            self.drain()
         return self.adjuster.records[before:]
 
-    def _drain(self) -> bool:
-        """Wait for the work in progress, and what follows from it; True if poses were corrected."""
+    def drain(self) -> bool:
+        """Wait for the work in progress, and what follows from it.
+
+        Returns:
+            True if poses were corrected.
+        """
         corrected = False
         while self.work is not None:
             corrected |= self._collect(True)
@@ -225,7 +229,7 @@ class LoopCloser:
         chosen = np.linspace(0, len(rows) - 1, min(searches, len(rows))).round().astype(int)
         for row in rows[chosen].tolist():
             loop = self.finder.find(kept[row])
-            if loop is not None and not loop.joins and self._is_within(loop, agreement):
+            if loop is not None and not loop.joins and self.is_within(loop, agreement):
                 self._accept(loop)
         return corrected
 
@@ -239,7 +243,7 @@ class LoopCloser:
             loop = self.finder.find(kept[row], self.pending) if len(worlds) > 1 else None
             if loop is not None and loop.joins:
                 self._found(loop)
-                corrected |= self._drain()
+                corrected |= self.drain()
         return corrected
 
     def information(self) -> dict[str, Any]:
@@ -330,16 +334,21 @@ class LoopCloser:
             self._accept(pending)
         self._accept(loop)
         self.pending = None
-        self._correct(loop)
+        self.correct(loop)
 
     def _needs_confirmation(self, loop: Loop) -> bool:
         """Return True unless the loop changes next to nothing, so that the present poses confirm it."""
-        return loop.joins or not self._is_within(loop, _SMALL)
+        return loop.joins or not self.is_within(loop, _SMALL)
 
-    def _is_within(self, loop: Loop, limits: tuple[float, float, float]) -> bool:
-        """Return True if a loop agrees with the poses: translation in median depths, rotation in rad, log scale.
+    def is_within(self, loop: Loop, limits: tuple[float, float, float]) -> bool:
+        """Find out if a loop agrees with the poses.
 
-        A loop of a keyframe whose patches were released meanwhile does not: its nan is within no limit.
+        Args:
+            loop: in the present units of its keyframes.
+            limits: largest difference: translation in median depths, rotation in rad, log scale.
+
+        Returns:
+            True if it does; False if the patches of its newer keyframe were released meanwhile: nan is within no limit.
         """
         old, new = sim3.from_se3(self.graph.poses_cw(np.array([loop.old, loop.new])))
         error = sim3.compose(loop.measurement, sim3.inverse(sim3.compose(new, sim3.inverse(old))))
@@ -352,9 +361,13 @@ class LoopCloser:
         self.graph.add_loop(loop.edges)
         self.loops.append(replace(loop, edges=None))
 
-    def _correct(self, loop: Loop) -> None:
-        """Begin to correct all keyframes of the worlds of a loop, unless it changes next to nothing."""
-        if not loop.joins and self._is_within(loop, _SMALL):
+    def correct(self, loop: Loop) -> None:
+        """Begin to correct all keyframes of the worlds of a loop, unless it changes next to nothing.
+
+        Args:
+            loop: the last of :attr:`loops`.
+        """
+        if not loop.joins and self.is_within(loop, _SMALL):
             return
         correction = loop_correction.prepare(self.graph, self.finder.kept, self.loops, loop)
         task = self._background.start(correction.solve)

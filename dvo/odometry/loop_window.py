@@ -34,9 +34,9 @@ from dvo.odometry.window_step import WindowStep
 Group = tuple[ArchivedKeyframe, ...]
 """Keyframe with its neighbours."""
 
-# Change by an update below which further ones bring nothing: translation in median depths, rotation in rad, log scale.
-# A tenth of the standard deviations of a loop in the pose graph (:mod:`dvo.odometry.loop_correction`).
-_SETTLED = (0.001, 0.0002, 0.001)
+SETTLED_CHANGES = (0.001, 0.0002, 0.001)
+"""Change by an update below which further ones bring nothing: translation in median depths, rotation in rad, log scale.
+A tenth of the standard deviations of a loop in the pose graph (:mod:`dvo.odometry.loop_correction`)."""
 _MAPS = 8  # keyframes whose feature maps are kept for the next match: a search may last for many frames
 
 
@@ -175,4 +175,4 @@ def _is_settled(before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor]) -> 
     moved = se3.relative(before[0], after[0])
     changes = moved[:, :3].norm(dim=-1).max() * after[1].median(), so3.angle(moved[:, 3:]).max()
     scale = (before[1] / after[1]).median().log().abs()
-    return all(float(change) <= limit for change, limit in zip((*changes, scale), _SETTLED, strict=True))
+    return all(float(change) <= limit for change, limit in zip((*changes, scale), SETTLED_CHANGES, strict=True))

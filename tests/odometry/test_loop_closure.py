@@ -10,7 +10,7 @@ import torch
 
 import dvo
 from dvo.errors import DvoError
-from dvo.geometry import se3, so3
+from dvo.geometry import se3, sim3, so3
 from dvo.metrics import evaluate
 from dvo.odometry import loop_correction, loop_window
 from dvo.odometry.background import Steps, all_steps
@@ -61,12 +61,13 @@ def turned_away(finder):
     old, new = finder.kept[1], finder.kept[-2]
     search = finder.prepare(new)
     kept = next(pair for pair in search.pairs if pair.candidate.new == new)
-    group = finder._group(old)
+    group = finder.kept[:3]  # with its neighbours
     poses_cw = finder.graph.poses_cw(np.array(group))
     turn = se3.exp(torch.tensor([0, 0, 0, 0, math.radians(30), 0], dtype=torch.float64))
     start = se3.compose(turn, poses_cw[group.index(old)])
     candidate = replace(kept.candidate, old=old, kind="retrieval", pose_cw=start)
-    pair = replace(kept, candidate=candidate, old=finder._frames(group), old_cw=poses_cw)
+    frames = tuple(finder.graph.archive[identifier] for identifier in group)
+    pair = replace(kept, candidate=candidate, old=frames, old_cw=poses_cw)
     return replace(search, pairs=(pair,), predicted=0)
 
 
@@ -80,7 +81,8 @@ def test_a_place_is_recognised_from_a_wrong_start(closed):
         assert all_steps(finder.matcher.match(pair.old, pair.new, pair.start, decisions)) is None
         loop = all_steps(finder.verify(search))
         assert loop is not None and loop.inliers > 2 * Limits().inliers
-        assert finder._moved(loop, finder.graph.poses_cw(np.array([loop.new]))[0])[3:7].abs()[3] > 0.99
+        old_cw = sim3.from_se3(finder.graph.poses_cw(np.array([loop.old]))[0])
+        assert sim3.compose(loop.measurement, old_cw)[3:7].abs()[3] > 0.99
         predicted = replace(search, predicted=1)  # is matched from where it is predicted, without a guess
         assert all_steps(finder.verify(predicted)) is None
 
@@ -93,8 +95,8 @@ def test_a_match_ends_once_further_updates_change_nothing(closed, monkeypatch):
         if pair is None:
             continue
         matches, lengths = [], []
-        for limits in (loop_window._SETTLED, (-1.0, -1.0, -1.0)):
-            monkeypatch.setattr(loop_window, "_SETTLED", limits)
+        for limits in (loop_window.SETTLED_CHANGES, (-1.0, -1.0, -1.0)):
+            monkeypatch.setattr(loop_window, "SETTLED_CHANGES", limits)
             steps = 0
             work = finder.matcher.match(pair.old, pair.new, pair.start, ((2, 0.0), (2, 0.0), (40, 0.0)))
             task = Steps(work)
@@ -210,8 +212,8 @@ def test_a_correction_at_the_end_moves_keyframes_that_were_not_looked_at(correct
 def released(graph, identifiers):
     """Release the patches of keyframes, as the archive does beyond its bound."""
     for identifier in identifiers:
-        empty = {"centres": np.zeros((0, 2), np.float32), "colors": np.zeros((0, 3), np.uint8)}
-        graph.archive._change(identifier, inverse_depth=np.zeros(0, np.float32), **empty)
+        centres, depth, colors = np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8)
+        graph.archive.add(replace(graph.archive[identifier], centres=centres, inverse_depth=depth, colors=colors))
 
 
 @pytest.mark.filterwarnings("error")
@@ -235,9 +237,9 @@ def test_keyframes_without_patches_are_corrected_with_the_others(correcting):
 @pytest.mark.filterwarnings("error")
 def test_a_loop_of_a_keyframe_whose_patches_were_released_counts_for_nothing(correcting):
     loops, loop = correcting.loops, correcting.loops.loops[-1]
-    assert loops.finder.agree(loop, loop) and loops._is_within(loop, (1e6, 4.0, 1e6))
+    assert loops.finder.agree(loop, loop) and loops.is_within(loop, (1e6, 4.0, 1e6))
     released(correcting.graph, [loop.new])
-    assert not loops.finder.agree(loop, loop) and not loops._is_within(loop, (1e6, 4.0, 1e6))
+    assert not loops.finder.agree(loop, loop) and not loops.is_within(loop, (1e6, 4.0, 1e6))
 
 
 def test_an_interruption_while_a_frame_waits_leaves_the_work(correcting, monkeypatch):

@@ -68,8 +68,7 @@ def test_a_keyframe_takes_less_than_its_share_of_memory():
         odometry.track(replace(clip[index], timestamp=number / 15.0))
         kept = odometry.graph.log.keyframes
         if kept not in held:
-            while odometry.loops.work is not None:  # what a search needs meanwhile is not kept
-                odometry.loops._collect(True)
+            odometry.loops.drain()  # what a search needs meanwhile is not kept
             held[kept] = held_bytes(odometry)
     first, last = 6, max(held)
     assert last > 2 * first

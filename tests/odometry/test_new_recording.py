@@ -218,8 +218,8 @@ def test_worlds_of_a_map_that_a_recording_connects():
     for old, new, joined in ((4, 28, [0, 1, 0]), (18, 30, [0, 0, 0])):
         loop = seen_again(graph, old, new)
         closer.loops.append(loop)
-        closer._correct(loop)
-        assert closer._drain()
+        closer.correct(loop)
+        assert closer.drain()
         assert [graph.world_of(k) for k in range(3)] == joined
         assert torch.equal(graph.poses_cw(at[0]), first)
     for k in (1, 2):

@@ -50,7 +50,7 @@ def better_solution(window: DenseWindow, measure: Callable[[], object], abandon:
     Returns:
         True if the other solution was taken.
     """
-    other = _other_poses(window) if len(window) > 2 else None
+    other = other_poses(window) if len(window) > 2 else None
     if other is None:
         return False
     poses = other
@@ -161,7 +161,7 @@ def _turned(a: Tensor, b: Tensor) -> float:
     return float(so3.angle(so3.multiply(so3.conjugate(before), after)).max())
 
 
-def _other_poses(window: DenseWindow) -> Tensor | None:
+def other_poses(window: DenseWindow) -> Tensor | None:
     """Poses by the other motions of neighbouring keyframes, with steps in units of the median depth.
 
     Args:

@@ -58,12 +58,18 @@ class RefinementOptions:
 
 
 @dataclass(frozen=True)
-class _Rays:
-    """Both ends of each flow on the planes ``z = 1``, float64."""
+class Rays:
+    """Both ends of each flow on the planes ``z = 1``, float64.
 
-    start: Tensor  # (M, 3) of camera a
-    end: Tensor  # (M, 3) of camera b
-    weights: Tensor  # (M,)
+    Attributes:
+        start, end: ``(M, 3)`` of camera ``a`` and of camera ``b``.
+        weights: ``(M,)``.
+        focal: mean focal length, pixels of the map.
+    """
+
+    start: Tensor
+    end: Tensor
+    weights: Tensor
     focal: float
 
 
@@ -95,26 +101,26 @@ def refine_motion(
         >>> pose_ab = refine_motion(flow, [motion.poses_ab()[0]], intrinsics / model.STRIDE)
     """
     options = options or RefinementOptions()
-    rays = _rays(flow.double(), intrinsics.double(), options.points, weights)
+    rays = flow_rays(flow.double(), intrinsics.double(), options.points, weights)
     _, rotation, direction = min((_wide(rays, start, options) for start in starts), key=lambda item: item[0])
     _, rotation, direction = _descend(rays, rotation, direction, options)
     return torch.cat([-direction if direction @ starts[0][:3].double() < 0 else direction, rotation])
 
 
-def _wide(rays: _Rays, start: Tensor, options: RefinementOptions) -> tuple[float, Tensor, Tensor]:
+def _wide(rays: Rays, start: Tensor, options: RefinementOptions) -> tuple[float, Tensor, Tensor]:
     """Descend at the wider scale."""
     rotation, direction = so3.normalise(start[3:].double()), _unit(start[:3].double())
     return _descend(rays, rotation, direction, replace(options, scale=_COARSE * options.scale))
 
 
 def _descend(
-    rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions
+    rays: Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions
 ) -> tuple[float, Tensor, Tensor]:
     """Levenberg-Marquardt steps until the cost settles; gives cost, rotation and direction."""
-    cost, damping = _cost(rays, rotation, direction, options), options.damping
+    cost, damping = motion_cost(rays, rotation, direction, options), options.damping
     for _ in range(options.iterations):
-        next_rotation, next_direction = _step(rays, rotation, direction, options, damping)
-        next_cost = _cost(rays, next_rotation, next_direction, options)
+        next_rotation, next_direction = refinement_step(rays, rotation, direction, options, damping)
+        next_cost = motion_cost(rays, next_rotation, next_direction, options)
         if next_cost < cost:
             settled = next_cost > cost * (1 - _SETTLED)
             rotation, direction, cost = next_rotation, next_direction, next_cost
@@ -155,7 +161,16 @@ def _normals(start: Tensor, end: Tensor, matrix: Tensor, skew: Tensor) -> tuple[
     return turned, epipolar, of_end, spread
 
 
-def _rays(flow: Tensor, intrinsics: Tensor, points: int, weights: Tensor | None = None) -> _Rays:
+def flow_rays(flow: Tensor, intrinsics: Tensor, points: int, weights: Tensor | None = None) -> Rays:
+    """Rays of the pixels that count.
+
+    Args:
+        flow, intrinsics, weights: see :func:`refine_motion`; the flow gives the precision.
+        points: largest number of pixels, of which those without a finite flow are left out.
+
+    Returns:
+        The rays.
+    """
     _, h, w = flow.shape
     every = max(1, math.ceil(math.sqrt(h * w / points)))
     fx, fy, cx, cy = intrinsics.tolist()
@@ -168,21 +183,40 @@ def _rays(flow: Tensor, intrinsics: Tensor, points: int, weights: Tensor | None 
     end = torch.stack([(x + flow[0] - cx) / fx, (y + flow[1] - cy) / fy, one], -1)[::every, ::every].flatten(0, 1)
     counts = torch.isfinite(end).all(-1)
     weights = torch.ones_like(x) if weights is None else weights.to(x)
-    return _Rays(start[counts], end[counts], weights[::every, ::every].flatten()[counts], (fx + fy) / 2)
+    return Rays(start[counts], end[counts], weights[::every, ::every].flatten()[counts], (fx + fy) / 2)
 
 
-def _cost(rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions) -> float:
-    """Weighted sum of the Cauchy costs of both kinds of residuals."""
+def motion_cost(rays: Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions) -> float:
+    """Weighted sum of the Cauchy costs of both kinds of residuals.
+
+    Args:
+        rays: of the pixels that count.
+        rotation, direction: ``(4,)`` and ``(3,)``, see :func:`epipolar_residuals`.
+        options: scale, and weight of the parallax.
+
+    Returns:
+        The cost.
+    """
     distance, left, ahead = epipolar_residuals(rays.start, rays.end, rotation, direction)
     scaled = (distance * (rays.focal / options.scale)).square()
     parallax = left.square().sum(-1) * (rays.focal * options.parallax / options.scale) ** 2
     return float((rays.weights * torch.where(ahead, scaled.log1p() + parallax.log1p(), 100.0)).sum())
 
 
-def _step(
-    rays: _Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions, damping: float
+def refinement_step(
+    rays: Rays, rotation: Tensor, direction: Tensor, options: RefinementOptions, damping: float
 ) -> tuple[Tensor, Tensor]:
-    """One Gauss-Newton step over a rotation vector on the left of the rotation and two angles of the direction."""
+    """One Gauss-Newton step over a rotation vector on the left of the rotation and two angles of the direction.
+
+    Args:
+        rays: of the pixels that count.
+        rotation, direction: ``(4,)`` and ``(3,)``, see :func:`epipolar_residuals`.
+        options: scale, and weight of the parallax.
+        damping: added to the diagonal of the normal equations, relative to it.
+
+    Returns:
+        Rotation ``(4,)`` and direction ``(3,)`` after the step, of length one.
+    """
     start, matrix, skew = rays.start, so3.matrix(rotation), so3.hat(direction)
     turned, epipolar, of_end, spread = _normals(start, rays.end, matrix, skew)
     distance, ahead = (start * epipolar).sum(-1) / spread, turned[:, 2] > _LEAST_AHEAD

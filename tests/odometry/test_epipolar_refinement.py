@@ -12,12 +12,11 @@ from dvo.geometry import so3
 from dvo.losses.two_frame import true_flow
 from dvo.odometry.epipolar_refinement import (
     RefinementOptions,
-    _cost,
-    _rays,
-    _step,
-    _tangents,
     epipolar_residuals,
+    flow_rays,
+    motion_cost,
     refine_motion,
+    refinement_step,
 )
 
 CAMERA = torch.tensor([24.0, 25.0, 19.0, 15.5], dtype=torch.float64)
@@ -49,6 +48,11 @@ def near(true, seed, by=0.02):
     return torch.cat([true[:3] + 0.2 * a, so3.multiply(so3.exp(by * b), true[3:])])
 
 
+def tangents(pose):
+    """Two unit vectors perpendicular to the translation of a pose and to each other."""
+    return torch.linalg.svd(pose[None, :3]).Vh[1:]
+
+
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000))
 def test_exact_flow_gives_the_motion(seed):
@@ -72,38 +76,39 @@ def test_the_cost_is_least_where_a_plain_search_finds_it():
     flow, true = views(3)
     flow = flow + 0.1 * torch.randn(flow.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     options, start = RefinementOptions(iterations=50, points=2000), near(true, 3)
-    rays, basis = _rays(flow, CAMERA, 2000), _tangents(start[:3] / start[:3].norm())
+    rays, basis = flow_rays(flow, CAMERA, 2000), tangents(start)
 
     def cost(x):
         turned = so3.multiply(so3.exp(torch.from_numpy(x[:3])), start[3:])
         direction = torch.nn.functional.normalize(start[:3] / start[:3].norm() + torch.from_numpy(x[3:]) @ basis, dim=0)
-        return _cost(rays, turned, direction, options)
+        return motion_cost(rays, turned, direction, options)
 
     plain = minimize(cost, np.zeros(5), method="Nelder-Mead", options={"maxiter": 4000, "xatol": 1e-7, "fatol": 1e-7})
     found = refine_motion(flow, [start], CAMERA, options)
-    assert _cost(rays, found[3:], found[:3], options) <= plain.fun * (1 + 1e-4)
+    assert motion_cost(rays, found[3:], found[:3], options) <= plain.fun * (1 + 1e-4)
 
 
 def test_steps_use_the_derivatives_of_the_cost():
     """Without damping and weights (a wide scale), the gradient is that of half the sum of squares."""
     flow, true = views(6)
     start, options = near(true, 6), RefinementOptions(scale=1e3, parallax=2.0)
-    direction, rays = torch.nn.functional.normalize(start[:3], dim=0), _rays(flow, CAMERA, 2000)
+    direction, rays = torch.nn.functional.normalize(start[:3], dim=0), flow_rays(flow, CAMERA, 2000)
+    basis = tangents(start)
 
     def residuals(x):
         turned = so3.multiply(so3.exp(x[:3]), start[3:])
-        moved = torch.nn.functional.normalize(direction + x[3:] @ _tangents(direction), dim=0)
+        moved = torch.nn.functional.normalize(direction + x[3:] @ basis, dim=0)
         distance, left, _ = epipolar_residuals(rays.start, rays.end, turned, moved)
         return torch.cat([distance, options.parallax * left.flatten()])
 
     zero = torch.zeros(5, dtype=torch.float64)
     jacobian = torch.autograd.functional.jacobian(residuals, zero)
     plain = -torch.linalg.lstsq(jacobian, residuals(zero)[:, None]).solution[:, 0]
-    rotation, moved = _step(rays, start[3:], direction, options, 0.0)
+    rotation, moved = refinement_step(rays, start[3:], direction, options, 0.0)
     torch.testing.assert_close(
         so3.log(so3.multiply(rotation, so3.conjugate(start[3:]))), plain[:3], atol=1e-6, rtol=1e-4
     )
-    wanted = torch.nn.functional.normalize(direction + plain[3:] @ _tangents(direction), dim=0)
+    wanted = torch.nn.functional.normalize(direction + plain[3:] @ basis, dim=0)
     torch.testing.assert_close(moved, wanted, atol=1e-6, rtol=1e-4)
 
 
@@ -128,20 +133,21 @@ def test_a_weight_of_two_counts_a_pixel_twice():
     options, start = RefinementOptions(points=300), near(true, 7)  # every second row and column
     twice = torch.ones(30, 40)
     twice[::4] = 2
-    rays = _rays(flow, CAMERA, 300, twice)
+    rays = flow_rays(flow, CAMERA, 300, twice)
     again = torch.cat([torch.arange(300), torch.arange(300)[rays.weights == 2]])
     plain = type(rays)(rays.start[again], rays.end[again], torch.ones(len(again)).double(), rays.focal)
     direction = torch.nn.functional.normalize(start[:3], dim=0)
     assert len(again) == 460 and (rays.weights == 2).sum() == 160
-    assert _cost(rays, start[3:], direction, options) == pytest.approx(_cost(plain, start[3:], direction, options))
-    for found, wanted in zip(*(_step(r, start[3:], direction, options, 0.0) for r in (rays, plain)), strict=True):
+    motion = start[3:], direction, options
+    assert motion_cost(rays, *motion) == pytest.approx(motion_cost(plain, *motion))
+    for found, wanted in zip(*(refinement_step(r, *motion, 0.0) for r in (rays, plain)), strict=True):
         torch.testing.assert_close(found, wanted)
 
 
 def test_residuals_are_distances_from_epipolar_lines():
     """To first order: the length of the least move of both ends that puts them on one epipolar plane."""
     flow, true = views(5)
-    rays = _rays(flow, CAMERA, 10_000)
+    rays = flow_rays(flow, CAMERA, 10_000)
     distance, _, ahead = epipolar_residuals(rays.start, rays.end, true[3:], true[:3])
     assert ahead.all() and distance.abs().max() < 1e-9
     moved = rays.end.clone()

@@ -147,6 +147,9 @@ class DepthCloud:
         file: PLY of the cloud.
         mesh: PLY of a mesh from a truncated signed distance function, by Open3D; None for none.
 
+    Attributes:
+        views: kept so far, at most :data:`VIEWS`.
+
     Raises:
         DvoError: Open3D is not installed.
     """
@@ -154,7 +157,7 @@ class DepthCloud:
     def __init__(self, file: Path, mesh: Path | None = None) -> None:
         self.file, self.mesh = file, mesh
         self._open3d = None if mesh is None else import_open3d()
-        self._views: list[DepthView] = []
+        self.views: list[DepthView] = []
         self._every, self._seen = 1, 0
         self._odometry: Odometry | None = None
 
@@ -168,9 +171,9 @@ class DepthCloud:
         self._seen += estimate is not None
         if depth is None:
             return
-        self._views.append(depth_view(frame, depth))
-        if len(self._views) > VIEWS:
-            self._views, self._every = self._views[::2], 2 * self._every
+        self.views.append(depth_view(frame, depth))
+        if len(self.views) > VIEWS:
+            self.views, self._every = self.views[::2], 2 * self._every
 
     def finish(self, run: Run) -> None:
         """See :class:`dvo.odometry.observer.Observer`."""
@@ -191,13 +194,13 @@ class DepthCloud:
 
     def close(self) -> None:
         """See :class:`dvo.odometry.observer.Observer`."""
-        self._views.clear()
+        self.views.clear()
 
     def _posed(self, run: Run) -> list[tuple[DepthView, np.ndarray]]:
         """Views with final poses: those of keyframes, unless fewer than two are kept."""
         trajectory = run.result.trajectory
         poses = dict(zip(trajectory.timestamps.tolist(), trajectory.poses_wc, strict=True))
-        posed = [(view, poses[view.timestamp]) for view in self._views if view.timestamp in poses]
+        posed = [(view, poses[view.timestamp]) for view in self.views if view.timestamp in poses]
         assert self._odometry is not None
         keyframes = set(keyframe_times(self._odometry, run.result) or ())
         chosen = [pair for pair in posed if pair[0].timestamp in keyframes]

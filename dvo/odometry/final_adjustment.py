@@ -209,7 +209,7 @@ def _leave_minimum(
 
     def extended(problem: PatchProblem, _: GlobalBAOptions) -> PatchProblem:
         solved = better.problem.inverse_depths.view(n, m)[:, ::2]
-        poses, found = _extended(poses_cw, depths, better.problem.poses_cw, solved)
+        poses, found = extend_solution(poses_cw, depths, better.problem.poses_cw, solved)
         return problem.with_values(poses_cw=poses, inverse_depths=found.flatten())
 
     def restarted(problem: PatchProblem, settings: GlobalBAOptions) -> PatchProblem:
@@ -224,7 +224,7 @@ def _leave_minimum(
     return found.poses_cw, found.inverse_depths.reshape_as(depths)
 
 
-def _extended(poses_cw: Tensor, depths: Tensor, first_cw: Tensor, solved: Tensor) -> tuple[Tensor, Tensor]:
+def extend_solution(poses_cw: Tensor, depths: Tensor, first_cw: Tensor, solved: Tensor) -> tuple[Tensor, Tensor]:
     """Start of all frames from another solution of the first ones.
 
     Later frames keep their motion; their patches, whose relief belongs to the old solution, get equal depths.

@@ -172,7 +172,7 @@ class WindowAlignment:
         found = slope_equations(
             self._images, map_slots[window.ii[edges]], map_slots[window.jj[edges]],
             window.patches[kk, :2, centre, centre] * stride, window.targets[edges] * stride,
-            patch_warps(seen.coords[0], self._tilts(edges)),
+            patch_warps(seen.coords[0], self.tilts(edges)),
             seen.jac_d[0, ..., 0] * window.patches[kk, 2, centre, centre, None], self.options,
         )  # fmt: skip
         good = (window.weights[edges] > window.confidence[edges]).any(-1).to(found.matrix)
@@ -215,16 +215,22 @@ class WindowAlignment:
         map_slots = window.map_slots
         found = align_patches(
             self._images, map_slots[window.ii[edges]], map_slots[window.jj[edges]], centres, measured * stride,
-            patch_warps(coords, self._tilts(edges)), options,
+            patch_warps(coords, self.tilts(edges)), options,
         )  # fmt: skip
         size = self._images.shape[2], self._images.shape[1]
         return found.positions / stride, accept(found, measured * stride, size, stride, options)
 
-    def _tilts(self, edges: Tensor) -> Tensor | None:
-        """Part ``(e, 2, 2)`` of the warps of edges by the slopes of the surfaces; None if no slope is known.
+    def tilts(self, edges: Tensor) -> Tensor | None:
+        """Part of the warps of edges by the slopes of the surfaces.
 
         Where the inverse depth at an offset ``o`` from the centre is ``d (1 + s o)``, the pixel there moves by
         ``du/dd d s o`` more than at the depth of the centre.
+
+        Args:
+            edges: ``(e,)`` positions among the edges of the window.
+
+        Returns:
+            ``(e, 2, 2)``; None if no slope is known.
         """
         w = self.window
         slopes, centre = w.slopes, w.patches.shape[-1] // 2

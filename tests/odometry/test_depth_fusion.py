@@ -65,7 +65,7 @@ def test_the_cloud_of_a_run_is_a_plane_and_bounded(tmp_path, monkeypatch, limit)
     cloud.begin(object())
     for k in range(12):
         cloud.update(frame(k, np.full((240, 320), 2.0)), Estimate(0.1 * k, None, Status.LOST))
-    assert len(cloud._views) <= limit
+    assert len(cloud.views) <= limit
     cloud.finish(run_of(12))
     data = (tmp_path / "cloud.ply").read_bytes()
     header, body = data.split(b"end_header\n")

@@ -12,7 +12,7 @@ from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.graph.archive import ArchiveConfig
 from dvo.metrics import evaluate
-from dvo.odometry.final_adjustment import AdjustmentOptions, _extended, adjust_segment
+from dvo.odometry.final_adjustment import AdjustmentOptions, adjust_segment, extend_solution
 from dvo.odometry.session import run
 from dvo.synth.sequence import make_sequence
 from tests.support.archived_walk import archived_walk
@@ -76,7 +76,7 @@ def test_a_better_beginning_is_extended_to_later_frames(scale, first):
     true_cw = se3.exp(0.3 * torch.randn(12, 6, generator=generator, dtype=torch.float64))
     true_depths = 0.5 + torch.rand(12, 1, generator=generator, dtype=torch.float64).expand(12, 6)
     old_cw = torch.cat([scale * true_cw[:, :3], true_cw[:, 3:]], 1)
-    poses, depths = _extended(old_cw, true_depths / scale, true_cw[:first], true_depths[:first, ::2])
+    poses, depths = extend_solution(old_cw, true_depths / scale, true_cw[:first], true_depths[:first, ::2])
     torch.testing.assert_close(se3.relative(true_cw, poses), se3.identity(dtype=torch.float64).expand(12, 7))
     torch.testing.assert_close(depths, true_depths)
 

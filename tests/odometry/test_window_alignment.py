@@ -10,8 +10,9 @@ from dvo.geometry.projection import reproject
 from dvo.graph.window import Keyframe, Window
 from dvo.metrics import evaluate
 from dvo.models.step import Revision, UpdateState
-from dvo.nets.alignment import AlignmentOptions, patch_warps
+from dvo.nets.alignment import AlignmentOptions, align_patches, patch_warps
 from dvo.nets.patchifier import patch_coordinates
+from dvo.odometry import window_alignment
 from dvo.odometry.patch_depth import followed_planes
 from dvo.odometry.session import run
 from dvo.odometry.window_alignment import WindowAlignment
@@ -70,15 +71,19 @@ def test_measurements_are_replaced_where_the_images_agree(two_frames):
 def test_only_new_and_moved_edges_are_aligned(two_frames, monkeypatch):
     window, alignment, before = two_frames
     asked = []
-    original = alignment._align
-    monkeypatch.setattr(alignment, "_align", lambda *a: (asked.append(a[1].tolist()), original(*a)))
+
+    def spy(images, source, target, centres, *rest):
+        asked.append((centres[:, 0] / 4).tolist())
+        return align_patches(images, source, target, centres, *rest)
+
+    monkeypatch.setattr(window_alignment, "align_patches", spy)
     first = alignment(*before(torch.tensor([0.1, 0.0])))
     again = alignment(*before(torch.tensor([0.15, 0.0])))  # has moved by less than a tenth
     assert torch.equal(first.targets[0, :3], again.targets[0, :3])
     alignment(*before(torch.tensor([0.25, 0.0])))
     alignment.forget(window.edge_slots[1:2])
     alignment(*before(torch.tensor([0.25, 0.0])))
-    assert asked == [[0, 1, 2, 3], [0, 1, 2, 3], [1]]
+    assert asked == [[8, 16, 24, 0], [8, 16, 24, 0], [16]]  # columns of the centres
 
 
 def test_an_alignment_that_the_network_has_left_is_not_used(two_frames):
@@ -162,7 +167,7 @@ def test_the_warp_of_a_slanted_surface_is_that_of_its_plane():
     window.connect(torch.arange(2), torch.ones(2, dtype=torch.long))
     at = window.poses_cw[None], window.intrinsics[None], window.ii, window.jj, window.kk
     flat = reproject(at[0], window.patches[None], *at[1:]).coords[0]
-    found = patch_warps(flat, alignment._tilts(torch.arange(2)))
+    found = patch_warps(flat, alignment.tilts(torch.arange(2)))
     tilted = window.patches.clone()
     offsets = tilted[:, :2] - tilted[:, :2, 1:2, 1:2]
     tilted[:, 2] *= 1 + torch.einsum("kc,kcpq->kpq", window.slopes, offsets)
@@ -170,4 +175,4 @@ def test_the_warp_of_a_slanted_surface_is_that_of_its_plane():
     assert (found - patch_warps(flat)).abs().amax((1, 2)).tolist() == [pytest.approx(0.09, abs=0.06), 0]
     for frame in window.frames:
         frame.slopes = None
-    assert alignment._tilts(torch.arange(2)) is None
+    assert alignment.tilts(torch.arange(2)) is None

@@ -2,6 +2,8 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -11,10 +13,14 @@ from dvo.data import read_calibration
 from dvo.data.focal_guess import FocalGuess, guess_from_angle
 from dvo.errors import DvoError
 from dvo.odometry import calibrate as calibrate_module
-from dvo.odometry.calibrate import CalibrationOptions, _slope, calibrate
+from dvo.odometry.calibrate import CalibrationOptions, calibrate
 from dvo.odometry.camera_estimate import SelfCalibration
+from dvo.odometry.config import TrackerConfig
 from dvo.odometry.focal_length import FocalProfile
+from dvo.odometry.protocol import Estimate, Status
+from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.self_calibration import Minimum
+from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
 
 FLAT = (Minimum(0.0, math.inf, 0.0),) * 2
@@ -84,16 +90,6 @@ def test_the_file_for_the_next_run(tmp_path, found):
     assert not found.write(file) and file.read_text() == "1 2 3 4\n"
 
 
-@pytest.mark.parametrize(("lean", "rounds"), [(0.0, 1), (0.3, 3), (0.6, 3)])
-def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(lean, rounds):
-    """Measurements tracked at x ask for (1 - lean) of the way to 0."""
-    at, walk = 0.4, []
-    for _ in range(rounds):
-        walk.append((at, -(1 - lean) * at))
-        at += walk[-1][1] / _slope(walk)
-    assert at == pytest.approx(0, abs=1e-9)
-
-
 @pytest.fixture
 def leaning(clip, monkeypatch):
     """Calibration by measurements that ask for a share of the way to 200 px, the logarithm known to 1 %."""
@@ -101,20 +97,33 @@ def leaning(clip, monkeypatch):
     def find(share, guess, aside=FLAT, **options):
         tracked = []
 
-        def track(odometry, frames, focal, *rest):
-            tracked.append(focal)
-            return 60
+        def track(frame):
+            if frame.index == 0:
+                tracked.append(frame.camera.fx)
+            return Estimate(frame.timestamp, None, Status.TRACKING)
 
-        def profile(odometry):
+        def profile(*_):
             step = share * math.log(200 / tracked[-1])
-            return FocalProfile(Minimum(step, 0.01, 0.5), 0.5, aside), 60
+            return FocalProfile(Minimum(step, 0.01, 0.5), 0.5, aside)
 
-        monkeypatch.setattr(calibrate_module, "_track", track)
-        monkeypatch.setattr(calibrate_module, "_profile", profile)
-        monkeypatch.setattr(calibrate_module, "load", lambda *_, **__: None)
-        return calibrate(clip[:1], guess, options=CalibrationOptions(frames=30, **options)), tracked
+        odometry = create_autospec(PatchOdometry, instance=True)
+        odometry.track.side_effect = track
+        odometry.state = SimpleNamespace(adjustable=[0], info={}, shutter=Shutter(0.0, 36.0))
+        odometry.graph, odometry.config = SimpleNamespace(members=lambda segment: range(60)), TrackerConfig()
+        monkeypatch.setattr(calibrate_module, "load", lambda *_, **__: odometry)
+        monkeypatch.setattr(calibrate_module, "find_focal", profile)
+        frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(60)]
+        return calibrate(frames, guess, options=CalibrationOptions(frames=30, **options)), tracked
 
     return find
+
+
+@pytest.mark.parametrize(("lean", "rounds"), [(0.0, 1), (0.3, 3), (0.6, 3)])
+def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(leaning, lean, rounds):
+    """Measurements tracked at x ask for (1 - lean) of the way to 0."""
+    guess = FocalGuess(200 * math.exp(0.4), 100.0, "prior", 192, 144)
+    found, _ = leaning(1 - lean, guess, rounds=rounds)
+    assert found.found and math.log(found.focal / 200) == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5])

@@ -1,5 +1,5 @@
+import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +12,10 @@ from dvo.data.reduction import MAX_PIXELS, Reduction
 from dvo.data.right_source import with_right
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.odometry.focal_length import FocalProfile
+from dvo.odometry.protocol import Estimate, Status
+from dvo.odometry.self_calibration import Minimum
+from tests.support.stand_in_calibration import replace_tracking
 
 WIDTH, HEIGHT = 160, 120
 LIMIT = WIDTH * HEIGHT // 3  # a factor of 2
@@ -181,22 +185,16 @@ def test_limits_that_are_none(make, pixels):
 
 def test_a_found_focal_length_is_that_of_the_recorded_images(make, monkeypatch):
     """The odometry gets the camera of the reduced frames, and the result is in pixels of the recorded ones."""
-    import dvo.odometry.calibrate as module
-
     cameras = []
 
-    def track(odometry, frames, focal, *_):
-        cameras.append((focal, next(iter(frames)).camera.width))
-        return 0
+    def track(frame):
+        cameras.append((frame.camera.fx, frame.camera.width))
+        return Estimate(frame.timestamp, None, Status.LOST)
 
-    monkeypatch.setattr(module, "_track", track)
-    monkeypatch.setattr(module, "load", lambda *_, **__: None)
-    minimum = SimpleNamespace(value=0.0, deviation=0.1)
-    monkeypatch.setattr(module, "_profile", lambda _: (SimpleNamespace(minimum=minimum), 0))
-    monkeypatch.setattr(module, "_doubt", lambda *_: "no motion")
+    replace_tracking(monkeypatch, track, lambda: FocalProfile(Minimum(0.0, math.inf, 0.0), 0.0))
     source = open_source(folder(make), guess=True, fps=10, max_pixels=LIMIT)
     found = dvo.calibrate(source)
-    assert source.guess.width == WIDTH and cameras == [(pytest.approx(source.guess.focal / 2), 80)]
+    assert source.guess.width == WIDTH and cameras == 3 * [(pytest.approx(source.guess.focal / 2), 80)]
     assert (found.focal, found.width, found.height) == (source.guess.focal, WIDTH, HEIGHT)
     assert source.recalibrated(found.calibration).camera.fx == pytest.approx(found.focal / 2)
 

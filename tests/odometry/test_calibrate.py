@@ -2,8 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
-from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
@@ -12,16 +10,13 @@ import dvo
 from dvo.data import read_calibration
 from dvo.data.focal_guess import FocalGuess, guess_from_angle
 from dvo.errors import DvoError
-from dvo.odometry import calibrate as calibrate_module
 from dvo.odometry.calibrate import CalibrationOptions, calibrate
 from dvo.odometry.camera_estimate import SelfCalibration
-from dvo.odometry.config import TrackerConfig
 from dvo.odometry.focal_length import FocalProfile
 from dvo.odometry.protocol import Estimate, Status
-from dvo.odometry.rolling_shutter import Shutter
 from dvo.odometry.self_calibration import Minimum
-from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
+from tests.support.stand_in_calibration import replace_tracking
 
 FLAT = (Minimum(0.0, math.inf, 0.0),) * 2
 
@@ -102,16 +97,11 @@ def leaning(clip, monkeypatch):
                 tracked.append(frame.camera.fx)
             return Estimate(frame.timestamp, None, Status.TRACKING)
 
-        def profile(*_):
+        def profile():
             step = share * math.log(200 / tracked[-1])
             return FocalProfile(Minimum(step, 0.01, 0.5), 0.5, aside)
 
-        odometry = create_autospec(PatchOdometry, instance=True)
-        odometry.track.side_effect = track
-        odometry.state = SimpleNamespace(adjustable=[0], info={}, shutter=Shutter(0.0, 36.0))
-        odometry.graph, odometry.config = SimpleNamespace(members=lambda segment: range(60)), TrackerConfig()
-        monkeypatch.setattr(calibrate_module, "load", lambda *_, **__: odometry)
-        monkeypatch.setattr(calibrate_module, "find_focal", profile)
+        replace_tracking(monkeypatch, track, profile)
         frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(60)]
         return calibrate(frames, guess, options=CalibrationOptions(frames=30, **options)), tracked
 

@@ -1,0 +1,27 @@
+"""Calibration from images with a stand-in for the odometry and for the estimate of the focal length."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from unittest.mock import create_autospec
+
+from dvo.odometry import calibrate
+from dvo.odometry.config import TrackerConfig
+from dvo.odometry.rolling_shutter import Shutter
+from dvo.odometry.tracker import PatchOdometry
+
+
+def replace_tracking(monkeypatch, track, profile):
+    """Replace what :func:`dvo.calibrate` tracks and measures with.
+
+    Args:
+        monkeypatch: of the test.
+        track: called with each frame that is tracked, in place of the method of the odometry.
+        profile: called without arguments after each round, gives the profile of the focal length.
+    """
+    odometry = create_autospec(PatchOdometry, instance=True)
+    odometry.track.side_effect = track
+    odometry.state = SimpleNamespace(adjustable=[0], info={}, shutter=Shutter(0.0, 36.0))
+    odometry.graph, odometry.config = SimpleNamespace(members=lambda segment: range(60)), TrackerConfig()
+    monkeypatch.setattr(calibrate, "load", lambda *_, **__: odometry)
+    monkeypatch.setattr(calibrate, "find_focal", lambda *_: profile())

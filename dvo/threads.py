@@ -21,8 +21,10 @@ WAIT_POLICY = "OMP_WAIT_POLICY"
 NUMBERS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _WAITING = (WAIT_POLICY, "GOMP_SPINCOUNT", "KMP_BLOCKTIME")  # of OpenMP, of its GNU and of its LLVM library
 _CHOICE = {WAIT_POLICY: "PASSIVE", "GOMP_SPINCOUNT": "1000"}  # turns of GNU's loop, 25 to 50 us, before a thread sleeps
-_CGROUPS = Path("/sys/fs/cgroup")
-_MEMBERSHIP = Path("/proc/self/cgroup")
+CGROUPS = Path("/sys/fs/cgroup")
+"""Folder of the control groups."""
+MEMBERSHIP = Path("/proc/self/cgroup")
+"""File that lists the control groups of this process."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ def available_cores() -> int:
         1 or more; independent of the load.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.floor(min(cores, _quota(_MEMBERSHIP, _CGROUPS))))
+    return max(1, math.floor(min(cores, processor_quota(MEMBERSHIP, CGROUPS))))
 
 
 def thread_rule(cores: int) -> int:
@@ -195,8 +197,16 @@ def default_counts() -> set[int]:
 _state: dict[str, str] = {}  # origins of the choices made in this process
 
 
-def _quota(membership: Path, root: Path) -> float:
-    """Processor time that the control group of this process may use, in cores; infinity without a limit."""
+def processor_quota(membership: Path, root: Path) -> float:
+    """Processor time that the control group of a process may use.
+
+    Args:
+        membership: file that lists the control groups of the process.
+        root: folder of the control groups.
+
+    Returns:
+        Cores; infinity without a limit.
+    """
     limit = math.inf
     for line in _text(membership).splitlines():
         _, _, rest = line.partition(":")

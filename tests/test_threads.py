@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dvo import threads
-from dvo.threads import available_cores, process_environment, thread_rule
+from dvo.threads import available_cores, process_environment, processor_quota, thread_rule
 from eval.benchmarks import threads as benchmark
 from eval.benchmarks.threads import Speed
 
@@ -67,9 +67,9 @@ def test_quota_of_the_control_group(tmp_path, monkeypatch, membership, files, ex
     for name, text in files.items():
         (tmp_path / "groups" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "groups" / name).write_text(text + "\n")
-    assert threads._quota(tmp_path / "self", tmp_path / "groups") == expected
-    monkeypatch.setattr(threads, "_MEMBERSHIP", tmp_path / "self")
-    monkeypatch.setattr(threads, "_CGROUPS", tmp_path / "groups")
+    assert processor_quota(tmp_path / "self", tmp_path / "groups") == expected
+    monkeypatch.setattr(threads, "MEMBERSHIP", tmp_path / "self")
+    monkeypatch.setattr(threads, "CGROUPS", tmp_path / "groups")
     monkeypatch.setattr(threads.os, "sched_getaffinity", lambda process: set(range(6)), raising=False)
     assert available_cores() == max(1, int(min(6, expected)))
 

@@ -14,8 +14,9 @@ from dvo.errors import DvoError
 
 T = TypeVar("T")
 
+JOIN_TIMEOUT = 2.0
+"""Seconds to wait for the thread at the end; one that hangs in a driver dies with the process."""
 _CHECK = 1.0  # seconds after which a waiting consumer looks again, see LiveFrames._wait
-_JOIN = 2.0  # seconds to wait for the thread at the end; one that hangs in a driver dies with the process
 
 
 @dataclass
@@ -166,7 +167,7 @@ class LiveFrames(Generic[T]):
         self.stop()
         thread = self._thread
         if thread is not None and thread is not threading.current_thread():
-            thread.join(_JOIN)
+            thread.join(JOIN_TIMEOUT)
 
     def __enter__(self) -> LiveFrames[T]:
         self.start()

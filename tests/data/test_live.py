@@ -188,4 +188,6 @@ def test_an_error_at_the_end_of_a_generator_reaches_the_consumer():
     live = LiveFrames(Frames(OSError("at its release"))(), drop=False, queue=1)
     assert next(iter(live)) == 0
     live.close()  # closing the generator raises in its thread
-    assert live._ended and gone("dvo stream stream")
+    assert gone("dvo stream stream")
+    with pytest.raises(OSError, match="at its release"):
+        live.peek(LIMIT)

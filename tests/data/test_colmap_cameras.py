@@ -1,16 +1,16 @@
 """Cameras of COLMAP models as calibrations."""
 
 import struct
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from dvo.data import Calibration, read_calibration
 from dvo.errors import DvoError
-from dvo.export import colmap
+from dvo.export.colmap import write_colmap, write_colmap_text
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import distort
+from tests.support.reconstructions import one_view
 
 # Number of the model and parameters in COLMAP's files; expected: fx fy cx cy with pixel centres at integers.
 MODELS = {
@@ -84,11 +84,11 @@ def test_a_ray_falls_on_the_same_place_of_the_image(name, make):
 
 def test_an_exported_model_gives_the_camera_back(tmp_path):
     camera = Camera(50.5, 51.25, 31.0, 23.0, 64, 48)
-    model = SimpleNamespace(cameras=[camera])
-    (tmp_path / "cameras.bin").write_bytes(colmap._cameras_bin(model))
-    (tmp_path / "cameras.txt").write_text("\n".join(colmap._cameras_txt(model)))
-    for name in ("cameras.bin", "cameras.txt"):
-        assert read_calibration(tmp_path / name).camera(64, 48) == camera
+    model, _ = one_view(np.eye(4), camera, (31.0, 23.0), 2.0)
+    for write, name in ((write_colmap, "cameras.bin"), (write_colmap_text, "cameras.txt")):
+        (folder := tmp_path / name).mkdir()
+        write(model, folder)
+        assert read_calibration(folder / "sparse" / "0" / name).camera(64, 48) == camera
 
 
 def test_a_camera_by_its_number(make):

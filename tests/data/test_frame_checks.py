@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from importlib.util import find_spec, module_from_spec
 
 import numpy as np
 import pytest
 import torch
 
-from dvo.data import frame_checks
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.errors import DvoError
@@ -102,18 +102,25 @@ def test_floats_are_rounded_and_may_exceed_the_range_by_less_than_half_a_level()
         checked_frame(frame(image))
 
 
-def test_low_16_bit_values_warn_once(monkeypatch):
-    monkeypatch.setattr(frame_checks, "_warned", set())
-    dark = RGB.astype(np.uint16) * 8
+def as_in_a_new_process():
+    """The check, from a copy of its module that has not warned of anything yet."""
+    spec = find_spec("dvo.data.frame_checks")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.checked_frame
+
+
+def test_low_16_bit_values_warn_once():
+    check, dark = as_in_a_new_process(), RGB.astype(np.uint16) * 8
     with pytest.warns(UserWarning, match="frame 7: image: uint16 values up to 2040") as told:
-        checked_frame(frame(dark))
-        checked_frame(frame(dark, index=8))
+        check(frame(dark))
+        check(frame(dark, index=8))
     assert len(told) == 1
-    monkeypatch.setattr(frame_checks, "_warned", set())
+    check = as_in_a_new_process()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        checked_frame(frame(np.zeros_like(dark)))
-        checked_frame(frame(dark + 4096))
+        check(frame(np.zeros_like(dark)))
+        check(frame(dark + 4096))
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB", "RGBA", "P", "1", "LA", "CMYK", "I;16", "F"])

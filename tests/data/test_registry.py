@@ -4,6 +4,7 @@ import dataclasses
 import os
 import sys
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
@@ -102,9 +103,8 @@ def test_what_is_no_file_and_no_folder(tmp_path):
 
 @pytest.mark.parametrize("file", ["tum.py", "depth.py", "source.py"])
 def test_cached_predictions_depend_on_every_reader(monkeypatch, file):
-    from eval.execution import versions
+    from eval.execution.versions import reader_digest
 
-    before = versions.reader_digest()
-    read = versions._content
-    monkeypatch.setattr(versions, "_content", lambda path: read(path) + b"#" * (path.name == file))
-    assert versions.reader_digest() != before
+    before, read = reader_digest(), Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + b"#" * (path.name == file))
+    assert reader_digest() != before

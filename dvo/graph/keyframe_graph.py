@@ -29,7 +29,8 @@ from dvo.graph.window import Keyframe, Window
 NEAR = 0.05
 """Points whose inverse depth is below this fraction of their keyframe's median are left out of the map, because their
 depth is uncertain."""
-_TIDY = 64  # frames that have left the window, after which free memory of the heap is released
+RELEASE_INTERVAL = 64
+"""Frames that have left the window, after which free memory of the heap is released."""
 
 
 class KeyframeGraph:
@@ -379,5 +380,5 @@ class KeyframeGraph:
                 measured=None if frame.measured is None else frame.measured.float().cpu().numpy(),
             )
         )
-        if len(self.archive) % _TIDY == 0:
+        if len(self.archive) % RELEASE_INTERVAL == 0:
             release_free_memory()

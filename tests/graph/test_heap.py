@@ -10,7 +10,7 @@ import torch
 
 from dvo.graph import keyframe_graph
 from dvo.graph.heap import release_free_memory
-from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.graph.keyframe_graph import RELEASE_INTERVAL, KeyframeGraph
 from dvo.graph.window import Keyframe
 
 BLOCK = 2**16  # bytes: below the size from which an array gets a mapping of its own
@@ -38,10 +38,10 @@ def test_memory_is_released_after_a_number_of_frames_kept_or_dropped(monkeypatch
     graph, m = KeyframeGraph(2, 3, 5, torch.device("cpu")), 2
     pose, patches = torch.tensor([0, 0, 0, 0, 0, 0, 1.0]), torch.ones(m, 3, 3, 3)
     features = torch.zeros(m, 4, 3, 3), torch.zeros(m, 5), torch.zeros(m, 3, dtype=torch.uint8), torch.ones(4)
-    for number in range(3 * keyframe_graph._TIDY):
+    for number in range(3 * RELEASE_INTERVAL):
         graph.window.append(Keyframe(number, 0.1 * number, 0, *features), pose, patches)
         if number % 3 == 1:
             graph.drop(1)
         elif len(graph.window) > 1:
             graph.archive_oldest()
-    assert calls == [keyframe_graph._TIDY, 2 * keyframe_graph._TIDY]
+    assert calls == [RELEASE_INTERVAL, 2 * RELEASE_INTERVAL]

@@ -81,9 +81,11 @@ def as_dpvo(channels):
 def test_cached_windows_equal_reference(seed):
     patches, maps, coords, kk, jj = problem(batch=1, seed=seed)
     features = patches.detach()[0].flatten(2)
-    caches = [EdgeCorrelation(1, 9, 3, 14, "cpu"), EdgeCorrelation(4, 9, 3, 12, "cpu")]
-    for cache in caches:
-        cache._products = cache._products.double()
+    torch.set_default_dtype(torch.float64)
+    try:
+        caches = [EdgeCorrelation(1, 9, 3, 14, "cpu"), EdgeCorrelation(4, 9, 3, 12, "cpu")]
+    finally:
+        torch.set_default_dtype(torch.float32)
     for cache, level in zip(caches, pool_levels(maps.detach(), (1, 4)), strict=True):
         for frame in range(3):
             cache.keep_map(frame, level[0, frame])

@@ -9,6 +9,7 @@ import pytest
 import dvo
 from dvo.metrics import evaluate
 from dvo.odometry.adjuster import Adjusting
+from dvo.odometry.background import Background
 from dvo.odometry.graph_adjustment import AdjustmentLimits
 from dvo.odometry.loop_work import Correcting, Searching
 from tests.support.loop_walk import there_and_back, track, until
@@ -68,7 +69,7 @@ def test_an_adjustment_on_request(film):
     assert after < before
     assert loaded.track(film[0][count]).status is dvo.Status.TRACKING
     loaded.config, loaded.loops.real_time = replace(loaded.config, real_time=True), True
-    loaded.loops.work = Searching(loaded.loops._background.start(lambda: release.wait(60) and None))
+    loaded.loops.work = Searching(Background().start(lambda: release.wait(60) and None))
     assert loaded.adjust() == () and loaded.loops.adjuster.wanted == [0]
     loaded.track(film[0][count + 1])
     assert isinstance(loaded.loops.work, Searching)

@@ -62,7 +62,7 @@ class KltPnp:
 
     def __init__(self, config: KltPnpConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = replace(config or KltPnpConfig(), **settings)
-        self._seed = seed
+        self.seed = seed
         self._log = FrameLog()
         self._tracks = Tracks()
         self._grey: np.ndarray | None = None  # the last image in which the tracks were seen
@@ -150,7 +150,7 @@ class KltPnp:
 
     def _try_start(self, frame: Frame, grey: np.ndarray, index: int) -> None:
         c, tracks = self.config, self._tracks
-        pair = two_view.relative_pose(tracks.anchor_uv, tracks.uv, self._intrinsics, c.epipolar, self._seed + index)
+        pair = two_view.relative_pose(tracks.anchor_uv, tracks.uv, self._intrinsics, c.epipolar, self.seed + index)
         focal = float(self._intrinsics[:2].mean())
         if pair is not None and pair.parallax > c.start_parallax * focal and self._start(pair, index):
             self._update_points(index)
@@ -188,7 +188,7 @@ class KltPnp:
             both = np.array([i for i, track in enumerate(tracks.ids) if track in row and tracks.has_point[i]], int)
             seen = uv[[row[tracks.ids[i]] for i in both]]
             pose = two_view.pose_from_points(
-                tracks.points[both], seen, self._intrinsics, c.reprojection, self._seed + frame
+                tracks.points[both], seen, self._intrinsics, c.reprojection, self.seed + frame
             )
             if pose is not None:
                 self._log.set_pose(frame, pose[0])
@@ -204,7 +204,7 @@ class KltPnp:
         c, tracks = self.config, self._tracks
         known = np.flatnonzero(tracks.has_point)
         points, uv = tracks.points[known], tracks.uv[known]
-        found = two_view.pose_from_points(points, uv, self._intrinsics, c.reprojection, self._seed + index)
+        found = two_view.pose_from_points(points, uv, self._intrinsics, c.reprojection, self.seed + index)
         if found is not None and found[1].sum() >= max(c.pose_points, 0.2 * len(known)):
             T, inliers = found
         else:
@@ -225,7 +225,7 @@ class KltPnp:
         """
         c, tracks = self.config, self._tracks
         last = self._log.last_pose()
-        pair = two_view.relative_pose(tracks.last_uv, tracks.uv, self._intrinsics, c.epipolar, self._seed + index)
+        pair = two_view.relative_pose(tracks.last_uv, tracks.uv, self._intrinsics, c.epipolar, self.seed + index)
         step = np.eye(4)
         if pair is None or pair.parallax < c.step_parallax:
             step[:3, :3] = two_view.rotation_between(tracks.last_uv, tracks.uv, self._intrinsics)

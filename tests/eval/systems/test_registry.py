@@ -67,10 +67,10 @@ def test_settings_are_arguments_and_part_of_the_name(tmp_path):
     system = find_system("klt-pnp+corners=400+refill=0.5")
     assert (system.name, system.settings) == ("klt-pnp+corners=400+refill=0.5", {"corners": 400, "refill": 0.5})
     odometry = system.build(3, "cpu")
-    assert (odometry.config.corners, odometry.config.refill, odometry._seed) == (400, 0.5, 3)
+    assert (odometry.config.corners, odometry.config.refill, odometry.seed) == (400, 0.5, 3)
     for name in ("monoslam+fewest=7", "keyframe+corners=300", "direct+patience=3"):
         assert isinstance(find_system(name).build(0, "cpu"), Odometry)
-    assert find_system("klt-pnp+seed=5").build(0, "cpu")._seed == 5
+    assert find_system("klt-pnp+seed=5").build(0, "cpu").seed == 5
     with pytest.raises(TypeError, match="colour"):
         find_system("klt-pnp+colour=red").build(0, "cpu")
     with pytest.raises(DvoError, match="setting"):

@@ -38,7 +38,7 @@ def refine_pose(
         distance = np.linalg.norm(residual, axis=1)
         width = np.clip(1.5 * np.median(distance), 0.5 * threshold, 10 * threshold)
         weights = 1 / (1 + (distance / width) ** 2)
-        J = _jacobian(x, y, z, intrinsics)
+        J = pixel_jacobian(x, y, z, intrinsics)
         Jw = (J * weights[:, None, None]).reshape(-1, 6)
         H = Jw.T @ J.reshape(-1, 6)
         step = -np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), Jw.T @ residual.ravel())
@@ -61,8 +61,16 @@ def reprojects(
     return (depth > 0) & (error < threshold)
 
 
-def _jacobian(x: np.ndarray, y: np.ndarray, z: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
-    """d pixel / d (tau, phi) ``(N, 2, 6)`` of points in the camera moved by ``Exp([tau, phi])`` from the left."""
+def pixel_jacobian(x: np.ndarray, y: np.ndarray, z: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Derivatives of pixels by a motion of the points ``Exp([tau, phi])`` from the left.
+
+    Args:
+        x, y, z: ``(N,)`` of the points in the camera.
+        intrinsics: ``(4,)`` fx fy cx cy, pixels.
+
+    Returns:
+        d pixel / d (tau, phi) ``(N, 2, 6)``.
+    """
     fx, fy = intrinsics[:2]
     zero = np.zeros_like(x)
     along_u = np.column_stack([fx / z, zero, -fx * x / z**2, -fx * x * y / z**2, fx * (1 + x**2 / z**2), -fx * y / z])

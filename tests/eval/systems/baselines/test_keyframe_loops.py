@@ -95,12 +95,12 @@ def test_a_loop_takes_the_drift_away(monkeypatch: pytest.MonkeyPatch) -> None:
     relative = truth[23] @ np.linalg.inv(truth[0])
     exact = sim3.from_se3(torch.from_numpy(poses_from_matrices(relative)).double(), unit)
     exact = torch.cat([exact[:3] * unit, exact[3:]])
-    found = Loop(0, 46, exact, 0.8, 60)
-    monkeypatch.setattr(loops, "verify", lambda *_: found)
+    found, searches = Loop(0, 46, exact, 0.8, 60), []
+    monkeypatch.setattr(loops, "verify", lambda *_: searches.append(1))
     monkeypatch.setattr(loops, "feature", lambda *_: np.eye(1, 1200)[0])
     for keyframe in world.keyframes[:23]:
-        closer._places.add(keyframe.frame, np.eye(1, 1200)[0])
-    closer._map = world
+        assert closer.visit(world, keyframe, log, INTRINSICS) is None
+    monkeypatch.setattr(loops, "verify", lambda *_: found)
     assert closer.visit(world, world.keyframes[-1], log, INTRINSICS) is None and not closer.loops  # not confirmed
     scale = closer.visit(world, world.keyframes[-1], log, INTRINSICS)
     assert scale == pytest.approx(unit, rel=0.03) and reprojection(world) < 1e-2
@@ -111,7 +111,11 @@ def test_a_loop_takes_the_drift_away(monkeypatch: pytest.MonkeyPatch) -> None:
     assert errors[1] < 0.25 * errors[0]
     told = closer.information(log)["loops"]
     assert [(one["from"], one["to"], one["inliers"]) for one in told] == [(46.0, 0.0, 0.8)] * 2
-    assert closer._wait == KeyframeConfig().loop_every
+    searches.clear()
+    monkeypatch.setattr(loops, "verify", lambda *_: searches.append(1))
+    for number in range(1, KeyframeConfig().loop_every + 1):
+        assert closer.visit(world, world.keyframes[-1], log, INTRINSICS) is None
+        assert bool(searches) == (number == KeyframeConfig().loop_every)
 
 
 def test_loops_agree_about_the_same_correction() -> None:

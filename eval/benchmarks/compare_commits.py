@@ -29,8 +29,8 @@ from eval.suites.suite import ROOT
 
 CLIPS = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr1_rpy_60")
 WHAT = ("tracking", "ba", "training")
+SCRIPT = str(Path(__file__).with_name("measurements.py"))  # measures in a working tree
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-_SCRIPT = str(Path(__file__).with_name("measurements.py"))
 _SECONDS = re.compile(r"SECONDS ([0-9.]+)")
 
 
@@ -95,7 +95,7 @@ def seconds(what: str, tree: Path, settings: Settings) -> float:
     frames = ["--frames", str(settings.frames)] if settings.frames else []
     changed = what == "tracking" and tree == ROOT and settings.preset != "default"
     preset = ["--preset", settings.preset] if changed else []
-    output = _run([sys.executable, _SCRIPT, what, *clip, *frames, *preset], tree)
+    output = _run([sys.executable, SCRIPT, what, *clip, *frames, *preset], tree)
     found = _SECONDS.search(output)
     if found is None:
         raise DvoError("output without a time", file=tree, field=what, remedy="run the measurement by hand")
@@ -107,7 +107,7 @@ class _Steps:
 
     def __init__(self, tree: Path) -> None:
         self.tree = tree
-        command = [sys.executable, _SCRIPT, "training"]
+        command = [sys.executable, SCRIPT, "training"]
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(command, cwd=tree, env=_environment(tree), text=True, stdin=pipe, stdout=pipe)
         self._answer("READY")
@@ -123,7 +123,7 @@ class _Steps:
         assert self.process.stdout is not None
         answer = self.process.stdout.readline()
         if not answer.startswith(start):
-            raise DvoError("training failed", file=self.tree, remedy=f"run 'python {_SCRIPT} training' there")
+            raise DvoError("training failed", file=self.tree, remedy=f"run 'python {SCRIPT} training' there")
         return answer
 
     def close(self) -> None:

@@ -267,7 +267,7 @@ def _print_tables(given: argparse.Namespace) -> None:
         options = {name: value for name, value in entry.rendered or () if name not in ("version", "depth")}
         baseline = float(options.pop("baseline", BASELINE))
         options["seed"] += CALIBRATION + clip * CLIP_STEP if calibrate else 0
-        sequence = _beginning(make_sequence(**options), given.frames)
+        sequence = beginning(make_sequence(**options), given.frames)
         errors = measure(sequence, given.weights, given.seed, given.scale, baseline)
         found.append(errors)
         families.setdefault(options["family"], []).append(errors)
@@ -284,8 +284,16 @@ def _print_tables(given: argparse.Namespace) -> None:
     print(f"\n{tolerance}", *confidence_table({k: Errors.concatenate(v) for k, v in families.items()}), sep="\n")
 
 
-def _beginning(sequence: SyntheticSequence, frames: int) -> SyntheticSequence:
-    """The first frames of a sequence; each has the same bytes."""
+def beginning(sequence: SyntheticSequence, frames: int) -> SyntheticSequence:
+    """The first frames of a sequence.
+
+    Args:
+        sequence: rendered one.
+        frames: their number.
+
+    Returns:
+        Sequence of these, each with the same bytes.
+    """
     truth = sequence.groundtruth
     return replace(sequence, groundtruth=Trajectory(truth.timestamps[:frames], truth.poses_wc[:frames]))
 

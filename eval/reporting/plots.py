@@ -109,7 +109,7 @@ def plot_sequence(
                 values = np.linalg.norm(aligned.positions[i] - groundtruth.positions[j], axis=1)
             if len(values):
                 medians.append(values)
-                curve = _with_breaks(_thin(np.column_stack([stamps - start, values])))
+                curve = with_breaks(_thin(np.column_stack([stamps - start, values])))
                 error.plot(*curve.T, **{**look, "lw": style.width * 0.8})
             if position:
                 plan.plot(*aligned.positions[0, [first, second]], "o", color=style.color, **RING)
@@ -256,8 +256,15 @@ def _thin(rows: np.ndarray) -> np.ndarray:
     return rows[::step] if step > 1 and not np.isnan(rows).any() else rows
 
 
-def _with_breaks(curve: np.ndarray) -> np.ndarray:
-    """Rows of time and value, with a row of nan where no frame has a value for a while: no line across the gap."""
+def with_breaks(curve: np.ndarray) -> np.ndarray:
+    """Break a curve where no frame has a value for a while, so that no line is drawn across the gap.
+
+    Args:
+        curve: ``(N, 2)`` rows of time and value.
+
+    Returns:
+        The rows, with a row of nan in each gap.
+    """
     steps = np.diff(curve[:, 0])
     gaps = np.flatnonzero(steps > GAP_STEPS * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
     return np.insert(curve, gaps, np.nan, axis=0)

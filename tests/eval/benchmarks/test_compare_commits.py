@@ -89,7 +89,7 @@ def test_training_steps_of_two_trees_take_turns(tmp_path, monkeypatch):
         "    with open('../turns', 'a') as file: file.write(pathlib.Path.cwd().name)\n"
         "    print('SECONDS', 99 if number < 2 else 1 + ('b' == pathlib.Path.cwd().name), flush=True)\n"
     )
-    monkeypatch.setattr(compare_commits, "_SCRIPT", str(script))
+    monkeypatch.setattr(compare_commits, "SCRIPT", str(script))
     for name in "ab":
         (tmp_path / name).mkdir()
     assert alternate_steps(tmp_path / "a", tmp_path / "b", 3) == (1.0, 2.0)

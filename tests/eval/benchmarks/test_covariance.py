@@ -11,7 +11,7 @@ from eval.benchmarks import covariance
 from eval.benchmarks.covariance import (
     FARTHEST,
     Errors,
-    _beginning,
+    beginning,
     confidence_table,
     frames_of,
     line,
@@ -117,7 +117,7 @@ def test_the_calibration_split_has_other_scenes_of_the_same_options(monkeypatch,
         return gaussian(count=3)
 
     monkeypatch.setattr(covariance, "make_sequence", lambda **options: options)
-    monkeypatch.setattr(covariance, "_beginning", lambda sequence, frames: sequence)
+    monkeypatch.setattr(covariance, "beginning", lambda sequence, frames: sequence)
     monkeypatch.setattr(covariance, "measure", tracked)
     assert main(["--scale", "stereo"]) == main(["--scale", "stereo", "--split", "calibration", "--clips", "2"]) == 0
     printed = capsys.readouterr().out
@@ -133,7 +133,7 @@ def test_the_calibration_split_has_other_scenes_of_the_same_options(monkeypatch,
 
 def test_a_sequence_is_measured_on_its_first_frames():
     longer = walk(40)
-    short = _beginning(longer, 18)
+    short = beginning(longer, 18)
     assert len(short) == 18 and np.array_equal(short.frame(17).image, longer.frame(17).image)
     errors = measure(short, "small", 0)
     assert 5 < errors.poses <= 18 and len(errors.joint) == errors.poses

@@ -17,7 +17,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Segment
 from eval.__main__ import main
 from eval.execution.plan import read_manifest
-from eval.reporting.plots import OURS, RING, _with_breaks, plot_axis, plot_sequence, plot_speed, styles
+from eval.reporting.plots import OURS, RING, plot_axis, plot_sequence, plot_speed, styles, with_breaks
 from eval.reporting.report import overall, shade, write_report, write_tables
 from eval.reporting.tables import markdown
 from eval.reporting.verdict import verdicts
@@ -181,9 +181,9 @@ def test_segments_are_told_apart_in_the_figure():
 
 def test_curves_break_where_there_are_no_frames():
     stamps = np.r_[0:10, 20:30] / 10
-    curve = _with_breaks(np.column_stack([stamps, stamps]))
+    curve = with_breaks(np.column_stack([stamps, stamps]))
     assert np.isnan(curve[:, 0]).tolist() == [row == 10 for row in range(21)]
-    assert len(_with_breaks(curve[:1])) == 1 and len(_with_breaks(curve[:0])) == 0
+    assert len(with_breaks(curve[:1])) == 1 and len(with_breaks(curve[:0])) == 0
 
 
 def test_tables_and_page_tell_segments_and_made_up_poses(plan, rows):

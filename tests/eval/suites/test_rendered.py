@@ -14,6 +14,7 @@ import pytest
 
 from dvo.errors import DvoError
 from dvo.synth import HELD_OUT, LONG_KINDS, make_sequence
+from dvo.synth.export import write_calibration
 from eval import commands
 from eval.__main__ import main
 from eval.suites import rendered
@@ -153,7 +154,7 @@ def test_renderings_of_before_the_readout_are_not_used() -> None:
 def test_cache_is_used_and_keyed_by_everything(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = rendered_folder("one", OPTIONS)
     stamp = (folder / RECORD).stat().st_mtime_ns
-    monkeypatch.setattr(rendered, "_write", lambda *_: pytest.fail("rendered again"))
+    monkeypatch.setattr("dvo.synth.sequence.make_sequence", lambda **_: pytest.fail("rendered again"))
     assert rendered_folder("one", dict(reversed(OPTIONS.items()))) == folder
     assert (folder / RECORD).stat().st_mtime_ns == stamp
     others = [place_of("one", {**OPTIONS, key: 2}) for key in ("version", "seed", "frames")]
@@ -189,14 +190,13 @@ def test_interrupted_rendering_leaves_nothing_that_counts(cache: Path, monkeypat
 
 def test_two_at_once_agree(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another process finishes the same sequence first: its folder stands, ours goes."""
-    write = rendered._write
 
-    def slow(folder: Path, name: str, options: dict[str, Any]) -> None:
-        write(folder, name, options)
-        shutil.copytree(folder, place_of(name, options))
-        (place_of(name, options) / "first").touch()
+    def slow(*given: Any) -> None:
+        monkeypatch.setattr("dvo.synth.export.write_calibration", write_calibration)
+        (rendered_folder("one", OPTIONS) / "first").touch()
+        write_calibration(*given)
 
-    monkeypatch.setattr(rendered, "_write", slow)
+    monkeypatch.setattr("dvo.synth.export.write_calibration", slow)
     folder = rendered_folder("one", OPTIONS)
     assert (folder / "first").is_file() and [path.name for path in cache.iterdir()] == [folder.name]
 

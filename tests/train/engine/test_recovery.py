@@ -53,15 +53,19 @@ def test_many_bad_steps_in_a_row_return_to_the_last_good_state(tmp_path, runs):
 
 def test_weights_that_go_bad_are_replaced_at_once(tmp_path, runs):
     program = runs.module(keep_every=1)
-    real = program._after_step
+    real = program.configure_optimizers
 
-    def spoiled(optimizer):
+    def spoil(*_):
         if program.global_step == 2:
             with torch.no_grad():
                 next(program.net.parameters()).fill_(torch.nan)
-        real(optimizer)
 
-    program._after_step = spoiled
+    def configured():
+        found = real()
+        found["optimizer"].register_step_post_hook(spoil)
+        return found
+
+    program.configure_optimizers = configured
     _, losses = runs.fit(tmp_path, 5, program)
     assert program.recovered == 1 and int(program.skipped) == 1
     assert None not in losses and finite(program)

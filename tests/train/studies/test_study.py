@@ -63,7 +63,8 @@ def test_arms_start_from_a_state_with_settings_and_clips_of_their_own(tmp_path):
         "arm_clips": {"still": {"movers": 0.0}},
     }  # fmt: skip
     config = small_study(tmp_path / "study", **changes)
-    program = study._program(config, 5)
+    common = {"model": config.model, "seed": 5, "updates": config.updates}
+    program = study.task_program(config.task, common, **config.settings)
     study.fit(
         tmp_path, program, study.StudyClips(study.DiskClips(tmp_path, 0, 1, config, config.clip_options)), 1, [], 1
     )

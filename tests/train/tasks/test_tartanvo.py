@@ -220,25 +220,28 @@ def test_virtual_pairs_are_drawn_from_the_seed_and_the_step(runs):
 def test_virtual_pairs_train_the_pose_network_alone(runs):
     part = program(virtual=VirtualMotions(pairs=6), loss=LossConfig(flow=0.0, translation=0.0, rotation=0.0))
     plain = program(loss=LossConfig(flow=0.0, translation=0.0, rotation=0.0))
+    alone = program(virtual=VirtualMotions(pairs=6), matching_from=1)
     batch = runs.batch(0, 1, sizes=[(48, 64)])
-    for found in (part, plain):
+    for found in (part, plain, alone):
         found.task.loss = LossConfig(flow=0.0)
     net = part.net
-    extra, shown = part.task._virtual_loss(net, batch, 0)
-    extra.backward()
+    extra = alone.task.compute_loss(StepContext(net, 0, {}), batch)
+    extra.loss.backward()
     assert all(p.grad is None for p in net.matching.parameters())
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in net.pose.parameters())
     whole = part.task.compute_loss(StepContext(net, 0, {}), batch)
     without = plain.task.compute_loss(StepContext(net, 0, {}), batch)
-    torch.testing.assert_close(whole.loss, without.loss + extra)
-    assert shown["virtual_rotation_deg"] > 0 and "virtual_rotation_ratio" in whole.measures
+    torch.testing.assert_close(whole.loss, without.loss + extra.loss)
+    assert extra.measures["virtual_rotation_deg"] > 0 and "virtual_rotation_ratio" in whole.measures
 
 
 def test_the_first_steps_may_train_the_pose_network_alone(runs):
     part = program(virtual=VirtualMotions(pairs=6), matching_from=5)
     batch = runs.batch(0, 1, sizes=[(48, 64)])
     early = part.task.compute_loss(StepContext(part.net, 4, {}), batch)
-    torch.testing.assert_close(early.loss, part.task._virtual_loss(part.net, batch, 4)[0])
+    both, plain = program(virtual=VirtualMotions(pairs=6)), program()
+    whole, without = (one.task.compute_loss(StepContext(part.net, 4, {}), batch) for one in (both, plain))
+    torch.testing.assert_close(whole.loss, without.loss + early.loss)
     late = part.task.compute_loss(StepContext(part.net, 5, {}), batch)
     assert "loss_flow" in late.measures and "loss_flow" not in early.measures
     with pytest.raises(DvoError, match="matching_from"):

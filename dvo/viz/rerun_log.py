@@ -128,7 +128,7 @@ class RerunLog:
                 self._stream.log(f"final/trajectory/{number}", strip)
         if len(result.map.points):
             self._stream.log("final/map", rr.Points3D(result.map.points, colors=result.map.colors))
-        loops = _loop_lines(result)
+        loops = loop_lines(result)
         if len(loops):
             self._lines("final/loops", loops, [30, 160, 90])
         graph = None if self._odometry is None else graph_of(self._odometry)
@@ -231,8 +231,15 @@ def _shares_world(result: Result, number: int) -> bool:
     return bool(len(times)) and bool(np.isin(times, result.trajectory.timestamps).all())
 
 
-def _loop_lines(result: Result) -> np.ndarray:
-    """``(L, 2, 3)`` positions of both visits of each loop in the world of the result."""
+def loop_lines(result: Result) -> np.ndarray:
+    """Lines between both visits of each loop in the world of the result.
+
+    Args:
+        result: whose ``info`` lists the loops, if there are any.
+
+    Returns:
+        ``(L, 2, 3)`` positions, the later visit first.
+    """
     times, positions = result.trajectory.timestamps, result.trajectory.positions
     lines = []
     for loop in result.info.get("loops", ()):

@@ -58,22 +58,42 @@ class WithGraph:
     name: str = "graph"
 
 
-def test_patches_are_marked_where_they_are():
+class FakeWriter:
+    """Stand-in for ``cv2.VideoWriter`` that keeps the frames as they are."""
+
+    fourcc = cv2.VideoWriter.fourcc
+    frames: list[np.ndarray] = []
+
+    def __init__(self, *arguments):
+        self.frames.clear()
+
+    def isOpened(self):
+        return True
+
+    def write(self, image):
+        self.frames.append(image[..., ::-1])
+
+    def release(self):
+        pass
+
+
+def test_patches_are_marked_where_they_are(tmp_path, monkeypatch):
     graph = KeyframeGraph(1, 3, 4, torch.device("cpu"))
     features = torch.zeros(1, 1, 1, 1), torch.zeros(1, 4), torch.zeros(1, 3, dtype=torch.uint8)
     keyframe = Keyframe(0, 2.0, 0, *features, torch.tensor([12.5, 10, 7.875, 5.875]))
     patches = torch.ones(1, 3, 3, 3)
     patches[:, 0], patches[:, 1] = 10, 8  # pixel (40, 32) of the image, which is four times as large
     graph.window.append(keyframe, torch.tensor([0.0, 0, 0, 0, 0, 0, 1]), patches)
-    overlay = OverlayVideo.__new__(OverlayVideo)
-    overlay._odometry = WithGraph(graph)
+    monkeypatch.setattr(cv2, "VideoWriter", FakeWriter)
+    overlay = OverlayVideo(tmp_path / "patches.mp4")
+    overlay.begin(WithGraph(graph))
     frame = Frame(0, 2.0, np.zeros((48, 64, 3), np.uint8), CAMERA)
-    picture = overlay._picture(frame, Estimate(2.0, None, Status.INITIALISING))
+    overlay.update(frame, Estimate(2.0, None, Status.INITIALISING))
+    overlay.update(Frame(1, 3.0, frame.image, CAMERA), Estimate(3.0, None, Status.LOST))
+    picture, later = FakeWriter.frames
     rows, columns = np.nonzero(picture[24:].min(axis=2) > 60)
     np.testing.assert_allclose([rows.mean() + 24, columns.mean()], [32, 40], atol=0.5)
-    later = Frame(1, 3.0, frame.image, CAMERA)
-    nothing = overlay._picture(later, Estimate(3.0, None, Status.LOST))[24:]
-    assert nothing.max() == 0, "a frame that has left the window has no marks"
+    assert later[24:].max() == 0, "a frame that has left the window has no marks"
 
 
 @pytest.mark.parametrize("name", ["none/a.mp4", "a.txt"])

@@ -9,7 +9,7 @@ import pytest
 
 from dvo.cli import main
 from dvo.commands.view_options import VIEWER
-from dvo.viz.rerun_log import _loop_lines
+from dvo.viz.rerun_log import loop_lines
 from tests.support.command_line import arguments, errors, names
 
 
@@ -80,5 +80,5 @@ def test_loops_join_the_positions_of_both_visits(fake_odometry):
     result = fake_odometry().finish()
     poses = np.arange(35.0).reshape(5, 7)
     result = replace(result, trajectory=Trajectory(np.arange(5.0), poses), info={"loops": [{"from": 4.0, "to": 1.0}]})
-    np.testing.assert_array_equal(_loop_lines(result), [[poses[4, :3], poses[1, :3]]])
-    assert _loop_lines(replace(result, info={"loops": [{"from": 4.0, "to": 9.0}]})).shape == (0, 2, 3)
+    np.testing.assert_array_equal(loop_lines(result), [[poses[4, :3], poses[1, :3]]])
+    assert loop_lines(replace(result, info={"loops": [{"from": 4.0, "to": 9.0}]})).shape == (0, 2, 3)

@@ -70,6 +70,7 @@ def test_live_examples_use_names_that_are_there(name):
             inspect.signature(getattr(dvo, call.func.attr)).bind(*call.args, **{k.arg: k for k in call.keywords})
 
 
+@pytest.mark.slow
 def test_fine_tune(tmp_path):
     out = run(EXAMPLES / "fine_tune.py", "--steps", "2", "--out", "tuned.safetensors", cwd=tmp_path)
     assert "gives dvo-tuned" in out and len(re.findall(r"^step \d: loss \d", out, re.MULTILINE)) == 2

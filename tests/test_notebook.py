@@ -55,6 +55,7 @@ def test_links_lead_to_pages_and_sections(cells):
         assert not anchor or anchor in [re.sub(r"\W+", "-", title.lower()) for title in titles], (page, anchor)
 
 
+@pytest.mark.slow
 def test_the_cells_run_in_order(cells, monkeypatch, tmp_path, capsys):
     """In one namespace, and each figure shows something; the pictures stay in the folder of the test."""
     before = matplotlib.get_backend()

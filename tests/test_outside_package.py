@@ -80,6 +80,7 @@ def test_the_update_operator_is_chosen_by_a_word():
     assert found.strip() == "Still True"
 
 
+@pytest.mark.slow
 def test_train_export_and_run(recording, tmp_path):
     """Task, network, odometry and reader: trained, exported and tracked by the ordinary commands."""
     saver = {"dirpath": str(tmp_path), "save_last": True, "every_n_train_steps": 1, "enable_version_counter": False}

@@ -66,6 +66,7 @@ def test_pictures_are_small_and_those_of_their_script(folder, page, names):
     assert all(f"({folder}/{picture.name})" in text for picture in pictures)
 
 
+@pytest.mark.slow
 def test_script_of_the_figures_draws_them(tmp_path, monkeypatch):
     """Of the first frames of the walk, on which the window has just been initialised."""
     script = runpy.run_path(str(DOCS / "figures" / "make.py"))

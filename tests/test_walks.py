@@ -49,6 +49,7 @@ def filmed() -> SyntheticSequence:
     return make_sequence(77, frames=24, height=160, width=120, fps=8.0, family="room", kind="handheld", apart=True)
 
 
+@pytest.mark.slow
 def test_owner_of_a_phone(shell, filmed):
     """A video alone: the focal length is found, used for the next run, and the results go to a viewer and to COLMAP."""
     writer = cv2.VideoWriter(str(shell.folder / "video.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 8.0, (120, 160))
@@ -175,6 +176,7 @@ def robot(shell: Terminal) -> tuple[Terminal, list, np.ndarray]:
     return shell, images, truth
 
 
+@pytest.mark.slow
 def test_roboticist(robot):
     """A bag is tracked in the frame of the robot and becomes a map; a live recording is recognised in it; and the same
     in Python, twice with one odometry."""

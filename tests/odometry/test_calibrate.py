@@ -42,6 +42,7 @@ def test_the_focal_length_of_a_rendered_walk_is_found(clip, found):
     assert f"focal length {found.focal:.0f} +- {found.deviation:.0f} px (self-calibrated from" in str(found)
 
 
+@pytest.mark.slow
 def test_the_principal_point_is_told_where_the_measurements_tell_it(clip):
     """That of the rendered camera lies 3 pixels from the middle of the image."""
     camera, believed = clip[0].camera, CalibrationOptions().max_aside * 192

@@ -81,6 +81,7 @@ def test_a_better_beginning_is_extended_to_later_frames(scale, first):
     torch.testing.assert_close(depths, true_depths)
 
 
+@pytest.mark.slow
 def test_frames_dropped_on_a_slow_walk_get_the_scale_of_the_whole():
     """Most frames of a slow walk are dropped; their poses are as exact as those of the keyframes."""
     clip = make_sequence(77, frames=40, height=144, width=192, fps=30.0, family="street", kind="handheld", apart=True)

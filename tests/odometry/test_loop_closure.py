@@ -255,6 +255,7 @@ def test_an_interruption_while_a_frame_waits_leaves_the_work(correcting, monkeyp
     assert loops.advance([0], at_once=True) and loops.corrections == 1
 
 
+@pytest.mark.slow
 def test_a_search_at_once_finds_the_same_places(film, closed):
     """Without a delay, searches and corrections are done within ``track``."""
     odometry, _, result = track(film[0], replace(OPTIONS, delay=0))
@@ -272,9 +273,9 @@ def test_in_real_time_a_frame_does_not_wait_for_a_search(film, monkeypatch):
         return (yield from real(search))
 
     monkeypatch.setattr(odometry.loops.finder, "verify", slow)
-    estimates = [odometry.track(frame) for frame in film[0]]
+    estimates = [odometry.track(frame) for frame in film[0][:64]]
     assert isinstance(odometry.loops.work, Searching) and not odometry.loops.work.task.done
-    assert sum(estimate.pose_wc is not None for estimate in estimates) > 60
+    assert sum(estimate.pose_wc is not None for estimate in estimates) > 45
     release.set()
     assert odometry.finish().info["loops"] is not None and odometry.loops.work is None
 

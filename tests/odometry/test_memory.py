@@ -57,6 +57,7 @@ def test_storages_are_found_once_and_as_a_whole(keep):
     assert held_bytes(holder) == 4000 + 80 + keep
 
 
+@pytest.mark.slow
 def test_a_keyframe_takes_less_than_its_share_of_memory():
     walk = make_sequence(
         63, frames=THERE, family="room", kind="handheld", speed=5.0, height=120, width=160, fps=15.0, sensor=False

@@ -52,6 +52,7 @@ def interrupted():
     return [replace(frame, image=image) for frame, image in zip(film, images, strict=True)]
 
 
+@pytest.mark.slow
 def test_saving_changes_nothing_while_lost_and_after_a_change_of_segment(interrupted, tmp_path):
     """With the shipped weights, by their name; while views wait to be joined, one of them repeated."""
     new = lambda: dvo.load("small", **FAST)  # noqa: E731

@@ -105,7 +105,7 @@ def tracked(clip, **settings):
     return done.result.trajectory
 
 
-@pytest.mark.parametrize(("mode", "adjusted"), [("always", False), ("final", True)])
+@pytest.mark.parametrize(("mode", "adjusted"), [pytest.param("always", False, marks=pytest.mark.slow), ("final", True)])
 def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip, mode, adjusted):
     plain, aligned, again = (tracked(clip, align=align, final_adjustment=adjusted) for align in ("none", mode, mode))
     assert np.array_equal(aligned.poses_wc, again.poses_wc)
@@ -113,6 +113,7 @@ def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip, mode, adjust
     assert len(aligned) == 24 and errors[1] < 0.75 * errors[0]
 
 
+@pytest.mark.slow
 def test_slopes_of_surfaces_are_found_from_all_edges_of_a_patch():
     """In a hall, mostly seen at an angle: the slopes are those of the rendered depth, and the poses more exact."""
     walk = make_sequence(77003, frames=60, height=240, width=320, fps=15.0, family="hall", kind="handheld", apart=True)

@@ -1,11 +1,13 @@
 """True measurements in place of the network's: what is left is the tracker's own error."""
 
+import pytest
 import torch
 
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.error_budget import measure
 
 
+@pytest.mark.slow
 def test_true_measurements_leave_next_to_no_error():
     sequence = make_sequence(
         77, frames=36, height=192, width=256, fps=15.0, family="street", kind="handheld", apart=True

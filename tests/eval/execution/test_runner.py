@@ -125,6 +125,7 @@ def test_score_of_an_unfinished_evaluation_says_so(plan, image_folder, capsys):
     assert "- null, clip, seed 1: not run: the evaluation was stopped before" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_parallel_is_serial(tmp_path, image_folder, suite_file, walk):
     assert main(command(tmp_path, suite_file, walk, "serial")) == 0
     assert main(command(tmp_path, suite_file, walk, "parallel", "--workers", "3")) == 0

@@ -77,6 +77,7 @@ def test_the_same_seed_gives_the_same_bytes_and_resuming_those_of_not_having_sto
         assert torch.equal(a, b) and torch.equal(a, c), name
 
 
+@pytest.mark.slow
 def test_the_shipped_configuration_trains_resumes_and_gives_weights_that_track(tmp_path, command):
     """By the ordinary commands, with smaller sizes on top."""
     watch = {"every": 2, "rendered": 1, "frames": 4, "size": [48, 64]}

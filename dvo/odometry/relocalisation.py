@@ -43,9 +43,9 @@ REFRESH = 2
 MIN_GUESSED = 0.2
 """Share of the patches of a group that agree on a pose from points, below which the network does not look at it. Other
 places had at most a tenth, the same place more than 0.4."""
-DECISIONS = ((8, 0.08), (6, 0.25))
+DECISIONS = ((8, 0.08), (6, 0.15))
 """Updates of the network, and the share of inliers below which a candidate is refused after them. The same place had
-0.25 to 0.5, other places none."""
+0.2 to 0.5 (patches of a group that lie out of view count as none), other places none."""
 ACCURACY = 0.02
 """Relative standard deviation of the inverse depths of archived patches."""
 

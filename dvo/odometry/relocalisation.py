@@ -43,9 +43,12 @@ REFRESH = 2
 MIN_GUESSED = 0.2
 """Share of the patches of a group that agree on a pose from points, below which the network does not look at it. Other
 places had at most a tenth, the same place more than 0.4."""
-DECISIONS = ((8, 0.08), (6, 0.15))
-"""Updates of the network, and the share of inliers below which a candidate is refused after them. The same place had
-0.2 to 0.5 (patches of a group that lie out of view count as none), other places none."""
+UPDATES, MIN_MATCHED = (8, 6), 0.08
+"""Updates of the network in two parts, and the share of inliers below which a candidate is refused after the first."""
+MIN_INLIERS, MIN_INLIERS_IN_MAP = 0.25, 0.15
+"""The same after the second part: for a place of the recording, with which its segments are compared once more at the
+end, and for one of an earlier recording. The same place had 0.2 to 0.5 (patches of a group that lie out of view count
+as none), other places none."""
 ACCURACY = 0.02
 """Relative standard deviation of the inverse depths of archived patches."""
 
@@ -113,7 +116,9 @@ def _found_among(finder: LoopFinder, view: View, frame: ArchivedKeyframe) -> Loc
     guesses.sort(key=lambda found: -found[0].inliers)
     for guess, old, group, poses_cw in guesses[:MATCHED]:
         start = torch.cat([poses_cw, guess.pose_cw[None]])
-        match = all_steps(finder.matcher.match(group, (_seen_from(frame, group, start),), start, DECISIONS))
+        in_map = finder.graph.segment_of(old) < finder.graph.recording.segment
+        decisions = tuple(zip(UPDATES, (MIN_MATCHED, MIN_INLIERS_IN_MAP if in_map else MIN_INLIERS), strict=True))
+        match = all_steps(finder.matcher.match(group, (_seen_from(frame, group, start),), start, decisions))
         if match is not None:
             return _located(finder, group, frame, old, match)
     return None

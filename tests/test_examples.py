@@ -40,10 +40,12 @@ def test_quick_start(tmp_path):
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_track_arrays(tmp_path):
     assert "14 of 14 frames" in run(EXAMPLES / "track_arrays.py", "--frames", "14", cwd=tmp_path)
 
 
+@pytest.mark.slow
 def test_webcam(tmp_path, image_folder):
     """On recorded images: the program has no camera here."""
     calib = image_folder.parent / "calib.txt"

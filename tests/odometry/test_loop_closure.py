@@ -167,6 +167,7 @@ def correcting(film):
     return until(film, lambda loops: isinstance(loops.work, Correcting))[0]
 
 
+@pytest.mark.slow
 def test_saving_leaves_work_in_progress_alone(film, closed, tmp_path):
     """Maps are those before the result of a search, or a correction, is there."""
     states = {

@@ -89,7 +89,7 @@ def test_while_it_sees_the_map_the_window_has_keyframes_of_it_that_stay(runs):
     assert sorted(odometry.graph.log.poses) == sorted(f.identifier for f in odometry.graph.archive if f.anchor is None)
 
 
-@pytest.mark.parametrize("scene", [103, 105])
+@pytest.mark.parametrize("scene", [103, pytest.param(105, marks=pytest.mark.slow)])
 def test_other_scenes_are_found_back_as_well(scene):
     frames, _ = interrupted(scene, BACK)
     _, estimates, result = track(frames)
@@ -97,7 +97,7 @@ def test_other_scenes_are_found_back_as_well(scene):
     assert [segment.joined_to for segment in result.segments] == [None, 0]
 
 
-@pytest.mark.parametrize(("scene", "other"), [(63, 105), (105, 103)])
+@pytest.mark.parametrize(("scene", "other"), [(63, 105), pytest.param(105, 103, marks=pytest.mark.slow)])
 def test_another_scene_begins_a_world_of_its_own(scene, other):
     frames, _ = interrupted(scene, range(30), other)
     _, estimates, result = track(frames)

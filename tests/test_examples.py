@@ -88,6 +88,7 @@ def test_own_odometry_alone(tmp_path):
     assert "ATE" in run(EXAMPLES / "own_odometry.py", cwd=tmp_path)
 
 
+@pytest.mark.slow
 def test_own_odometry_in_the_evaluation(tmp_path):
     pytest.importorskip("evo")
     rendered = {"seed": 3, "frames": 8, "height": 48, "width": 64, "fps": 10.0, "version": 3}

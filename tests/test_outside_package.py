@@ -106,6 +106,7 @@ def test_train_export_and_run(recording, tmp_path):
     assert facts["kind"] == "array" and facts["odometry"] == "dvo-distance" and facts["frames"]["tracked"] == 6
 
 
+@pytest.mark.slow
 def test_the_system_is_evaluated_beside_the_others(recording, tmp_path):
     sequence = {"name": "walk", "path": "walk", "groundtruth": "groundtruth.txt"}
     suite = {"name": "walks", "label": "a walk", "sequences": [sequence]}

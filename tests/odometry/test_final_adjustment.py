@@ -92,6 +92,7 @@ def test_frames_dropped_on_a_slow_walk_get_the_scale_of_the_whole():
     assert errors[1] < 0.8 * errors[0]
 
 
+@pytest.mark.slow
 def test_frames_of_a_slow_start_get_poses_of_their_own():
     """Before the initialisation a frame with little motion has the pose of the last keyframe; afterwards its own."""
     clip = make_sequence(77, frames=40, height=144, width=192, fps=30.0, family="street", kind="handheld", apart=True)

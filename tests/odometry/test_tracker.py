@@ -139,6 +139,7 @@ def test_unknown_setting_is_named():
         TrackerConfig.from_dict({"colour": 1})
 
 
+@pytest.mark.slow
 def test_a_covered_lens_is_lost_and_the_way_found_again():
     """Half a second without light: those frames are lost, nothing else is, and the path goes on as if it had not been
     (the same sequence without the dark is the yardstick)."""

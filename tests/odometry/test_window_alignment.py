@@ -105,7 +105,8 @@ def tracked(clip, **settings):
     return done.result.trajectory
 
 
-@pytest.mark.parametrize(("mode", "adjusted"), [pytest.param("always", False, marks=pytest.mark.slow), ("final", True)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "adjusted"), [("always", False), ("final", True)])
 def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip, mode, adjusted):
     plain, aligned, again = (tracked(clip, align=align, final_adjustment=adjusted) for align in ("none", mode, mode))
     assert np.array_equal(aligned.poses_wc, again.poses_wc)

@@ -75,6 +75,7 @@ def test_a_run_from_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
         assert math.isnan(carry_out(replace(task, loops=False)).found)
 
 
+@pytest.mark.slow
 def test_two_runs_take_turns_and_find_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("evo", reason="evo is in the extra 'eval'")
     monkeypatch.setenv("DVO_CACHE", str(tmp_path))

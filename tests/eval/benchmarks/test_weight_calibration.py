@@ -42,6 +42,7 @@ def test_the_table_reports_the_other_sequences_over_the_fitted_sigma():
     assert chi_of(Errors.concatenate([])).count == 0
 
 
+@pytest.mark.slow
 def test_measurements_are_compared_with_the_truth():
     sequence = make_sequence(77, frames=32, height=192, width=256, fps=15.0, family="street", apart=True)
     depth = torch.stack([torch.as_tensor(sequence.rendering(i).depth[0]) for i in range(len(sequence))])

@@ -130,6 +130,7 @@ def test_a_class_of_another_package_needs_no_registration(job):
     assert find_system("numpy:ndarray").version() == metadata.version("numpy")
 
 
+@pytest.mark.slow
 def test_a_package_announces_a_system_by_name(tmp_path, image_folder, suite_file):
     """As ``pip install`` leaves it: a module, its metadata, an entry point. The worker process finds it too."""
     (tmp_path / "site").mkdir()

@@ -30,6 +30,7 @@ def test_tracks_a_clean_scene(film, path):
     assert len(result.map.points) > 15 and len(result.map.points) == len(result.map.colors)
 
 
+@pytest.mark.slow
 def test_tracks_a_rendered_room():
     sequence = make_sequence(5002, frames=60, family="room", kind="handheld")
     _, result = run(list(sequence))

@@ -27,7 +27,7 @@ from dvo.errors import DvoError
 T = TypeVar("T")
 
 _KIND = CompanionKind("right images", "--right", "images")
-_VIDEOS = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
 
 
 def with_right(source: Source, right: Path | str | None = None, baseline: float | None = None) -> Source:
@@ -73,7 +73,7 @@ def with_right(source: Source, right: Path | str | None = None, baseline: float 
         found.recording.sensors = sensors
         return found
     rig = _rig(source, baseline)
-    if path is not None and path.suffix.lower() in _VIDEOS and path.is_file():
+    if path is not None and path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
         found.recording = PairedRecording(recording, find_reader(path, None).open(path, Request()), rig)
     else:
         files = companions_of_frames(path, recording.frame_count, _KIND)

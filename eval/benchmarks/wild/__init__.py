@@ -1,0 +1,1 @@
+"""Videos without ground truth: `python -m eval.benchmarks.wild DIR`."""

@@ -28,6 +28,7 @@ T = TypeVar("T")
 
 _KIND = CompanionKind("right images", "--right", "images")
 VIDEO_SUFFIXES = frozenset({".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
+"""Endings of the names of videos."""
 
 
 def with_right(source: Source, right: Path | str | None = None, baseline: float | None = None) -> Source:

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.data.calibration import Calibration
 from dvo.data.right_source import VIDEO_SUFFIXES
 from dvo.errors import DvoError
 from dvo.threads import settle_threads
@@ -85,7 +86,7 @@ def judge(video: Video, tasks: Iterable[Task], runs: dict[str, Run], expected: E
     outcome, faults = [], []
     for run, found in zip(own, measures, strict=True):
         wrong = expected.faults(found, run.first)
-        if expected.seeds is not None and not seeds <= expected.seeds:
+        if expected.seeds is not None and len(own) > 1 and not seeds <= expected.seeds:
             wrong.append(f"seeds {seeds:.2g} %")
         if expected.must == "still":
             wrong = ["poses, or not said"] if len(run.poses) else []
@@ -131,12 +132,14 @@ def table(judged: list[Judged]) -> str:
 def videos_of(folder: Path, expected: dict[str, Expected], base: Path) -> list[Video]:
     """Videos of a folder, or of a list."""
     if not expected:
+        if not folder.is_dir():
+            raise DvoError("no folder", file=folder, remedy="give a folder with videos, or --expected FILE")
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
         return [Video(file.stem, file, _calib(file)) for file in files]
     found = []
     for name, entry in expected.items():
         file = base / entry.video
-        values = None if entry.calib is None else " ".join(map(str, entry.calib))
+        values = None if entry.calib is None else Calibration(*entry.calib)
         found.append(Video(name, file, values or _calib(file), entry.frames))
     return found
 
@@ -174,8 +177,16 @@ def make_runs(tasks: Sequence[Task], out: Path, jobs: int = 1) -> dict[str, Run]
     record = out / "runs.jsonl"
     runs = {}
     for line in record.read_text(encoding="utf-8").splitlines() if record.exists() else ():
-        values = json.loads(line)
-        runs[values["key"]] = Run(**values, poses=np.load(out / f"{values['key']}.npy"))
+        try:
+            values = json.loads(line)
+            runs[values["key"]] = Run(**values, poses=np.load(out / f"{values['key']}.npy"))
+        except (ValueError, TypeError, KeyError, OSError) as error:
+            raise DvoError(
+                f"not a run ({error})", file=record, remedy="give another --out, or remove the line"
+            ) from error
+    for task in tasks:  # of the same name, but another clip, calibration or number of frames
+        if task.key in runs and runs[task.key].video != str(task.video):
+            del runs[task.key]
     missing = [task for task in tasks if task.key not in runs]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, settle_threads, max_tasks_per_child=1) as pool:

@@ -17,6 +17,8 @@ from dvo.yaml_files import read_yaml
 
 PARTS = 5
 """Equal parts of a clip whose mean speeds are compared."""
+COUNTS = {"frames": 1, "calib": 4, "straightness": 2, "turn": 2, "even": 2, "seeds": 1, "first_pose": 1}
+"""Numbers of each entry of :class:`Expected`."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class Expected:
             measures: of its trajectory.
             first: number of the first frame with a measured pose; None if there is none.
         """
-        found = []
+        found = [] if measures.rows else ["no poses"]
         for name in ("straightness", "turn"):
             wanted, value = getattr(self, name), getattr(measures, name)
             if wanted is not None and not wanted[0] <= value <= wanted[1]:
@@ -135,7 +137,10 @@ def read_expected(file: Path) -> dict[str, Expected]:
     """
     known = {field.name for field in fields(Expected)}
     found = {}
-    for name, entry in dict(read_yaml(file)).items():
+    entries = read_yaml(file)
+    if not isinstance(entries, Mapping):
+        raise DvoError("no list of videos", file=file, remedy="give NAME: {video: FILE, must: good|told|still}")
+    for name, entry in entries.items():
         if not isinstance(entry, Mapping) or "video" not in entry:
             raise DvoError("names no video", file=file, field=name, remedy="give {video: FILE, must: good|told|still}")
         if unknown := sorted(set(entry) - known):
@@ -143,5 +148,12 @@ def read_expected(file: Path) -> dict[str, Expected]:
         values: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in entry.items()}
         if values.get("must", "told") not in ("good", "told", "still"):
             raise DvoError("unknown value", file=file, field=f"{name}.must", remedy="use good, told or still")
-        found[name] = Expected(**values)
+        for key, count in COUNTS.items():
+            value = values.get(key)
+            numbers = value if isinstance(value, tuple) else (value,)
+            plain = all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in numbers)
+            if value is not None and not (plain and len(numbers) == count):
+                remedy = f"give {count} numbers" if count > 1 else "give a number"
+                raise DvoError("not understood", file=file, field=f"{name}.{key}", remedy=remedy)
+        found[str(name)] = Expected(**values)
     return found

@@ -38,7 +38,7 @@ def write_page(file: Path, judged: list[Judged], table: str) -> None:
         figures.append(f'<figure><img src="{picture.name}" alt="{caption}"><figcaption>{caption}</figcaption></figure>')
     body = f"<h1>Videos without ground truth</h1><main>{''.join(figures)}</main><pre>{html.escape(table)}</pre>"
     text = (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Wild</title><style>{STYLE}</style>{body}</html>'
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Videos</title><style>{STYLE}</style>{body}</html>'
     )
     file.write_text(text, encoding="utf-8")
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import dvo
+from dvo.data.calibration import Calibration
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
@@ -31,13 +32,13 @@ class Video:
     Attributes:
         name: in tables.
         file: video or folder.
-        calib: file or values of its calibration; None: the focal length is found in the images.
+        calib: its calibration, or the file of it; None: the focal length is found in the images.
         frames: number of its first frames that are tracked; None for all.
     """
 
     name: str
     file: Path
-    calib: Path | str | None = None
+    calib: Path | Calibration | None = None
     frames: int | None = None
 
     def open(self) -> Source:
@@ -74,6 +75,7 @@ class Run:
 
     Attributes:
         key: of the task.
+        video: file, calibration and number of frames that were asked for.
         frames: number of frames that were tracked.
         first: number of the first frame with a measured pose; None if there is none.
         segments: number of segments.
@@ -84,6 +86,7 @@ class Run:
     """
 
     key: str
+    video: str = ""
     frames: int = 0
     first: int | None = None
     segments: int = 0
@@ -137,9 +140,9 @@ def carry_out(task: Task) -> Run:
         done = session.run(system.build(task.seed, "cpu"), frames, on_frame=on_frame)
         seconds["tracking"] = time.process_time() - begun
     except DvoError as error:
-        return Run(task.key, verdict="failed", error=str(error))
+        return Run(task.key, str(task.video), verdict="failed", error=str(error))
     rows = done.result.trajectory
     return Run(
-        task.key, done.result.frames_read, first[0] if first else None, len(done.result.segments), seconds,
-        "-" if len(rows) else "failed", poses=np.column_stack([rows.timestamps, rows.poses_wc]),
+        task.key, str(task.video), done.result.frames_read, first[0] if first else None, len(done.result.segments),
+        seconds, "-" if len(rows) else "failed", poses=np.column_stack([rows.timestamps, rows.poses_wc]),
     )  # fmt: skip

@@ -58,14 +58,14 @@ def test_faults_name_what_is_not_as_expected():
     right = Expected("a.mp4", straightness=(0.9, 1), turn=(0, 5), even=(0.9, 1.1), first_pose=15)
     assert right.faults(Measures(50, 0.95, 2.0, (0.95, 1.05)), 10) == []
     assert len(right.faults(Measures(50, 0.8, 7.0, (0.5, 1.05)), 20)) == 4
-    assert len(right.faults(Measures(), None)) == 4, "no poses are not right"
+    assert len(right.faults(Measures(), None)) == 5 and Expected("a.mp4").faults(Measures(), None) == ["no poses"]
 
 
 def runs_of(tasks, *positions):
     def run(task, rows):
         found = path(rows)
         poses = np.column_stack([found.timestamps, found.poses_wc])
-        return Run(task.key, 51, 3, 1, {"tracking": 1.0}, "-" if len(rows) else "failed", poses=poses)
+        return Run(task.key, str(task.video), 51, 3, 1, {"tracking": 1.0}, "-" if len(rows) else "failed", poses=poses)
 
     return {task.key: run(task, rows) for task, rows in zip(tasks, positions, strict=True)}
 
@@ -94,7 +94,14 @@ def test_runs_are_right_told_or_silent(tmp_path, must, rows, outcome):
 
 @pytest.mark.parametrize(
     ("text", "field"),
-    [("a: {frames: 3}", "a"), ("a: {video: b.mp4, speed: 1}", "speed"), ("a: {video: b.mp4, must: fine}", "must")],
+    [
+        ("a: {frames: 3}", "a"),
+        ("a: {video: b.mp4, speed: 1}", "speed"),
+        ("a: {video: b.mp4, must: fine}", "must"),
+        ("a: {video: b.mp4, turn: 3}", "turn"),
+        ("a: {video: b.mp4, seeds: x}", "seeds"),
+        ("[1, 2]", "no list of videos"),
+    ],
 )
 def test_lists_that_are_not_understood_are_refused(tmp_path, text, field):
     file = tmp_path / "expected.yaml"
@@ -121,3 +128,12 @@ def test_the_command_writes_table_and_page_and_goes_on(tmp_path, capsys):
     assert "frames" not in again.split("|")[0] and "| clip |" in again, "nothing is run again"
     with pytest.raises(SystemExit, match="no videos"):
         main([str(out)])
+    with pytest.raises(SystemExit, match="no folder"):
+        main([str(tmp_path / "none")])
+    (tmp_path / "clip.calib.txt").unlink()
+    (tmp_path / "right.yaml").write_text("clip: {video: clip.avi, frames: 6, calib: [50, 50, 31.5, 23.5]}\n")
+    main([*command, "--expected", str(tmp_path / "right.yaml")])
+    assert "6 of 6 frames" in capsys.readouterr().out, "runs of another number of frames are not taken for these"
+    (out / "runs.jsonl").write_text("{")
+    with pytest.raises(SystemExit, match="runs.jsonl.*not a run"):
+        main(command)

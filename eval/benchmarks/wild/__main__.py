@@ -4,7 +4,7 @@ Every video of a folder, or of a list of what is right (`--expected`), is tracke
 by the first system backward too. The table has, for each video, the frame with the first measured pose, straightness,
 angle, the largest difference of two seeds, the difference of forward and backward and of the other systems in percent
 of the path after a similarity, and seconds of the processor. With a list it also prints if each run is right, wrong and
-told (without a pose), or wrong and silent. The calibration is that of the list or
+told (without a pose), wrong and silent, or ended with an error. The calibration is that of the list or
 NAME.calib.txt beside the video; without one the focal length is found in the images.
 
 Runs and trajectories are kept in `--out`, and the same command goes on from there; `page.html` shows all plots.
@@ -31,6 +31,9 @@ from eval.benchmarks.wild.measures import Expected, Measures, backward, differen
 from eval.benchmarks.wild.page import write_page
 from eval.benchmarks.wild.runs import Run, Task, Video, carry_out
 
+LEAST_POSES = 0.5
+"""Share of the frames that must have a pose in the trajectory of a run that is right."""
+
 
 @dataclass(frozen=True)
 class Judged:
@@ -43,7 +46,8 @@ class Judged:
         seeds: largest difference of two seeds of it, percent of the path.
         turned: difference of forward and backward.
         others: differences of the other systems, by name.
-        outcome: of each seed: ``right``, ``told`` or ``silent``; empty without a list.
+        outcome: of each seed: ``right``, ``told``, ``silent``, or ``error`` of a run that ended with one; empty without
+            a list.
         faults: what is not as expected.
     """
 
@@ -86,10 +90,15 @@ def judge(video: Video, tasks: Iterable[Task], runs: dict[str, Run], expected: E
     outcome, faults = [], []
     for run, found in zip(own, measures, strict=True):
         wrong = expected.faults(found, run.first)
+        if 0 < found.rows < LEAST_POSES * run.frames:
+            wrong.append(f"poses of {found.rows} of {run.frames} frames")
         if expected.seeds is not None and len(own) > 1 and not seeds <= expected.seeds:
             wrong.append(f"seeds {seeds:.2g} %")
         if expected.must == "still":
-            wrong = ["poses, or not said"] if len(run.poses) else []
+            wrong = ["poses"] if len(run.poses) else []
+        if run.error:  # nothing was tracked, so that nothing can be right or told
+            outcome.append("error")
+            continue
         outcome.append("right" if not wrong else "told" if run.verdict == "failed" else "silent")
         faults += [fault for fault in wrong if fault not in faults]
     kept = {task.key: runs[task.key] for task in mine}
@@ -124,7 +133,7 @@ def table(judged: list[Judged]) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     total = [outcome for one in judged for outcome in one.outcome]
     if total:
-        counts = ", ".join(f"{name} {total.count(name)}" for name in ("right", "told", "silent"))
+        counts = ", ".join(f"{name} {total.count(name)}" for name in ("right", "told", "silent", "error"))
         lines.append(f"\nOf {len(total)} runs: {counts}.")
     return "\n".join(lines)
 
@@ -135,12 +144,17 @@ def videos_of(folder: Path, expected: dict[str, Expected], base: Path) -> list[V
         if not folder.is_dir():
             raise DvoError("no folder", file=folder, remedy="give a folder with videos, or --expected FILE")
         files = sorted(file for file in folder.iterdir() if file.suffix.lower() in VIDEO_SUFFIXES)
-        return [Video(file.stem, file, _calib(file)) for file in files]
+        stems = [file.stem for file in files]
+        names = [file.stem if stems.count(file.stem) == 1 else file.name for file in files]
+        return [Video(name, file, _calib(file)) for name, file in zip(names, files, strict=True)]
     found = []
     for name, entry in expected.items():
         file = base / entry.video
-        values = None if entry.calib is None else Calibration(*entry.calib)
-        found.append(Video(name, file, values or _calib(file), entry.frames))
+        calib: Calibration | Path | None = _calib(file)
+        if entry.calib is not None:
+            fx, fy, cx, cy = entry.calib
+            calib = Calibration(fx, fy, cx, cy)
+        found.append(Video(name, file, calib, entry.frames))
     return found
 
 
@@ -214,9 +228,15 @@ def main(given: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/wild"), help="folder of runs, table and page")
     arguments = parser.parse_args(given)
     try:
+        for name in ("seeds", "jobs"):
+            if getattr(arguments, name) < 1:
+                raise DvoError("must be 1 or more", field=f"--{name}", remedy="give a whole number")
         expected = read_expected(arguments.expected) if arguments.expected else {}
         base = arguments.expected.parent if arguments.expected else arguments.folder
         videos = videos_of(arguments.folder, expected, base)
+        known = [video.name for video in videos]
+        if unknown := [name for name in arguments.videos or () if name not in known]:
+            raise DvoError(f"no video '{unknown[0]}'", field="--videos", remedy=f"choose from {', '.join(known)}")
         chosen = [video for video in videos if arguments.videos is None or video.name in arguments.videos]
         if not chosen:
             raise DvoError("no videos", file=arguments.folder, remedy="give a folder with videos, or --expected FILE")

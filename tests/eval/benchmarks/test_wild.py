@@ -92,6 +92,16 @@ def test_runs_are_right_told_or_silent(tmp_path, must, rows, outcome):
     assert judge(video, tasks, runs_of(tasks, rows, rows, rows, straight()), None).outcome == ()
 
 
+def test_a_run_with_an_error_or_few_poses_is_not_right(tmp_path):
+    video = Video("clip", tmp_path / "clip.mp4")
+    tasks = tasks_of(video, ["dvo-small"], 1)
+    for must in ("good", "told", "still"):
+        failed = {task.key: Run(task.key, verdict="failed", error="no such file") for task in tasks}
+        assert judge(video, tasks, failed, Expected("clip.mp4", must)).outcome == ("error",)
+    few = judge(video, tasks, runs_of(tasks, straight(20), straight(20)), Expected("clip.mp4", straightness=(0.9, 1)))
+    assert few.outcome == ("silent",) and few.faults == ("poses of 20 of 51 frames",)
+
+
 @pytest.mark.parametrize(
     ("text", "field"),
     [
@@ -121,13 +131,19 @@ def test_the_command_writes_table_and_page_and_goes_on(tmp_path, capsys):
     command = [str(tmp_path), "--systems", "null", "--seeds", "2", "--out", str(out)]
     main([*command, "--expected", str(tmp_path / "right.yaml")])
     told = capsys.readouterr().out
-    assert "clip-null-0-backward: -, 12 of 12 frames" in told and "Of 2 runs: right 2, told 0, silent 0." in told
+    assert (
+        "clip-null-0-backward: -, 12 of 12 frames" in told and "Of 2 runs: right 2, told 0, silent 0, error 0." in told
+    )
     assert (out / "clip.png").stat().st_size > 1000 and "clip.png" in (out / "page.html").read_text()
     main(command)
     again = capsys.readouterr().out
     assert "frames" not in again.split("|")[0] and "| clip |" in again, "nothing is run again"
     with pytest.raises(SystemExit, match="no videos"):
         main([str(out)])
+    with pytest.raises(SystemExit, match="no video 'b'.*choose from clip|no video 'b'. Choose from clip"):
+        main([*command, "--videos", "clip,b"])
+    with pytest.raises(SystemExit, match="--seeds"):
+        main([*command, "--seeds", "0"])
     with pytest.raises(SystemExit, match="no folder"):
         main([str(tmp_path / "none")])
     (tmp_path / "clip.calib.txt").unlink()

@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     listing = verbs.add_parser("list", help="systems with licence and state; suites with their sequences")
     listing.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings")
     ahead = verbs.add_parser("prepare", help="render suites ahead of an evaluation")
-    ahead.add_argument("suites", nargs="+", metavar="SUITE", help="axes, axes/test, fast/test/large, memory, ...")
+    ahead.add_argument("suites", nargs="+", metavar="SUITE", help="axes, axes/test, fast/test/large, memory, world")
     ahead.add_argument("--sheet", type=Path, metavar="PNG", help="write a contact sheet too")
     words = verbs.add_parser("vocabulary", help="train a vocabulary for ORB-SLAM3 on rendered pictures")
     words.add_argument("--out", type=Path, required=True, metavar="FILE", help="text file that ORB-SLAM3 reads")

@@ -30,6 +30,7 @@ LENS = 7406  # distortion coefficients
 # Moving bodies and meshes
 MOVERS = 7501  # shape and motion of bodies
 MESH_TEXTURE = 7502  # procedural replacement of a missing texture
+SURROUNDINGS = 7503  # water, clouds, leaves, people, a bonnet, rain
 # Ground truth and export
 TRACKS = 7601  # points that are followed
 IMU = 7602  # inertial noise

@@ -34,6 +34,7 @@ from dvo.synth.sensors.sensor import (
     random_sensor,
 )
 from dvo.synth.specs import CameraSpec, SequenceSpec, sequence_spec
+from dvo.synth.surroundings import Canvas, Drawing, drawings
 from dvo.synth.textures.texture import texture_pool
 from dvo.synth.truth import Flow, Tracks, dynamic_mask, optical_flow, tracks
 
@@ -58,6 +59,7 @@ class SyntheticSequence:
         device: where frames are rendered.
         warnings: always empty; part of the interface of a source.
         interval: seconds between frames (where none was lost).
+        surroundings: drawn over the scene (:mod:`dvo.synth.surroundings`), as they are at the time of the frame.
 
     Example:
         >>> sequence = make_sequence(0, frames=10, family="room")
@@ -75,6 +77,7 @@ class SyntheticSequence:
     device: torch.device | str = "cpu"
     warnings: list[str] = field(default_factory=list)
     interval: float = 1 / 30
+    surroundings: tuple[Drawing, ...] = ()
 
     def __post_init__(self) -> None:
         readout = (self.sensor or Sensor()).readout * self.interval
@@ -125,12 +128,24 @@ class SyntheticSequence:
         Returns:
             Image ``(H, W, 3)`` uint8 RGB, timestamp and camera.
         """
-        images = self.rendering(index).images
+        rendered = self.rendering(index)
+        images = self._covered(index, rendered)[0] if self.surroundings else rendered.images
         if self.sensor is not None:
             rng = np.random.default_rng([self.seed, salts.NOISE, index])
             images = expose(images, self.sensor, rng, times=self.groundtruth.timestamps[index : index + 1])
         image = (images[0] * 255).round_().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
         return Frame(index, self.time(index), image, self.camera)
+
+    def _covered(self, index: int, rendered: Rendering) -> tuple[torch.Tensor, np.ndarray]:
+        """Image ``(1, 3, H, W)`` with the surroundings, and the pixels ``(H, W)`` that they cover."""
+        image = rendered.images[0].permute(1, 2, 0).cpu().double().numpy().copy()
+        depth = rendered.depth[0].cpu().double().numpy()
+        depth = np.where(depth > 0, depth, np.inf)
+        canvas = Canvas(image, depth, self.groundtruth.poses_wc[index], self.camera, self.time(index))
+        covered = np.zeros(depth.shape, bool)
+        for draw in self.surroundings:
+            covered |= draw(canvas)
+        return torch.from_numpy(image.clip(0, 1)).permute(2, 0, 1)[None].to(rendered.images), covered
 
     def __iter__(self) -> Iterator[Frame]:
         return (self.frame(index) for index in range(len(self)))
@@ -147,7 +162,7 @@ class SyntheticSequence:
         return optical_flow(self.shot, self.time(start), self.time(end))
 
     def dynamic_mask(self, index: int) -> np.ndarray:
-        """``(H, W)`` bool: pixels that show a moving body.
+        """``(H, W)`` bool: pixels that show a moving body, or surroundings.
 
         Args:
             index: of the frame.
@@ -155,7 +170,8 @@ class SyntheticSequence:
         Returns:
             ``(H, W)`` bool.
         """
-        return dynamic_mask(self.shot, self.time(index))
+        moving = dynamic_mask(self.shot, self.time(index))
+        return moving | self._covered(index, self.rendering(index))[1] if self.surroundings else moving
 
     def tracks(self, count: int = 200, *, seed: int = 0) -> Tracks:
         """``count`` surface points followed through all frames, see :func:`dvo.synth.tracks`.
@@ -203,6 +219,7 @@ class SyntheticSequence:
 def film(
     scene: Scene | Stage, path: Motion, camera: Camera, sensor: Sensor | None = None, seed: int = 0,
     device: torch.device | str = "cpu", *, times: np.ndarray, supersample: int = 1, name: str = "film",
+    surroundings: str = "",
 ) -> SyntheticSequence:  # fmt: skip
     """Sequence of a given scene and camera path.
 
@@ -216,6 +233,7 @@ def film(
         times: ``(N,)`` increasing timestamps of the frames, seconds.
         supersample: rays per pixel edge for the colours.
         name: of the sequence.
+        surroundings: names of what is drawn over the scene, see :class:`dvo.synth.specs.SceneSpec`.
 
     Returns:
         The sequence; its frames are rendered when they are read.
@@ -240,7 +258,10 @@ def film(
             kept[0] = True
             times = times[kept]
     truth = Trajectory(times, path.poses_wc(times))
-    return SyntheticSequence(name, camera, truth, scene, path, sensor, seed, supersample, device, interval=interval)
+    return SyntheticSequence(
+        name, camera, truth, scene, path, sensor, seed, supersample, device, interval=interval,
+        surroundings=drawings(surroundings, seed, truth.positions.mean(0)),
+    )  # fmt: skip
 
 
 def make_sequence(
@@ -286,6 +307,7 @@ def make_sequence(
     return film(
         stage, path, camera, sensor if spec.camera.sensor else None, seed, device,
         times=np.arange(form.frames) / form.fps, supersample=form.supersample, name=f"{scene.family}-{kind}-{seed}",
+        surroundings=spec.scene.surroundings,
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from dvo.errors import DvoError
 from dvo.geometry.camera import DistortionModel
 from dvo.settings import shown
+from dvo.synth.surroundings import check_surroundings
 
 MOST_FRAMES = 100_000
 LONGEST = 3600.0  # seconds; planning the path of an hour takes minutes
@@ -72,6 +73,8 @@ class SceneSpec:
         texture: share of the textures' contrast that is kept, in [0, 1]; small values give bare walls.
         movers: number of moving bodies.
         apart: take a scene seed that training clips never draw (``dvo.synth.sequence.APART`` or above).
+        surroundings: names in ``dvo.synth.surroundings.SURROUNDINGS`` that are drawn over the scene in this order,
+            joined by ``+`` (``sky+water``); empty for none.
         textures: folder of photographs to use as textures; those shipped with scikit-image if None.
 
     Raises:
@@ -82,11 +85,13 @@ class SceneSpec:
     texture: float = 1.0
     movers: int = 0
     apart: bool = False
+    surroundings: str = ""
     textures: str | None = None
 
     def __post_init__(self) -> None:
         check_share("texture", self.texture)
         _check_number("movers", self.movers, 0, 1000, whole=True)
+        check_surroundings(self.surroundings)
 
 
 @dataclass(frozen=True)

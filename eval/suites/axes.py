@@ -1,4 +1,4 @@
-"""Rendered suites of configs/eval/axes.yaml and memory.yaml: seed and options of each sequence."""
+"""Rendered suites of configs/eval/axes.yaml, memory.yaml and world.yaml: seed and options of each sequence."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from eval.suites.rendered import rendered_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITES = ROOT / "configs" / "eval"
-RENDERED = ("axes", "memory")  # files of rendered suites; each is also the name of all suites in it
+RENDERED = ("axes", "memory", "world")  # files of rendered suites; each is also the name of all suites in it
 LONGEST_NAME = 100
 Judge = Literal["ate_percent", "rpe_rot_deg", "recovery_s"]
 
@@ -115,7 +115,8 @@ def read_suites(text: str) -> list[Suite]:
 
     ``fast`` is the mini tier of the validation split of a rendered axis, ``fast/test``, ``fast/large`` and
     ``fast/test/large`` the others; ``axes`` (or ``axes/test``, ...) names all twelve, ``memory`` those in which a
-    place is seen again. Anything else is the name of a config or a file, as for :func:`read_suite`.
+    place is seen again, ``world`` those of ordinary footage. Anything else is the name of a config or a file, as for
+    :func:`read_suite`.
 
     Args:
         text: NAME, NAME/SPLIT/TIER, or a file.

@@ -15,6 +15,7 @@ import pytest
 from dvo.errors import DvoError
 from dvo.synth import HELD_OUT, LONG_KINDS, make_sequence
 from dvo.synth.export import write_calibration
+from dvo.synth.surroundings import SURROUNDINGS
 from eval import commands
 from eval.__main__ import main
 from eval.suites import rendered
@@ -81,6 +82,20 @@ def test_places_seen_again_are_suites_of_their_own() -> None:
     assert len(set(seeds)) == len(seeds) == 36 and not others & set(seeds)
     assert read_suites("kidnap/test") == [read_suites("memory/test")[1]]
     assert {q.judged_by for q in read_suites("kidnap")[0].sequences} == {"recovery_s"}
+
+
+def test_suites_of_ordinary_footage_stand_apart() -> None:
+    others = {dict(q.rendered or ())["seed"] for name in ("axes", "memory") for split in ("validation", "test")
+              for tier in ("mini", "large") for suite in read_suites(f"{name}/{split}/{tier}")
+              for q in suite.sequences}  # fmt: skip
+    found = [dict(q.rendered or ()) for split in ("validation", "test") for tier in ("mini", "large")
+             for suite in read_suites(f"world/{split}/{tier}") for q in suite.sequences]  # fmt: skip
+    names = [suite.name for suite in read_suites("world")]
+    assert names == ["water", "sky", "foliage", "bonnet", "far", "crowd", "rain", "road"]
+    seeds = {one["seed"] for one in found}
+    assert len(seeds) == len(found) == 2 * 8 * 6 and not seeds & others
+    assert all(one["apart"] and one["family"] in HELD_OUT for one in found)
+    assert {name for one in found for name in one.get("surroundings", "").split("+")} == {"", *SURROUNDINGS}
 
 
 def test_names_on_the_command_line() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -34,13 +35,14 @@ def with_calibration(
         folder: results folder.
 
     Returns:
-        The source with the camera to track it with, and the entries ``camera`` and ``self_calibration`` of run.json.
+        The source with the camera to track it with, and the entries ``camera`` and ``self_calibration`` of run.json,
+        with ``seconds.calibrating``, wall time.
 
     Raises:
         DvoError: no frame could be read.
         OSError: the calibration file cannot be written.
     """
-    found, file = None, folder / CALIBRATION
+    found, file, began = None, folder / CALIBRATION, time.perf_counter()
     if source.guess is not None:
         warn(_announcement(source), "note")
         weights = odometry.weights or arguments.weights if isinstance(odometry, PatchOdometry) else "small"
@@ -55,7 +57,8 @@ def with_calibration(
         file.unlink(missing_ok=True)  # of an earlier run
     factor = 1 if source.reduction is None else source.reduction.factor
     camera = {**asdict(source.recorded_camera), "turned": source.turned, "reduced_by": factor}
-    return source, {"camera": camera, "self_calibration": None if found is None else _facts(found)}
+    facts: dict[str, Any] = {"camera": camera, "self_calibration": None if found is None else _facts(found)}
+    return source, facts if found is None else facts | {"seconds": {"calibrating": time.perf_counter() - began}}
 
 
 def _is_given(file: Path, source: Source, calib: str | None) -> bool:

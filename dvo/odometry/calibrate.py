@@ -2,14 +2,15 @@
 
 The beginning of a clip is tracked with a guess of the focal length, which is then estimated from the measurements
 (:mod:`dvo.odometry.focal_length`); measurements made with a focal length far off are worse ones, so this is repeated
-with what was found. The motion may not tell the focal length; then the guess is kept, and the result says so. The
-principal point is the middle of the image, unless the measurements tell it closely.
+with what was found, as long as no more frames are tracked than the clip has, and a few. The motion may not tell the
+focal length; then the guess is kept, and the result says so. The principal point is the middle of the image, unless
+the measurements tell it closely.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import islice, tee
@@ -34,6 +35,7 @@ _FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sid
 _RANGES = {
     "frames": (3, 10**6),
     "rounds": (1, 100),
+    "spare": (0, 10**6),
     "interval": (0, 1e6),
     "settled": (0, 10),
     "min_contrast": (0, 100),
@@ -51,6 +53,8 @@ class CalibrationOptions:
     Attributes:
         frames: tracked frames that the focal length is estimated from. If they cannot tell it, twice as many are tried.
         rounds: times that they are tracked, at most.
+        spare: frames that all rounds together track beyond as many as the clip has; of a clip whose length is not
+            known any number.
         interval: seconds between frames, at least; of a faster camera frames are left out.
         settled: change of the logarithm of the focal length in a round below which it has settled; the principal point
             has, once it moves by less than ``max_aside``.
@@ -68,6 +72,7 @@ class CalibrationOptions:
 
     frames: int = 120
     rounds: int = 4
+    spare: int = 60
     interval: float = 0.03
     settled: float = 0.02
     min_contrast: float = 0.02
@@ -129,19 +134,22 @@ def calibrate(
 
     focal, aside, wanted, reason, count = guess.focal, (0.0, 0.0), options.frames, "", 0
     walk: list[tuple[float, float]] = []
+    length = _length(frames)
+    left = math.inf if length is None else length + options.spare
     for number in range(options.rounds):
         odometry = load(weights, device=device, seed=seed, loops=False)
         clip = islice(_readable(frames if kept is None else copy(kept)), limit)
         ratio = first.camera.width / width
-        seen = _track(odometry, clip, focal * ratio, (aside[0] * ratio, aside[1] * ratio), wanted, options.interval,
-                      on_frame)  # fmt: skip
+        seen, fed = _track(odometry, clip, focal * ratio, (aside[0] * ratio, aside[1] * ratio), wanted,
+                           options.interval, left, on_frame)  # fmt: skip
+        left -= fed
         profile, count = _profile(odometry)
         asked = [*walk, (math.log(focal), profile.minimum.value)]
         slope = _slope(asked)
         step = profile.minimum.value / slope
         deviation = math.hypot(options.inflation * profile.minimum.deviation / slope, options.floor)
         reason = _doubt(profile, deviation, focal * math.exp(step), guess, options)
-        is_last = number + 1 == options.rounds
+        is_last = number + 1 == options.rounds or left < min(wanted, math.inf if length is None else length) / 2
         if reason:
             if seen < wanted or wanted > options.frames or is_last:
                 break
@@ -156,6 +164,12 @@ def calibrate(
         if is_settled or is_last:
             return result(focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure)
     return result(guess.focal, guess.deviation, guess.source, count, reason, guess)
+
+
+def _length(frames: Iterable[Frame]) -> int | None:
+    """Number of frames; None if it is not known before they are read."""
+    count: int | None = getattr(frames, "frame_count", None)
+    return len(frames) if count is None and isinstance(frames, Sized) else count
 
 
 def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:
@@ -197,10 +211,11 @@ def _track(
     aside: tuple[float, float],
     wanted: int,
     interval: float,
+    most: float,
     on_frame: Callable[[Frame, Estimate | None], None] | None,
-) -> int:
-    """Track frames with a focal length until as many as wanted have a pose; gives their number."""
-    tracked, last = 0, -math.inf
+) -> tuple[int, int]:
+    """Track frames with a focal length until as many as wanted have a pose; numbers of these, and of all."""
+    tracked, fed, last = 0, 0, -math.inf
     for frame in frames:
         if frame.timestamp < last + interval:
             continue
@@ -209,11 +224,11 @@ def _track(
         estimate = odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera, mask=frame.mask))
         if on_frame is not None:
             on_frame(frame, estimate)
-        tracked += estimate.status is Status.TRACKING
-        if tracked >= wanted:
+        tracked, fed = tracked + (estimate.status is Status.TRACKING), fed + 1
+        if tracked >= wanted or fed >= most:
             break
     odometry.finish()
-    return tracked
+    return tracked, fed
 
 
 def _profile(odometry: Odometry) -> tuple[FocalProfile, int]:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ import torch
 import dvo
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
+from dvo.odometry.quality import Quality
 
 FILES = ["frames.csv", "map.ply", "run.json", "summary.html", "trajectory.png", "trajectory.txt"]
 
@@ -118,6 +120,23 @@ def test_lost_frames_have_no_row(given, image_folder, tmp_path):
     assert main(arguments(image_folder, tmp_path / "out")) == 0
     assert summary(tmp_path / "out")["frames"]["lost"] == 3
     assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 17
+
+
+def test_the_verdict_comes_first(given, image_folder, tmp_path, capsys):
+    odometry = given()
+    finish = odometry.finish
+    told = Quality("doubtful", "waves, most likely", "film the coast", check=0.4, checks=7)
+    odometry.finish = lambda: replace(finish(), quality=told)
+    out = tmp_path / "out"
+    assert main(arguments(image_folder, out)) == 0
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first == "verdict: doubtful: waves, most likely" and second == "what may help: film the coast"
+    written = summary(out)["quality"]
+    assert (written["verdict"], written["remedy"], written["check"], written["second"]) == (
+        "doubtful", "film the coast", 0.4, None
+    )  # fmt: skip
+    page = (out / "summary.html").read_text()
+    assert "doubtful: waves, most likely. What may help: film the coast." in page
 
 
 def test_nothing_tracked_says_so(given, image_folder, tmp_path, capsys):

@@ -30,6 +30,9 @@ def headline_of(facts: dict[str, Any]) -> str:
     text = f"tracked with {', '.join(filter(None, parts))}" if any(parts) else ""
     version = (facts.get("versions") or {}).get("dvo")
     text += f" (dvo {version})" if version else ""
+    quality = facts.get("quality") or {}
+    if quality.get("reason"):
+        text = f"{quality['verdict']}: {quality['reason']}. What may help: {quality['remedy']}. {text}"
     if facts.get("interrupted"):
         text += "; interrupted"
     return text.strip("; ")
@@ -46,7 +49,9 @@ def figures(facts: dict[str, Any], rows: Sequence[FrameRow]) -> list[tuple[str, 
         Name and value of each.
     """
     frames, info, metrics = (facts.get(name) or {} for name in ("frames", "info", "metrics"))
-    found = [("tracked frames", f"{frames.get('tracked', '?')} of {frames.get('read', '?')}")]
+    quality = facts.get("quality") or {}
+    found = [("verdict", str(quality["verdict"]))] if quality.get("verdict") else []
+    found.append(("tracked frames", f"{frames.get('tracked', '?')} of {frames.get('read', '?')}"))
     if metrics.get("ate_rmse") is not None:
         group = "SE(3)" if metrics.get("alignment") == "se3" else "Sim(3)"
         found.append((f"ATE after {group}", f"{metrics['ate_rmse']:.3g} m"))

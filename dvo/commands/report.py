@@ -160,7 +160,7 @@ def describe_scale(scale: Mapping[str, Any]) -> str:
 
 
 def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = ()) -> None:
-    """Print counts, breaks, segments, errors and the names of the files.
+    """Print verdict, counts, breaks, segments, errors and the names of the files.
 
     Args:
         folder: of the results.
@@ -170,6 +170,10 @@ def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = (
     """
     result, metrics = run.result, scores.longest
     several = len(result.segments) > 1
+    if result.quality is not None:
+        say(f"verdict: {result.quality}")
+        if result.quality.remedy:
+            say(f"what may help: {result.quality.remedy}")
     say(
         f"tracked {result.frames_tracked} of {result.frames_read} frames, {run.frames_per_second:.1f} frames/s, "
         f"{len(result.map.points)} map points"

@@ -128,9 +128,15 @@ def run(arguments: argparse.Namespace) -> int:
             export=arguments.export,
             save_map=save_map,
             observers=observers,
+            again=None if arguments.map else partial(load_odometry, _reseeded(arguments), device),
         )
         print_counts(source)
         return code
+
+
+def _reseeded(arguments: argparse.Namespace) -> argparse.Namespace:
+    """Arguments with another seed."""
+    return argparse.Namespace(**{**vars(arguments), "seed": (arguments.seed + 1) % 2**63})
 
 
 def _map_file(text: str, odometry: Odometry) -> Path:
@@ -182,6 +188,7 @@ def track(
     export: Sequence[str] = (),
     save_map: Path | None = None,
     observers: Sequence[Observer] = (),
+    again: Callable[[], Odometry] | None = None,
 ) -> int:
     """Track a clip, write the results folder and print a summary.
 
@@ -198,6 +205,7 @@ def track(
         export: formats to write the results in too, into ``export/NAME`` of the results folder.
         save_map: map file to write at the end; the odometry is :class:`dvo.odometry.protocol.Saveable`.
         observers: told of every frame and of the result; the caller closes them.
+        again: builds the odometry with another seed, for a result that leaves doubt.
 
     Returns:
         Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C, 143 after SIGTERM.
@@ -206,7 +214,7 @@ def track(
         DvoError: no frame could be read, or a result cannot be written.
     """
     with results.results_folder(out, clip.name) as folder:
-        return _track(odometry, clip, folder, stride, facts, export, save_map, observers)
+        return _track(odometry, clip, folder, stride, facts, export, save_map, observers, again)
 
 
 def _track(
@@ -218,6 +226,7 @@ def _track(
     export: Sequence[str],
     save_map: Path | None,
     observers: Sequence[Observer],
+    again: Callable[[], Odometry] | None,
 ) -> int:
     printed = set(clip.warnings)
     for observer in observers:
@@ -237,8 +246,9 @@ def _track(
     with InterruptSwitch(getattr(clip, "stop", None)) as switch, TrackingProgress(clip.frame_count) as progress:
         try:
             done = session.run(
-                odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None
-            )
+                odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None,
+                again=again,
+            )  # fmt: skip
         except KeyboardInterrupt:
             recorder.stop(interrupted=True, reason=_ABORTED)
             raise
@@ -246,7 +256,9 @@ def _track(
             recorder.stop(interrupted=False, reason=f"ended by {type(error).__name__}: {error}")
             raise
         new_warnings = [warning for warning in done.warnings if warning not in printed]
-        done = replace(done, warnings=(*done.warnings, *recorder.warnings))
+        done = replace(
+            done, warnings=(*done.warnings, *recorder.warnings), seconds={**facts.get("seconds", {}), **done.seconds}
+        )
         scores = score(done, clip.groundtruth)
         writer = None if save_map is None else partial(_save, odometry, save_map)
         pages = Pages(clip.name, done, table, odometry, clip.groundtruth)

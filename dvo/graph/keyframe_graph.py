@@ -111,31 +111,33 @@ class KeyframeGraph:
         return self.recordings[-1]
 
     def begin_segment(self, first: int, keep: bool = True, reason: str = "") -> None:
-        """Begin a segment. The window must be empty.
+        """Begin a segment. What is in the window belongs to the one before: it is archived with it, or discarded.
 
         Args:
             first: identifier of its first keyframe; those from it on belong to the new segment.
             keep: keep the segment before it; otherwise its frames are lost, and the new one takes its number.
             reason: cause of the loss, if it is not kept.
         """
-        if not keep:
-            for record in self.log.frames:
-                if record.segment == self.segment and not record.lost:
-                    record.lost, record.reason = True, record.reason or reason
-            self.starts[-1] = (self.starts[-1][0], -1)
-        self.segment += int(keep)
+        if keep:
+            self.archive_window()
+            self.segment += 1
+            self.starts.append((first, self.segment))
+        else:
+            self.reject(first, reason)
         self.located = None
-        self.starts.append((first, self.segment))
 
-    def split_segment(self, first: int) -> None:
-        """Begin a segment with the keyframes of the window.
+    def reject(self, first: int, reason: str) -> None:
+        """Lose the frames of the segment before one of its keyframes, with which it begins anew.
 
         Args:
-            first: identifier of its first keyframe; those before it have left the window, and share no edge with it.
+            first: identifier of the keyframe; those before it have no edge with the ones from it on.
+            reason: cause of the loss.
         """
-        for record in self.log.rows(self.segment, first):
-            record.segment += 1
-        self.segment += 1
+        while len(self.window) and self.window.frames[0].identifier < first:
+            self.log.lose(self.discard(0).identifier, reason)
+        for record in self.log.rows(self.segment, last=first - 1):
+            record.lost, record.reason = True, record.reason or reason
+        self.starts[-1] = (self.starts[-1][0], -1)
         self.starts.append((first, self.segment))
 
     def segment_of(self, identifier: int) -> int:

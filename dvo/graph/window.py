@@ -88,6 +88,8 @@ class Window:
         jj, kk: ``(E,)`` target frame and patch of each edge.
         edge_slots: ``(E,)`` index of each edge in the correlation caches.
         frames: the keyframes, oldest first.
+        unfixed: ``(h, w)`` bool, pixels of the feature maps that are not fixed to the images; None: all. It counts for
+            all frames but guests, beside their own masks.
     """
 
     per_frame: int
@@ -101,6 +103,7 @@ class Window:
     kk: Tensor
     edge_slots: Tensor
     frames: list[Keyframe] = field(default_factory=list)
+    unfixed: Tensor | None = None
     _edges: PatchGraph | None = None
 
     @classmethod
@@ -153,11 +156,17 @@ class Window:
     @property
     def visible(self) -> Tensor | None:
         """``(n, h, w)`` bool, pixels of the feature maps that measurements may lie in; None: all of all frames."""
-        known = next((frame.visible for frame in self.frames if frame.visible is not None), None)
+        masks = [frame.visible for frame in self.frames]
+        if self.unfixed is not None:
+            masks = [
+                mask if frame.guest else self.unfixed if mask is None else mask & self.unfixed
+                for mask, frame in zip(masks, self.frames, strict=True)
+            ]
+        known = next((mask for mask in masks if mask is not None), None)
         if known is None:
             return None
         every = torch.ones_like(known)
-        return torch.stack([every if frame.visible is None else frame.visible for frame in self.frames])
+        return torch.stack([every if mask is None else mask for mask in masks])
 
     @property
     def context(self) -> Tensor:

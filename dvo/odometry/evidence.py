@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 from torch import Tensor
 
 from dvo.geometry.projection import reproject
@@ -19,6 +19,9 @@ CONFIDENT = 0.1
 """Confidence of a measurement above which it can be an inlier."""
 AGREEMENT = 0.5
 """Largest distance of an inlier from the reprojection of its patch after bundle adjustment, feature pixels."""
+
+MATCHED = 0.15
+"""Least share of matched corners of two images of the same scene."""
 
 NO_MATCH = "no match with the frames before"
 MASKED = "masked image"
@@ -211,7 +214,7 @@ def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:
     Returns:
         ``(E,)`` bool; ``among`` itself if no frame has a mask.
     """
-    return among if window.visible is None else among & (confidence > 0).any(dim=-1)
+    return among if window.visible is None else among & (confidence != 0).any(dim=-1)  # NaN is evidence against
 
 
 def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
@@ -233,21 +236,13 @@ def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
             continue
         pair = measured(window, window.confidence, pair)
         confidence, inliers = float(window.confidence[pair].mean()), _inliers(step, pair)
-        if not (confidence >= config.lost_confidence and inliers >= config.initial_inliers):  # NaN fails too
+        if confidence >= config.lost_confidence and inliers >= config.initial_inliers:
+            continue
+        # Where most of the picture is sky or water few patches agree, although both frames show the same.
+        before, after = window.frames[position - 1].image, window.frames[position].image
+        if before is None or after is None or math.isnan(confidence) or matched_share(before, after) < MATCHED:
             found = position
     return found
-
-
-def window_inliers(step: WindowStep) -> float:
-    """Share of the edges between different frames of a window that are inliers.
-
-    Args:
-        step: of the model on the window.
-
-    Returns:
-        In [0, 1].
-    """
-    return related_share(step, torch.ones_like(step.window.jj, dtype=torch.bool))
 
 
 def related_share(step: WindowStep, among: Tensor) -> float:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import math
+from dataclasses import asdict, replace
 from typing import Any
 
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.focal_length import find_focal
 from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.metric_scale import settle_scale
+from dvo.odometry.protocol import Result
+from dvo.odometry.quality import CALIBRATE, WRONG_FOCAL, Quality, leaves_doubt
+from dvo.odometry.quality_measures import measure_quality
 from dvo.odometry.self_calibration import adjust_segments
 from dvo.odometry.tracker_state import TrackerState
+
+SURE_CONTRAST = 0.02
+"""Increase of the cost at focal lengths a fifth off above which the motion tells the focal length."""
 
 
 def finish_segments(
@@ -33,6 +41,37 @@ def finish_segments(
         options = config.estimate_readout, config.adjustment
         info |= adjust_segments(graph, state.adjustable, state.shutter, *options)
     return info | settle_scale(graph, state.adjustable, config.scale, loops)
+
+
+def judge_result(
+    graph: KeyframeGraph, result: Result, state: TrackerState, config: TrackerConfig, stride: int
+) -> Quality:
+    """Quality of the result of a finished sequence; one that leaves doubt is asked for its focal length too.
+
+    Args:
+        graph: adjusted.
+        result: of the sequence.
+        state: of the tracker.
+        config: of the tracker.
+        stride: of the feature maps, pixels of the working image.
+
+    Returns:
+        Measures and verdict, see :mod:`dvo.odometry.quality`.
+    """
+    own = [k for k in state.adjustable if k >= graph.recording.segment]
+    readout = state.info.get("readout", 0.0)
+    shutter = replace(state.shutter, readout=readout if isinstance(readout, float) else 0.0)
+    quality = measure_quality(
+        graph, result, own, state.checks, stride=stride, shutter=shutter, first=state.started, fixed=state.hidden
+    )
+    if not leaves_doubt(quality):
+        return quality
+    profile = find_focal(graph, max(own, key=lambda segment: len(graph.members(segment))), shutter, config.adjustment)
+    step, sure = profile.minimum.value, profile.contrast >= SURE_CONTRAST
+    if not (sure and abs(step) > WRONG_FOCAL):
+        return quality
+    reason = f"the measurements fit a focal length {math.exp(step):.2f} times the one that is given"
+    return replace(quality, verdict="doubtful", reason=reason, remedy=CALIBRATE)
 
 
 def run_information(

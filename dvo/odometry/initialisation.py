@@ -9,7 +9,7 @@ from dvo.graph.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import MOST, match_window, measured_share
-from dvo.odometry.evidence import NO_MATCH, last_unrelated, measured, related_share, window_inliers
+from dvo.odometry.evidence import NO_MATCH, last_unrelated, measured
 from dvo.odometry.motion import parallax
 from dvo.odometry.uncertainty import has_second_solution
 from dvo.odometry.window_step import WindowStep
@@ -18,10 +18,35 @@ RESTART_AGES = frozenset({4, 8, 16, 32})
 """Numbers of frames after the initialisation at which its solution is compared with others."""
 AGAIN = 8
 """Frames from one comparison to the next as long as another solution is nearly as good."""
+MOVED = 0.2
+"""Share of the patches that have to move: the others may be far away, or fixed to the camera."""
+SLOW = (0.3, 0.6)
+"""Shares of the motion and of the parallax that a slow start needs."""
+SLOW_AFTER = (4, 10)
+"""Frames without a start between which what is needed goes down to :data:`SLOW`."""
+NOT_INITIALISED = "not initialised: too little motion"
+"""Cause of the loss of the frames of a segment that was never initialised."""
 
 
-def median_revision(revision: Revision, window: Window) -> float:
-    """Median revision of the flow from the last keyframe to the newest frame, at equal poses.
+def needed(waited: int) -> tuple[float, float]:
+    """Shares of ``initial_motion`` and ``initial_parallax`` that a start needs.
+
+    Little motion over a long time is as sure as much over a short one: its measurements are better.
+
+    Args:
+        waited: frames with content since the segment has begun.
+
+    Returns:
+        From 1 to :data:`SLOW`.
+    """
+    slow = min(max((waited - SLOW_AFTER[0]) / (SLOW_AFTER[1] - SLOW_AFTER[0]), 0.0), 1.0)
+    return 1 - slow * (1 - SLOW[0]), 1 - slow * (1 - SLOW[1])
+
+
+def flow_revision(revision: Revision, window: Window) -> float:
+    """Revision of the flow from the last keyframe to the newest frame, at equal poses, that :data:`MOVED` exceed.
+
+    The median would stay at zero for ever where most of the picture is far, or fixed to the camera.
 
     Args:
         revision: output of the network for the edges of the window.
@@ -32,7 +57,7 @@ def median_revision(revision: Revision, window: Window) -> float:
     """
     n = len(window)
     edges = measured(window, revision.weights[0], (window.ii == n - 2) & (window.jj == n - 1))
-    return float(revision.delta[0][edges].norm(dim=-1).median()) if bool(edges.any()) else 0.0
+    return float(revision.delta[0][edges].norm(dim=-1).quantile(1 - MOVED)) if bool(edges.any()) else 0.0
 
 
 def newest_confidence(revision: Revision, window: Window) -> float:
@@ -50,22 +75,23 @@ def newest_confidence(revision: Revision, window: Window) -> float:
     return float(revision.weights[0][edges].mean()) if bool(edges.any()) else 0.0
 
 
-def first_motion(revision: Revision, window: Window, config: TrackerConfig) -> bool:
+def first_motion(revision: Revision, window: Window, config: TrackerConfig, waited: int) -> bool:
     """Find out if the newest frame of a window that is not initialised yet has moved.
 
     Args:
         revision: output of the network for the edges of the window.
         window: keyframes, the newest frame last.
         config: settings of the tracker.
+        waited: frames since the segment has begun, see :func:`needed`.
 
     Returns:
         False for a confident frame with too little motion to initialise.
     """
     confident = newest_confidence(revision, window) >= config.lost_confidence
-    return not confident or median_revision(revision, window) >= config.initial_motion
+    return not confident or flow_revision(revision, window) >= needed(waited)[0] * config.initial_motion
 
 
-def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
+def initialise(window: Window, step: WindowStep, config: TrackerConfig, waited: int) -> bool:
     """Optimise the first window.
 
     After half of the updates the window is also solved from identity poses with the current flow, and the better of the
@@ -76,6 +102,7 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
         window: the first keyframes; changed in place.
         step: step of the model on the window.
         config: settings of the tracker.
+        waited: frames since the segment has begun, see :func:`needed`.
 
     Returns:
         True if the parallax is sufficient for tracking.
@@ -89,10 +116,10 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig) -> bool:
     n = len(window)
     if measured:
         return True
-    seen = parallax(window, 0, n - 1)
+    seen = parallax(window, 0, n - 1, MOVED)
     if n > config.initial_frames:
-        seen = max(seen, parallax(window, n // 2, n - 1))
-    return seen >= config.initial_parallax
+        seen = max(seen, parallax(window, n // 2, n - 1, MOVED))
+    return seen >= needed(waited)[1] * config.initial_parallax
 
 
 def _solve_again(window: Window, step: WindowStep) -> None:
@@ -111,7 +138,7 @@ def _take(window: Window, solution: Solution) -> None:
     window.poses_cw, window.patches = problem.poses_cw.to(window.poses_cw), problem.patches.to(window.patches)
 
 
-def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> bool:
+def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, waited: int) -> bool:
     """Optimise the first window without the frames that do not show the scene of the newest ones.
 
     Where frames are removed, the others begin anew: poses and depths that were fitted to another scene, or to noise,
@@ -121,22 +148,22 @@ def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerCo
         graph: of the sequence; its window is changed in place.
         step: step of the model on the window.
         config: settings of the tracker.
+        waited: frames since the segment has begun, see :func:`needed`.
 
     Returns:
         True if the frames are as many as an initialisation needs, and the parallax is sufficient for tracking.
     """
-    enough = initialise(graph.window, step, config)
+    enough = initialise(graph.window, step, config, waited)
     if drop_unrelated(graph, step, config):
         graph.window.reset()
-        enough = len(graph.window) >= config.initial_frames and initialise(graph.window, step, config)
+        enough = len(graph.window) >= config.initial_frames and initialise(graph.window, step, config, waited)
     return enough and len(graph.window) >= config.initial_frames
 
 
 def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> bool:
     """Remove the frames of the first window that do not show the scene of the newest ones.
 
-    They are a segment of their own, with the keyframes that have left the window, if they are as many as an
-    initialisation needs and agree with each other; otherwise they are lost.
+    They are lost: nothing is known of the motion between them.
 
     Args:
         graph: of the sequence; the window is not initialised yet.
@@ -146,47 +173,10 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
     Returns:
         True if frames were removed.
     """
-    window, count = graph.window, last_unrelated(step, config)
-    if not count:
-        return False
-    first = window.frames[count].identifier
-    earlier = (window.ii < count) & (window.jj < count)
-    rows = len(graph.log.rows(graph.segment, last=first - 1))
-    if rows >= config.initial_frames and related_share(step, earlier) >= config.min_inliers:
-        window.keep(earlier | ((window.ii >= count) & (window.jj >= count)))
-        for _ in range(count):
-            graph.archive_oldest()
-    else:
-        for _ in range(count):
-            graph.log.lose(graph.discard(0).identifier, NO_MATCH)
-    if graph.log.rows(graph.segment, last=first - 1):
-        graph.split_segment(first)
-    return True
-
-
-def settle_first_window(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, last: bool) -> bool:
-    """Optimise the window of a segment that was never initialised and ends, and decide if its frames are kept.
-
-    Args:
-        graph: of the sequence; its window is changed in place.
-        step: of the model on the window.
-        config: settings of the tracker.
-        last: no frame will follow.
-
-    Returns:
-        True if they agree with each other, and are as many as an initialisation needs or the only ones of the sequence.
-    """
-    if len(graph.window) > 1:
-        for age in range(config.initial_updates):
-            step(StepOptions(fixed=1, damping=damping_at(age)))
-        drop_unrelated(graph, step, config)
-    if not len(graph.window):
-        return False
-    records = graph.log.frames
-    rows = sum(not record.lost and record.segment == graph.segment for record in records)
-    only = last and graph.segment == 0 and not any(record.reason == NO_MATCH for record in records)
-    agree = len(graph.window) == 1 or window_inliers(step) >= config.min_inliers
-    return agree and (only or rows >= config.initial_frames)
+    count = last_unrelated(step, config)
+    if count:
+        graph.reject(graph.window.frames[count].identifier, NO_MATCH)
+    return count > 0
 
 
 def restart_due(age: int, ambiguous: bool) -> bool:

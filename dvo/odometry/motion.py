@@ -62,18 +62,19 @@ def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tenso
     return whole, only
 
 
-def parallax(window: Window, i: int, j: int) -> float:
-    """Parallax of a frame pair: median displacement that translation adds to the rotational flow.
+def parallax(window: Window, i: int, j: int, share: float = 0.5) -> float:
+    """Parallax of a frame pair: displacement that translation adds to the rotational flow.
 
     Args:
         window: keyframes.
         i, j: positions of source and target frame in the window.
+        share: of the patches that have as much.
 
     Returns:
         Feature pixels.
     """
     whole, only = _displacement(window, i, j, rotation=True)
-    return float((whole - only).norm(dim=-1).median())
+    return float((whole - only).norm(dim=-1).quantile(1 - share))
 
 
 def flow_magnitude(window: Window, i: int, j: int) -> float:

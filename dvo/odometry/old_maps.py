@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from dvo.graph.map_file import MapReader
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.finishing import run_information
+from dvo.odometry.initialisation import NOT_INITIALISED
 from dvo.odometry.map_tables import LoopTable, MapTable
 from dvo.odometry.metric_scale import settle_scale
 
@@ -102,7 +103,7 @@ def close_old_sequence(source: MapReader, odometry: PatchOdometry, tracker: OldT
     if not tracker.finished:
         first = max((frame.identifier for frame in graph.archive), default=-1) + 1
         source.require(tracker.keyframes >= first, "fewer keyframes than there are", "tracker: keyframes")
-        graph.begin_segment(tracker.keyframes, tracker.initialised, "too few frames with content")
+        graph.begin_segment(tracker.keyframes, tracker.initialised, NOT_INITIALISED)
         scale = settle_scale(graph, tracker.adjustable, config.scale, odometry.loops)
     state = replace(odometry.state, adjustable=list(tracker.adjustable), info=tracker.info)
     closer = replace(odometry.loops, enabled=config.loops, corrections=loops.corrections)

@@ -15,6 +15,7 @@ import numpy as np
 
 from dvo.data.frame import Frame, Lazy, LazyNumber
 from dvo.data.trajectory import Trajectory
+from dvo.odometry.quality import Quality
 
 
 class Status(StrEnum):
@@ -175,6 +176,8 @@ class Result:
         segments: all segments in order of time; given none, the trajectory is the only one.
         breaks: intervals without poses, and changes of segment, in order of time.
         depth: depth maps of the keyframes of all segments, in order of time; empty for systems without them.
+        quality: what tells if the result can be trusted, with the verdict; None from systems that do not judge
+            themselves, and of a map without a new recording.
     """
 
     trajectory: Trajectory
@@ -185,6 +188,7 @@ class Result:
     segments: tuple[Segment, ...] = ()
     breaks: tuple[Break, ...] = ()
     depth: tuple[DepthMap, ...] = ()
+    quality: Quality | None = None
 
     def __post_init__(self) -> None:
         times = self.trajectory.timestamps

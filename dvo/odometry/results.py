@@ -235,6 +235,7 @@ def summary(run: Run, segment_facts: Sequence[dict[str, Any]] = ()) -> dict[str,
     """
     result = run.result
     return {
+        "quality": None if result.quality is None else asdict(result.quality),
         "frames": {
             "read": result.frames_read,
             "fed": run.frames_fed,

@@ -21,7 +21,7 @@ from dvo.graph.places import PlaceIndex
 from dvo.graph.serialisation import graph_arrays
 from dvo.models.weights import tensor_digest
 from dvo.odometry.finishing import run_information
-from dvo.odometry.initialisation import settle_first_window
+from dvo.odometry.initialisation import NOT_INITIALISED
 from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.map_tables import LoopsTable, LoopTable, MapTable, WeightsTable
 from dvo.odometry.metric_scale import settle_scale
@@ -71,9 +71,7 @@ def _closed(odometry: PatchOdometry) -> tuple[KeyframeGraph, LoopCloser, dict[st
     with torch.inference_mode():
         step = odometry.step.of_copy(graph.window, state.initialised)
         graph.finalise = step.finalise
-        keep = state.initialised or settle_first_window(graph, step, config, last=True)
-        graph.archive_window()
-        graph.begin_segment(state.keyframes, keep, "too few frames with content")
+        graph.begin_segment(state.keyframes, state.initialised, NOT_INITIALISED)
         for frame in graph.archive.kept_after(finder.kept[-1] if finder.kept else -1):
             if graph.segment_of(frame.identifier) in state.adjustable:
                 finder.keep(frame.identifier)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -13,6 +15,8 @@ from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Estimate, Odometry, Result
+from dvo.odometry.quality import leaves_doubt
+from dvo.odometry.second_run import can_be_read_again, compare_again
 from dvo.odometry.segments import find_breaks
 
 FrameCallback = Callable[[Frame, Estimate | None], None]
@@ -27,7 +31,8 @@ class Run:
         frames_fed: number of frames passed to the odometry (fewer than read, with a stride).
         interrupted: True if the user stopped the run.
         warnings: problems that did not end the run, a sentence each.
-        seconds: wall time of ``reading``, ``tracking`` and ``finishing``.
+        seconds: wall time of ``reading``, ``tracking`` and ``finishing``; of ``calibrating`` before them, if the focal
+            length was found in the images, and of ``checking`` after them, if there was a second run.
         frame_seconds: wall time of each call of ``track``.
     """
 
@@ -41,7 +46,8 @@ class Run:
     @property
     def frames_per_second(self) -> float:
         """Tracked frames per second of wall time, reading and finishing included."""
-        return self.frames_fed / max(sum(self.seconds.values()), 1e-9)
+        own = sum(value for part, value in self.seconds.items() if part not in ("calibrating", "checking"))
+        return self.frames_fed / max(own, 1e-9)
 
 
 def run(
@@ -52,6 +58,7 @@ def run(
     on_frame: FrameCallback | None = None,
     should_stop: Callable[[], bool] | None = None,
     strict: bool = False,
+    again: Callable[[], Odometry] | None = None,
 ) -> Run:
     """Run an odometry over a source.
 
@@ -68,6 +75,8 @@ def run(
         should_stop: called before each frame; True ends tracking. With it the caller handles Ctrl-C; without it a
             KeyboardInterrupt ends tracking too.
         strict: raise errors and interruptions instead.
+        again: builds the odometry with another seed. Where the result leaves doubt, and the source can be read again,
+            its beginning is tracked a second time and compared (:mod:`dvo.odometry.second_run`).
 
     Returns:
         The result with its timings. Poses are ``T_wc``.
@@ -112,6 +121,13 @@ def run(
     started = time.perf_counter()
     result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
+    if again is not None and not interrupted and leaves_doubt(result.quality) and can_be_read_again(source):
+        started = time.perf_counter()
+        stop = should_stop or (lambda: False)
+        with contextlib.suppress(DvoError, OSError, KeyboardInterrupt):  # the result stands without it
+            beginning = itertools.takewhile(lambda _: not stop(), source)
+            result = replace(result, quality=compare_again(result, again(), beginning, stride))
+        feeding.seconds["checking"] = time.perf_counter() - started
     return Run(
         result=over_source(result, np.array(feeding.fed), np.array(feeding.skipped), feeding.reasons),
         frames_fed=len(feeding.fed),

@@ -25,22 +25,23 @@ from dvo.graph.keyframe_log import FrameRecord
 from dvo.graph.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
+from dvo.nets.masks import visible_features
 from dvo.nets.patchifier import patch_coordinates
 from dvo.odometry.adjusting import adjust
 from dvo.odometry.config import TrackerConfig
 from dvo.odometry.depth_factor import MOST, measured_share
 from dvo.odometry.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
 from dvo.odometry.exclusive import exclusive
-from dvo.odometry.finishing import finish_segments, run_information
+from dvo.odometry.finishing import finish_segments, judge_result, run_information
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View, keyframe_of, observe
 from dvo.odometry.initial_pose import first_depth, first_pose
 from dvo.odometry.initialisation import (
+    NOT_INITIALISED,
     first_motion,
     initialise_related,
     leave_minimum,
     restart_due,
-    settle_first_window,
 )
 from dvo.odometry.late_join import join_waiting
 from dvo.odometry.loop_closure import loop_closer
@@ -165,9 +166,11 @@ class PatchOdometry:
         else:
             if gap and state.initialised and not state.joining:
                 state.joining, state.skipped = str(gap), not gap.frozen
+            mask = self._without_fixed(image, mask)
             seen = observe(self.model, image, camera, self.select, self.device, mask=mask)
             seen = measure_depth(self.model, seen, frame, self.config)
             state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
+            state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
             estimate = self._take(View([record], seen))
             if len(state.waiting) >= self.config.patience:
                 estimate = self._begin_segment()
@@ -187,10 +190,11 @@ class PatchOdometry:
         if begun:
             if len(state.waiting) >= config.initial_frames:
                 self._begin_segment()
-            self._close_segment(last=True)
+            self._close_segment()
             self.loops.complete(state.adjustable)
             state.info |= finish_segments(self.graph, state, config, self.loops)
-        return self._result({})
+            state.quality = judge_result(self.graph, self._result({}), state, config, self.model.config.STRIDE)
+        return replace(self._result({}), quality=state.quality)
 
     @torch.inference_mode()
     def current(self) -> Result:
@@ -278,10 +282,10 @@ class PatchOdometry:
     def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
         window, config, state, record = self.window, self.config, self.state, view.records[0]
-        state.joining = ""
+        state.joining, state.waited = "", state.waited + 1
         if len(window) > 1:
             revision = self.step.revise()
-            if not first_motion(revision, window, config):
+            if not first_motion(revision, window, config, state.waited):
                 # Too little motion to initialise: until the final adjustment it shares the pose of the last keyframe.
                 self.step.store(revision)
                 self.graph.drop(len(window) - 1, still=True)
@@ -289,7 +293,7 @@ class PatchOdometry:
                 return self._estimate(record, None, Status.INITIALISING)
         record.place(keyframe.identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
-            enough = initialise_related(self.graph, self.step, config)
+            enough = initialise_related(self.graph, self.step, config, state.waited)
             state.initialised = enough and newest_evidence(self.step).supports(config)
             state.adjustable += [self.graph.segment] * state.initialised
             if state.initialised and config.restart:
@@ -297,6 +301,18 @@ class PatchOdometry:
         self._reduce()
         pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)
+
+    def _without_fixed(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
+        """Mask of a frame without the pixels that are fixed to it, in which measurements of the window end too."""
+        fixed = self.state.fixed
+        if fixed.see(image):
+            size, unfixed = self.model.config.patch_size, fixed.mask
+            self.window.unfixed = None if unfixed is None else visible_features(unfixed, size, self.device)
+        if fixed.mask is None:
+            self.state.hidden = 0.0
+            return mask
+        self.state.hidden = float((~fixed.mask if mask is None else mask & ~fixed.mask).mean())
+        return fixed.mask if mask is None else mask & fixed.mask
 
     def _repeat(self, record: FrameRecord) -> Estimate:
         """Give a frame with the image of the frame before it the same pose and state."""
@@ -328,16 +344,12 @@ class PatchOdometry:
             waiting[0].records[0].reason = reason
         return estimate
 
-    def _close_segment(self, last: bool = False) -> None:
-        """Refine the window and archive it, and decide if the rows of the segment are kept."""
-        config, keep = self.config, self.state.initialised
-        if keep:
-            for _ in range(config.final_updates if len(self.window) > 1 else 0):
-                self._update()
-        else:
-            keep = settle_first_window(self.graph, self.step, config, last)
-        self.graph.archive_window()
-        self.graph.begin_segment(self.state.keyframes, keep, "too few frames with content")
+    def _close_segment(self) -> None:
+        """Refine the window and archive it; a segment that was never initialised has no rows."""
+        keep = self.state.initialised
+        for _ in range(self.config.final_updates if keep and len(self.window) > 1 else 0):
+            self._update()
+        self.graph.begin_segment(self.state.keyframes, keep, NOT_INITIALISED)
         self.state.begin_segment()
 
     def _append(self, view: View, found: Located | None = None) -> Keyframe:
@@ -387,6 +399,7 @@ class PatchOdometry:
         segment = graph.segment - graph.recording.segment
         if pose_wc is None:
             return Estimate(record.timestamp, None, status, 0.0, segment, reason, recovered)
+        state.started = record.timestamp if state.started is None else state.started
         sure = LaterUncertainty(self.step, self.config, state.ambiguous)
         return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
                         sure.covariance, sure.reference)  # fmt: skip

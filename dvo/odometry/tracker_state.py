@@ -7,10 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from dvo.odometry.check_pairs import CheckPairs
+from dvo.odometry.fixed_pixels import FixedPixels
 from dvo.odometry.frame_sequence import FrameSequence
 from dvo.odometry.front_end import View
 from dvo.odometry.map_tables import MapTable
 from dvo.odometry.protocol import Estimate
+from dvo.odometry.quality import Quality
 from dvo.odometry.rolling_shutter import Shutter
 
 
@@ -23,6 +26,7 @@ class TrackerState:
         sequence: order, size and intervals of the frames.
         keyframes: number of identifiers of keyframes given so far.
         tracked: frames of the segment since its initialisation.
+        waited: frames of the segment before it.
         initialised: the segment is.
         ambiguous: its window may have a second solution (:mod:`dvo.odometry.second_solution`).
         finished: no frame is taken any more.
@@ -34,6 +38,11 @@ class TrackerState:
         world: that of the last pose of the segment (:meth:`KeyframeGraph.world_of`); -1 before its first one.
         shutter: timing of the rows of the last frame.
         info: metadata for run.json.
+        fixed: pixels that are fixed to the images.
+        hidden: share of the last image that they are, without those of a given mask.
+        checks: measurements that take no part in the trajectory.
+        started: timestamp of the first measured pose, seconds; None before it.
+        quality: of the result, after ``finish``.
         map: of the file that the tracker was loaded from, until the first frame of the new recording.
     """
 
@@ -41,6 +50,7 @@ class TrackerState:
     sequence: FrameSequence
     keyframes: int = 0
     tracked: int = 0
+    waited: int = 0
     initialised: bool = False
     ambiguous: bool = False
     finished: bool = False
@@ -53,11 +63,16 @@ class TrackerState:
     shutter: Shutter = Shutter(0.0, 1.0)
     info: dict[str, object] = field(default_factory=dict)
     map: MapTable | None = None
+    fixed: FixedPixels = field(default_factory=FixedPixels)
+    hidden: float = 0.0
+    checks: CheckPairs = field(default_factory=CheckPairs)
+    started: float | None = None
+    quality: Quality | None = None
 
     def begin_segment(self) -> None:
         """Forget the segment that has been closed."""
         self.initialised, self.joining, self.skipped, self.tracked, self.world = False, "", False, 0, -1
-        self.ambiguous = False
+        self.ambiguous, self.waited = False, 0
 
     def enter(self, segment: int, world: int) -> bool:
         """Record the world of a pose.

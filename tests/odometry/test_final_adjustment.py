@@ -84,7 +84,7 @@ def test_a_better_beginning_is_extended_to_later_frames(scale, first):
 @pytest.mark.slow
 def test_frames_dropped_on_a_slow_walk_get_the_scale_of_the_whole():
     """Most frames of a slow walk are dropped; their poses are as exact as those of the keyframes."""
-    clip = make_sequence(77, frames=40, height=144, width=192, fps=30.0, family="street", kind="handheld", apart=True)
+    clip = make_sequence(77, frames=40, height=144, width=192, fps=90.0, family="street", kind="handheld", apart=True)
     errors = []
     for final_adjustment in (False, True):
         done = run(dvo.load("small", seed=0, pixels=144 * 192, final_adjustment=final_adjustment), clip)
@@ -95,7 +95,7 @@ def test_frames_dropped_on_a_slow_walk_get_the_scale_of_the_whole():
 @pytest.mark.slow
 def test_frames_of_a_slow_start_get_poses_of_their_own():
     """Before the initialisation a frame with little motion has the pose of the last keyframe; afterwards its own."""
-    clip = make_sequence(77, frames=40, height=144, width=192, fps=30.0, family="street", kind="handheld", apart=True)
+    clip = make_sequence(77, frames=40, height=144, width=192, fps=90.0, family="street", kind="handheld", apart=True)
     shares, errors = [], []
     for final_adjustment in (False, True):
         done = run(dvo.load("small", seed=0, pixels=144 * 192, final_adjustment=final_adjustment), clip)

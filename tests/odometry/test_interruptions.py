@@ -58,19 +58,23 @@ def test_no_pose_without_a_view_and_a_segment_of_its_own_after_it(film, clear, s
     rows = np.concatenate([segment.trajectory.timestamps for segment in result.segments])
     assert not np.isin(times[CUT : CUT + dark], rows).any()
     assert np.isin(np.delete(times, slice(CUT, CUT + dark)), rows).mean() >= 0.95
-    assert len(result.breaks) == 1 and result.breaks[0].frames == dark and result.breaks[0].reason
-    assert result.breaks[0].start == times[CUT - 1] and result.breaks[0].end == times[CUT + dark]
+    # The frame after the interruption may show too little of what was seen before it to be found there.
+    assert len(result.breaks) == 1 and result.breaks[0].reason
+    lost = result.breaks[0].frames
+    assert lost in (dark, dark + 1)
+    assert result.breaks[0].start == times[CUT - 1] and result.breaks[0].end == times[CUT + lost]
     assert {e.segment for e in estimates if e.pose_wc is not None} == set(range(len(result.segments)))
     worlds = worlds_of(result.segments)  # with loop closure, the end of the sequence may join what belongs together
     assert len(result.trajectory) == max(sum(len(result.segments[k]) for k in world) for world in worlds)
     assert evaluate(result.trajectory, film.groundtruth).ate_percent < 1.0
-    # The segment after the interruption begins as soon as a start with its frames would, and is as good as such starts
-    # are: over these twelve poses their errors differ by up to 1.8 times with the seed.
+    # The segment after the interruption begins as soon as a start with its frames would, or as they have been tried
+    # long enough, and is as good as such starts are: over these twelve poses their errors differ by up to 1.8 times
+    # with the seed.
     first, *expected = (
         next(k for k, e in enumerate(some) if e.status is Status.TRACKING)
         for some in (after, *(alone for alone, _, _ in starts))
     )
-    assert first <= min(expected) + 2
+    assert first <= max(min(expected) + 2, odometry.config.patience - 1)
     error, *errors = (
         evaluate(rows, film.groundtruth).ate_rmse
         for rows in (result.segments[1].trajectory, *(fresh.trajectory for _, fresh, _ in starts))
@@ -149,25 +153,33 @@ def test_results_so_far_agree_with_the_estimates(clear):
     assert odometry.finish().trajectory.poses_wc.tobytes() == again.finish().trajectory.poses_wc.tobytes()
 
 
-def test_a_window_that_is_not_initialised_keeps_its_frames(film, clear):
+def standing(image, count):
+    """Images of a camera that does not move, with noise of its sensor."""
+    rng = np.random.default_rng(0)
+    return [(image + rng.integers(0, 3, image.shape)).clip(0, 255).astype(np.uint8) for _ in range(count)]
+
+
+def test_frames_without_motion_before_the_first_motion_are_filled_in(clear):
+    images = [*standing(clear[0].image, 8), *(frame.image for frame in clear[1:16])]
+    estimates, result, _ = track([replace(frame, image=image) for frame, image in zip(clear, images, strict=False)])
+    assert all(e.status is Status.INITIALISING for e in estimates[:8]) and estimates[-1].status is Status.TRACKING
+    assert len(result.trajectory) == len(images)
+    away = np.linalg.norm(result.trajectory.positions - result.trajectory.positions[0], axis=1)
+    assert away[:8].max() < 0.02 * away.max()
+
+
+def test_a_window_that_is_not_initialised_gives_no_rows(film, clear):
     """A standing camera, which initialises nothing, then frames without a view, then another scene."""
     foreign = [
-        frame.image for frame in make_sequence(62, frames=14, family="corridor", kind="handheld", speed=3.0, **SIZE)
+        frame.image for frame in make_sequence(62, frames=24, family="corridor", kind="handheld", speed=3.0, **SIZE)
     ]
-    rng = np.random.default_rng(0)
-    still = [
-        (clear[k // 6].image + rng.integers(0, 3, clear[0].image.shape)).clip(0, 255).astype(np.uint8)
-        for k in range(12)
-    ]
-    black = [np.zeros_like(still[0])] * 3
-    images = [*still, *black, *foreign]
-    odometry = dvo.load("small", device="cpu", initial_parallax=1e3, initial_motion=0.0, initial_updates=4)
+    still = standing(clear[0].image, 12)
+    images = [*still, *[np.zeros_like(still[0])] * 3, *foreign]
+    odometry = dvo.load("small", device="cpu", initial_updates=4)
     times = np.array([frame.timestamp for frame in clear[: len(images)]])
     for frame, image in zip(clear, images, strict=False):
         odometry.track(replace(frame, image=image))
     result = odometry.finish()
     rows = [np.searchsorted(times, segment.trajectory.timestamps) for segment in result.segments]
-    assert len(rows) == 2
-    np.testing.assert_array_equal(rows[0], np.arange(12))
-    assert rows[1].min() >= 15 and len(rows[1]) >= 10
-    assert [(b.frames, b.new_segment, b.reason) for b in result.breaks] == [(rows[1].min() - 12, True, "black image")]
+    assert len(rows) == 1 and rows[0].min() >= 15 and len(rows[0]) >= 22
+    assert result.breaks[0].start is None and result.breaks[0].frames == rows[0].min()

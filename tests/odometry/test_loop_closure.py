@@ -58,10 +58,14 @@ def test_loops_are_found_where_the_way_is_repeated(film, closed):
 
 def turned_away(finder):
     """Search of a repeated view, with a candidate whose pose to start from is turned by 30 degrees."""
-    old, new = finder.kept[1], finder.kept[-2]
+    time = {identifier: finder.graph.archive[identifier].timestamp for identifier in finder.kept}
+    new = finder.kept[-3]
+    mirrored = 2 * (THERE - 1) / 15.0 - time[new]
+    old = min(finder.kept[1:], key=lambda identifier: abs(time[identifier] - mirrored))
     search = finder.prepare(new)
     kept = next(pair for pair in search.pairs if pair.candidate.new == new)
-    group = finder.kept[:3]  # with its neighbours
+    first = finder.kept.index(old) - 1
+    group = finder.kept[first : first + 3]  # with its neighbours
     poses_cw = finder.graph.poses_cw(np.array(group))
     turn = se3.exp(torch.tensor([0, 0, 0, 0, math.radians(30), 0], dtype=torch.float64))
     start = se3.compose(turn, poses_cw[group.index(old)])

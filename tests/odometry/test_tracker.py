@@ -13,6 +13,7 @@ from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.metrics import evaluate
 from dvo.odometry.config import TrackerConfig
+from dvo.odometry.initialisation import NOT_INITIALISED
 from dvo.odometry.protocol import Odometry, Status
 from dvo.synth.sequence import make_sequence
 from tests.support.tiny_tracker import SMALL, frames, run, tracker
@@ -66,13 +67,14 @@ def test_dropped_keyframes_keep_their_frames():
     assert result.info["keyframes"] < 12
 
 
-def test_frames_without_motion_before_initialisation_are_back_filled():
-    odometry = tracker(replace(SMALL, initial_motion=1e9))
-    estimates, result = run(odometry, frames(9))
-    assert all(e.status is Status.INITIALISING for e in estimates)
-    assert len(result.trajectory) == 9
-    # Nothing was accepted after the first frame, so nothing may move: no invented motion.
-    np.testing.assert_allclose(result.trajectory.positions, 0, atol=1e-12)
+@pytest.mark.parametrize("setting", ["initial_motion", "initial_parallax"])
+def test_a_sequence_that_is_not_initialised_has_no_rows(setting):
+    """Neither without motion nor without parallax: a pose of every frame would be an invention, points too."""
+    estimates, result = run(tracker(replace(SMALL, **{setting: 1e9})), frames(30))
+    assert all(e.status is Status.INITIALISING and e.pose_wc is None for e in estimates)
+    assert len(result.trajectory) == result.frames_tracked == 0 and result.frames_lost == 30
+    assert len(result.map.points) == 0 and not result.segments
+    assert [(b.frames, b.reason) for b in result.breaks] == [(30, NOT_INITIALISED)]
 
 
 def test_window_does_not_grow():
@@ -87,7 +89,7 @@ def test_window_does_not_grow():
 @pytest.mark.parametrize("count", [0, 1, 2, 4])
 def test_finish_after_few_frames(count):
     _, result = run(tracker(), frames(count))
-    assert len(result.trajectory) == result.frames_read == count
+    assert result.frames_read == result.frames_lost == count and len(result.trajectory) == 0
 
 
 def test_frames_out_of_order_or_of_another_size_are_refused():
@@ -98,7 +100,7 @@ def test_frames_out_of_order_or_of_another_size_are_refused():
         odometry.track(images[0])
     with pytest.raises(DvoError, match="64x48"):
         odometry.track(replace(frames(1, size=(64, 48))[0], timestamp=9.0))
-    assert len(odometry.finish().trajectory) == 1
+    assert odometry.finish().frames_read == 1
 
 
 def test_a_buffer_that_is_used_again_for_every_frame():

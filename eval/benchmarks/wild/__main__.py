@@ -4,8 +4,8 @@ Every video of a folder, or of a list of what is right (`--expected`), is tracke
 by the first system backward too. The table has, for each video, the frame with the first measured pose, straightness,
 angle, the largest difference of two seeds, the difference of forward and backward and of the other systems in percent
 of the path after a similarity, and seconds of the processor. With a list it also prints if each run is right, wrong and
-told (without a pose), wrong and silent, or ended with an error. The calibration is that of the list or
-NAME.calib.txt beside the video; without one the focal length is found in the images.
+told (the verdict is not good), wrong and silent, right and doubted, or ended with an error. The calibration is that of
+the list or NAME.calib.txt beside the video; without one the focal length is found in the images.
 
 Runs and trajectories are kept in `--out`, and the same command goes on from there; `page.html` shows all plots.
 """
@@ -46,8 +46,8 @@ class Judged:
         seeds: largest difference of two seeds of it, percent of the path.
         turned: difference of forward and backward.
         others: differences of the other systems, by name.
-        outcome: of each seed: ``right``, ``told``, ``silent``, or ``error`` of a run that ended with one; empty without
-            a list.
+        outcome: of each seed: ``right``, ``told``, ``silent``, ``doubted`` (right, but not good), or ``error`` of a run
+            that ended with one; empty without a list.
         faults: what is not as expected.
     """
 
@@ -99,7 +99,12 @@ def judge(video: Video, tasks: Iterable[Task], runs: dict[str, Run], expected: E
         if run.error:  # nothing was tracked, so that nothing can be right or told
             outcome.append("error")
             continue
-        outcome.append("right" if not wrong else "told" if run.verdict == "failed" else "silent")
+        if not wrong and expected.must == "good" and run.verdict == "doubtful":
+            outcome.append("doubted")
+            wrong = [f"doubtful although right: {run.reason}"]
+        else:
+            told = run.verdict in ("failed", "doubtful")
+            outcome.append("right" if not wrong else "told" if told else "silent")
         faults += [fault for fault in wrong if fault not in faults]
     kept = {task.key: runs[task.key] for task in mine}
     return Judged(video.name, kept, measures, seeds, turned, others, tuple(outcome), tuple(faults))
@@ -133,7 +138,7 @@ def table(judged: list[Judged]) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     total = [outcome for one in judged for outcome in one.outcome]
     if total:
-        counts = ", ".join(f"{name} {total.count(name)}" for name in ("right", "told", "silent", "error"))
+        counts = ", ".join(f"{name} {total.count(name)}" for name in ("right", "told", "silent", "doubted", "error"))
         lines.append(f"\nOf {len(total)} runs: {counts}.")
     return "\n".join(lines)
 

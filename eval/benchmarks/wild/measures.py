@@ -89,7 +89,7 @@ class Expected:
 
     Attributes:
         video: file, relative to the list.
-        must: ``good`` (right), ``told`` (right, or no pose), or ``still`` (a camera that does not move: no pose).
+        must: ``good`` (right), ``told`` (right, or not good), or ``still`` (a camera that does not move: no pose).
         frames: first frames that are tracked; None for all.
         calib: ``fx fy cx cy``; None: NAME.calib.txt beside the video, or none.
         straightness, turn, even: intervals, see :class:`Measures`; None: any.

@@ -6,6 +6,7 @@ import itertools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,9 @@ class Run:
         first: number of the first frame with a measured pose; None if there is none.
         segments: number of segments.
         seconds: processor time of tracking and finishing, and of finding the focal length.
-        verdict: ``failed`` without a pose, else ``-``: nothing is said about the poses.
+        verdict: of the result, see :mod:`dvo.odometry.quality`; of systems that do not judge themselves ``failed``
+            without a pose, else ``-``.
+        reason: of the verdict.
         error: what ended the run; empty if nothing did.
         poses: ``(N, 8)`` time and ``T_wc`` of the trajectory; not in JSON.
     """
@@ -92,6 +95,7 @@ class Run:
     segments: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     verdict: str = "-"
+    reason: str = ""
     error: str = ""
     poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 8)))
 
@@ -137,12 +141,15 @@ def carry_out(task: Task) -> Run:
         if task.backward:
             frames = reversed_frames(list(source))
         begun = time.process_time()
-        done = session.run(system.build(task.seed, "cpu"), frames, on_frame=on_frame)
+        again = partial(system.build, task.seed + 1, "cpu")
+        done = session.run(system.build(task.seed, "cpu"), frames, on_frame=on_frame, again=again)
         seconds["tracking"] = time.process_time() - begun
     except DvoError as error:
         return Run(task.key, str(task.video), verdict="failed", error=str(error))
-    rows = done.result.trajectory
+    rows, quality = done.result.trajectory, done.result.quality
+    verdict = quality.verdict if quality is not None else "-" if len(rows) else "failed"
     return Run(
         task.key, str(task.video), done.result.frames_read, first[0] if first else None, len(done.result.segments),
-        seconds, "-" if len(rows) else "failed", poses=np.column_stack([rows.timestamps, rows.poses_wc]),
+        seconds, verdict, "" if quality is None else quality.reason,
+        poses=np.column_stack([rows.timestamps, rows.poses_wc]),
     )  # fmt: skip

@@ -1,6 +1,7 @@
 """Videos without ground truth: figures of a trajectory, what is right, and the table."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -92,6 +93,20 @@ def test_runs_are_right_told_or_silent(tmp_path, must, rows, outcome):
     assert judge(video, tasks, runs_of(tasks, rows, rows, rows, straight()), None).outcome == ()
 
 
+def test_verdicts_count(tmp_path):
+    """A wrong run that is doubtful is told; one that is right and has to be good is doubted."""
+    video = Video("clip", tmp_path / "clip.mp4")
+    tasks = tasks_of(video, ["dvo-small"], 1)
+    back = np.concatenate([straight(26), straight(25)[::-1]])
+    for rows, must, outcome in (
+        (straight(), "good", "doubted"), (straight(), "told", "right"), (back, "good", "told"), (back, "told", "told"),
+    ):  # fmt: skip
+        runs = runs_of(tasks, rows, rows)
+        runs = {key: replace(run, verdict="doubtful", reason="waves") for key, run in runs.items()}
+        found = judge(video, tasks, runs, Expected("clip.mp4", must, straightness=(0.9, 1)))
+        assert found.outcome == (outcome,) and ("waves" in str(found.faults)) == (outcome == "doubted")
+
+
 def test_a_run_with_an_error_or_few_poses_is_not_right(tmp_path):
     video = Video("clip", tmp_path / "clip.mp4")
     tasks = tasks_of(video, ["dvo-small"], 1)
@@ -132,7 +147,8 @@ def test_the_command_writes_table_and_page_and_goes_on(tmp_path, capsys):
     main([*command, "--expected", str(tmp_path / "right.yaml")])
     told = capsys.readouterr().out
     assert (
-        "clip-null-0-backward: -, 12 of 12 frames" in told and "Of 2 runs: right 2, told 0, silent 0, error 0." in told
+        "clip-null-0-backward: -, 12 of 12 frames" in told
+        and "Of 2 runs: right 2, told 0, silent 0, doubted 0, error 0." in told
     )
     assert (out / "clip.png").stat().st_size > 1000 and "clip.png" in (out / "page.html").read_text()
     main(command)

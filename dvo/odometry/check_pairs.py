@@ -1,0 +1,136 @@
+"""Corners followed from one image to a later one: measurements that take no part in the trajectory, to check it by.
+
+They come from another method than the network (Lucas-Kanade, forward and back), so that a network that is wrong with
+confidence, or that follows something else than the scene, does not agree with them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from dvo.geometry import se3
+
+CORNERS = 120
+"""Largest number of corners of a pair."""
+FEWEST = 16
+"""Corners below which a pair says nothing."""
+MOST = 256
+"""Pairs that are kept; those of a longer sequence are further apart."""
+GAPS = (4, 32)
+"""Frames from the first image to the second: at the beginning, and at most."""
+MOVED = (2.0, 6.0, 20.0)
+"""Median displacements of the corners of a pair, pixels: below the first they tell nothing and the second image is a
+later one; the gap grows below the second, and shrinks above the third."""
+RETURN = 0.4
+"""Largest distance of a corner from where it was, followed forward and back, pixels."""
+
+
+@dataclass(frozen=True)
+class CheckPair:
+    """Corners of two images.
+
+    Attributes:
+        first, second: numbers of the frames in the log.
+        points: ``(N, 4)`` float32 x, y in the first and in the second image, pixels.
+        intrinsics: ``(4,)`` fx fy cx cy of the images.
+    """
+
+    first: int
+    second: int
+    points: np.ndarray
+    intrinsics: np.ndarray
+
+
+class CheckPairs:
+    """Pairs of a sequence.
+
+    Attributes:
+        pairs: so far, in order of time.
+    """
+
+    def __init__(self) -> None:
+        self.pairs: list[CheckPair] = []
+        self._gap, self._pause = GAPS[0], 0
+        self._first: tuple[int, np.ndarray] | None = None
+        self._next = 0
+
+    def see(self, number: int, image: np.ndarray, intrinsics: np.ndarray, mask: np.ndarray | None) -> None:
+        """Take the next frame with content.
+
+        Args:
+            number: of the frame in the log.
+            image: ``(H, W, 3)`` uint8 RGB.
+            intrinsics: ``(4,)`` fx fy cx cy.
+            mask: ``(H, W)`` bool, False for ignored pixels; None: none.
+        """
+        if number < self._next:
+            return
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        pause = 0
+        if self._first is not None:
+            first, before = self._first
+            points = followed(before, grey, mask)
+            moved = float(np.median(np.linalg.norm(points[:, 2:] - points[:, :2], axis=1))) if len(points) else 0.0
+            if len(points) >= FEWEST and moved < MOVED[0] and number < first + GAPS[1]:
+                self._next = number + self._gap
+                return
+            if len(points) >= FEWEST and moved >= MOVED[0]:
+                self.pairs.append(CheckPair(first, number, points, np.asarray(intrinsics, np.float64)))
+                pause = self._pause
+            shorter, longer = len(points) < FEWEST or moved > MOVED[2], moved < MOVED[1]
+            self._gap = max(self._gap // 2, 1) if shorter else min(2 * self._gap, GAPS[1]) if longer else self._gap
+        if len(self.pairs) > MOST:
+            self.pairs, self._pause = self.pairs[::2], 2 * self._pause + self._gap
+        self._first, self._next = (None, number + pause) if pause else ((number, grey), number + self._gap)
+
+
+def followed(first: np.ndarray, second: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Follow corners from an image to another one and back.
+
+    Args:
+        first, second: ``(H, W)`` uint8.
+        mask: ``(H, W)`` bool, False for pixels without corners; None: none.
+
+    Returns:
+        ``(N, 4)`` float32 x, y in the first and in the second image.
+    """
+    valid = None if mask is None else mask.astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(first, CORNERS, 0.01, 8, mask=valid)
+    if corners is None:
+        return np.zeros((0, 4), np.float32)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, np.zeros_like(corners), winSize=(15, 15))
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(second, first, there, np.zeros_like(corners), winSize=(15, 15))
+    near = np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < RETURN
+    kept = near & (found.ravel() > 0) & (returned.ravel() > 0)
+    return np.concatenate([corners.reshape(-1, 2), there.reshape(-1, 2)], axis=1)[kept]
+
+
+def epipolar_distances(pair: CheckPair, first_cw: np.ndarray, second_cw: np.ndarray) -> np.ndarray:
+    """Sampson distances of the corners of a pair from the epipolar geometry of two poses.
+
+    Without translation any epipolar geometry holds for what the rotation explains.
+
+    Args:
+        pair: corners.
+        first_cw, second_cw: ``(7,)`` poses ``T_cw`` of its frames.
+
+    Returns:
+        ``(N,)`` pixels (Hartley and Zisserman, Multiple View Geometry, 11.4.3).
+    """
+    fx, fy, cx, cy = pair.intrinsics
+    points = pair.points.astype(np.float64)
+    a, b = (
+        np.column_stack([(p[:, 0] - cx) / fx, (p[:, 1] - cy) / fy, np.ones(len(p))])
+        for p in (points[:, :2], points[:, 2:])
+    )
+    poses = (torch.as_tensor(pose, dtype=torch.float64) for pose in (first_cw, second_cw))
+    motion = se3.matrix(se3.relative(*poses)).numpy()
+    x, y, z = motion[:3, 3] / max(float(np.linalg.norm(motion[:3, 3])), 1e-12)
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ motion[:3, :3]
+    lines, back = a @ essential.T, b @ essential
+    gradient = (lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
+    return np.abs((b * lines).sum(1)) / np.sqrt(np.maximum(gradient, 1e-18)) * np.sqrt(fx * fy)

@@ -1,0 +1,89 @@
+"""Pixels that do not move with the scene: bonnet, dashboard, watermark, drops on the lens, black border.
+
+A pixel of the image is fixed to it if its grey level varies less, over frames between which the picture has changed,
+than a small displacement would make it with the gradient that is there. Edges along which the picture moves (a lane
+marking) and what is very far straight ahead count as fixed as well; they tell little of a translation.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+TEXTURE = 3.0
+"""Least mean gradient of a pixel that can be judged, grey levels a pixel."""
+DISPLACEMENT = 0.3
+"""Largest RMS displacement of a fixed pixel, pixels of the working image."""
+NOISE = 2.0
+"""Standard deviation of the grey level of a pixel of a still scene."""
+CHANGED = 0.2
+"""Share of the pixels with texture that have to change from one sample to the next."""
+SAMPLES = 12
+"""Samples before the first mask."""
+MEMORY = 24
+"""Samples over which means are taken, about."""
+FIXED_SHARES = (0.002, 0.6)
+"""Least and largest share of the pixels with texture that are fixed, for a mask: where nearly all is fixed the camera
+stands still before something that moves."""
+MARGIN = 3
+"""Distance from a fixed pixel that is ignored too, pixels."""
+
+
+class FixedPixels:
+    """Running statistics of the grey levels of working images.
+
+    Only frames in which the picture has changed count as samples, so that a camera that stands still fixes nothing.
+
+    Attributes:
+        mask: ``(H, W)`` bool, False for pixels that are fixed to the image; None as long as there are none.
+    """
+
+    def __init__(self) -> None:
+        self.mask: np.ndarray | None = None
+        self._count = 0
+        self._last = self._mean = self._square = self._slope = np.zeros((0, 0), np.float32)
+
+    def see(self, image: np.ndarray) -> bool:
+        """Take the next working image.
+
+        Args:
+            image: ``(H, W, 3)`` uint8 RGB, of the size of those before.
+
+        Returns:
+            True if :attr:`mask` was made anew.
+        """
+        grey, slope = _grey_and_slope(image)
+        if not self._count:
+            self._count, self._last, self._mean, self._square, self._slope = 1, grey, grey, grey**2, slope
+            return False
+        texture = np.maximum(slope, self._slope) > TEXTURE
+        changed = texture & (np.abs(grey - self._last) > DISPLACEMENT * slope + 2 * NOISE)
+        if int(changed.sum()) < CHANGED * max(int(texture.sum()), 1):
+            return False
+        self._last, self._count = grey, self._count + 1
+        rate = 1 / min(self._count, MEMORY)
+        self._mean = self._mean + rate * (grey - self._mean)
+        self._square = self._square + rate * (grey**2 - self._square)
+        self._slope = self._slope + rate * (slope - self._slope)
+        if self._count < SAMPLES:
+            return False
+        before, self.mask = self.mask, self._found()
+        return not (before is None and self.mask is None)
+
+    def _found(self) -> np.ndarray | None:
+        """Mask by the samples so far."""
+        variance = np.maximum(self._square - self._mean**2, 0)
+        texture = self._slope > TEXTURE
+        fixed = texture & (np.sqrt(variance) < DISPLACEMENT * self._slope + NOISE)
+        whole = cv2.morphologyEx(fixed.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        share = int(whole.sum()) / max(int(texture.sum()), 1)
+        if not FIXED_SHARES[0] < share < FIXED_SHARES[1]:
+            return None
+        return cv2.dilate(whole, np.ones((2 * MARGIN + 1,) * 2, np.uint8)) == 0
+
+
+def _grey_and_slope(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed grey levels ``(H, W)`` float32, and the magnitude of their gradient."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
+    x, y = (cv2.Sobel(grey, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    return grey, cv2.magnitude(x, y)

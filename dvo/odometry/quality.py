@@ -1,0 +1,140 @@
+"""Verdict on the result of a sequence: good, doubtful or failed, with what it rests on.
+
+A trajectory that is wrong is often as smooth, and its measurements are as confident, as one that is right: the network
+may follow what moves before the camera, or what is fixed to it. What tells is whether measurements agree that have no
+part in it: corners that another method has followed (:mod:`dvo.odometry.check_pairs`), and measurements between frames
+that are far apart. The thresholds come from runs that were made to fail (``python -m eval.benchmarks.verdict``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+Verdict = Literal["good", "doubtful", "failed"]
+
+LEAST_CHECK = 0.75
+"""Share of followed corners that agree with the poses below which a result is doubtful by that alone."""
+LEAST_AGREEMENT = 0.9375
+"""The same of the confident measurements that agree with each other. What the two lack adds up (:func:`lacks`)."""
+LEAST_TRACKED = 0.5
+"""Share of frames with a pose below which a result is doubtful."""
+UNSURE = 0.5
+"""Lack of agreement, of what makes a result doubtful, above which it is looked at more closely."""
+MOST_FIXED = 0.2
+"""Share of the image that is fixed to the camera: it takes part until it is found, so that the beginning suffers."""
+WRONG_FOCAL = 0.12
+"""Logarithm of the focal length that the measurements ask for over the one that is given."""
+FEWEST_CHECKS = 3
+"""Pairs of images with followed corners that a verdict needs."""
+MOST_JUMPS = 2
+"""Jumps in a hundred frames."""
+
+MASK = "mask what moves or is fixed to the camera (--mask), or film so that most of the picture stands still"
+CALIBRATE = "check the calibration (dvo calibrate), or run without --calib"
+FILM = "film textured surfaces at a few metres while the camera moves sideways, or use --preset accurate"
+MOVE = "move the camera sideways while filming; a tripod or a single picture has no trajectory"
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What tells if a result can be trusted, and the verdict.
+
+    Attributes:
+        verdict: ``good``; ``doubtful``: poses that may be wrong; ``failed``: none.
+        reason: of a verdict that is not good, in words.
+        remedy: what to do about it.
+        initialised_at: timestamp of the first pose that was measured, seconds; None if there is none.
+        tracked: share of the frames that have a pose, of the longest world.
+        inliers: share of all measurements that are confident and agree with the poses.
+        spread: share of twelve fields of the image with such measurements, median over the keyframes.
+        agreement: share of the confident measurements that agree with the poses; NaN without one.
+        residual: median distance of confident measurements from the reprojection, pixels of the working image.
+        check: share of the followed corners within a pixel of the epipolar lines of the poses; NaN without pairs.
+        checks: number of pairs of images with followed corners.
+        jumps: number of frames between which the camera moved far more than before and after.
+        fixed: share of the image that is fixed to the camera, is in no mask that was given, and was left out.
+        second: difference of a second run with another seed, percent of the path; NaN if there was none.
+
+    Example:
+        >>> result = dvo.run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt")).result
+        >>> if result.quality.verdict != "good":
+        ...     print(result.quality)
+        doubtful: corners that were followed do not agree with the poses (41% of them do)
+    """
+
+    verdict: Verdict
+    reason: str = ""
+    remedy: str = ""
+    initialised_at: float | None = None
+    tracked: float = 0.0
+    inliers: float = 0.0
+    spread: float = 0.0
+    agreement: float = float("nan")
+    residual: float = float("nan")
+    check: float = float("nan")
+    checks: int = 0
+    jumps: int = 0
+    fixed: float = 0.0
+    second: float = float("nan")
+
+    def __str__(self) -> str:
+        return self.verdict if not self.reason else f"{self.verdict}: {self.reason}"
+
+
+def lacks(quality: Quality) -> tuple[float, float]:
+    """How far followed corners and measurements are from agreeing with the poses; together 1 is doubtful.
+
+    Args:
+        quality: of a result.
+
+    Returns:
+        Shares that do not agree, over those of :data:`LEAST_CHECK` and :data:`LEAST_AGREEMENT`; NaN for what is not
+        known.
+    """
+    return (1 - quality.check) / (1 - LEAST_CHECK), (1 - quality.agreement) / (1 - LEAST_AGREEMENT)
+
+
+def leaves_doubt(quality: Quality | None) -> bool:
+    """Tell if a result is worth a closer look.
+
+    Args:
+        quality: of the result; None if it is not known.
+
+    Returns:
+        True for a good result that is not far from a doubtful one.
+    """
+    return quality is not None and quality.verdict == "good" and sum(lacks(quality)) > UNSURE
+
+
+def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str, str]:
+    """Find the verdict of what was measured.
+
+    Args:
+        quality: of a result; its verdict is not looked at.
+        frames: number of frames that were read.
+        cause: of the loss of the frames, if none has a pose.
+
+    Returns:
+        Verdict, reason and remedy; the last two are empty for a good result.
+    """
+    if not quality.tracked:
+        few = f"; {frames} {'frame is' if frames == 1 else 'frames are'} too few" if frames < 5 else ""
+        return "failed", f"no frame has a pose ({cause or 'nothing was tracked'}{few})", MOVE
+    doubts = [lack if math.isfinite(lack) else 0.0 for lack in lacks(quality)]
+    if sum(doubts) > 1 and doubts[0] > doubts[1]:
+        reason = f"corners that were followed do not agree with the poses ({quality.check:.0%} of them do)"
+        return "doubtful", reason, MASK
+    if sum(doubts) > 1 or not math.isfinite(quality.agreement):
+        share = f"{quality.agreement:.1%} of them agree" if math.isfinite(quality.agreement) else "there are none"
+        return "doubtful", f"the measurements contradict each other ({share})", CALIBRATE
+    if quality.checks < FEWEST_CHECKS:
+        return "doubtful", "too little of the picture moves to check the poses by", FILM
+    if quality.fixed > MOST_FIXED:
+        return "doubtful", f"{quality.fixed:.0%} of the picture are fixed to the camera; found only after a while", MASK
+    if quality.tracked < LEAST_TRACKED:
+        return "doubtful", f"{quality.tracked:.0%} of the frames have a pose", FILM
+    if quality.jumps > MOST_JUMPS * max(frames / 100, 1):
+        return "doubtful", f"the camera jumps {quality.jumps} times", FILM
+    return "good", "", ""

@@ -1,0 +1,72 @@
+"""Second run over the beginning of a sequence, with another seed, where the first one leaves doubt.
+
+Measurements may fit a wrong motion nearly as well as the right one: of a flat scene, say, or a picture of which little
+moves. Which of them a run finds is then a matter of chance, so that two runs differ. Runs that agree prove nothing:
+what is fixed to the camera holds them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import torch
+
+from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
+from dvo.data.trajectory import Trajectory
+from dvo.geometry import sim3
+from dvo.geometry.alignment import align
+from dvo.odometry.protocol import Odometry, Result
+from dvo.odometry.quality import FILM, Quality
+
+FRAMES = 150
+"""Frames that are tracked again."""
+FEWEST = 10
+"""Common frames with poses that a comparison needs."""
+DIFFERENT = 3.0
+"""Largest RMS difference of the two after a similarity, percent of the path."""
+
+
+def can_be_read_again(source: object) -> bool:
+    """Tell if frames can be read a second time: a recording or a list, not what arrives as it is.
+
+    Args:
+        source: of frames.
+    """
+    return not isinstance(source, Iterator) and not hasattr(source, "stop")
+
+
+def compare_again(result: Result, odometry: Odometry, frames: Iterable[Frame], stride: int = 1) -> Quality:
+    """Track the beginning of a sequence again, and compare.
+
+    Args:
+        result: of the first run, with its quality.
+        odometry: newly built, with another seed.
+        frames: of the sequence, from the first on.
+        stride: distance of tracked frames.
+
+    Returns:
+        The quality with the difference; a doubtful one if it is large.
+    """
+    assert result.quality is not None
+    for frame in islice(frames, 0, FRAMES * stride, stride):
+        odometry.track(checked_frame(frame))
+    difference = _difference(odometry.finish().trajectory, result.trajectory)
+    if not difference > DIFFERENT:  # NaN: nothing is known
+        return replace(result.quality, second=difference)
+    reason = f"a second run with another seed differs by {difference:.0f}% of the path"
+    return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
+
+
+def _difference(one: Trajectory, other: Trajectory) -> float:
+    """RMS distance after a similarity, percent of the path of the second; NaN with fewer than ten common frames."""
+    _, i, j = np.intersect1d(one.timestamps, other.timestamps, return_indices=True)
+    source, target = one.positions[i], other.positions[j]
+    length = float(np.linalg.norm(np.diff(target, axis=0), axis=1).sum()) if len(j) else 0.0
+    if len(j) < FEWEST or length == 0:
+        return float("nan")
+    moved = sim3.act(align(source, target), torch.from_numpy(source)).numpy()
+    return 100 * float(np.sqrt(((moved - target) ** 2).sum(1).mean())) / length

@@ -1,0 +1,1 @@
+"""Manufactured failures, and what the verdict of a result says of them."""

@@ -1,0 +1,112 @@
+"""Verdicts: good results are good, manufactured failures are told, and what says so is measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dvo
+from dvo.data.trajectory import Trajectory
+from dvo.odometry.protocol import Result, SparseMap
+from dvo.odometry.quality import LEAST_AGREEMENT, LEAST_CHECK, Quality, judge
+from dvo.odometry.quality_measures import count_jumps
+from dvo.synth.sequence import make_sequence
+from eval.benchmarks.verdict.failures import before_still_camera, with_crowd, with_overlay, with_waves
+
+GOOD = Quality("good", tracked=1.0, inliers=0.6, spread=1.0, agreement=0.999, residual=0.1, check=0.98, checks=9)
+
+
+@pytest.fixture(scope="module")
+def film():
+    size = {"frames": 36, "height": 120, "width": 160, "fps": 15.0}
+    return list(make_sequence(61, family="room", kind="handheld", speed=3.0, **size))
+
+
+def result_of(frames, **settings):
+    return dvo.run(dvo.load("small", device="cpu", seed=0, **settings), frames).result
+
+
+def test_a_good_result(film):
+    quality = result_of(film).quality
+    assert quality.verdict == "good" and not quality.reason and not quality.remedy and str(quality) == "good"
+    assert quality.tracked == 1 and quality.checks > 3 and quality.check > 0.9 and quality.agreement > 0.98
+    assert 0 < quality.inliers <= 1 and 0.5 < quality.spread <= 1 and 0 < quality.residual < 2
+    assert quality.initialised_at > film[0].timestamp and quality.fixed == 0
+
+
+@pytest.mark.parametrize(("change", "number"), [(with_crowd, 0), (with_waves, 0), (with_overlay, 2)])
+def test_a_failure_is_not_good(film, change, number):
+    """A crowd of six to twelve large bodies, a sea of two thirds, a reflection over all of the picture."""
+    quality = result_of(change(np.random.default_rng(3), film, number)).quality
+    assert quality.verdict == "doubtful" and quality.reason and quality.remedy
+
+
+def test_motion_before_a_still_camera_is_not_good(film):
+    quality = result_of(before_still_camera(np.random.default_rng(0), film, 1)).quality
+    assert quality.verdict in ("doubtful", "failed")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_clip_of_a_few_frames_fails(film, count):
+    result = result_of(film[:count])
+    assert result.frames_tracked == 0 and result.quality.verdict == "failed"
+    assert "too little motion" in result.quality.reason and "too few" in result.quality.reason
+
+
+def test_a_tripod_fails(film):
+    rng = np.random.default_rng(0)
+    still = [
+        replace(frame, image=(film[0].image + rng.normal(0, 2, film[0].image.shape)).clip(0, 255).astype(np.uint8))
+        for frame in film
+    ]
+    result = result_of(still)
+    assert result.frames_tracked == 0 and len(result.map.points) == 0
+    assert result.quality.verdict == "failed" and "too little motion" in result.quality.reason
+
+
+def test_standing_still_after_the_start_is_good(film):
+    rng = np.random.default_rng(0)
+    stand = [(film[19].image + rng.normal(0, 2, film[0].image.shape)).clip(0, 255).astype(np.uint8) for _ in range(16)]
+    frames = [*film[:20], *(replace(frame, image=image) for frame, image in zip(film[20:], stand, strict=True))]
+    result = result_of(frames)
+    assert result.frames_lost == 0 and result.quality.verdict == "good"
+
+
+@pytest.mark.parametrize(
+    ("changed", "verdict", "words"),
+    [
+        ({}, "good", ""),
+        ({"check": LEAST_CHECK - 0.01}, "doubtful", "do not agree with the poses"),
+        ({"check": 0.85, "agreement": 0.973}, "doubtful", "(85% of them do)"),
+        ({"check": 0.9, "agreement": 0.955}, "doubtful", "contradict each other"),
+        ({"check": 0.9, "agreement": 0.98}, "good", ""),
+        ({"check": float("nan"), "checks": 0}, "doubtful", "too little of the picture moves"),
+        ({"agreement": LEAST_AGREEMENT - 0.01}, "doubtful", "contradict each other"),
+        ({"agreement": float("nan")}, "doubtful", "there are none"),
+        ({"fixed": 0.3}, "doubtful", "30% of the picture"),
+        ({"tracked": 0.3}, "doubtful", "30% of the frames"),
+        ({"jumps": 3}, "doubtful", "jumps 3 times"),
+        ({"tracked": 0.0}, "failed", "black image"),
+    ],
+)
+def test_each_measure_has_its_say(changed, verdict, words):
+    found, reason, remedy = judge(replace(GOOD, **changed), 100, "black image")
+    assert found == verdict and words in reason and bool(reason) == bool(remedy) == (verdict != "good")
+
+
+def test_jumps_are_counted():
+    positions = np.column_stack([np.arange(20.0), np.zeros(20), np.zeros(20)])
+    poses = np.column_stack([positions, np.tile([0.0, 0, 0, 1], (20, 1))])
+    times = 0.1 * np.arange(20)
+
+    def jumps(poses, times=times):
+        return count_jumps(Result(Trajectory(times, poses), SparseMap(), len(poses), 0))
+
+    assert jumps(poses) == 0
+    moved = poses.copy()
+    moved[10:, 1] += 30
+    assert jumps(moved) == 1
+    later = times.copy()
+    later[10:] += 5.0  # a gap in time is no jump
+    assert jumps(moved, later) == 0
+    assert jumps(np.tile(poses[0], (20, 1))) == 0

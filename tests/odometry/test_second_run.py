@@ -1,0 +1,90 @@
+"""Second run with another seed: when it is made, what it says, and that it costs nothing that was done."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dvo
+from dvo.data.live import LiveFrames
+from dvo.data.trajectory import Trajectory
+from dvo.errors import DvoError
+from dvo.odometry import second_run
+from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.quality import Quality, leaves_doubt
+from dvo.odometry.second_run import can_be_read_again, compare_again
+from tests.support.tiny_tracker import frames
+
+SURE = Quality("good", tracked=1.0, agreement=1.0, check=1.0, checks=9)
+UNSURE = replace(SURE, check=0.85)
+
+
+class Walk:
+    """Odometry of a known path, scaled and bent, with a quality."""
+
+    name = "walk"
+
+    def __init__(self, bend=0.0, quality=UNSURE, fail=False):
+        self.bend, self.quality, self.fail, self.times = bend, quality, fail, []
+
+    def track(self, frame):
+        if self.fail:
+            raise DvoError("broken")
+        self.times.append(frame.timestamp)
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    def finish(self):
+        t = np.array(self.times)
+        positions = np.column_stack([t, np.sin(t) + self.bend * t**2, np.zeros_like(t)]) * (1 + self.bend)
+        poses = np.column_stack([positions, np.tile([0.0, 0, 0, 1], (len(t), 1))])
+        return Result(Trajectory(t, poses), SparseMap(), len(t), 0, quality=self.quality)
+
+
+def ran(again, first=UNSURE, source=None, **options):
+    return dvo.run(Walk(quality=first), frames(30) if source is None else source, again=again, **options)
+
+
+def test_it_is_made_where_a_good_result_leaves_doubt():
+    assert leaves_doubt(UNSURE) and not leaves_doubt(SURE) and not leaves_doubt(None)
+    assert not leaves_doubt(replace(UNSURE, verdict="doubtful", check=0.1))
+    never = lambda: pytest.fail("a second run of a sure result")  # noqa: E731
+    assert "checking" not in ran(never, first=SURE).seconds
+    ran(never, source=iter(frames(30)))
+
+
+def test_runs_that_agree_stay_good():
+    done = ran(lambda: Walk(0.0))
+    assert done.result.quality.verdict == "good" and done.result.quality.second == pytest.approx(0, abs=1e-6)
+    assert done.seconds["checking"] > 0 and done.frames_fed == 30
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_runs_that_differ_are_doubtful(stride):
+    quality = ran(lambda: Walk(2.0), stride=stride).result.quality
+    assert quality.verdict == "doubtful" and quality.second > 3 and quality.remedy
+    assert f"differs by {quality.second:.0f}% of the path" in quality.reason
+
+
+def test_the_beginning_alone_is_tracked_again(monkeypatch):
+    monkeypatch.setattr(second_run, "FRAMES", 5)
+    other = Walk()
+    compare_again(Walk().finish(), other, frames(30), stride=2)
+    assert other.times == [pytest.approx(0.2 * k) for k in range(5)]
+
+
+def test_a_second_run_that_fails_or_is_stopped_leaves_the_first():
+    assert ran(lambda: Walk(fail=True)).result.quality == UNSURE
+    pressed = []
+    other = Walk()
+
+    def begin():
+        pressed.append(True)
+        return other
+
+    done = ran(begin, should_stop=lambda: bool(pressed))
+    assert done.result.quality.verdict == "good" and not other.times and len(done.result.trajectory) == 30
+
+
+def test_what_arrives_once_is_not_read_again():
+    assert can_be_read_again(frames(3)) and not can_be_read_again(iter(frames(3)))
+    assert not can_be_read_again(LiveFrames(frames(3)))

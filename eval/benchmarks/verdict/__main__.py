@@ -78,7 +78,8 @@ def main(given: list[str] | None = None) -> None:
     outcomes = {(values["kind"], values["number"]): Outcome(**values) for values in map(json.loads, lines)}
     missing = [trial for trial in trials if (trial.kind, trial.number) not in outcomes]
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.jobs, context, settle_threads) as pool:
+    # New processes now and then: renderings stay in the memory of one.
+    with ProcessPoolExecutor(options.jobs, context, settle_threads, max_tasks_per_child=16) as pool:
         for done in pool.map(carry_out, missing):
             outcomes[done.kind, done.number] = done
             with record.open("a", encoding="utf-8") as file:

@@ -64,7 +64,7 @@ def judge_result(
     quality = measure_quality(
         graph, result, own, state.checks, stride=stride, shutter=shutter, first=state.started, fixed=state.hidden
     )
-    if not leaves_doubt(quality):
+    if not (own and leaves_doubt(quality)):
         return quality
     profile = find_focal(graph, max(own, key=lambda segment: len(graph.members(segment))), shutter, config.adjustment)
     step, sure = profile.minimum.value, profile.contrast >= SURE_CONTRAST

@@ -308,11 +308,12 @@ class PatchOdometry:
         if fixed.see(image):
             size, unfixed = self.model.config.patch_size, fixed.mask
             self.window.unfixed = None if unfixed is None else visible_features(unfixed, size, self.device)
-        if fixed.mask is None:
-            self.state.hidden = 0.0
+        left = fixed.mask if mask is None or fixed.mask is None else mask & fixed.mask
+        if left is None or missing_content(image, left):  # with too little left of the image, all of it is used
+            self.state.hidden, self.window.unfixed = 0.0, None
             return mask
-        self.state.hidden = float((~fixed.mask if mask is None else mask & ~fixed.mask).mean())
-        return fixed.mask if mask is None else mask & fixed.mask
+        self.state.hidden = float((left.size if mask is None else mask.sum()) - left.sum()) / left.size
+        return left
 
     def _repeat(self, record: FrameRecord) -> Estimate:
         """Give a frame with the image of the frame before it the same pose and state."""

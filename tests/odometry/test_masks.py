@@ -121,3 +121,16 @@ def test_a_clip_under_an_overlay():
     assert [result.quality.verdict for result in results] == ["doubtful", "good"]
     assert results[0].quality.fixed > 0.2 > 0.05 > results[1].quality.fixed
     assert 0.2 < 1 - hidden[0].mask.mean() < 0.25
+
+
+def test_fixed_pixels_that_leave_too_little_are_used():
+    """As many as all: the frames are not lost for it, and nothing is reported as left out."""
+    odometry = tracker()
+    given = frames(12)
+    for frame in given:
+        odometry.state.fixed.mask = np.zeros(frame.image.shape[:2], bool)
+        odometry.state.fixed.see = lambda image: True
+        odometry.track(frame)
+    assert odometry.window.unfixed is None
+    result = odometry.finish()
+    assert len(result.trajectory) == len(given) > 6 and result.quality.fixed == 0

@@ -5,7 +5,7 @@ odometry fail: something fixed to the camera, a crowd, waves, a wrong focal leng
 network, something that moves before a camera that stands still. A run is wrong if its ATE is above 2 % of the path and
 above five times that of the best of dvo, `keyframe` and `klt-pnp` on the same clip as it was rendered, or if it has
 poses before a camera that stands still. Scenes with an even number were there to choose the thresholds of
-`dvo.odometry.quality` by; the figures that count are those of the odd ones. Intervals are Wilson's of 95 %.
+`dvo.odometry.quality` by; those of the odd ones are printed apart. Intervals are Wilson's of 95 %.
 
 Runs are kept in `--out`, and the same command goes on from there.
 """
@@ -72,10 +72,16 @@ def main(given: list[str] | None = None) -> None:
     trials = [Trial("right", n) for n in range(options.right)]
     trials += [Trial(kind, n) for n in range(options.wrong) for kind in KINDS[1:]]
     trials.sort(key=lambda trial: trial.number / (options.right if trial.kind == "right" else options.wrong))
+    for name in ("right", "wrong", "jobs"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name}: must be 1 or more")
     options.out.mkdir(parents=True, exist_ok=True)
     record = options.out / "outcomes.jsonl"
     lines = record.read_text(encoding="utf-8").splitlines() if record.exists() else []
-    outcomes = {(values["kind"], values["number"]): Outcome(**values) for values in map(json.loads, lines)}
+    try:
+        outcomes = {(values["kind"], values["number"]): Outcome(**values) for values in map(json.loads, lines)}
+    except (ValueError, TypeError, KeyError) as error:
+        parser.error(f"{record}: not an outcome ({error}); give another --out, or remove the line")
     missing = [trial for trial in trials if (trial.kind, trial.number) not in outcomes]
     context = multiprocessing.get_context("spawn")
     # New processes now and then: renderings stay in the memory of one.

@@ -69,6 +69,14 @@ def test_intervals():
     assert interval(3, 100) == "3 of 100, 3 % (1 to 8)"
 
 
+def test_what_is_not_understood_is_refused(tmp_path, capsys):
+    (tmp_path / "outcomes.jsonl").write_text('{"kind": "right"}\n')
+    for more in (["--jobs", "0"], ["--right", "0"], []):
+        with pytest.raises(SystemExit):
+            main(["--out", str(tmp_path), *more])
+    assert "not an outcome" in capsys.readouterr().err
+
+
 def test_the_command_goes_on_from_what_is_kept(tmp_path, capsys):
     kept = [outcome(kind, 0, kind != "right", "good" if kind == "right" else "doubtful") for kind in KINDS]
     (tmp_path / "outcomes.jsonl").write_text("".join(json.dumps(vars(one)) + "\n" for one in kept))

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from dvo.errors import DvoError
+from dvo.geometry.camera import Camera
 from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth import salts
 from dvo.synth.conditions import Conditions, draw_conditions, stage_clip
@@ -26,9 +27,11 @@ from dvo.synth.scenes.scene import Scene
 from dvo.synth.sensors.sensor import Sensor, expose, low_light, random_degradation, random_intrinsics, random_sensor
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.synth.specs import check_names, check_share
+from dvo.synth.surroundings import Style, draw_over, drawings
 from dvo.synth.textures.texture import texture_pool
 
 Array = np.ndarray
+MOST_COVERED = 0.8  # share of a frame that surroundings may cover
 LOW = 5  # planning renders depth this many times smaller
 
 
@@ -46,6 +49,8 @@ class ClipSpec:
         textures: folder of photographs to use as textures; those shipped with scikit-image if None.
         movers: probability of a clip with moving bodies, 1 to 8 of them.
         low_light: probability of a clip with 3 to 30 % of the usual light; without a sensor it has no effect.
+        surroundings: probability of a clip with one or two kinds of :data:`dvo.synth.surroundings.SURROUNDINGS`, which
+            count as moving; clips of which they would cover more than four fifths of a frame stay without.
 
     Raises:
         DvoError: sizes or flow range out of order, or a probability that is none.
@@ -61,13 +66,14 @@ class ClipSpec:
     textures: str | None = None
     movers: float = 0.0
     low_light: float = 0.0
+    surroundings: float = 0.0
 
     def __post_init__(self) -> None:
         if self.frames < 2 or self.height < 16 or self.width < 16:
             raise DvoError("a clip needs 2 frames or more of 16x16 pixels or more", field="frames, height, width")
         if not 0 < self.flow_range[0] <= self.flow_range[1]:
             raise DvoError(f"not a range: {self.flow_range}", field="flow_range", remedy="give low <= high, in pixels")
-        for name in ("movers", "low_light"):
+        for name in ("movers", "low_light", "surroundings"):
             check_share(name, getattr(self, name))
 
 
@@ -81,7 +87,7 @@ class Clip:
             is 1.
         poses_cw: ``(N, 7)`` float32 world to camera, in units of that depth; the first is the identity.
         intrinsics: ``(N, 4)`` float32 fx fy cx cy in pixels of the images.
-        moving: ``(N, H, W)`` bool, pixels that show a moving body; None if nothing moves.
+        moving: ``(N, H, W)`` bool, pixels that show a moving body or surroundings; None if nothing moves.
     """
 
     images: torch.Tensor
@@ -92,7 +98,7 @@ class Clip:
 
     @property
     def static_depth(self) -> torch.Tensor:
-        """Depth ``(N, H, W)``, nan at pixels that show a moving body."""
+        """Depth ``(N, H, W)``, nan at pixels that show a moving body or surroundings."""
         return self.depth if self.moving is None else self.depth.masked_fill(self.moving, torch.nan)
 
 
@@ -244,9 +250,11 @@ def make_clip(
     rng = np.random.default_rng([seed, salts.CLIP, index])
     plan, intrinsics = _draw_plan(scene, rng, spec, index)
     poses_wc = plan.path.poses_wc(plan.times)
-    conditions = draw_conditions(seed, index, spec.movers, spec.low_light)
+    conditions = draw_conditions(seed, index, spec.movers, spec.low_light, spec.surroundings)
     rendering, moving = _render(scene, plan, poses_wc, intrinsics, spec, conditions, device)
     images = rendering.images
+    if conditions.surroundings:
+        images, moving = _surround(rendering, moving, plan.times, poses_wc, intrinsics, conditions)
     if spec.sensor:
         camera = random_sensor(rng)
         flow: torch.Tensor | None = None
@@ -291,6 +299,27 @@ def _render(
         coordinates=False, times=times,
     )  # fmt: skip
     return rendering, rendering.surface >= stage.static if isinstance(stage, Stage) else None
+
+
+def _surround(
+    rendering: Rendering, moving: torch.Tensor | None, times: Array, poses_wc: Array, intrinsics: Array,
+    conditions: Conditions,
+) -> tuple[torch.Tensor, torch.Tensor | None]:  # fmt: skip
+    """Images with the surroundings over them, and the pixels without rigid truth; as they were where little is left."""
+    _, height, width = rendering.depth.shape
+    fx, fy, cx, cy = intrinsics.tolist()
+    camera = Camera(fx, fy, cx, cy, width, height)
+    drawn = drawings(conditions.surroundings, conditions.seed, poses_wc[:, :3].mean(0), Style(training=True))
+    seconds = (times - times[0]) * (conditions.step * (len(times) - 1) / (times[-1] - times[0]))
+    frames = [
+        draw_over(drawn, image, depth, pose, camera, float(time))
+        for image, depth, pose, time in zip(rendering.images, rendering.depth, poses_wc, seconds, strict=True)
+    ]
+    covered = np.stack([cover for _, cover in frames])
+    if covered.mean((1, 2)).max() > MOST_COVERED:
+        return rendering.images, moving
+    there = torch.from_numpy(covered).to(rendering.depth.device)
+    return torch.stack([image for image, _ in frames]), there if moving is None else there | moving
 
 
 def _draw_plan(scene: Scene, rng: np.random.Generator, spec: ClipSpec, index: int) -> tuple[_Plan, Array]:

@@ -1,8 +1,8 @@
-"""Hard conditions of training clips: moving bodies and low light, drawn from a random stream of their own."""
+"""Hard conditions of training clips: moving bodies, low light and surroundings, drawn from streams of their own."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,12 +11,14 @@ from dvo.synth.motion.movers import random_bodies
 from dvo.synth.protocols import Motion
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.scene import Scene
+from dvo.synth.surroundings import SURROUNDINGS
 
 Array = np.ndarray
 MOST_BODIES = 8
 LIGHT = (0.03, 0.3)  # share of the usual light that arrives in a clip with little of it
 PACE = (0.4, 2.0)  # motion of bodies against that of the camera, in pixels a frame
 BODY_SPEED = 0.4  # of a body of random_bodies: share of its distance to the camera that it moves in a second, about
+SURROUNDINGS_STEP = (0.015, 0.15)  # seconds between frames under the clock of the surroundings
 LONGEST_STEP = 0.6  # seconds of the bodies' clock; a quarter of the shortest period of their sway
 
 
@@ -26,15 +28,19 @@ class Conditions:
 
     Attributes:
         bodies: number of moving bodies, 0 for none.
-        seed: of their shapes and motions.
+        seed: of their shapes and motions, and of the surroundings.
         pace: their motion against that of the camera, in pixels a frame.
         light: share of the usual light that arrives, in (0, 1].
+        surroundings: names of what is drawn over the scene, joined by ``+``.
+        step: seconds between frames, in mean, under the clock of the surroundings.
     """
 
     bodies: int = 0
     seed: int = 0
     pace: float = 1.0
     light: float = 1.0
+    surroundings: str = ""
+    step: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,7 @@ class Clocked:
         return self.motion.poses_wc(self.start + self.rate * np.asarray(times, float))
 
 
-def draw_conditions(seed: int, index: int, movers: float, low_light: float) -> Conditions:
+def draw_conditions(seed: int, index: int, movers: float, low_light: float, surroundings: float = 0.0) -> Conditions:
     """Draw the conditions of a clip.
 
     Args:
@@ -71,6 +77,7 @@ def draw_conditions(seed: int, index: int, movers: float, low_light: float) -> C
         index: of the clip.
         movers: probability of moving bodies.
         low_light: probability of little light.
+        surroundings: probability of one or two kinds of them.
 
     Returns:
         The conditions; a clip that is chosen at some probability is chosen, with the same bodies and the same light,
@@ -83,7 +90,13 @@ def draw_conditions(seed: int, index: int, movers: float, low_light: float) -> C
     body_seed = int(rng.integers(2**31))
     pace = float(np.exp(rng.uniform(*np.log(PACE))))
     light = float(np.exp(rng.uniform(*np.log(LIGHT))))
-    return Conditions(bodies if with_bodies < movers else 0, body_seed, pace, light if dark < low_light else 1.0)
+    conditions = Conditions(bodies if with_bodies < movers else 0, body_seed, pace, light if dark < low_light else 1.0)
+    rng = np.random.default_rng([seed, salts.CLIP_SURROUNDINGS, index])
+    if rng.random() >= surroundings:
+        return conditions
+    names = rng.choice(list(SURROUNDINGS), int(rng.integers(1, 3)), replace=False)
+    step = float(np.exp(rng.uniform(*np.log(SURROUNDINGS_STEP))))
+    return replace(conditions, surroundings="+".join(sorted(names, key=list(SURROUNDINGS).index)), step=step)
 
 
 def stage_clip(

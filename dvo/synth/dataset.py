@@ -14,8 +14,8 @@ class ClipDataset(Dataset[dict[str, Tensor]]):
     """Data set of ``length`` clips of stream ``seed``; the same bytes for any number of workers.
 
     Items are ``images (N, 3, H, W)`` uint8, ``depth (N, H, W)``, ``poses_cw (N, 7)``, ``intrinsics (N, 4)``, see
-    :class:`dvo.synth.clip.Clip`; the depth is nan at pixels that show a moving body. Neighbouring indices share a scene
-    (``clips_per_scene``), so reading in order is faster than reading shuffled.
+    :class:`dvo.synth.clip.Clip`; the depth is nan at pixels that show a moving body or surroundings. Neighbouring
+    indices share a scene (``clips_per_scene``), so reading in order is faster than reading shuffled.
 
     Args:
         seed: of the stream.

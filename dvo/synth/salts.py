@@ -20,6 +20,7 @@ LONG_PATH = 7202  # long path of a sequence
 CLIP = 7301  # path, intrinsics, sensor
 CLIP_DEGRADATION = 7302  # compression and exposure changes
 CLIP_CONDITIONS = 7303  # moving bodies and low light
+CLIP_SURROUNDINGS = 7304  # what is drawn over the scene, and its clock
 # Sequences
 SEQUENCE = 7401  # scene, path, intrinsics, sensor
 NOISE = 7402  # noise of one frame

@@ -34,7 +34,7 @@ from dvo.synth.sensors.sensor import (
     random_sensor,
 )
 from dvo.synth.specs import CameraSpec, SequenceSpec, sequence_spec
-from dvo.synth.surroundings import Canvas, Drawing, drawings
+from dvo.synth.surroundings import Drawing, draw_over, drawings
 from dvo.synth.textures.texture import texture_pool
 from dvo.synth.truth import Flow, Tracks, dynamic_mask, optical_flow, tracks
 
@@ -138,14 +138,11 @@ class SyntheticSequence:
 
     def _covered(self, index: int, rendered: Rendering) -> tuple[torch.Tensor, np.ndarray]:
         """Image ``(1, 3, H, W)`` with the surroundings, and the pixels ``(H, W)`` that they cover."""
-        image = rendered.images[0].permute(1, 2, 0).cpu().double().numpy().copy()
-        depth = rendered.depth[0].cpu().double().numpy()
-        depth = np.where(depth > 0, depth, np.inf)
-        canvas = Canvas(image, depth, self.groundtruth.poses_wc[index], self.camera, self.time(index))
-        covered = np.zeros(depth.shape, bool)
-        for draw in self.surroundings:
-            covered |= draw(canvas)
-        return torch.from_numpy(image.clip(0, 1)).permute(2, 0, 1)[None].to(rendered.images), covered
+        pose = self.groundtruth.poses_wc[index]
+        image, covered = draw_over(
+            self.surroundings, rendered.images[0], rendered.depth[0], pose, self.camera, self.time(index)
+        )
+        return image[None], covered
 
     def __iter__(self) -> Iterator[Frame]:
         return (self.frame(index) for index in range(len(self)))

@@ -105,6 +105,7 @@ class Renderings(BatchStream):
         courses: former name of ``stages``.
         movers: probability that moving bodies are in a rendered clip; the depth is nan where they are seen.
         low_light: probability that a rendered clip has 3 to 30 % of the usual light.
+        surroundings: probability of water, leaves, people, rain, a bonnet..., see :class:`dvo.synth.clip.ClipSpec`.
 
     Raises:
         DvoError: ``stages`` under both names, sizes of no batch and no clip, a probability that is none, or no
@@ -126,6 +127,7 @@ class Renderings(BatchStream):
         courses: list[CurriculumStage] | None = None,
         movers: float = 0.0,
         low_light: float = 0.0,
+        surroundings: float = 0.0,
     ) -> None:
         super().__init__()
         if stages and courses:
@@ -135,6 +137,7 @@ class Renderings(BatchStream):
                 raise DvoError(f"{value} is too small", field=f"data.{name}", remedy=f"give {least} or more")
         check_share("data.movers", movers)
         check_share("data.low_light", low_light)
+        check_share("data.surroundings", surroundings)
         if real is not None:
             real.check()
         self.save_hyperparameters(
@@ -144,12 +147,13 @@ class Renderings(BatchStream):
         first = CurriculumStage(0, flow_low, flow_high, sizes or [(120, 160)])
         self.stages = [first, *(stages or courses or [])]
         self.real, self.textures = real, textures
-        self.movers, self.low_light = movers, low_light
+        self.movers, self.low_light, self.surroundings = movers, low_light, surroundings
 
     def clips(self, processes: int = 1) -> MixedClips:
         """The clips, in batches that span so many processes."""
         options = {
             "frames": self.frames, "textures": self.textures, "movers": self.movers, "low_light": self.low_light,
+            "surroundings": self.surroundings,
         }  # fmt: skip
         return MixedClips(self.seed, self.stages, self.batch_size * processes, self.real, **options)
 

@@ -25,11 +25,13 @@ from dvo.errors import DvoError
 from dvo.odometry.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
 from dvo.odometry.focal_length import FocalProfile, find_focal
 from dvo.odometry.load import load
-from dvo.odometry.protocol import Estimate, Odometry, Status
+from dvo.odometry.protocol import Estimate, Status
 from dvo.settings import check_settings
 
 if TYPE_CHECKING:
     import torch
+
+    from dvo.odometry.tracker import PatchOdometry
 
 _FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sides of the image, are not believed
 _RANGES = {
@@ -137,7 +139,7 @@ def calibrate(
     length = _length(frames)
     left = math.inf if length is None else length + options.spare
     for number in range(options.rounds):
-        odometry = load(weights, device=device, seed=seed, loops=False)
+        odometry = _loaded(weights, device, seed)
         clip = islice(_readable(frames if kept is None else copy(kept)), limit)
         ratio = first.camera.width / width
         seen, fed = _track(odometry, clip, focal * ratio, (aside[0] * ratio, aside[1] * ratio), wanted,
@@ -205,7 +207,7 @@ def _slope(walk: list[tuple[float, float]]) -> float:
 
 
 def _track(
-    odometry: Odometry,
+    odometry: PatchOdometry,
     frames: Iterable[Frame],
     focal: float,
     aside: tuple[float, float],
@@ -227,18 +229,24 @@ def _track(
         tracked, fed = tracked + (estimate.status is Status.TRACKING), fed + 1
         if tracked >= wanted or fed >= most:
             break
-    odometry.finish()
+    odometry.complete()
     return tracked, fed
 
 
-def _profile(odometry: Odometry) -> tuple[FocalProfile, int]:
-    """Profile of the longest segment, and its number of frames."""
+def _loaded(weights: str, device: torch.device | str, seed: int) -> PatchOdometry:
+    """Odometry of weights that keeps its measurements."""
     from dvo.odometry.tracker import PatchOdometry
 
+    odometry = load(weights, device=device, seed=seed, loops=False)
     if not isinstance(odometry, PatchOdometry):
         raise DvoError(
             f"the odometry {odometry.name} keeps no measurements", field="weights", remedy="use weights of patch_vo"
         )
+    return odometry
+
+
+def _profile(odometry: PatchOdometry) -> tuple[FocalProfile, int]:
+    """Profile of the longest segment, and its number of frames."""
     graph, state = odometry.graph, odometry.state
     segments = state.adjustable or [0]
     longest = max(segments, key=lambda segment: len(graph.members(segment)))

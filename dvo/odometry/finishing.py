@@ -66,7 +66,8 @@ def judge_result(
     )
     if not (own and leaves_doubt(quality)):
         return quality
-    profile = find_focal(graph, max(own, key=lambda segment: len(graph.members(segment))), shutter, config.adjustment)
+    longest = max(own, key=lambda segment: len(graph.members(segment)))
+    profile = find_focal(graph, longest, shutter, config.adjustment, principal_point=False)
     step, sure = profile.minimum.value, profile.contrast >= SURE_CONTRAST
     if not (sure and abs(step) > WRONG_FOCAL):
         return quality

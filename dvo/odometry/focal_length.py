@@ -62,14 +62,17 @@ def find_focal(
     segment: int,
     shutter: Shutter,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
+    *,
+    principal_point: bool = True,
 ) -> FocalProfile:
-    """Estimate the focal length, one factor of fx and fy, and the principal point.
+    """Estimate the focal length, one factor of fx and fy, and if wanted the principal point.
 
     Args:
         graph: the segment is archived and adjusted; it is not changed.
         segment: its number.
         shutter: timing of the rows; a rolling shutter that is not corrected is taken for another focal length.
         options: of the adjustment; its last kernel counts.
+        principal_point: False leaves it where it is.
 
     Returns:
         The profile; an infinite deviation if the cost still falls at the end of the range, or for fewer than
@@ -92,13 +95,17 @@ def find_focal(
     sides = [solve(fine.value + side * float(np.log(1.2))) for side in (-1, 1)]
     contrast = min(sides) / here - 1 if here > 0 else 0.0
 
+    found = FocalProfile(replace(fine, gain=coarse.gain), contrast)
+    if not principal_point:
+        return found
+
     def aside(cost: Callable[[float], float]) -> Minimum:
         return profile_minimum(cost, 0.0, _ASIDE_STEP, -ASIDE, ASIDE, freedom)
 
     right = aside(lambda x: solve(fine.value, x))
     at = right.value if np.isfinite(right.deviation) else 0.0
     down = aside(lambda y: solve(fine.value, at, y))
-    return FocalProfile(replace(fine, gain=coarse.gain), contrast, (right, down))
+    return replace(found, aside=(right, down))
 
 
 class _Solver:

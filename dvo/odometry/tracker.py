@@ -185,16 +185,27 @@ class PatchOdometry:
             Trajectories ``T_wc`` of all segments and the sparse map of the longest, each in the world of its first
             keyframe, up to scale. Of a map without a frame of a new recording, the result of the map.
         """
-        config, state = self.config, self.state
+        state = self.state
+        if self.complete():
+            state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
+        return replace(self._result({}), quality=state.quality)
+
+    @torch.inference_mode()
+    def complete(self) -> bool:
+        """Archive and adjust everything, for those who want the graph alone: no result, no verdict.
+
+        Returns:
+            False if it was done before, or for a map without a frame of a new recording.
+        """
+        state = self.state
         begun, state.finished = not state.finished and state.map is None, True
         if begun:
-            if len(state.waiting) >= config.initial_frames:
+            if len(state.waiting) >= self.config.initial_frames:
                 self._begin_segment()
             self._close_segment()
             self.loops.complete(state.adjustable)
-            state.info |= finish_segments(self.graph, state, config, self.loops)
-            state.quality = judge_result(self.graph, self._result({}), state, config, self.model.config.STRIDE)
-        return replace(self._result({}), quality=state.quality)
+            state.info |= finish_segments(self.graph, state, self.config, self.loops)
+        return begun
 
     @torch.inference_mode()
     def current(self) -> Result:

@@ -73,3 +73,28 @@ def test_a_mask_ends_when_what_was_fixed_moves(texture):
     for image in moving(texture, 60, 3.0):
         fixed.see(image)
     assert fixed.mask is None or fixed.mask[95:].mean() > 0.9
+
+
+def test_edges_along_which_the_picture_moves_are_not_fixed(texture):
+    """Lane markings of a straight drive: they look the same in every frame."""
+    lane = np.zeros((120, 160, 3), np.uint8)
+    lane[100:106] = 255
+    lane[94:100] = 40
+    mask = seen(moving(texture, 30, 3.0, lane)).mask
+    assert mask is None or mask[92:108].mean() > 0.97
+
+
+def test_what_lies_straight_ahead_is_not_fixed(texture):
+    """The picture grows from its middle, where nothing moves."""
+    base = texture[40:160, 100:260]
+
+    def grown(scale):
+        matrix = cv2.getRotationMatrix2D((79.5, 59.5), 0, scale)
+        return cv2.warpAffine(base, matrix, (160, 120), borderMode=cv2.BORDER_REFLECT)
+
+    frames = [grown(1.03**k) for k in range(30)]
+    mask = seen(frames).mask
+    assert mask is None or mask.mean() > 0.98
+    overlay = bonnet(texture)
+    mask = seen([np.where(overlay > 0, overlay, image) for image in frames]).mask
+    assert mask is not None and (~mask[95:]).mean() > 0.4 and mask[:85].mean() > 0.97

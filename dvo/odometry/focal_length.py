@@ -31,6 +31,9 @@ FARTHEST = 1.2
 ASIDE = 0.08
 """Largest distance of a principal point that is tried from that of the graph, focal lengths."""
 
+FLAT = 0.005
+"""Contrast of the coarse minimum below which no finer one is looked for."""
+
 _STEPS = 0.08, 0.02  # distance of the values that are tried, in logarithms: coarse, then fine
 _ASIDE_STEP = 0.01  # distance of the principal points that are tried, focal lengths
 _ITERATIONS = 6
@@ -75,8 +78,8 @@ def find_focal(
         principal_point: False leaves it where it is.
 
     Returns:
-        The profile; an infinite deviation if the cost still falls at the end of the range, or for fewer than
-        :data:`FEWEST` frames.
+        The profile; that of the coarse steps alone where it is flat (:data:`FLAT`). An infinite deviation if the cost
+        still falls at the end of the range, or for fewer than :data:`FEWEST` frames.
     """
     frames = graph.members(segment)
     if len(frames) < FEWEST:
@@ -90,12 +93,16 @@ def find_focal(
     coarse = profile_minimum(solve, 0.0, _STEPS[0], -FARTHEST, FARTHEST, freedom)
     if not np.isfinite(coarse.deviation):
         return FocalProfile(coarse, 0.0)
-    fine = profile_minimum(solve, coarse.value, _STEPS[1], -FARTHEST, FARTHEST, freedom)
-    here = solve(fine.value)
-    sides = [solve(fine.value + side * float(np.log(1.2))) for side in (-1, 1)]
-    contrast = min(sides) / here - 1 if here > 0 else 0.0
 
-    found = FocalProfile(replace(fine, gain=coarse.gain), contrast)
+    def contrast_at(value: float) -> float:
+        sides = [solve(value + side * float(np.log(1.2))) for side in (-1, 1)]
+        return min(sides) / here - 1 if (here := solve(value)) > 0 else 0.0
+
+    flat = contrast_at(coarse.value)
+    if flat < FLAT:
+        return FocalProfile(coarse, flat)
+    fine = profile_minimum(solve, coarse.value, _STEPS[1], -FARTHEST, FARTHEST, freedom)
+    found = FocalProfile(replace(fine, gain=coarse.gain), contrast_at(fine.value))
     if not principal_point:
         return found
 

@@ -117,7 +117,7 @@ def test_bad_options() -> None:
 
 
 def test_bad_probabilities() -> None:
-    for name in ("movers", "low_light"):
+    for name in ("movers", "low_light", "surroundings"):
         for value in (-0.1, 1.1, float("nan")):
             with pytest.raises(DvoError, match=f"{name}: not a share"):
                 make_clip(SEED, 0, **{name: value})
@@ -161,6 +161,34 @@ def test_bodies_move_and_are_the_same_for_the_same_seed() -> None:
     assert digest(parts(clip)) == digest(parts(again))
     assert clip.moving is not None and again.moving is not None and torch.equal(clip.moving, again.moving)
     assert not torch.equal(clip.moving[0], clip.moving[-1])
+
+
+def test_depth_is_nan_where_surroundings_are_seen() -> None:
+    """Nothing else changes, and clips that are not chosen keep their bytes."""
+    options = {"sensor": False, **SMALL}
+    chosen = [draw_conditions(SEED, i, 0.0, 0.0, 0.8).surroundings for i in range(8)]
+    shown = 0
+    for index in range(8):
+        clip, again, bare = (make_clip(SEED, index, surroundings=share, **options) for share in (0.8, 0.8, 0.0))
+        assert digest(parts(clip)) == digest(parts(again))
+        if clip.moving is None:
+            assert digest(parts(clip)) == digest(parts(bare))
+            continue
+        moving, shown = clip.moving, shown + 1
+        assert chosen[index]
+        change = (clip.images.int() - bare.images.int()).abs().sum(1)
+        assert (change[moving] > 0).float().mean() > 0.5 and not (change[~moving] > 0).any()
+        assert torch.equal(torch.isnan(clip.static_depth), moving)
+        assert float(clip.static_depth.nanmedian()) == pytest.approx(1, rel=1e-5)
+        factors = clip.depth / bare.depth
+        torch.testing.assert_close(factors, factors.flatten()[0].expand_as(factors), rtol=1e-4, atol=0)
+    assert 0 < shown < 8
+
+
+def test_what_would_cover_everything_is_left_out() -> None:
+    for index in range(30):
+        clip = make_clip(SEED, index, surroundings=1.0, **SMALL)
+        assert clip.moving is None or float(clip.moving.float().mean((1, 2)).max()) <= 0.8
 
 
 def test_low_light_is_noise_in_the_pictures_alone() -> None:

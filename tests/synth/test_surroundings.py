@@ -6,7 +6,7 @@ import pytest
 from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth.sequence import make_sequence
-from dvo.synth.surroundings import SURROUNDINGS, Canvas, drawings
+from dvo.synth.surroundings import SURROUNDINGS, Canvas, Style, drawings
 
 SIZE = {"frames": 4, "height": 60, "width": 80, "fps": 15.0, "sensor": False, "family": "street", "kind": "forward"}
 CENTRE = np.array([0.0, 0.0, 2.0])
@@ -38,12 +38,14 @@ def test_what_it_covers_is_marked_and_nothing_else_changes(name):
 
 @pytest.mark.parametrize("name", SURROUNDINGS)
 def test_it_moves_before_a_camera_that_stands_still(name):
-    """All but a bonnet, whose reflections alone do."""
-    (draw,) = drawings(name, 0, CENTRE)
-    one, other = level(time=0.0), level(time=2.0)
-    draw(one), draw(other)
-    moved = (np.abs(one.image - other.image) > 0.02).mean()
-    assert moved > 0.02
+    """All but a bonnet, whose reflections alone do, and a border, of which a propeller does."""
+    moved = []
+    for seed, later in [(seed, later) for seed in range(6 if name == "border" else 1) for later in (0.8, 2.0)]:
+        (draw,) = drawings(name, seed, CENTRE)
+        one, other = level(time=0.0), level(time=later)
+        draw(one), draw(other)
+        moved.append((np.abs(one.image - other.image) > 0.02).mean())
+    assert max(moved) > 0.02
     if name == "bonnet":
         assert np.array_equal(draw(level(time=0.0)), draw(level(time=2.0)))
 
@@ -62,7 +64,16 @@ def test_several_are_drawn_in_order():
     assert drawings("", 0, CENTRE) == ()
 
 
-@pytest.mark.parametrize("names", ["snow", "water+", "water, sky", "Water", None, 3])
+@pytest.mark.parametrize("names", ["hail", "water+", "water, sky", "Water", None, 3])
 def test_names_that_are_not_known_are_refused(names):
     with pytest.raises(DvoError, match="surroundings"):
         sequence(names)
+
+
+@pytest.mark.parametrize("name", SURROUNDINGS)
+def test_training_clips_show_other_pictures_than_sequences(name):
+    """No suite shows a texture or an outline that a network was trained on."""
+    (one,), (other,) = (drawings(name, 0, CENTRE, style) for style in (Style(), Style(training=True)))
+    shown, trained = level(), level()
+    one(shown), other(trained)
+    assert name == "snow" or not np.allclose(shown.image, trained.image, atol=0.02)

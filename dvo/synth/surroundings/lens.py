@@ -133,7 +133,7 @@ def glass(rng: np.random.Generator, _: Array, style: Style) -> Drawing:
     """Window before the camera: in a part of it the reflection of a room that stays with the camera."""
     texture = np.stack([style.texture(rng, 256, (4, 8, 32)) for _ in range(3)], -1)
     strength, low, high = rng.uniform(0.3, 0.6), rng.uniform(0.0, 0.4), rng.uniform(0.6, 1.0)
-    slope, sway, rate = rng.uniform(-0.4, 0.4), rng.uniform(0.0, 0.03), rng.uniform(1, 3)
+    slope, sway, rate = rng.uniform(-0.4, 0.4), rng.uniform(0.02, 0.05), rng.uniform(1, 3)
 
     def draw(canvas: Canvas) -> Array:
         height, width = canvas.depth.shape

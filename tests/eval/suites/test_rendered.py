@@ -95,7 +95,7 @@ def test_suites_of_ordinary_footage_stand_apart() -> None:
     seeds = {one["seed"] for one in found}
     assert len(seeds) == len(found) == 2 * 8 * 6 and not seeds & others
     assert all(one["apart"] and one["family"] in HELD_OUT for one in found)
-    assert {name for one in found for name in one.get("surroundings", "").split("+")} == {"", *SURROUNDINGS}
+    assert {name for one in found for name in one.get("surroundings", "").split("+")} <= {"", *SURROUNDINGS}
 
 
 def test_names_on_the_command_line() -> None:

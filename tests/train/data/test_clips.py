@@ -33,7 +33,14 @@ def test_moving_bodies_and_low_light_are_in_the_clips_of_all_stages():
     assert torch.isfinite(usual["depth"]).all() and not torch.equal(usual["images"], hard[0]["images"])
 
 
-@pytest.mark.parametrize("name", ["movers", "low_light"])
+def test_surroundings_are_in_the_clips():
+    options = {"seed": 5, "frames": 2, "sizes": [(48, 64)], "flow_low": 1.0, "flow_high": 4.0}
+    some, none = Renderings(surroundings=1.0, **options).clips(), Renderings(**options).clips()
+    found = [bool(torch.isnan(some[index]["depth"]).any()) for index in range(4)]
+    assert any(found) and all(torch.isfinite(none[index]["depth"]).all() for index in range(4))
+
+
+@pytest.mark.parametrize("name", ["movers", "low_light", "surroundings"])
 def test_a_probability_is_from_0_to_1(name):
     for value in (-0.1, 1.5, float("nan")):
         with pytest.raises(DvoError, match=f"data.{name}: not a share"):

@@ -74,7 +74,7 @@ class CheckPairs:
         if self._first is not None:
             first, before = self._first
             points = followed(before, grey, mask)
-            moved = float(np.median(np.linalg.norm(points[:, 2:] - points[:, :2], axis=1))) if len(points) else 0.0
+            moved = median_displacement(points)
             if len(points) >= FEWEST and moved < MOVED[0] and number < first + GAPS[1]:
                 self._next = number + self._gap
                 return
@@ -107,6 +107,18 @@ def followed(first: np.ndarray, second: np.ndarray, mask: np.ndarray | None = No
     near = np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < RETURN
     kept = near & (found.ravel() > 0) & (returned.ravel() > 0)
     return np.concatenate([corners.reshape(-1, 2), there.reshape(-1, 2)], axis=1)[kept]
+
+
+def median_displacement(points: np.ndarray) -> float:
+    """Median displacement of corners, pixels.
+
+    Args:
+        points: ``(N, 4)`` x, y in the first and in the second image.
+
+    Returns:
+        0 without corners.
+    """
+    return float(np.median(np.linalg.norm(points[:, 2:] - points[:, :2], axis=1))) if len(points) else 0.0
 
 
 def epipolar_distances(pair: CheckPair, first_cw: np.ndarray, second_cw: np.ndarray) -> np.ndarray:

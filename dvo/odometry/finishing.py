@@ -12,7 +12,7 @@ from dvo.odometry.focal_length import find_focal
 from dvo.odometry.loop_closure import LoopCloser
 from dvo.odometry.metric_scale import settle_scale
 from dvo.odometry.protocol import Result
-from dvo.odometry.quality import CALIBRATE, WRONG_FOCAL, Quality, leaves_doubt
+from dvo.odometry.quality import CALIBRATE, CHECK_FOCAL, WRONG_FOCAL, Quality, leaves_doubt
 from dvo.odometry.quality_measures import measure_quality
 from dvo.odometry.self_calibration import adjust_segments
 from dvo.odometry.tracker_state import TrackerState
@@ -64,7 +64,7 @@ def judge_result(
     quality = measure_quality(
         graph, result, own, state.checks, stride=stride, shutter=shutter, first=state.started, fixed=state.hidden
     )
-    if not (own and leaves_doubt(quality)):
+    if not (own and leaves_doubt(quality, CHECK_FOCAL)):
         return quality
     longest = max(own, key=lambda segment: len(graph.members(segment)))
     profile = find_focal(graph, longest, shutter, config.adjustment, principal_point=False)

@@ -14,14 +14,15 @@ from typing import Literal
 
 Verdict = Literal["good", "doubtful", "failed"]
 
-LEAST_CHECK = 0.75
-"""Share of followed corners that agree with the poses below which a result is doubtful by that alone."""
-LEAST_AGREEMENT = 0.9375
-"""The same of the confident measurements that agree with each other. What the two lack adds up (:func:`lacks`)."""
+MOST_DEVIATION = 0.075
+"""Median distance of followed corners from the epipolar lines of the poses, over their displacement, above which a
+result is doubtful by that alone. Half of the corners may follow something that moves."""
+LEAST_AGREEMENT = 0.835
+"""Share of the confident measurements that agree with each other below which it is. The two add up (:func:`lacks`)."""
 LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
-UNSURE = 0.5
-"""Lack of agreement, of what makes a result doubtful, above which it is looked at more closely."""
+CHECK_FOCAL, RUN_AGAIN = 0.2, 0.45
+"""Lack of agreement, of what makes a result doubtful, above which it is asked for its focal length, and run again."""
 MOST_FIXED = 0.2
 """Share of the image that is fixed to the camera: it takes part until it is found, so that the beginning suffers."""
 WRONG_FOCAL = 0.12
@@ -51,7 +52,9 @@ class Quality:
         spread: share of twelve fields of the image with such measurements, median over the keyframes.
         agreement: share of the confident measurements that agree with the poses; NaN without one.
         residual: median distance of confident measurements from the reprojection, pixels of the working image.
-        check: share of the followed corners within a pixel of the epipolar lines of the poses; NaN without pairs.
+        deviation: median distance of the followed corners from the epipolar lines of the poses, over the median
+            displacement of the corners of their pair; NaN without pairs.
+        check: share of these corners within a pixel of the lines; NaN without pairs.
         checks: number of pairs of images with followed corners.
         jumps: number of frames between which the camera moved far more than before and after.
         fixed: share of the image that is fixed to the camera, is in no mask that was given, and was left out.
@@ -73,6 +76,7 @@ class Quality:
     spread: float = 0.0
     agreement: float = float("nan")
     residual: float = float("nan")
+    deviation: float = float("nan")
     check: float = float("nan")
     checks: int = 0
     jumps: int = 0
@@ -90,22 +94,23 @@ def lacks(quality: Quality) -> tuple[float, float]:
         quality: of a result.
 
     Returns:
-        Shares that do not agree, over those of :data:`LEAST_CHECK` and :data:`LEAST_AGREEMENT`; NaN for what is not
-        known.
+        Deviation over :data:`MOST_DEVIATION`, and the share of measurements that do not agree over that of
+        :data:`LEAST_AGREEMENT`; NaN for what is not known.
     """
-    return (1 - quality.check) / (1 - LEAST_CHECK), (1 - quality.agreement) / (1 - LEAST_AGREEMENT)
+    return quality.deviation / MOST_DEVIATION, (1 - quality.agreement) / (1 - LEAST_AGREEMENT)
 
 
-def leaves_doubt(quality: Quality | None) -> bool:
+def leaves_doubt(quality: Quality | None, above: float = RUN_AGAIN) -> bool:
     """Tell if a result is worth a closer look.
 
     Args:
         quality: of the result; None if it is not known.
+        above: lack of agreement.
 
     Returns:
         True for a good result that is not far from a doubtful one.
     """
-    return quality is not None and quality.verdict == "good" and sum(lacks(quality)) > UNSURE
+    return quality is not None and quality.verdict == "good" and sum(lacks(quality)) > above
 
 
 def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str, str]:

@@ -12,7 +12,7 @@ from dvo.geometry.projection import reproject
 from dvo.graph.keyframe_graph import KeyframeGraph
 from dvo.graph.problem import graph_problem
 from dvo.graph.recordings import increasing_times
-from dvo.odometry.check_pairs import CheckPairs, epipolar_distances
+from dvo.odometry.check_pairs import CheckPairs, epipolar_distances, median_displacement
 from dvo.odometry.evidence import AGREEMENT, CONFIDENT
 from dvo.odometry.protocol import Result
 from dvo.odometry.quality import Quality, judge
@@ -67,10 +67,12 @@ def measure_quality(
         quality = replace(
             quality, inliers=float(total[2] / total[0]), agreement=agreement, residual=residual, spread=longest[2]
         )
-    distances = _distances(graph, checks)
-    if distances:
-        agreed = float((np.concatenate(distances) < NEAR_LINE).mean())
-        quality = replace(quality, checks=len(distances), check=agreed)
+    pairs = _distances(graph, checks)
+    if pairs:
+        distances = np.concatenate([away for away, _ in pairs])
+        deviation = float(np.median(np.concatenate([away / moved for away, moved in pairs])))
+        agreed = float((distances < NEAR_LINE).mean())
+        quality = replace(quality, checks=len(pairs), deviation=deviation, check=agreed)
     verdict, reason, remedy = judge(quality, result.frames_read, cause)
     return replace(quality, verdict=verdict, reason=reason, remedy=remedy)
 
@@ -99,15 +101,15 @@ def _inliers(graph: KeyframeGraph, segment: int, shutter: Shutter) -> tuple[np.n
     return counts, residual[confident].numpy(), float(spread)
 
 
-def _distances(graph: KeyframeGraph, checks: CheckPairs) -> list[np.ndarray]:
-    """Distances of the corners of each pair whose frames have poses in one world, pixels."""
+def _distances(graph: KeyframeGraph, checks: CheckPairs) -> list[tuple[np.ndarray, float]]:
+    """Distances of the corners of each pair whose frames have poses in one world, and their displacement, pixels."""
     log, found = graph.log, []
     for pair in checks.pairs:
         frames = [log.frames[number] for number in (pair.first, pair.second)]
         poses = [log.pose(number) for number in (pair.first, pair.second)]
         same = graph.world_of(frames[0].segment) == graph.world_of(frames[1].segment)
         if not any(frame.lost for frame in frames) and same and poses[0] is not None and poses[1] is not None:
-            found.append(epipolar_distances(pair, poses[0], poses[1]))
+            found.append((epipolar_distances(pair, poses[0], poses[1]), median_displacement(pair.points)))
     return found
 
 

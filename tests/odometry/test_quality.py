@@ -8,12 +8,14 @@ import pytest
 import dvo
 from dvo.data.trajectory import Trajectory
 from dvo.odometry.protocol import Result, SparseMap
-from dvo.odometry.quality import LEAST_AGREEMENT, LEAST_CHECK, Quality, judge
+from dvo.odometry.quality import LEAST_AGREEMENT, MOST_DEVIATION, Quality, judge
 from dvo.odometry.quality_measures import count_jumps
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.verdict.failures import before_still_camera, with_crowd, with_overlay, with_waves
 
-GOOD = Quality("good", tracked=1.0, inliers=0.6, spread=1.0, agreement=0.999, residual=0.1, check=0.98, checks=9)
+GOOD = Quality(
+    "good", tracked=1.0, inliers=0.6, spread=1.0, agreement=0.999, residual=0.1, deviation=0.01, check=0.98, checks=9
+)
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +78,11 @@ def test_standing_still_after_the_start_is_good(film):
     ("changed", "verdict", "words"),
     [
         ({}, "good", ""),
-        ({"check": LEAST_CHECK - 0.01}, "doubtful", "do not agree with the poses"),
-        ({"check": 0.85, "agreement": 0.973}, "doubtful", "(85% of them do)"),
-        ({"check": 0.9, "agreement": 0.955}, "doubtful", "contradict each other"),
-        ({"check": 0.9, "agreement": 0.98}, "good", ""),
-        ({"check": float("nan"), "checks": 0}, "doubtful", "too little of the picture moves"),
+        ({"deviation": MOST_DEVIATION + 0.01}, "doubtful", "do not agree with the poses"),
+        ({"deviation": 0.06, "check": 0.6, "agreement": 0.95}, "doubtful", "(60% of them do)"),
+        ({"deviation": 0.03, "agreement": 0.89}, "doubtful", "contradict each other"),
+        ({"deviation": 0.03, "check": 0.6, "agreement": 0.92}, "good", ""),
+        ({"deviation": float("nan"), "checks": 0}, "doubtful", "too little of the picture moves"),
         ({"agreement": LEAST_AGREEMENT - 0.01}, "doubtful", "contradict each other"),
         ({"agreement": float("nan")}, "doubtful", "there are none"),
         ({"fixed": 0.3}, "doubtful", "30% of the picture"),

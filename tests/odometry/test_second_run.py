@@ -15,8 +15,8 @@ from dvo.odometry.quality import Quality, leaves_doubt
 from dvo.odometry.second_run import can_be_read_again, compare_again
 from tests.support.tiny_tracker import frames
 
-SURE = Quality("good", tracked=1.0, agreement=1.0, check=1.0, checks=9)
-UNSURE = replace(SURE, check=0.85)
+SURE = Quality("good", tracked=1.0, agreement=1.0, deviation=0.0, check=1.0, checks=9)
+UNSURE = replace(SURE, deviation=0.05)
 
 
 class Walk:
@@ -46,7 +46,7 @@ def ran(again, first=UNSURE, source=None, **options):
 
 def test_it_is_made_where_a_good_result_leaves_doubt():
     assert leaves_doubt(UNSURE) and not leaves_doubt(SURE) and not leaves_doubt(None)
-    assert not leaves_doubt(replace(UNSURE, verdict="doubtful", check=0.1))
+    assert not leaves_doubt(replace(UNSURE, verdict="doubtful", deviation=0.5))
     never = lambda: pytest.fail("a second run of a sure result")  # noqa: E731
     assert "checking" not in ran(never, first=SURE).seconds
     ran(never, source=iter(frames(30)))

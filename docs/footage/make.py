@@ -32,6 +32,15 @@ CLIPS: dict[str, dict[str, object]] = {
     "exposure": {"lighting": 4.0},
     "shutter": {"rolling_shutter": 1.0, "shake": 4.0, "speed": 1.5},
     "blackout": {"blackout": 1.0},
+    "water": {"family": "street", "kind": "forward", "surroundings": "sky+water"},
+    "leaves": {"surroundings": "foliage"},
+    "people": {"surroundings": "crowd"},
+    "traffic": {"family": "street", "kind": "forward", "surroundings": "traffic"},
+    "bonnet": {"family": "street", "kind": "forward", "speed": 2.0, "surroundings": "bonnet"},
+    "rain": {"family": "street", "kind": "forward", "surroundings": "rain"},
+    "snow": {"family": "street", "kind": "forward", "surroundings": "snow"},
+    "border": {"surroundings": "border"},
+    "glass": {"surroundings": "glass"},
 }
 """Rendering options of each clip that differ from :data:`COMMON`; see :func:`dvo.synth.sequence_spec`."""
 SHOWN = (20, 32)  # frames of a picture
@@ -80,7 +89,8 @@ def measure(name: str, frames: list[dvo.Frame], truth: dvo.Trajectory) -> str:
     posed = result.frames_read - result.frames_lost
     errors = evaluate(result.trajectory, truth) if len(result.trajectory) > 2 else None
     ate, turn = (errors.ate_percent, errors.rpe_rot_deg) if errors else (float("nan"), float("nan"))
-    return f"| {name} | {posed} of {result.frames_read} | {len(result.segments)} | {ate:.2f} | {turn:.3f} |"
+    count = f"{posed} of {result.frames_read} | {len(result.segments)}"
+    return f"| {name} | {count} | {ate:.2f} | {turn:.3f} | {result.quality} |"
 
 
 def main() -> None:
@@ -89,7 +99,7 @@ def main() -> None:
     parser.add_argument("--pictures", action="store_true", help="render the pictures alone, track nothing")
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the pictures")
     arguments = parser.parse_args()
-    print("| clip | frames with a pose | segments | ATE % | RPE ° |\n|---|--:|--:|--:|--:|")
+    print("| clip | frames with a pose | segments | ATE % | RPE ° | verdict |\n|---|--:|--:|--:|--:|---|")
     for name in [arguments.only] if arguments.only else CLIPS:
         clip = sequence(name)
         frames = list(islice(clip, SHOWN[-1] + 1 if arguments.pictures else None))

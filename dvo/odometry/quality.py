@@ -21,7 +21,7 @@ LEAST_AGREEMENT = 0.835
 """Share of the confident measurements that agree with each other below which it is. The two add up (:func:`lacks`)."""
 LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
-CHECK_FOCAL, RUN_AGAIN = 0.2, 0.45
+CHECK_FOCAL, RUN_AGAIN = 0.2, 0.25
 """Lack of agreement, of what makes a result doubtful, above which it is asked for its focal length, and run again."""
 MOST_FIXED = 0.2
 """Share of the image that is fixed to the camera: it takes part until it is found, so that the beginning suffers."""

@@ -58,7 +58,7 @@ class Quality:
         checks: number of pairs of images with followed corners.
         jumps: number of frames between which the camera moved far more than before and after.
         fixed: share of the image that is fixed to the camera, is in no mask that was given, and was left out.
-        second: difference of a second run with another seed, percent of the path; NaN if there was none.
+        second: difference of a second run, backward with another seed, percent of the path; NaN if there was none.
 
     Example:
         >>> result = dvo.run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt")).result

@@ -1,16 +1,17 @@
-"""Second run over the beginning of a sequence, with another seed, where the first one leaves doubt.
+"""Second run over the beginning of a sequence, backward and with another seed, where the first one leaves doubt.
 
 Measurements may fit a wrong motion nearly as well as the right one: of a flat scene, say, or a picture of which little
-moves. Which of them a run finds is then a matter of chance, so that two runs differ. Runs that agree prove nothing:
-what is fixed to the camera holds them all.
+moves. Which of them a run finds is then a matter of chance and of where it begins, so that two runs differ. Runs that
+agree prove nothing: what is fixed to the camera holds them all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 
+import cv2
 import numpy as np
 import torch
 
@@ -26,6 +27,8 @@ FRAMES = 150
 """Frames that are tracked again."""
 FEWEST = 10
 """Common frames with poses that a comparison needs."""
+PIXELS = 640 * 480
+"""Size of the images that are kept for it, at most."""
 DIFFERENT = 3.0
 """Largest RMS difference of the two after a similarity, percent of the path."""
 
@@ -39,26 +42,52 @@ def can_be_read_again(source: object) -> bool:
     return not isinstance(source, Iterator) and not hasattr(source, "stop")
 
 
-def compare_again(result: Result, odometry: Odometry, frames: Iterable[Frame], stride: int = 1) -> Quality:
-    """Track the beginning of a sequence again, and compare.
+def compare_again(
+    result: Result,
+    odometry: Odometry,
+    frames: Iterable[Frame],
+    stride: int = 1,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Quality:
+    """Track the beginning of a sequence again, from its end to its start, and compare.
 
     Args:
         result: of the first run, with its quality.
         odometry: newly built, with another seed.
         frames: of the sequence, from the first on.
         stride: distance of tracked frames.
+        should_stop: called before each frame; True ends the second run, and what it has is compared.
 
     Returns:
         The quality with the difference; a doubtful one if it is large.
     """
     assert result.quality is not None
-    for frame in islice(frames, 0, FRAMES * stride, stride):
-        odometry.track(checked_frame(frame))
-    difference = _difference(odometry.finish().trajectory, result.trajectory)
+    kept = [_reduced(checked_frame(frame)) for frame in islice(frames, 0, FRAMES * stride, stride)]
+    ends = kept[0].timestamp + kept[-1].timestamp if kept else 0.0
+    times = {ends - frame.timestamp: frame.timestamp for frame in kept}
+    for time, frame in zip(reversed(times), reversed(kept), strict=True):
+        if should_stop():
+            break
+        # Backward the rows are read from the last one on, which no camera states: without a readout time.
+        odometry.track(replace(frame, timestamp=time, camera=replace(frame.camera, readout=0.0)))
+    found = odometry.finish().trajectory
+    forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])
+    difference = _difference(forward, result.trajectory)
     if not difference > DIFFERENT:  # NaN: nothing is known
         return replace(result.quality, second=difference)
-    reason = f"a second run with another seed differs by {difference:.0f}% of the path"
+    reason = f"a second run, backward with another seed, differs by {difference:.0f}% of the path"
     return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
+
+
+def _reduced(frame: Frame) -> Frame:
+    """Frame whose large image is reduced, since many are kept."""
+    factor = np.sqrt(PIXELS / (frame.camera.width * frame.camera.height))
+    if factor >= 1 or frame.depth is not None or frame.right is not None:
+        return frame
+    width, height = round(frame.camera.width * factor), round(frame.camera.height * factor)
+    image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
+    mask = None if frame.mask is None else cv2.resize(frame.mask.astype(np.uint8), (width, height)) > 0
+    return replace(frame, image=image, camera=frame.camera.resized(width, height), mask=mask)
 
 
 def _difference(one: Trajectory, other: Trajectory) -> float:

@@ -76,7 +76,7 @@ def run(
             KeyboardInterrupt ends tracking too.
         strict: raise errors and interruptions instead.
         again: builds the odometry with another seed. Where the result leaves doubt, and the source can be read again,
-            its beginning is tracked a second time and compared (:mod:`dvo.odometry.second_run`).
+            its beginning is tracked a second time, backward, and compared (:mod:`dvo.odometry.second_run`).
 
     Returns:
         The result with its timings. Poses are ``T_wc``.
@@ -126,7 +126,7 @@ def run(
         stop = should_stop or (lambda: False)
         with contextlib.suppress(DvoError, OSError, KeyboardInterrupt):  # the result stands without it
             beginning = itertools.takewhile(lambda _: not stop(), source)
-            result = replace(result, quality=compare_again(result, again(), beginning, stride))
+            result = replace(result, quality=compare_again(result, again(), beginning, stride, stop))
         feeding.seconds["checking"] = time.perf_counter() - started
     return Run(
         result=over_source(result, np.array(feeding.fed), np.array(feeding.skipped), feeding.reasons),

@@ -1,4 +1,4 @@
-"""Second run with another seed: when it is made, what it says, and that it costs nothing that was done."""
+"""Second run, backward and with another seed: when it is made, what it says, and that nothing is lost by it."""
 
 from dataclasses import replace
 
@@ -25,19 +25,21 @@ class Walk:
     name = "walk"
 
     def __init__(self, bend=0.0, quality=UNSURE, fail=False):
-        self.bend, self.quality, self.fail, self.times = bend, quality, fail, []
+        self.bend, self.quality, self.fail, self.times, self.numbers, self.sizes = bend, quality, fail, [], [], set()
 
     def track(self, frame):
         if self.fail:
             raise DvoError("broken")
         self.times.append(frame.timestamp)
+        self.numbers.append(frame.index)
+        self.sizes.add((*frame.image.shape[:2], frame.camera.height, frame.camera.width))
         return Estimate(frame.timestamp, None, Status.TRACKING)
 
     def finish(self):
-        t = np.array(self.times)
+        t, times = 0.1 * np.array(self.numbers), np.array(self.times)
         positions = np.column_stack([t, np.sin(t) + self.bend * t**2, np.zeros_like(t)]) * (1 + self.bend)
         poses = np.column_stack([positions, np.tile([0.0, 0, 0, 1], (len(t), 1))])
-        return Result(Trajectory(t, poses), SparseMap(), len(t), 0, quality=self.quality)
+        return Result(Trajectory(times, poses), SparseMap(), len(t), 0, quality=self.quality)
 
 
 def ran(again, first=UNSURE, source=None, **options):
@@ -69,7 +71,15 @@ def test_the_beginning_alone_is_tracked_again(monkeypatch):
     monkeypatch.setattr(second_run, "FRAMES", 5)
     other = Walk()
     compare_again(Walk().finish(), other, frames(30), stride=2)
-    assert other.times == [pytest.approx(0.2 * k) for k in range(5)]
+    assert other.times == [pytest.approx(0.2 * k) for k in range(5)] and other.numbers == [8, 6, 4, 2, 0]
+
+
+def test_large_images_are_kept_small(monkeypatch):
+    monkeypatch.setattr(second_run, "PIXELS", 40 * 30)
+    other = Walk()
+    assert compare_again(Walk().finish(), other, frames(12)).verdict == "good"
+    ((height, width, *camera),) = other.sizes
+    assert height * width <= 1.1 * 40 * 30 and camera == [height, width]
 
 
 def test_a_second_run_that_fails_or_is_stopped_leaves_the_first():

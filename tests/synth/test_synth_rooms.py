@@ -16,13 +16,14 @@ ARROWS: dict[str, set[str]] = {
     "textures": set(),
     "sensors": set(),
     "meshes": {"textures"},
+    "surroundings": set(),
     "scenes": {"textures"},
     "render": {"scenes", "meshes", "textures"},
     "motion": {"render", "scenes"},
 }
 BASE = {"salts", "protocols"}
 FIRST = {"textures": "texture", "sensors": "sensor", "meshes": "mesh", "scenes": "scene", "render": "renderer",
-         "motion": "motion"}  # fmt: skip
+         "motion": "motion", "surroundings": "canvas"}  # fmt: skip
 FILES = sorted(file for room in ARROWS for file in (FOLDER / room).rglob("*.py"))
 
 

@@ -1,5 +1,7 @@
 """Second run over the beginning of a sequence, backward and with another seed, where the first one leaves doubt.
 
+Images and masks alone are tracked: with measured depths there is no second solution, and no second run.
+
 Measurements may fit a wrong motion nearly as well as the right one: of a flat scene, say, or a picture of which little
 moves. Which of them a run finds is then a matter of chance and of where it begins, so that two runs differ. Runs that
 agree prove nothing: what is fixed to the camera holds them all.
@@ -11,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 
-import cv2
 import numpy as np
 import torch
 
@@ -22,13 +23,14 @@ from dvo.geometry import sim3
 from dvo.geometry.alignment import align
 from dvo.odometry.protocol import Odometry, Result
 from dvo.odometry.quality import FILM, Quality
+from dvo.odometry.working_image import masked_image
 
 FRAMES = 150
 """Frames that are tracked again."""
 FEWEST = 10
 """Common frames with poses that a comparison needs."""
 PIXELS = 640 * 480
-"""Size of the images that are kept for it, at most."""
+"""Size of the images that are kept for it, about, at most."""
 DIFFERENT = 3.0
 """Largest RMS difference of the two after a similarity, percent of the path."""
 
@@ -62,14 +64,15 @@ def compare_again(
         The quality with the difference; a doubtful one if it is large.
     """
     assert result.quality is not None
-    kept = [_reduced(checked_frame(frame)) for frame in islice(frames, 0, FRAMES * stride, stride)]
-    ends = kept[0].timestamp + kept[-1].timestamp if kept else 0.0
-    times = {ends - frame.timestamp: frame.timestamp for frame in kept}
-    for time, frame in zip(reversed(times), reversed(kept), strict=True):
+    # Backward the rows are read from the last one on, which no camera states: without a readout time.
+    kept = [_kept(checked_frame(frame)) for frame in islice(frames, 0, FRAMES * stride, stride)]
+    times = {}
+    for frame in reversed(kept):
         if should_stop():
             break
-        # Backward the rows are read from the last one on, which no camera states: without a readout time.
-        odometry.track(replace(frame, timestamp=time, camera=replace(frame.camera, readout=0.0)))
+        time = kept[-1].timestamp - frame.timestamp
+        times[time] = frame.timestamp
+        odometry.track(replace(frame, timestamp=time))
     found = odometry.finish().trajectory
     forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])
     difference = _difference(forward, result.trajectory)
@@ -79,15 +82,10 @@ def compare_again(
     return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
 
 
-def _reduced(frame: Frame) -> Frame:
-    """Frame whose large image is reduced, since many are kept."""
-    factor = np.sqrt(PIXELS / (frame.camera.width * frame.camera.height))
-    if factor >= 1 or frame.depth is not None or frame.right is not None:
-        return frame
-    width, height = round(frame.camera.width * factor), round(frame.camera.height * factor)
-    image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
-    mask = None if frame.mask is None else cv2.resize(frame.mask.astype(np.uint8), (width, height)) > 0
-    return replace(frame, image=image, camera=frame.camera.resized(width, height), mask=mask)
+def _kept(frame: Frame) -> Frame:
+    """Image of a frame and its mask, of few pixels, since many are kept; without a readout time (see above)."""
+    image, camera, mask = masked_image(frame, PIXELS)
+    return Frame(frame.index, frame.timestamp, image, replace(camera, readout=0.0), mask=mask)
 
 
 def _difference(one: Trajectory, other: Trajectory) -> float:

@@ -18,7 +18,8 @@ MOST_DEVIATION = 0.075
 """Median distance of followed corners from the epipolar lines of the poses, over their displacement, above which a
 result is doubtful by that alone. Half of the corners may follow something that moves."""
 LEAST_AGREEMENT = 0.835
-"""Share of the confident measurements that agree with each other below which it is. The two add up (:func:`lacks`)."""
+"""Share of the confident measurements that agree with each other below which a result is doubtful by that alone. What
+the two lack adds up (:func:`lacks`)."""
 LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
 CHECK_FOCAL, RUN_AGAIN = 0.2, 0.25

@@ -22,7 +22,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.geometry import sim3
 from dvo.geometry.alignment import align
 from dvo.odometry.protocol import Odometry, Result
-from dvo.odometry.quality import FILM, Quality
+from dvo.odometry.quality import FILM, Quality, leaves_doubt
 from dvo.odometry.working_image import masked_image
 
 FRAMES = 150
@@ -42,6 +42,17 @@ def can_be_read_again(source: object) -> bool:
         source: of frames.
     """
     return not isinstance(source, Iterator) and not hasattr(source, "stop")
+
+
+def is_due(result: Result, source: object) -> bool:
+    """Tell if a second run is to be made: the first one leaves doubt, measured no depths, and can be repeated.
+
+    Args:
+        result: of the first run.
+        source: of its frames.
+    """
+    measured = result.info.get("scale", {}).get("source") in ("depth", "stereo")
+    return leaves_doubt(result.quality) and not measured and can_be_read_again(source)
 
 
 def compare_again(

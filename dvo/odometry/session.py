@@ -15,8 +15,7 @@ from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.errors import DvoError
 from dvo.odometry.protocol import Estimate, Odometry, Result
-from dvo.odometry.quality import leaves_doubt
-from dvo.odometry.second_run import can_be_read_again, compare_again
+from dvo.odometry.second_run import compare_again, is_due
 from dvo.odometry.segments import find_breaks
 
 FrameCallback = Callable[[Frame, Estimate | None], None]
@@ -121,7 +120,7 @@ def run(
     started = time.perf_counter()
     result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
-    if again is not None and not interrupted and leaves_doubt(result.quality) and can_be_read_again(source):
+    if again is not None and not interrupted and is_due(result, source):
         started = time.perf_counter()
         stop = should_stop or (lambda: False)
         with contextlib.suppress(DvoError, OSError, KeyboardInterrupt):  # the result stands without it

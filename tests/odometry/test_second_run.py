@@ -12,7 +12,7 @@ from dvo.errors import DvoError
 from dvo.odometry import second_run
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from dvo.odometry.quality import Quality, leaves_doubt
-from dvo.odometry.second_run import can_be_read_again, compare_again
+from dvo.odometry.second_run import can_be_read_again, compare_again, is_due
 from tests.support.tiny_tracker import frames
 
 SURE = Quality("good", tracked=1.0, agreement=1.0, deviation=0.0, check=1.0, checks=9)
@@ -52,6 +52,13 @@ def test_it_is_made_where_a_good_result_leaves_doubt():
     never = lambda: pytest.fail("a second run of a sure result")  # noqa: E731
     assert "checking" not in ran(never, first=SURE).seconds
     ran(never, source=iter(frames(30)))
+
+
+def test_measured_depths_need_none():
+    first = Walk().finish()
+    assert is_due(first, frames(3)) and not is_due(first, iter(frames(3)))
+    for source, due in (("stereo", False), ("depth", False), ("height", True)):
+        assert is_due(replace(first, info={"scale": {"source": source}}), frames(3)) is due
 
 
 def test_runs_that_agree_stay_good():

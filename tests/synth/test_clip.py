@@ -186,9 +186,9 @@ def test_depth_is_nan_where_surroundings_are_seen() -> None:
 
 
 def test_what_would_cover_everything_is_left_out() -> None:
-    for index in range(30):
-        clip = make_clip(SEED, index, surroundings=1.0, **SMALL)
-        assert clip.moving is None or float(clip.moving.float().mean((1, 2)).max()) <= 0.8
+    clips = [make_clip(SEED, index, surroundings=1.0, **SMALL) for index in range(30)]
+    shown = [clip.moving for clip in clips if clip.moving is not None]
+    assert 0 < len(shown) < 30 and all(float(moving.float().mean((1, 2)).max()) <= 0.8 for moving in shown)
 
 
 def test_low_light_is_noise_in_the_pictures_alone() -> None:

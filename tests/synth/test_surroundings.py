@@ -70,10 +70,10 @@ def test_names_that_are_not_known_are_refused(names):
         sequence(names)
 
 
-@pytest.mark.parametrize("name", SURROUNDINGS)
+@pytest.mark.parametrize("name", [name for name in SURROUNDINGS if name != "snow"])  # flakes have neither
 def test_training_clips_show_other_pictures_than_sequences(name):
     """No suite shows a texture or an outline that a network was trained on."""
     (one,), (other,) = (drawings(name, 0, CENTRE, style) for style in (Style(), Style(training=True)))
     shown, trained = level(), level()
     one(shown), other(trained)
-    assert name == "snow" or not np.allclose(shown.image, trained.image, atol=0.02)
+    assert not np.allclose(shown.image, trained.image, atol=0.02)

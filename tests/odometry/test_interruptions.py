@@ -50,14 +50,21 @@ def test_no_pose_without_a_view_and_a_segment_of_its_own_after_it(film, clear, s
         "white": [np.full(shape, 255, np.uint8)] * dark,
         "noise": noise(dark, shape),
     }[kind]
-    estimates, result, odometry = track(with_images(clear, images, CUT))
-    during, after = estimates[CUT : CUT + dark], estimates[CUT + dark :]
-    assert all(e.pose_wc is None and e.status is not Status.TRACKING for e in during)
-    assert any(e.status is Status.TRACKING for e in after)
     times = np.array([frame.timestamp for frame in clear])
-    rows = np.concatenate([segment.trajectory.timestamps for segment in result.segments])
-    assert not np.isin(times[CUT : CUT + dark], rows).any()
-    assert np.isin(np.delete(times, slice(CUT, CUT + dark)), rows).mean() >= 0.95
+    runs = [track(with_images(clear, images, CUT), seed) for seed in (0, 1, 2)]
+    shares = []
+    for estimates, result, _ in runs:
+        during, after = estimates[CUT : CUT + dark], estimates[CUT + dark :]
+        assert all(e.pose_wc is None and e.status is not Status.TRACKING for e in during)
+        assert any(e.status is Status.TRACKING for e in after)
+        rows = np.concatenate([segment.trajectory.timestamps for segment in result.segments])
+        assert not np.isin(times[CUT : CUT + dark], rows).any()
+        shares.append(np.isin(np.delete(times, slice(CUT, CUT + dark)), rows).mean())
+        assert evaluate(result.trajectory, film.groundtruth).ate_percent < 1.0
+    assert np.median(shares) >= 0.95
+    # A run may find the place again before it has the frames of a new segment: then there is one segment alone.
+    estimates, result, odometry = next(run for run in runs if len(run[1].segments) > 1)
+    after = estimates[CUT + dark :]
     # The frame after the interruption may show too little of what was seen before it to be found there.
     assert len(result.breaks) == 1 and result.breaks[0].reason
     lost = result.breaks[0].frames
@@ -66,7 +73,6 @@ def test_no_pose_without_a_view_and_a_segment_of_its_own_after_it(film, clear, s
     assert {e.segment for e in estimates if e.pose_wc is not None} == set(range(len(result.segments)))
     worlds = worlds_of(result.segments)  # with loop closure, the end of the sequence may join what belongs together
     assert len(result.trajectory) == max(sum(len(result.segments[k]) for k in world) for world in worlds)
-    assert evaluate(result.trajectory, film.groundtruth).ate_percent < 1.0
     # The segment after the interruption begins as soon as a start with its frames would, or as they have been tried
     # long enough, and is as good as such starts are: over these twelve poses their errors differ by up to 1.8 times
     # with the seed.

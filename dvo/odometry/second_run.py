@@ -4,7 +4,8 @@ Images and masks alone are tracked: with measured depths there is no second solu
 
 Measurements may fit a wrong motion nearly as well as the right one: of a flat scene, say, or a picture of which little
 moves. Which of them a run finds is then a matter of chance and of where it begins, so that two runs differ. Runs that
-agree prove nothing: what is fixed to the camera holds them all.
+agree prove nothing: what is fixed to the camera holds them all. Nor does one that fits its own measurements clearly
+worse, unless it is doubtful by itself: it then is the one that went wrong.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ PIXELS = 640 * 480
 """Size of the images that are kept for it, about, at most."""
 DIFFERENT = 3.0
 """Largest RMS difference of the two after a similarity, percent of the path."""
+WORSE = 1.25
+"""Residual of a good second run over that of the first above which their difference says nothing about the first."""
 
 
 def can_be_read_again(source: object) -> bool:
@@ -72,7 +75,8 @@ def compare_again(
         should_stop: called before each frame; True ends the second run, and what it has is compared.
 
     Returns:
-        The quality with the difference; a doubtful one if it is large.
+        The quality with the difference; a doubtful one if it is large, unless the second run is good and fits its
+        measurements worse.
     """
     assert result.quality is not None
     # Backward the rows are read from the last one on, which no camera states: without a readout time.
@@ -84,10 +88,13 @@ def compare_again(
         time = kept[-1].timestamp - frame.timestamp
         times[time] = frame.timestamp
         odometry.track(replace(frame, timestamp=time))
-    found = odometry.finish().trajectory
+    again = odometry.finish()
+    found = again.trajectory
     forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])
     difference = _difference(forward, result.trajectory)
-    if not difference > DIFFERENT:  # NaN: nothing is known
+    mine, other = result.quality, again.quality
+    worse = other is not None and other.verdict == "good" and other.residual > WORSE * mine.residual
+    if worse or not difference > DIFFERENT:  # NaN: nothing is known
         return replace(result.quality, second=difference)
     reason = f"a second run, backward with another seed, differs by {difference:.0f}% of the path"
     return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)

@@ -24,7 +24,16 @@ from dvo.synth.render.renderer import Rendering, render, render_depth
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.families import random_scene
 from dvo.synth.scenes.scene import Scene
-from dvo.synth.sensors.sensor import Sensor, expose, low_light, random_degradation, random_intrinsics, random_sensor
+from dvo.synth.sensors.sensor import (
+    Sensor,
+    expose,
+    floating_crop,
+    low_light,
+    random_degradation,
+    random_intrinsics,
+    random_sensor,
+)
+from dvo.synth.sensors.video_codec import compressed_video
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from dvo.synth.specs import check_names, check_share
 from dvo.synth.surroundings import Style, draw_over, drawings
@@ -50,7 +59,8 @@ class ClipSpec:
         movers: probability of a clip with moving bodies, 1 to 8 of them.
         low_light: probability of a clip with 3 to 30 % of the usual light; without a sensor it has no effect.
         surroundings: probability of a clip with one or two kinds of :data:`dvo.synth.surroundings.SURROUNDINGS`, which
-            count as moving; clips of which they would cover more than four fifths of a frame stay without.
+            count as moving; clips of which they would cover more than four fifths of a frame stay without. Some of
+            these clips are H.264 video, in others the crop of a stabilised video floats.
 
     Raises:
         DvoError: sizes or flow range out of order, or a probability that is none.
@@ -86,7 +96,8 @@ class Clip:
         depth: ``(N, H, W)`` float32 Z along the optical axis, of moving bodies too; the median over what does not move
             is 1.
         poses_cw: ``(N, 7)`` float32 world to camera, in units of that depth; the first is the identity.
-        intrinsics: ``(N, 4)`` float32 fx fy cx cy in pixels of the images.
+        intrinsics: ``(N, 4)`` float32 fx fy cx cy in pixels of the images; the same in all frames, unless their crop
+            floats.
         moving: ``(N, H, W)`` bool, pixels that show a moving body or surroundings; None if nothing moves.
     """
 
@@ -251,10 +262,17 @@ def make_clip(
     plan, intrinsics = _draw_plan(scene, rng, spec, index)
     poses_wc = plan.path.poses_wc(plan.times)
     conditions = draw_conditions(seed, index, spec.movers, spec.low_light, spec.surroundings)
-    rendering, moving = _render(scene, plan, poses_wc, intrinsics, spec, conditions, device)
+    seconds = (plan.times - plan.times[0]) * (conditions.step * (spec.frames - 1) / (plan.times[-1] - plan.times[0]))
+    every = np.tile(intrinsics, (spec.frames, 1))
+    if conditions.stabilised:
+        swings = floating_crop(
+            np.random.default_rng([conditions.seed, salts.CLIP_CROP]), seconds[-1], conditions.stabilised
+        )
+        every[:, 2:] += Sensor(crop=swings).crop_offsets(seconds, spec.width)
+    rendering, moving = _render(scene, plan, poses_wc, every, spec, conditions, device)
     images = rendering.images
     if conditions.surroundings:
-        images, moving = _surround(rendering, moving, plan.times, poses_wc, intrinsics, conditions)
+        images, moving = _surround(rendering, moving, seconds, poses_wc, every, conditions)
     if spec.sensor:
         camera = random_sensor(rng)
         flow: torch.Tensor | None = None
@@ -271,16 +289,20 @@ def make_clip(
             np.random.default_rng([seed, salts.CLIP_DEGRADATION, index]), camera, float(times[-1])
         )
         images = expose(images, camera, rng, flow, times)
+    pixels = (images * 255).round_().to(torch.uint8)
+    if conditions.h264:
+        coded = compressed_video(pixels.permute(0, 2, 3, 1).cpu().numpy(), conditions.h264)
+        pixels = torch.from_numpy(coded).permute(0, 3, 1, 2).contiguous().to(pixels.device)
     depth = rendering.depth if moving is None or moving.all() else rendering.depth[~moving]
     scale = float(depth.median())
     relative = compose_rodrigues(invert_rodrigues(poses_wc), poses_wc[:1])  # world := first camera
     relative[:, :3] /= scale
     relative[0] = [0, 0, 0, 0, 0, 0, 1]
     return Clip(
-        images=(images * 255).round_().to(torch.uint8),
+        images=pixels,
         depth=rendering.depth / scale,
         poses_cw=torch.from_numpy(relative.astype(np.float32)).to(device),
-        intrinsics=torch.from_numpy(np.tile(intrinsics, (spec.frames, 1)).astype(np.float32)).to(device),
+        intrinsics=torch.from_numpy(every.astype(np.float32)).to(device),
         moving=moving,
     )
 
@@ -293,7 +315,7 @@ def _render(
     stage: Scene | Stage = scene
     times: Array | None = None
     if conditions.bodies:
-        stage, times = stage_clip(scene, plan.path, plan.times, conditions, plan.flow, float(intrinsics[0]))
+        stage, times = stage_clip(scene, plan.path, plan.times, conditions, plan.flow, float(intrinsics[0, 0]))
     rendering = render(
         stage, poses_wc, intrinsics, spec.height, spec.width, quality=Quality(spec.supersample), device=device,
         coordinates=False, times=times,
@@ -302,18 +324,17 @@ def _render(
 
 
 def _surround(
-    rendering: Rendering, moving: torch.Tensor | None, times: Array, poses_wc: Array, intrinsics: Array,
+    rendering: Rendering, moving: torch.Tensor | None, seconds: Array, poses_wc: Array, intrinsics: Array,
     conditions: Conditions,
 ) -> tuple[torch.Tensor, torch.Tensor | None]:  # fmt: skip
     """Images with the surroundings over them, and the pixels without rigid truth; as they were where little is left."""
     _, height, width = rendering.depth.shape
-    fx, fy, cx, cy = intrinsics.tolist()
-    camera = Camera(fx, fy, cx, cy, width, height)
     drawn = drawings(conditions.surroundings, conditions.seed, poses_wc[:, :3].mean(0), Style(training=True))
-    seconds = (times - times[0]) * (conditions.step * (len(times) - 1) / (times[-1] - times[0]))
     frames = [
-        draw_over(drawn, image, depth, pose, camera, float(time))
-        for image, depth, pose, time in zip(rendering.images, rendering.depth, poses_wc, seconds, strict=True)
+        draw_over(drawn, image, depth, pose, Camera(fx, fy, cx, cy, width, height), float(time))
+        for image, depth, pose, (fx, fy, cx, cy), time in zip(
+            rendering.images, rendering.depth, poses_wc, intrinsics.tolist(), seconds, strict=True
+        )
     ]
     covered = np.stack([cover for _, cover in frames])
     if covered.mean((1, 2)).max() > MOST_COVERED:

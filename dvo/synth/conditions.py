@@ -19,6 +19,8 @@ LIGHT = (0.03, 0.3)  # share of the usual light that arrives in a clip with litt
 PACE = (0.4, 2.0)  # motion of bodies against that of the camera, in pixels a frame
 BODY_SPEED = 0.4  # of a body of random_bodies: share of its distance to the camera that it moves in a second, about
 SURROUNDINGS_STEP = (0.015, 0.15)  # seconds between frames under the clock of the surroundings
+CODED, CRF = 0.3, (22, 38)  # share of the clips with surroundings that are H.264 video, and its rate factors
+FLOATING, OFFSET = 0.15, (0.002, 0.02)  # share of them that are stabilised, and the offset in shares of the width
 LONGEST_STEP = 0.6  # seconds of the bodies' clock; a quarter of the shortest period of their sway
 
 
@@ -33,6 +35,8 @@ class Conditions:
         light: share of the usual light that arrives, in (0, 1].
         surroundings: names of what is drawn over the scene, joined by ``+``.
         step: seconds between frames, in mean, under the clock of the surroundings.
+        h264: constant rate factor of the video; 0 for images.
+        stabilised: offset of the crop of a stabilised video, share of the width.
     """
 
     bodies: int = 0
@@ -41,6 +45,8 @@ class Conditions:
     light: float = 1.0
     surroundings: str = ""
     step: float = 0.05
+    h264: int = 0
+    stabilised: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,7 @@ def draw_conditions(seed: int, index: int, movers: float, low_light: float, surr
         index: of the clip.
         movers: probability of moving bodies.
         low_light: probability of little light.
-        surroundings: probability of one or two kinds of them.
+        surroundings: probability of one or two kinds of them, and of a video that is coded or stabilised.
 
     Returns:
         The conditions; a clip that is chosen at some probability is chosen, with the same bodies and the same light,
@@ -96,7 +102,12 @@ def draw_conditions(seed: int, index: int, movers: float, low_light: float, surr
         return conditions
     names = rng.choice(list(SURROUNDINGS), int(rng.integers(1, 3)), replace=False)
     step = float(np.exp(rng.uniform(*np.log(SURROUNDINGS_STEP))))
-    return replace(conditions, surroundings="+".join(sorted(names, key=list(SURROUNDINGS).index)), step=step)
+    coded, floating = rng.random(2)
+    crf, offset = int(rng.integers(*CRF)), float(np.exp(rng.uniform(*np.log(OFFSET))))
+    return replace(
+        conditions, surroundings="+".join(sorted(names, key=list(SURROUNDINGS).index)), step=step,
+        h264=crf if coded < CODED else 0, stabilised=offset if floating < FLOATING else 0.0,
+    )  # fmt: skip
 
 
 def stage_clip(

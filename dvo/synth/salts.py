@@ -21,6 +21,7 @@ CLIP = 7301  # path, intrinsics, sensor
 CLIP_DEGRADATION = 7302  # compression and exposure changes
 CLIP_CONDITIONS = 7303  # moving bodies and low light
 CLIP_SURROUNDINGS = 7304  # what is drawn over the scene, and its clock
+CLIP_CROP = 7305  # offset of the crop of a stabilised video
 # Sequences
 SEQUENCE = 7401  # scene, path, intrinsics, sensor
 NOISE = 7402  # noise of one frame
@@ -28,6 +29,7 @@ DROPPED = 7403  # lost frames
 LIGHTING = 7404  # exposure changes
 REPAINT = 7405  # surfaces that lose their texture
 LENS = 7406  # distortion coefficients
+CROP = 7407  # offset of the crop of a stabilised video
 # Moving bodies and meshes
 MOVERS = 7501  # shape and motion of bodies
 MESH_TEXTURE = 7502  # procedural replacement of a missing texture

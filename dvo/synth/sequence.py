@@ -29,10 +29,12 @@ from dvo.synth.sensors.sensor import (
     Sensor,
     expose,
     exposure_changes,
+    floating_crop,
     low_light,
     random_intrinsics,
     random_sensor,
 )
+from dvo.synth.sensors.video_codec import LENGTH, compressed_video
 from dvo.synth.specs import CameraSpec, SequenceSpec, sequence_spec
 from dvo.synth.surroundings import Drawing, draw_over, drawings
 from dvo.synth.textures.texture import texture_pool
@@ -46,7 +48,8 @@ class SyntheticSequence:
     """Source of frames with ground truth. It can be iterated any number of times; every pass gives the same bytes.
 
     Timestamps and poses are those of the middle of the exposure, with a rolling shutter those of the middle row;
-    :mod:`dvo.synth.render.shot` states the consequences for depth and flow.
+    :mod:`dvo.synth.render.shot` states the consequences for depth and flow. Flow and tracks are those without
+    surroundings and with the crop at rest.
 
     Attributes:
         name: family, kind of path and seed.
@@ -78,6 +81,7 @@ class SyntheticSequence:
     warnings: list[str] = field(default_factory=list)
     interval: float = 1 / 30
     surroundings: tuple[Drawing, ...] = ()
+    _decoded: tuple[int, np.ndarray] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         readout = (self.sensor or Sensor()).readout * self.interval
@@ -117,7 +121,13 @@ class SyntheticSequence:
         Returns:
             Batch of one.
         """
-        return self.shot.rendering(self.time(index), self.groundtruth.poses_wc[index : index + 1])
+        shot = replace(self.shot, camera=self._cropped(index))
+        return shot.rendering(self.time(index), self.groundtruth.poses_wc[index : index + 1])
+
+    def _cropped(self, index: int) -> Camera:
+        """Camera with its principal point where the crop of a stabilised video has it."""
+        x, y = (self.sensor or Sensor()).crop_offsets(np.array([self.time(index)]), self.camera.width)[0].tolist()
+        return replace(self.camera, cx=self.camera.cx + x, cy=self.camera.cy + y)
 
     def frame(self, index: int) -> Frame:
         """One frame as the camera delivers it, with the sensor's noise.
@@ -128,19 +138,33 @@ class SyntheticSequence:
         Returns:
             Image ``(H, W, 3)`` uint8 RGB, timestamp and camera.
         """
+        if self.sensor is None or not self.sensor.h264:
+            return Frame(index, self.time(index), self._exposed(index), self.camera)
+        return Frame(index, self.time(index), self._video(index // LENGTH)[index % LENGTH], self.camera)
+
+    def _exposed(self, index: int) -> np.ndarray:
+        """Image ``(H, W, 3)`` of the sensor."""
         rendered = self.rendering(index)
         images = self._covered(index, rendered)[0] if self.surroundings else rendered.images
         if self.sensor is not None:
             rng = np.random.default_rng([self.seed, salts.NOISE, index])
             images = expose(images, self.sensor, rng, times=self.groundtruth.timestamps[index : index + 1])
-        image = (images[0] * 255).round_().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
-        return Frame(index, self.time(index), image, self.camera)
+        return (images[0] * 255).round_().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+
+    def _video(self, part: int) -> np.ndarray:
+        """Images of a part of the video ``(N, H, W, 3)`` after its compression; the last one is kept."""
+        if self._decoded is None or self._decoded[0] != part:
+            assert self.sensor is not None
+            frames = range(part * LENGTH, min((part + 1) * LENGTH, len(self)))
+            images = compressed_video(np.stack([self._exposed(k) for k in frames]), self.sensor.h264)
+            self._decoded = part, images
+        return self._decoded[1]
 
     def _covered(self, index: int, rendered: Rendering) -> tuple[torch.Tensor, np.ndarray]:
         """Image ``(1, 3, H, W)`` with the surroundings, and the pixels ``(H, W)`` that they cover."""
         pose = self.groundtruth.poses_wc[index]
         image, covered = draw_over(
-            self.surroundings, rendered.images[0], rendered.depth[0], pose, self.camera, self.time(index)
+            self.surroundings, rendered.images[0], rendered.depth[0], pose, self._cropped(index), self.time(index)
         )
         return image[None], covered
 
@@ -310,7 +334,12 @@ def make_sequence(
 
 def _apply_effects(sensor: Sensor, spec: CameraSpec, seed: int, duration: float) -> Sensor:
     """Sensor with the effects of a specification."""
-    sensor = replace(sensor, shutter=spec.shutter, readout=spec.rolling_shutter, drop=spec.drop, jpeg=spec.jpeg)
+    sensor = replace(
+        sensor, shutter=spec.shutter, readout=spec.rolling_shutter, drop=spec.drop, jpeg=spec.jpeg, h264=spec.h264
+    )
+    if spec.stabilised > 0:
+        rng = np.random.default_rng([seed, salts.CROP])
+        sensor = replace(sensor, crop=floating_crop(rng, duration, spec.stabilised))
     if spec.lighting > 0:
         rng = np.random.default_rng([seed, salts.LIGHTING])
         sensor = replace(sensor, stops=exposure_changes(rng, duration, spec.lighting))

@@ -129,6 +129,8 @@ class CameraSpec:
         blackout: seconds without light in the middle of the sequence.
         drop: probability that a frame is lost.
         jpeg: JPEG quality from 1 to 100, 0 for no compression.
+        h264: constant rate factor of H.264 from 1 to 51, the higher the fewer bits, 0 for no compression.
+        stabilised: standard deviation of the offset at which the crop of a stabilised video floats, share of the width.
         lens: ``radtan`` or ``fisheye`` draws a lens with distortion; frames are delivered distorted.
 
     Raises:
@@ -143,6 +145,8 @@ class CameraSpec:
     blackout: float = 0.0
     drop: float = 0.0
     jpeg: int = 0
+    h264: int = 0
+    stabilised: float = 0.0
     lens: DistortionModel = "none"
 
     def __post_init__(self) -> None:
@@ -152,6 +156,8 @@ class CameraSpec:
         _check_number("lighting", self.lighting, 0, 20)
         _check_number("blackout", self.blackout, 0, LONGEST)
         _check_number("jpeg", self.jpeg, 0, 100, whole=True)
+        _check_number("h264", self.h264, 0, 51, whole=True)
+        _check_number("stabilised", self.stabilised, 0, 0.1)
 
 
 @dataclass(frozen=True)

@@ -74,6 +74,16 @@ def test_runs_that_differ_are_doubtful(stride):
     assert f"differs by {quality.second:.0f}% of the path" in quality.reason
 
 
+def test_a_second_run_that_fits_its_measurements_worse_says_nothing_of_the_first():
+    """Unless it is doubtful by itself."""
+    for own, residual, verdict in (
+        ("good", 0.25, "doubtful"), ("good", 0.4, "good"), ("doubtful", 0.4, "doubtful"), ("good", np.nan, "doubtful")
+    ):  # fmt: skip
+        again = Walk(2.0, quality=replace(UNSURE, verdict=own, residual=residual))
+        quality = ran(lambda again=again: again, first=replace(UNSURE, residual=0.3)).result.quality
+        assert quality.verdict == verdict and quality.second > 3
+
+
 def test_the_beginning_alone_is_tracked_again(monkeypatch):
     monkeypatch.setattr(second_run, "FRAMES", 5)
     other = Walk()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -158,10 +159,39 @@ def test_film_is_the_whole_call(scene: Scene) -> None:
         film(scene, path, camera, times=np.array([0.2, 0.1]))
 
 
-@pytest.mark.parametrize("bad", [{"shutter": 1.5}, {"light": 0.0}, {"jpeg": 101}, {"blackout": 9.0}, {"movers": -1}])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"shutter": 1.5},
+        {"light": 0.0},
+        {"jpeg": 101},
+        {"h264": 52},
+        {"stabilised": 0.5},
+        {"blackout": 9.0},
+        {"movers": -1},
+    ],
+)
 def test_options_out_of_range(bad: dict[str, Any]) -> None:
     with pytest.raises(DvoError, match=next(iter(bad))):
         make_sequence(SEED, **SMALL, **bad)
+
+
+def test_the_crop_of_a_stabilised_video_floats() -> None:
+    """By whole pixels of a textured wall: the picture moves, the camera that frames state does not."""
+    still = {**SMALL, "speed": 0.0, "shake": 0.0, "kind": "handheld"}
+    floats, rests = (make_sequence(SEED, stabilised=amplitude, **still) for amplitude in (0.05, 0.0))
+    assert floats.sensor is not None and floats.camera == rests.camera == floats.frame(2).camera
+    offsets = floats.sensor.crop_offsets(floats.groundtruth.timestamps, floats.camera.width)
+    assert 0.5 < offsets.std(0).max() < 0.15 * floats.camera.width
+    for index in (0, 5):
+        dx, dy = offsets[index]
+        grid = np.float32([[1, 0, -dx], [0, 1, -dy]])
+        size = floats.camera.width, floats.camera.height
+        inverse = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+        moved = cv2.warpAffine(rests.rendering(index).images[0].permute(1, 2, 0).numpy(), grid, size, flags=inverse)
+        seen = floats.rendering(index).images[0].permute(1, 2, 0).numpy()
+        inner = (slice(10, -10), slice(10, -10))
+        assert np.median(np.abs(moved - seen)[inner]) < 0.02
 
 
 def test_frames_state_their_readout(plain: SyntheticSequence, scene: Scene) -> None:

@@ -35,6 +35,9 @@ class Sensor:
             one more stop is twice as bright. Empty: constant.
         blackout: spans ``(from, to)`` in seconds without light, of which only noise is recorded.
         jpeg: quality of compression, 1 to 100; 0 for none.
+        h264: constant rate factor of H.264 compression, 1 to 51; 0 for none.
+        crop: knots ``(second, x, y)`` of the offset of the image in shares of its width, linear between them: the crop
+            of a stabilised video floats over what the sensor sees. Empty: at rest.
         drop: probability that a frame is lost (sequences only).
     """
 
@@ -53,6 +56,8 @@ class Sensor:
     stops: tuple[tuple[float, float], ...] = ()
     blackout: tuple[tuple[float, float], ...] = ()
     jpeg: int = 0
+    h264: int = 0
+    crop: tuple[tuple[float, float, float], ...] = ()
     drop: float = 0.0
 
     def dark(self, times: np.ndarray) -> np.ndarray:
@@ -66,6 +71,21 @@ class Sensor:
         """
         times = np.asarray(times, float)
         return np.any([(times >= a) & (times < b) for a, b in self.blackout], 0) & np.ones(len(times), bool)
+
+    def crop_offsets(self, times: np.ndarray, width: int) -> np.ndarray:
+        """Offset of the principal point by the crop of a stabilised video.
+
+        Args:
+            times: ``(T,)`` seconds.
+            width: of the image, pixels.
+
+        Returns:
+            ``(T, 2)`` pixels.
+        """
+        if not self.crop:
+            return np.zeros((len(times), 2))
+        knots = np.array(self.crop)
+        return width * np.stack([np.interp(times, knots[:, 0], knots[:, axis]) for axis in (1, 2)], -1)
 
 
 def random_intrinsics(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
@@ -160,6 +180,25 @@ def exposure_changes(rng: np.random.Generator, duration: float, strength: float)
         recovered = 1 - np.exp(-np.maximum(grid - t - 0.15, 0) / 0.5)
         level = level + np.where(grid > t, jump * (1 - 0.8 * recovered), 0)
     return tuple((float(t), float(v)) for t, v in zip(grid, level, strict=True))
+
+
+def floating_crop(
+    rng: np.random.Generator, duration: float, amplitude: float
+) -> tuple[tuple[float, float, float], ...]:
+    """Draw knots for :attr:`Sensor.crop`: swings of half a second to some seconds along both axes.
+
+    Args:
+        rng: draws them.
+        duration: seconds.
+        amplitude: standard deviation, share of the width.
+
+    Returns:
+        Triples of second and offset along x and y.
+    """
+    times = np.linspace(0, duration, max(2, int(np.ceil(duration / 0.05))))
+    rates, phases = 2 * np.pi / rng.uniform(0.5, 3.0, (4, 2)), rng.uniform(0, 2 * np.pi, (4, 2))
+    offsets = amplitude * np.sin(times[:, None, None] * rates + phases).sum(1) / 2**0.5
+    return tuple((float(time), float(x), float(y)) for time, (x, y) in zip(times, offsets, strict=True))
 
 
 def low_light(sensor: Sensor, light: float) -> Sensor:

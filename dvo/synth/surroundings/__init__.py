@@ -17,14 +17,14 @@ from dvo.geometry.camera import Camera
 from dvo.settings import shown
 from dvo.synth import salts
 from dvo.synth.surroundings.canvas import Canvas, Drawing, Style
-from dvo.synth.surroundings.landscape import crowd, foliage, sky, traffic, water
+from dvo.synth.surroundings.landscape import crowd, foliage, night, screen, sky, traffic, water
 from dvo.synth.surroundings.lens import bonnet, border, glass, rain, snow
 
 Array = np.ndarray
 
 SURROUNDINGS: dict[str, Callable[[np.random.Generator, Array, Style], Drawing]] = {
     "water": water, "sky": sky, "foliage": foliage, "crowd": crowd, "bonnet": bonnet, "rain": rain,
-    "traffic": traffic, "snow": snow, "border": border, "glass": glass,
+    "traffic": traffic, "snow": snow, "border": border, "glass": glass, "screen": screen, "night": night,
 }  # fmt: skip
 """Drawings by name, of a random stream, the middle of the way of the camera ``(3,)`` and a style."""
 

@@ -1,4 +1,4 @@
-"""What moves in the world beside a rigid scene: water, clouds, leaves, people, cars."""
+"""What moves in the world beside a rigid scene: water, clouds, leaves, people, cars, screens, lamps at night."""
 
 from __future__ import annotations
 
@@ -131,3 +131,74 @@ def traffic(rng: np.random.Generator, centre: Array, style: Style) -> Drawing:
         return np.outer((place + speed * time + 15) % 30 - 15, along)  # who leaves comes back on the other side
 
     return _sprites(rng, style, count, (0.6, 1.4), 0.7, move, offset)
+
+
+def screen(rng: np.random.Generator, centre: Array, style: Style) -> Drawing:
+    """Upright screens and posters of light around the way of the camera: a picture that scrolls, and cuts."""
+    count, cuts = 7, 3
+    way, distance = rng.uniform(0, 6.3) + np.arange(count) * 6.3 / count, rng.uniform(1.5, 4.0, count)
+    places = centre + np.column_stack([distance * np.cos(way), distance * np.sin(way), rng.uniform(-0.5, 0.6, count)])
+    facing = way + rng.uniform(-0.6, 0.6, count)
+    half = rng.uniform(0.35, 1.0, count)[:, None] * np.array([1.0, 0.6])
+    pictures = [
+        np.stack([style.texture(rng, 128, (4, 16, 32)) for _ in range(3)], -1) for _ in range(cuts)
+    ]  # fmt: skip
+    scroll, every = rng.normal(0, 0.3, (count, 2)), rng.uniform(0.7, 2.5, count)
+
+    def draw(canvas: Canvas) -> Array:
+        rays, nearest = canvas.rays(), canvas.depth.copy()
+        covered = np.zeros(canvas.depth.shape, bool)
+        for k in range(count):
+            normal = np.array([np.cos(facing[k]), np.sin(facing[k]), 0.0])
+            along = rays @ normal
+            depth = (places[k] - canvas.pose_wc[:3]) @ normal / np.where(np.abs(along) > 1e-6, along, 1e-6)
+            a = (canvas.pose_wc[:3] + depth[..., None] * rays - places[k]) @ np.array([-normal[1], normal[0], 0.0])
+            b = canvas.pose_wc[2] + depth * rays[..., 2] - places[k, 2]
+            inside = (depth > 0.2) & (depth < nearest) & (np.abs(a) < half[k, 0]) & (np.abs(b) < half[k, 1])
+            picture = pictures[(k + int(canvas.time / every[k])) % cuts]
+            u, v = 0.4 * a + scroll[k, 0] * canvas.time, 0.4 * b + scroll[k, 1] * canvas.time
+            shown = np.stack([lookup(picture[..., channel], u, v) for channel in range(3)], -1)
+            canvas.image[inside] = (1.6 * shown - 0.2).clip(0, 1)[inside]
+            nearest[inside], covered[inside] = depth[inside], True
+        return covered
+
+    return draw
+
+
+def night(rng: np.random.Generator, centre: Array, style: Style) -> Drawing:
+    """Night: the scene is lit by lamps around the way of the camera, which shine into the lens; some drive past.
+
+    Light on a surface is no motion: only the lamps and their glare are covered.
+    """
+    count, reach = 18, 7.0
+    places = np.column_stack([rng.uniform(-reach, reach, (count, 2)), rng.uniform(0.2, 1.8, count)]) + centre
+    way, moves = rng.uniform(0, 6.3, count), rng.random(count) < 0.35
+    speed = (moves * rng.uniform(1, 5, count))[:, None] * np.column_stack([np.cos(way), np.sin(way), np.zeros(count)])
+    colours, strength = rng.uniform([0.9, 0.6, 0.3], [1.0, 1.0, 0.9], (count, 3)), rng.uniform(0.15, 0.6, count)
+    ambient, powers = rng.uniform(0.04, 0.12), [style.power(rng) for _ in range(count)]
+
+    def draw(canvas: Canvas) -> Array:
+        camera, (height, width) = canvas.camera, canvas.depth.shape
+        there = places + speed * canvas.time - centre
+        there[:, :2] = (there[:, :2] + reach) % (2 * reach) - reach  # who leaves comes back on the other side
+        there += centre
+        points = canvas.pose_wc[:3] + canvas.rays() * np.where(np.isfinite(canvas.depth), canvas.depth, 1e3)[..., None]
+        light = np.full((height, width, 3), ambient)
+        glare = np.zeros((height, width, 3))
+        y, x = np.mgrid[0:height, 0:width]
+        seen = (there - canvas.pose_wc[:3]) @ canvas.rotation
+        for k in range(count):
+            light += strength[k] * colours[k] / (((points - there[k]) ** 2).sum(-1, keepdims=True) + 0.3)
+            u, v = camera.fx * seen[k, 0] / seen[k, 2] + camera.cx, camera.fy * seen[k, 1] / seen[k, 2] + camera.cy
+            if seen[k, 2] < 0.3 or not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+                continue
+            if canvas.depth[round(v), round(u)] < seen[k, 2]:
+                continue
+            radius = 0.12 * camera.fx / seen[k, 2] + 0.01 * width
+            power = powers[k]
+            away = (np.abs((x - u) / radius) ** power + np.abs((y - v) / radius) ** power) ** (1 / power)
+            glare += (2 * strength[k] * np.exp(-(away**2)) + 1.5 * (away < 0.35))[..., None] * colours[k]
+        canvas.image[:] = (canvas.image * np.minimum(light, 1.5) + glare).clip(0, 1)
+        return glare.max(-1) > 0.02
+
+    return draw

@@ -6,7 +6,7 @@
     result = odometry.finish()
 
 The names below are imported when first used, so that ``import dvo`` and ``dvo --help`` stay fast. It
-also decides how the threads of a torch that is imported later wait, see :mod:`dvo.threads`.
+also decides how the threads of a torch that is imported later wait, see :mod:`dvo.core.threads`.
 """
 
 from __future__ import annotations
@@ -14,33 +14,33 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from dvo.errors import DvoError
-from dvo.threads import wait_passively
+from dvo.core.errors import DvoError
+from dvo.core.threads import wait_passively
 
 if TYPE_CHECKING:
     from dvo import losses
-    from dvo.ba.layer import bundle_adjust
+    from dvo.ba.layer.layer import bundle_adjust
     from dvo.ba.options import BADamping, BAOptions, BAResult
     from dvo.data.extrinsics import base_trajectory
     from dvo.data.frame import Frame
-    from dvo.data.live import LiveFrames
-    from dvo.data.live_source import open_stream
     from dvo.data.source import open_source as open
-    from dvo.data.streams import stream
+    from dvo.data.streams.live import LiveFrames
+    from dvo.data.streams.live_source import open_stream
+    from dvo.data.streams.streams import stream
     from dvo.data.trajectory import Trajectory
     from dvo.export.formats import export_map, export_trajectory
     from dvo.geometry import se3
     from dvo.geometry.camera import Camera
     from dvo.metrics import Metrics, evaluate
     from dvo.models.weights import load_model
-    from dvo.nets.config import ModelConfig
-    from dvo.odometry.calibrate import calibrate
-    from dvo.odometry.camera_estimate import SelfCalibration
-    from dvo.odometry.config import TrackerConfig
+    from dvo.nets.patch.config import ModelConfig
+    from dvo.odometry.calibrate.calibrate import calibrate
+    from dvo.odometry.calibrate.camera_estimate import SelfCalibration
     from dvo.odometry.load import load
     from dvo.odometry.load_map import load_map
+    from dvo.odometry.patch.config import TrackerConfig
     from dvo.odometry.protocol import Break, Estimate, Odometry, Result, Segment, SparseMap, Status
-    from dvo.odometry.session import run
+    from dvo.session.session import run
     from dvo.synth.dataset import ClipDataset
 
 wait_passively()
@@ -56,20 +56,20 @@ _LAZY = {
     "ClipDataset": ("dvo.synth.dataset", "ClipDataset"),
     "Estimate": ("dvo.odometry.protocol", "Estimate"),
     "Frame": ("dvo.data.frame", "Frame"),
-    "LiveFrames": ("dvo.data.live", "LiveFrames"),
+    "LiveFrames": ("dvo.data.streams.live", "LiveFrames"),
     "Metrics": ("dvo.metrics", "Metrics"),
-    "ModelConfig": ("dvo.nets.config", "ModelConfig"),
+    "ModelConfig": ("dvo.nets.patch.config", "ModelConfig"),
     "Odometry": ("dvo.odometry.protocol", "Odometry"),
     "Result": ("dvo.odometry.protocol", "Result"),
-    "SelfCalibration": ("dvo.odometry.camera_estimate", "SelfCalibration"),
+    "SelfCalibration": ("dvo.odometry.calibrate.camera_estimate", "SelfCalibration"),
     "Segment": ("dvo.odometry.protocol", "Segment"),
     "SparseMap": ("dvo.odometry.protocol", "SparseMap"),
     "Status": ("dvo.odometry.protocol", "Status"),
-    "TrackerConfig": ("dvo.odometry.config", "TrackerConfig"),
+    "TrackerConfig": ("dvo.odometry.patch.config", "TrackerConfig"),
     "Trajectory": ("dvo.data.trajectory", "Trajectory"),
     "base_trajectory": ("dvo.data.extrinsics", "base_trajectory"),
-    "bundle_adjust": ("dvo.ba.layer", "bundle_adjust"),
-    "calibrate": ("dvo.odometry.calibrate", "calibrate"),
+    "bundle_adjust": ("dvo.ba.layer.layer", "bundle_adjust"),
+    "calibrate": ("dvo.odometry.calibrate.calibrate", "calibrate"),
     "evaluate": ("dvo.metrics", "evaluate"),
     "export_map": ("dvo.export.formats", "export_map"),
     "export_trajectory": ("dvo.export.formats", "export_trajectory"),
@@ -78,10 +78,10 @@ _LAZY = {
     "load_model": ("dvo.models.weights", "load_model"),
     "losses": ("dvo.losses", ""),
     "open": ("dvo.data.source", "open_source"),
-    "open_stream": ("dvo.data.live_source", "open_stream"),
-    "run": ("dvo.odometry.session", "run"),
+    "open_stream": ("dvo.data.streams.live_source", "open_stream"),
+    "run": ("dvo.session.session", "run"),
     "se3": ("dvo.geometry.se3", ""),
-    "stream": ("dvo.data.streams", "stream"),
+    "stream": ("dvo.data.streams.streams", "stream"),
 }
 
 __all__ = [

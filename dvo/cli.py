@@ -23,7 +23,7 @@ from dvo.commands.input_options import add_input_options
 from dvo.commands.scale_options import add_scale_options
 from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 EXIT_CODES = (
     "exit codes: 0 done, 1 no frame could be tracked, 2 bad input or results that cannot be written, 130 interrupted, "

@@ -12,7 +12,7 @@ from dvo.commands.console import StderrConsole, device_of, say, seed_everything
 from dvo.commands.run import load_odometry, track
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.odometry.results import results_folder
+from dvo.session.results import results_folder
 from dvo.synth.sequence import make_sequence
 
 NAME, SCENE, FAMILY, FPS = "demo", 0, "room", 30.0

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import sys
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.commands import VERBS, parser
 
 

@@ -9,8 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
-from dvo.data.root import data_root
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
 from eval.execution.plan import Plan, read_manifest
 from eval.execution.runner import predict_all
 from eval.reporting.report import AXES, LOOPS, PAGE, RESULTS, TABLE, write_report, write_tables

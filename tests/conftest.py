@@ -16,7 +16,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-from dvo.data.root import data_root as find_data_root
+from dvo.data.files.root import data_root as find_data_root
 from dvo.data.trajectory import Trajectory, write_tum
 from tests.support.fake_odometry import FakeOdometry, curve
 

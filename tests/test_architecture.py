@@ -13,7 +13,7 @@ LIBRARY = sorted((ROOT / "dvo").rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
 EVERYTHING = LIBRARY + [file for folder in ("train", "eval") for file in sorted((ROOT / folder).rglob("*.py"))]
 
-# A room may import these rooms, itself, and dvo.errors.
+# A room may import these rooms, itself, and dvo.core.errors.
 ARROWS: dict[str, set[str]] = {
     "errors": set(),
     "allocator": set(),

@@ -11,8 +11,8 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.commands import calibrate as command
-from dvo.data.focal_guess import guess_from_angle
-from dvo.odometry.camera_estimate import SelfCalibration
+from dvo.data.calibration.focal_guess import guess_from_angle
+from dvo.odometry.calibrate.camera_estimate import SelfCalibration
 
 
 @pytest.fixture

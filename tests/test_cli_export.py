@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dvo.cli import main
-from dvo.data.euroc import read_state_groundtruth
+from dvo.data.readers.euroc import read_state_groundtruth
 from dvo.data.trajectory import read_kitti_poses, read_tum
 from dvo.geometry.poses import pose_matrices
 from tests.support.command_line import arguments, errors, names, summary

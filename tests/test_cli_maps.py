@@ -12,7 +12,7 @@ import torch
 
 import dvo
 from dvo.cli import main
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from tests.support.command_line import arguments, summary
 from tests.support.fake_odometry import FakeOdometry, curve
 

@@ -8,7 +8,7 @@ import pytest
 
 from dvo.cli import main
 from dvo.commands.observers import open_observers
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.viz.overlay import OverlayVideo
 from tests.support.command_line import arguments, summary
 

@@ -20,8 +20,8 @@ from dvo.cli import main
 from dvo.commands.console import describe_status
 from dvo.commands.report import describe_breaks
 from dvo.data.trajectory import read_tum
-from dvo.odometry import files
 from dvo.odometry.protocol import Break, Estimate, Status
+from dvo.session import files
 from tests.support.command_line import arguments, errors, names, summary
 
 resource = pytest.importorskip("resource")
@@ -80,7 +80,7 @@ def test_no_file_handle_is_free_at_the_end(given, image_folder, tmp_path, capsys
     def none_left(path: Path) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE), str(path))
 
-    given(at_frame={19: lambda: monkeypatch.setattr("dvo.odometry.results.replaced", none_left)})
+    given(at_frame={19: lambda: monkeypatch.setattr("dvo.session.results.replaced", none_left)})
     assert main(arguments(image_folder, tmp_path / "out")) == 2
     (error,) = errors(capsys.readouterr().err)
     assert "Too many open files" in error

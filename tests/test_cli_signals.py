@@ -83,7 +83,7 @@ def test_kill_at_ten_moments_of_a_real_clip(data_root, tmp_path, repository):
     script.write_text(
         "import sys, time, dvo\n"
         "from dvo.cli import main\n"
-        "from dvo.odometry.tracker import PatchOdometry\n"
+        "from dvo.odometry.patch.tracker import PatchOdometry\n"
         "track, log = PatchOdometry.track, open(sys.argv[1], 'w')\n"
         "def timed(self, frame):\n"
         "    estimate = track(self, frame)\n"

@@ -79,7 +79,7 @@ def test_ctrl_c_ends_a_camera_that_sends_nothing_more(given, monkeypatch, calib,
     """The main thread waits for an image when the signal comes; results are written, and dropped frames counted."""
     camera = type("Camera", (HangingCamera,), {"go": threading.Event(), "wake": threading.Event()})
     monkeypatch.setattr(cv2, "VideoCapture", camera)
-    monkeypatch.setattr("dvo.data.live.JOIN_TIMEOUT", 0.01)  # the camera hangs
+    monkeypatch.setattr("dvo.data.streams.live.JOIN_TIMEOUT", 0.01)  # the camera hangs
 
     def at_first():
         camera.go.set()

@@ -13,8 +13,8 @@ import pytest
 from dvo.cli import main
 from dvo.commands.page_tables import tables
 from dvo.data.trajectory import read_tum, write_tum
-from dvo.odometry.frame_table import read_frames
-from dvo.odometry.results_reader import read_results
+from dvo.session.frame_table import read_frames
+from dvo.session.results_reader import read_results
 from tests.support.command_line import arguments, errors, summary
 from tests.support.summary_page import data_of, floats
 

@@ -13,11 +13,11 @@ import pytest
 import torch
 import yaml
 
-from dvo.ba.layer import BADamping, BAOptions, bundle_adjust
+from dvo.ba.layer.layer import BADamping, BAOptions, bundle_adjust
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from dvo.nets.patchifier import patch_coordinates
+from dvo.nets.patch.patchifier import patch_coordinates
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = ROOT / "tests" / "outside"
@@ -60,7 +60,7 @@ def test_export_in_a_format_of_the_package(tmp_path):
 def test_parts_are_announced_without_a_call():
     listed = command("-c", (
         "from dvo.models.registry import ARCHITECTURES; from dvo.odometry.registry import ODOMETRIES\n"
-        "from dvo.data.registry import READERS; from dvo.synth.scenes.families import FAMILIES\n"
+        "from dvo.data.readers.registry import READERS; from dvo.synth.scenes.families import FAMILIES\n"
         "from train.tasks.registry import TASKS; from eval.systems.registry import SYSTEMS\n"
         "print([n in r for n, r in (('distance_vo', ARCHITECTURES), ('distance_vo', ODOMETRIES), ('array', READERS),\n"
         "    ('shed', FAMILIES), ('distance_vo', TASKS), ('standing-still', SYSTEMS))])"
@@ -70,7 +70,7 @@ def test_parts_are_announced_without_a_call():
 
 def test_the_update_operator_is_chosen_by_a_word():
     found = command("-c", (
-        "import torch; from dataclasses import replace; from dvo.nets.config import preset\n"
+        "import torch; from dataclasses import replace; from dvo.nets.patch.config import preset\n"
         "from dvo.models.patch_vo import PatchVO\n"
         "model = PatchVO(replace(preset('tiny'), update_operator='still'))\n"
         "intrinsics = torch.tensor([50.0, 50, 32, 24]).expand(1, 3, 4)\n"

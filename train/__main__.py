@@ -34,7 +34,7 @@ COMMANDS = {
 
 def main() -> None:
     """Entry point; bad input ends with code 2 and one line."""
-    from dvo.errors import DvoError
+    from dvo.core.errors import DvoError
 
     try:
         run()
@@ -49,7 +49,7 @@ def run() -> None:
     Raises:
         DvoError: no such command.
     """
-    from dvo.errors import DvoError
+    from dvo.core.errors import DvoError
 
     command, rest = (sys.argv[1:2] or [""])[0], sys.argv[2:]
     if command in COMMANDS:
@@ -62,7 +62,7 @@ def run() -> None:
     if command != "fit":
         remedy = f"give one of fit, {', '.join(COMMANDS)}"
         raise DvoError(f"no command '{command}'" if command else "a command is missing", remedy=remedy)
-    from dvo.allocator import reuse_freed_memory
+    from dvo.core.allocator import reuse_freed_memory
     from train.engine.cli import train
 
     reuse_freed_memory()

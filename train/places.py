@@ -1,7 +1,7 @@
 """Descriptor of places, fitted on renderings: ``python -m train places``.
 
 Renders pictures of the families of scenes that training draws (never of the held-out ones), encodes them with the
-network, and fits mean and projection of :class:`dvo.odometry.place_descriptors.GridDescriptor`.
+network, and fits mean and projection of :class:`dvo.odometry.loops.place_descriptors.GridDescriptor`.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.threads import settle_threads
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights
-from dvo.odometry.front_end import encode_image
-from dvo.odometry.place_descriptors import SHIPPED, fit_grid, pool_cells, save_descriptor
+from dvo.odometry.frames.front_end import encode_image
+from dvo.odometry.loops.place_descriptors import SHIPPED, fit_grid, pool_cells, save_descriptor
 from dvo.synth.scenes.families import SHARES
 from dvo.synth.sequence import make_sequence
-from dvo.threads import settle_threads
 
 FIRST_SEED = 3_800_000_000
 """Of the sequences; those of clips, suites and benchmarks lie elsewhere."""

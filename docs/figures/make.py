@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 import dvo
+from dvo.ba.layer.schur import invert_blocks
+from dvo.ba.layer.window_equations import window_equations
 from dvo.ba.options import BAOptions
-from dvo.ba.schur import invert_blocks
-from dvo.ba.window_equations import window_equations
-from dvo.nets.correlation import correlate_reference
-from dvo.odometry.front_end import encode_image
-from dvo.odometry.tracker import PatchOdometry
+from dvo.nets.correlation.correlation import correlate_reference
+from dvo.odometry.frames.front_end import encode_image
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.synth import make_sequence
 from dvo.viz.plot import ACCENT, INK, PAPER, TRUTH
 

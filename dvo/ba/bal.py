@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import so3
 
 

@@ -12,7 +12,7 @@ from dvo.ba.problem import StateBlock
 from dvo.geometry import se3, sim3
 
 POSES, INVERSE_DEPTHS, INTRINSICS = "poses", "inverse_depths", "intrinsics"
-"""Names of the blocks of :func:`dvo.ba.layer.bundle_adjust`; poses are world to camera (or to body)."""
+"""Names of the blocks of :func:`dvo.ba.layer.layer.bundle_adjust`; poses are world to camera (or to body)."""
 
 REFINED = {"focal": 1, "all": 4}
 """Unknowns of the intrinsics by what is refined: one common factor of fx and fy; fx, fy, cx, cy."""

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from dvo.ba.blocks import POSES
+from dvo.ba.layer.step import normal_equations, reduced_system
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
-from dvo.ba.step import normal_equations, reduced_system
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.precision import full_precision
 
@@ -40,7 +40,7 @@ def pose_covariance(
         damping: absolute damping of poses and inverse depths.
         block: name of the block.
         sigma: standard deviation of a measurement of weight 1, by which the result is scaled. For the confidence of a
-            network see :attr:`dvo.odometry.config.TrackerConfig.sigma`.
+            network see :attr:`dvo.odometry.patch.config.TrackerConfig.sigma`.
         constraint: ``(B, N, d)`` coefficients of the tangents of all poses whose sum is held at zero, for example
             :func:`size_gradient`; those of fixed poses are ignored. The direction may be one that nothing measures.
 

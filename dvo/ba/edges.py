@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 CHUNK = 1 << 17
 """Places linearised at a time: bounds the memory when every pixel of a feature map is a patch."""

@@ -20,12 +20,12 @@ import torch
 from torch import Tensor
 
 from dvo.ba.cold_start import damping_at
-from dvo.ba.global_adjust import GlobalBAOptions
 from dvo.ba.kernels import Kernel
-from dvo.ba.levenberg import LMOptions
 from dvo.ba.options import BAOptions
 from dvo.ba.patch_problem import KERNEL, MAX_RESIDUAL, PatchProblem
 from dvo.ba.solve import solve
+from dvo.ba.sparse.global_adjust import GlobalBAOptions
+from dvo.ba.sparse.levenberg import LMOptions
 from dvo.geometry import se3
 
 Start = Callable[[PatchProblem, GlobalBAOptions], PatchProblem]

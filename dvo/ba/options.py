@@ -1,4 +1,4 @@
-"""Options and result of :func:`dvo.ba.layer.bundle_adjust`."""
+"""Options and result of :func:`dvo.ba.layer.layer.bundle_adjust`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal, get_args
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 Refine = Literal["none", "focal", "all"]
 _REFINE = get_args(Refine)
@@ -50,7 +50,7 @@ class Sensors:
 
 @dataclass(frozen=True)
 class BAOptions:
-    """Options of :func:`dvo.ba.layer.bundle_adjust`.
+    """Options of :func:`dvo.ba.layer.layer.bundle_adjust`.
 
     Attributes:
         fixed: number of leading poses that stay, or which: bool ``(N,)``.
@@ -105,7 +105,7 @@ class BAOptions:
 
 @dataclass(frozen=True)
 class BAResult:
-    """Outcome of :func:`dvo.ba.layer.bundle_adjust`.
+    """Outcome of :func:`dvo.ba.layer.layer.bundle_adjust`.
 
     Attributes:
         poses_cw: ``(B, N, 7)`` world to camera (to body with several sensors).

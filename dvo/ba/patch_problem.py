@@ -12,11 +12,11 @@ from torch import Tensor
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
 from dvo.ba.edges import EdgePlan, plan_edges
 from dvo.ba.kernels import Kernel
+from dvo.ba.layer.reprojection import PatchReprojection
 from dvo.ba.options import Sensors
 from dvo.ba.problem import Factor
-from dvo.ba.reprojection import PatchReprojection
 from dvo.ba.state import StateBlock
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 KERNEL = Kernel("cauchy", 0.1)
 """Robust kernel that solutions are compared by, of weighted residuals in feature pixels."""
@@ -156,7 +156,7 @@ class PatchProblem:
         """The measurements as a factor of the generic kind.
 
         Args:
-            max_residual, bounds, kernel, focal_only: see :class:`dvo.ba.reprojection.PatchReprojection`.
+            max_residual, bounds, kernel, focal_only: see :class:`dvo.ba.layer.reprojection.PatchReprojection`.
 
         Returns:
             The factor, of a batch.

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.bal import PointProblem
-from dvo.ba.schur import eliminate
+from dvo.ba.layer.schur import eliminate
 from dvo.geometry import se3, so3
 
 MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from dvo.ba.edges import free_slots
 from dvo.ba.kernels import Kernel
-from dvo.ba.levenberg import LMOptions, levenberg_marquardt
-from dvo.ba.schur_pattern import make_schur_pattern
-from dvo.ba.sparse import SparseSystem
-from dvo.errors import DvoError
+from dvo.ba.sparse.equations import SparseSystem
+from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
+from dvo.ba.sparse.schur_pattern import make_schur_pattern
+from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3, so3
 from dvo.geometry.precision import full_precision
 

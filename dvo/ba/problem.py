@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dvo.ba.linearisation import AdjointConstants, Linearisation, NormalEquations, adjoint_term, assemble
+from dvo.ba.layer.linearisation import AdjointConstants, Linearisation, NormalEquations, adjoint_term, assemble
 from dvo.ba.state import State, StateBlock
 
 __all__ = ["AdjointConstants", "Factor", "Linearisation", "NormalEquations", "Problem", "State", "StateBlock"]

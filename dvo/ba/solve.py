@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import overload
 
-from dvo.ba.global_adjust import GlobalBAOptions, GlobalBAResult, adjust_sparse
-from dvo.ba.layer import adjust_dense
+from dvo.ba.layer.layer import adjust_dense
 from dvo.ba.options import BAOptions, BAResult
 from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.sparse.global_adjust import GlobalBAOptions, GlobalBAResult, adjust_sparse
 
 
 @overload
@@ -23,14 +23,15 @@ def solve(problem: PatchProblem, options: BAOptions | GlobalBAOptions) -> BAResu
     Args:
         problem: for a dense solution a batch, or one graph; for a sparse one one graph.
         options: :class:`dvo.ba.options.BAOptions` for dense Gauss-Newton steps, differentiable from end to end;
-            :class:`dvo.ba.global_adjust.GlobalBAOptions` for Levenberg-Marquardt with block-sparse equations, robust
-            costs and acceptance of steps, without gradients.
+            :class:`dvo.ba.sparse.global_adjust.GlobalBAOptions` for Levenberg-Marquardt with block-sparse equations,
+            robust costs and acceptance of steps, without gradients.
 
     Returns:
         New values, with the shapes of the problem.
 
     Raises:
-        DvoError: see :func:`dvo.ba.layer.bundle_adjust` and :func:`dvo.ba.global_adjust.global_bundle_adjust`.
+        DvoError: see :func:`dvo.ba.layer.layer.bundle_adjust` and
+            :func:`dvo.ba.sparse.global_adjust.global_bundle_adjust`.
 
     Example:
         >>> result = solve(problem, GlobalBAOptions(fixed=1))

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 _SEARCHED = 800  # pixels of the longer side of the image in which a checkerboard is searched
 _LEAST = 8  # corners of a ChArUco board in a view

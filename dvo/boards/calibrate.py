@@ -11,12 +11,12 @@ import numpy as np
 from dvo.boards.board import Board
 from dvo.boards.solve import NAMES, Solution, solve
 from dvo.boards.views import Search, View, choose_views, find_views
-from dvo.data.calibration import Calibration
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_settings
+from dvo.data.calibration.calibration import Calibration
+from dvo.data.files.output import replaced
 from dvo.data.frame import Frame
-from dvo.data.output import replaced
-from dvo.errors import DvoError
 from dvo.geometry.undistort import Undistorter, needs_undistortion
-from dvo.settings import check_settings
 
 _CELLS = (8, 6)  # columns and rows of the cells of the coverage
 _TILT = "tilt the board by 30 to 45 degrees to the left, right, up and down, and show it near and in all corners"
@@ -127,7 +127,7 @@ class BoardCalibration:
         return list(self.parameters.items())[start:stop]
 
     def write(self, file: Path | str) -> None:
-        """Write a calibration file that :func:`dvo.data.calibration.read_calibration` reads.
+        """Write a calibration file that :func:`dvo.data.calibration.calibration.read_calibration` reads.
 
         Args:
             file: text, ``fx fy cx cy k1 k2 p1 p2 [k3]``; a name that ends in ``.yaml`` for YAML, which a fisheye needs.

@@ -12,14 +12,14 @@ import numpy as np
 from dvo.commands.console import warn
 from dvo.commands.observers import GuardedObserver
 from dvo.data.extrinsics import base_trajectory, read_extrinsics
+from dvo.data.files.output import replaced
 from dvo.data.frame import Frame
 from dvo.data.opening import locate
-from dvo.data.output import replaced
 from dvo.data.trajectory import tum_row
-from dvo.odometry.observer import Observer
 from dvo.odometry.protocol import Estimate, Odometry
-from dvo.odometry.results import BASE
-from dvo.odometry.session import Run
+from dvo.session.observer import Observer
+from dvo.session.results import BASE
+from dvo.session.session import Run
 
 _HEADER = "# timestamp tx ty tz qx qy qz qw (base to the first base frame)\n"
 
@@ -40,10 +40,10 @@ class BaseFrame:
         self.warnings: list[str] = []
 
     def begin(self, odometry: Odometry) -> None:
-        """See :class:`dvo.odometry.observer.Observer`."""
+        """See :class:`dvo.session.observer.Observer`."""
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
-        """See :class:`dvo.odometry.observer.Observer`."""
+        """See :class:`dvo.session.observer.Observer`."""
 
     def finish(self, run: Run) -> None:
         """Write the file, and warn of a scale that does not suit the extrinsics."""
@@ -62,7 +62,7 @@ class BaseFrame:
             file.writelines(tum_row([time, *pose]) for time, pose in rows)
 
     def close(self) -> None:
-        """See :class:`dvo.odometry.observer.Observer`."""
+        """See :class:`dvo.session.observer.Observer`."""
 
 
 def base_observers(arguments: argparse.Namespace, folder: Path, source: Path) -> list[Observer]:

@@ -16,13 +16,13 @@ from dvo.boards.calibrate import BoardCalibration, BoardOptions, calibrate_board
 from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.camera import CALIBRATION
 from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, seed_everything, warn
-from dvo.data.capture import is_stream
-from dvo.data.output import replaced
-from dvo.data.reduction import MAX_PIXELS
+from dvo.core.errors import DvoError
+from dvo.data.files.output import replaced
+from dvo.data.images.reduction import MAX_PIXELS
 from dvo.data.source import Source
-from dvo.errors import DvoError
-from dvo.odometry import results
-from dvo.odometry.calibrate import calibrate as self_calibrate
+from dvo.data.streams.capture import is_stream
+from dvo.odometry.calibrate.calibrate import calibrate as self_calibrate
+from dvo.session import results
 
 FISHEYE = "calib.yaml"
 """Calibration file of a fisheye, which the text file cannot hold."""

@@ -13,10 +13,10 @@ import torch
 
 from dvo.commands.console import TrackingProgress, say, seed_everything, warn
 from dvo.data.source import Source
-from dvo.odometry.calibrate import calibrate
-from dvo.odometry.camera_estimate import SelfCalibration, is_foreign
+from dvo.odometry.calibrate.calibrate import calibrate
+from dvo.odometry.calibrate.camera_estimate import SelfCalibration, is_foreign
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Odometry
-from dvo.odometry.tracker import PatchOdometry
 
 CALIBRATION = "calib.txt"
 """Calibration file in the results folder of a run without a calibration, for the next run."""

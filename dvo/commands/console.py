@@ -20,8 +20,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from dvo.commands import Terminated
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
 from dvo.odometry.protocol import Estimate, Result, Status
 
 _COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red"}
@@ -179,7 +179,7 @@ class TrackingProgress:
             self._progress.stop()
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
-        """Advance by a frame; callback of :func:`dvo.odometry.session.run`.
+        """Advance by a frame; callback of :func:`dvo.session.session.run`.
 
         Args:
             frame: the frame.

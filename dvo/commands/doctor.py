@@ -181,7 +181,7 @@ def threads(problems: list[str]) -> Section:
     """
     import cv2
 
-    from dvo.threads import settle_threads
+    from dvo.core.threads import settle_threads
 
     now = settle_threads()
     if now.count > 1 and now.waits_by == "OpenMP":
@@ -254,7 +254,7 @@ def folders(problems: list[str]) -> Section:
     Args:
         problems: folders that are set but missing, or cannot be written, are added.
     """
-    from dvo.data.root import VARIABLE, data_root
+    from dvo.data.files.root import VARIABLE, data_root
 
     data = data_root(required=False)
     given = VARIABLE in os.environ

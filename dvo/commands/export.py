@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from dvo.commands.console import say
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import read_tum
-from dvo.errors import DvoError
 from dvo.export.formats import (
     MAP_FORMATS,
     TRAJECTORY_FORMATS,
@@ -17,9 +17,9 @@ from dvo.export.formats import (
     export_graph,
     export_trajectory,
 )
-from dvo.graph.serialisation import load_graph
-from dvo.odometry import results
+from dvo.map.io.serialisation import load_graph
 from dvo.odometry.segments import result_of_log
+from dvo.session import results
 
 
 def export(arguments: argparse.Namespace) -> int:

@@ -12,10 +12,10 @@ import dvo
 from dvo.commands import NOT_RECOGNISED, OK
 from dvo.commands.console import device_of, say, seed_everything, warn
 from dvo.commands.report import describe_localisation
-from dvo.errors import DvoError
-from dvo.odometry.files import check_writable
+from dvo.core.errors import DvoError
 from dvo.odometry.merging import merge_maps
 from dvo.odometry.protocol import Odometry
+from dvo.session.files import check_writable
 
 DEFAULT_WEIGHTS = "small"  # of --weights; with a map: those of the map
 

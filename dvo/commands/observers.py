@@ -9,11 +9,11 @@ from pathlib import Path
 
 from dvo.commands.console import warn
 from dvo.commands.view_options import VIEWER
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
-from dvo.odometry.observer import Observer
 from dvo.odometry.protocol import Estimate, Odometry
-from dvo.odometry.session import Run
+from dvo.session.observer import Observer
+from dvo.session.session import Run
 
 
 class GuardedObserver:
@@ -43,19 +43,19 @@ class GuardedObserver:
         return None if self._failed else getattr(self._observer, "file", None)
 
     def begin(self, odometry: Odometry) -> None:
-        """See :class:`dvo.odometry.observer.Observer`."""
+        """See :class:`dvo.session.observer.Observer`."""
         if not self._failed:
             with self._guard():
                 self._observer.begin(odometry)
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
-        """See :class:`dvo.odometry.observer.Observer`."""
+        """See :class:`dvo.session.observer.Observer`."""
         if not self._failed:
             with self._guard():
                 self._observer.update(frame, estimate)
 
     def finish(self, run: Run) -> None:
-        """See :class:`dvo.odometry.observer.Observer`."""
+        """See :class:`dvo.session.observer.Observer`."""
         if not self._failed:
             with self._guard():
                 self._observer.finish(run)

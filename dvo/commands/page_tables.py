@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dvo.odometry.frame_table import FrameRow
+from dvo.session.frame_table import FrameRow
 from dvo.viz.run_page import colour_of
 
 SETTINGS = ("source", "kind", "odometry", "weights", "device", "seed", "stride", "calibration", "readout",

@@ -10,9 +10,9 @@ from typing import Any
 from dvo.commands.console import say
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics, evaluate
-from dvo.odometry import results
 from dvo.odometry.protocol import Break
-from dvo.odometry.session import Run
+from dvo.session import results
+from dvo.session.session import Run
 
 _SHOWN = 5  # breaks and segments that are printed one by one
 _SCALES = {
@@ -143,7 +143,7 @@ def describe_scale(scale: Mapping[str, Any]) -> str:
     """Describe the source of the scale.
 
     Args:
-        scale: of the metadata of a result, see :func:`dvo.odometry.metric_scale.settle_scale`.
+        scale: of the metadata of a result, see :func:`dvo.odometry.scale.metric_scale.settle_scale`.
 
     Returns:
         Text such as ``poses and map are in metres, from depth images (scale known to 0.21 %)``.

@@ -26,18 +26,18 @@ from dvo.commands.report import Scores, headline, print_report, score
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
 from dvo.commands.streams import print_counts, stream_facts, stream_settings
 from dvo.commands.summary import Pages
-from dvo.data.capture import shown
+from dvo.core.errors import DvoError
+from dvo.core.settings import parse_settings, read_settings
 from dvo.data.frame import Frame
+from dvo.data.streams.capture import shown
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.export.formats import check_formats, export_run, remove_exports
-from dvo.odometry import results, session
-from dvo.odometry.camera_estimate import is_foreign
-from dvo.odometry.frame_table import FrameTable
-from dvo.odometry.observer import Observer
+from dvo.odometry.calibrate.camera_estimate import is_foreign
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
-from dvo.odometry.recorder import Recorder
-from dvo.settings import parse_settings, read_settings
+from dvo.session import results, session
+from dvo.session.frame_table import FrameTable
+from dvo.session.observer import Observer
+from dvo.session.recorder import Recorder
 
 EXPORT = "export"  # folder of the exports in the results folder
 _ABORTED = "aborted by a second Ctrl-C or SIGTERM"
@@ -192,7 +192,7 @@ def track(
 ) -> int:
     """Track a clip, write the results folder and print a summary.
 
-    Results are written from the first frame on (:class:`dvo.odometry.recorder.Recorder`) and replaced at the end. The
+    Results are written from the first frame on (:class:`dvo.session.recorder.Recorder`) and replaced at the end. The
     first Ctrl-C or SIGTERM ends tracking and still writes all results; a second one aborts, and what the recorder has
     written stays.
 

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from dvo.commands.observers import GuardedObserver
-from dvo.data.depth_source import with_depth
-from dvo.data.right_source import with_right
+from dvo.core.errors import DvoError
+from dvo.data.companions.depth_source import with_depth
+from dvo.data.companions.right_source import with_right
 from dvo.data.source import Source
-from dvo.errors import DvoError
-from dvo.odometry import results
-from dvo.odometry.depth_fusion import DepthCloud
-from dvo.odometry.observer import Observer
+from dvo.session import results
+from dvo.session.depth_fusion import DepthCloud
+from dvo.session.observer import Observer
 
 
 def scaled_source(source: Source, arguments: argparse.Namespace) -> Source:

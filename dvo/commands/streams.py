@@ -7,8 +7,8 @@ import time
 from typing import Any
 
 from dvo.commands.console import say
-from dvo.data.live_source import LiveSource
 from dvo.data.source import Source
+from dvo.data.streams.live_source import LiveSource
 
 
 def stream_settings(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -16,15 +16,15 @@ from dvo.commands.console import say
 from dvo.commands.page_tables import figures, headline_of, tables
 from dvo.commands.picture import world_root
 from dvo.commands.report import score
-from dvo.data.output import replaced
+from dvo.data.files.output import replaced
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.metrics import MINIMUM_MATCHES, associate, fit_alignment, stands_still, transform
-from dvo.odometry import results
-from dvo.odometry.files import write_error
-from dvo.odometry.frame_table import FrameRow, FrameTable, keyframe_times, write_frames
 from dvo.odometry.protocol import Odometry, Result
-from dvo.odometry.results_reader import Stored, read_results
-from dvo.odometry.session import Run
+from dvo.session import results
+from dvo.session.files import write_error
+from dvo.session.frame_table import FrameRow, FrameTable, keyframe_times, write_frames
+from dvo.session.results_reader import Stored, read_results
+from dvo.session.session import Run
 from dvo.viz.run_page import RunPage, TrackLine, World, write_page
 
 Similarity = tuple[float, np.ndarray, np.ndarray]

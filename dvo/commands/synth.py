@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from dvo.commands.console import device_of
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth import FAMILIES, MeshScene, load_mesh
 from dvo.synth.export import export_sequence, mesh_sequence
 from dvo.synth.preview import contact_sheet, family_sheet, sequence_rows

@@ -10,9 +10,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.weights import WeightsInfo, import_checkpoint, list_weights, weights_info
-from dvo.odometry.results import jsonable
+from dvo.session.results import jsonable
 
 
 def list_shipped(arguments: argparse.Namespace) -> int:

@@ -1,12 +1,12 @@
 """Frames, calibrations and trajectories, and the readers of videos, image folders, data sets and streams."""
 
-from dvo.data.calibration import Calibration, read_calibration
+from dvo.data.calibration.calibration import Calibration, read_calibration
 from dvo.data.frame import Frame, InertialSamples, StereoView
+from dvo.data.readers.registry import READERS
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-from dvo.data.registry import READERS
-from dvo.data.sensors import Sensors, StereoRig
+from dvo.data.sensors.sensors import Sensors, StereoRig
 from dvo.data.source import Source, open_source
-from dvo.data.streams import FrameStream, stream
+from dvo.data.streams.streams import FrameStream, stream
 from dvo.data.trajectory import Trajectory, interpolate, read_kitti_poses, read_tum, write_kitti_poses, write_tum
 
 __all__ = [

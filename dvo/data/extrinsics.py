@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from dvo.data.files import MAX_NUMBER, parse_number, read_rows
+from dvo.core.errors import DvoError
+from dvo.core.yaml_files import read_yaml
+from dvo.data.files.files import MAX_NUMBER, parse_number, read_rows
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry.poses import compose_poses, invert_poses, poses_from_matrices
-from dvo.yaml_files import read_yaml
 
 KEYS = ("T_base_camera", "T_BS")
 """Names of the matrix in a YAML or JSON file; the second is EuRoC's, sensor to body."""

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 
 T = TypeVar("T")

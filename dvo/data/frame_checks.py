@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.mask import checked_mask
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 
 _CHANNELS = (1, 3, 4)

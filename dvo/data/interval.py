@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
 Bound = float | str

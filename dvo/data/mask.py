@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from dvo.data.images import decode, list_images
+from dvo.core.errors import DvoError
+from dvo.data.images.images import decode, list_images
+from dvo.data.images.reduction import Reduction
 from dvo.data.recording import ImageRecording
-from dvo.data.reduction import Reduction
-from dvo.errors import DvoError
 from dvo.geometry.undistort import Undistorter
 
 _HALF = 128  # grey level from which a pixel of a JPEG file is white: its black is not exactly 0

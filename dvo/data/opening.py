@@ -6,10 +6,10 @@ from itertools import islice
 from numbers import Integral
 from pathlib import Path
 
-from dvo.data.colmap_cameras import is_calibration_file
-from dvo.data.files import is_file, is_folder
+from dvo.core.errors import DvoError
+from dvo.data.calibration.colmap_cameras import is_calibration_file
+from dvo.data.files.files import is_file, is_folder
 from dvo.data.recording import Log, RawFrame, Recording
-from dvo.errors import DvoError
 
 
 def check_stride(stride: object) -> None:

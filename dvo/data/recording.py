@@ -11,16 +11,16 @@ from typing import Protocol
 
 import numpy as np
 
-from dvo.data.calibration import Calibration
-from dvo.data.depth import read_depth
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration
 from dvo.data.frame import InertialSamples
-from dvo.data.images import read_image
+from dvo.data.images.images import read_image
+from dvo.data.images.orientation import common_orientation, turn
+from dvo.data.images.reduction import Reduction
 from dvo.data.interval import Interval
-from dvo.data.orientation import common_orientation, turn
-from dvo.data.reduction import Reduction
-from dvo.data.sensors import Sensors, StereoRig
+from dvo.data.sensors.depth import read_depth
+from dvo.data.sensors.sensors import Sensors, StereoRig
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class ImageRecording:
 
     Attributes:
         interval: that is read, see :func:`dvo.data.interval.limit`.
-        reduction: of the images, see :func:`dvo.data.reduction.reduce_images`.
+        reduction: of the images, see :func:`dvo.data.images.reduction.reduce_images`.
         orientation: of EXIF, by which all images are turned; 1 (as stored) if they do not agree, or if the data set has
             depth or right images.
 

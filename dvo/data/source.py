@@ -10,24 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from dvo.data.calibration import Calibration, read_calibration
-from dvo.data.capture import is_stream
-from dvo.data.depth import registered_depth, resized_depth
-from dvo.data.files import lookups
-from dvo.data.focal_guess import FocalGuess, guess_focal
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration, read_calibration
+from dvo.data.calibration.focal_guess import FocalGuess, guess_focal
+from dvo.data.files.files import lookups
+from dvo.data.files.stamps import checked_rate
 from dvo.data.frame import Frame, InertialSamples, StereoView
-from dvo.data.groundtruth import read_groundtruth
+from dvo.data.images.reduction import MAX_PIXELS, Reduction, reduce_images
 from dvo.data.interval import Bound, Interval, expected_frames, limit
 from dvo.data.mask import Masks, open_masks
 from dvo.data.opening import check_invert, check_stride, first_frame, locate, no_calibration
+from dvo.data.readers.groundtruth import read_groundtruth
+from dvo.data.readers.registry import find_reader
+from dvo.data.readers.rosbag import split_topic
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
-from dvo.data.reduction import MAX_PIXELS, Reduction, reduce_images
-from dvo.data.registry import find_reader
-from dvo.data.rosbag import split_topic
-from dvo.data.sensors import StereoRig
-from dvo.data.stamps import checked_rate
+from dvo.data.sensors.depth import registered_depth, resized_depth
+from dvo.data.sensors.sensors import StereoRig
+from dvo.data.streams.capture import is_stream
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.field_of_view import notice_of_cut
 from dvo.geometry.undistort import Undistorter, needs_undistortion
@@ -41,7 +41,7 @@ class Source:
     Attributes:
         recording: as its reader found it, before cameras and undistortion.
         name: of the sequence.
-        kind: name of the reader, see :data:`dvo.data.registry.READERS`.
+        kind: name of the reader, see :data:`dvo.data.readers.registry.READERS`.
         path: file or folder that was opened.
         camera: the camera of every frame (without distortion if frames are undistorted, reduced if they are).
         recorded_camera: the camera as calibrated, distortion included.
@@ -237,23 +237,24 @@ def open_source(
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
     ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it), a bag of ROS; or a stream:
-    ``webcam:0``, ``rtsp://...``, ``http://...`` or ``-``, see :func:`dvo.data.live_source.open_stream`.
+    ``webcam:0``, ``rtsp://...``, ``http://...`` or ``-``, see :func:`dvo.data.streams.live_source.open_stream`.
 
     Relative paths of the options are looked up from the working directory, then from the source's folder, so that
     ``--calib ../calib.txt`` beside an image folder is found from anywhere.
 
     Args:
         source: path to a file or folder.
-        calib: calibration that wins over the dataset's own; see :func:`dvo.data.calibration.read_calibration`.
+        calib: calibration that wins over the dataset's own; see
+            :func:`dvo.data.calibration.calibration.read_calibration`.
         times: file with the time of every image in its first column.
         fps: frames a second, where nothing else gives times; for a video it overrides the container.
         stride: read every ``stride``-th frame.
         groundtruth: TUM trajectory (camera to world), or a format without times for the images of a folder, see
-            :func:`dvo.data.groundtruth.read_groundtruth`; wins over the data set's own.
+            :func:`dvo.data.readers.groundtruth.read_groundtruth`; wins over the data set's own.
         undistort: resample images, depth and right images to pinhole cameras; otherwise frames carry the distorted
             cameras.
-        reader: name of the reader (``dvo.data.registry.READERS``); None: the first whose layout matches.
-        guess: where there is no calibration, guess the focal length (:mod:`dvo.data.focal_guess`), for
+        reader: name of the reader (``dvo.data.readers.registry.READERS``); None: the first whose layout matches.
+        guess: where there is no calibration, guess the focal length (:mod:`dvo.data.calibration.focal_guess`), for
             :func:`dvo.calibrate`.
         queue: of a stream, frames that may wait.
         topic: of the images in a bag of ROS, if there are several; ``bag.mcap:/camera/image`` names it too.
@@ -265,8 +266,8 @@ def open_source(
             one for each image (:func:`dvo.data.mask.open_masks`); for ``Frame.mask``.
         mask_invert: white is ignored and black used.
         max_pixels: images with more are reduced by area right after they are decoded, by the smallest whole factor that
-            suffices (:mod:`dvo.data.reduction`); calibration and masks remain those of the recorded images. None for
-            never; streams and bags of ROS are never reduced.
+            suffices (:mod:`dvo.data.images.reduction`); calibration and masks remain those of the recorded images. None
+            for never; streams and bags of ROS are never reduced.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -283,7 +284,7 @@ def open_source(
                 print(frame.timestamp, frame.image.shape, frame.depth is not None)
     """
     if is_stream(source):
-        from dvo.data.live_source import open_stream
+        from dvo.data.streams.live_source import open_stream
 
         for field, value in dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start).items():
             if value is not None:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dvo.data.files import parse_number, read_rows
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.files.files import parse_number, read_rows
 from dvo.geometry.poses import pose_matrices, poses_from_matrices, slerp
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
@@ -128,10 +128,10 @@ def read_tum(path: Path | str) -> Trajectory:
 
 
 def read_numbers(path: Path, columns: int, row: str, header: str) -> tuple[np.ndarray, list[int]]:
-    """Read a table of numbers, none of which is beyond :data:`dvo.data.files.MAX_NUMBER`.
+    """Read a table of numbers, none of which is beyond :data:`dvo.data.files.files.MAX_NUMBER`.
 
     Args:
-        path: the file; see :func:`dvo.data.files.read_rows`.
+        path: the file; see :func:`dvo.data.files.files.read_rows`.
         columns: numbers in each row.
         row: name of a row, for messages.
         header: names of the numbers, for messages.

@@ -13,15 +13,15 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dvo.data.output import PART
+from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
+from dvo.data.files.output import PART
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
-from dvo.odometry.files import write_error
-from dvo.registry import Registry
+from dvo.session.files import write_error
 
 if TYPE_CHECKING:
     from dvo.export.reconstruction import Reconstruction
-    from dvo.graph.keyframe_graph import KeyframeGraph
+    from dvo.map.keyframe_graph import KeyframeGraph
     from dvo.odometry.protocol import Odometry, Result
 
 MAP_FORMATS = Registry(
@@ -70,7 +70,7 @@ def export_map(
         >>> print(dvo.export_map(odometry, "video-colmap"))
     """
     from dvo.export.reconstruction import longest_segment
-    from dvo.graph.keyframe_graph import KeyframeGraph
+    from dvo.map.keyframe_graph import KeyframeGraph
 
     graph = graph_of(source)
     if not isinstance(source, KeyframeGraph) and len(graph.window):
@@ -208,7 +208,7 @@ def graph_of(source: object) -> KeyframeGraph:
     Raises:
         DvoError: an odometry without one.
     """
-    from dvo.graph.keyframe_graph import KeyframeGraph
+    from dvo.map.keyframe_graph import KeyframeGraph
 
     graph = source if isinstance(source, KeyframeGraph) else getattr(source, "graph", None)
     if isinstance(graph, KeyframeGraph):

@@ -17,8 +17,8 @@ import numpy as np
 from dvo.export.colmap import write_images
 from dvo.export.reconstruction import CORNER, Reconstruction
 from dvo.geometry.camera import Camera
-from dvo.odometry.files import write_ply
 from dvo.odometry.protocol import SparseMap
+from dvo.session.files import write_ply
 
 APPLIED_TRANSFORM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """``(3, 4)`` from the world of the keyframes (y down) to that of the files (z up): ``(x, y, z)`` to ``(x, z, -y)``."""

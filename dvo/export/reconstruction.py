@@ -1,6 +1,6 @@
 """Reconstruction of a segment: images, points and observations of a keyframe graph, which the map formats write.
 
-A feature-map pixel ``(u, v)`` is centred on the image pixel ``(4u, 4v)`` (:class:`dvo.nets.encoder.Encoder`), so
+A feature-map pixel ``(u, v)`` is centred on the image pixel ``(4u, 4v)`` (:class:`dvo.nets.patch.encoder.Encoder`), so
 positions and intrinsics of the feature map times 4 are those of the working image, without a half pixel. Pixel centres
 lie at integers here; a format that counts from the corner of the first pixel adds 0.5 (:data:`CORNER`).
 """
@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dvo.data.image_header import image_size
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_settings
+from dvo.data.images.image_header import image_size
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices
-from dvo.graph.archive import ArchivedKeyframe
-from dvo.graph.keyframe_graph import NEAR, KeyframeGraph
-from dvo.graph.measurements import ArchivedEdges
-from dvo.nets.config import ModelConfig
-from dvo.settings import check_settings
+from dvo.map.archive import ArchivedKeyframe
+from dvo.map.keyframe_graph import NEAR, KeyframeGraph
+from dvo.map.measurements import ArchivedEdges
+from dvo.nets.patch.config import ModelConfig
 
 CORNER = 0.5
 """Pixel coordinates counted from the corner of the first pixel, less those counted from its centre."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import sim3, so3
 
 AlignMode = Literal["none", "scale", "se3", "sim3"]

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 DistortionModel = Literal["none", "radtan", "fisheye"]
 

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dvo.settings import check_settings
+from dvo.core.settings import check_settings
 
 
 @dataclass(frozen=True)

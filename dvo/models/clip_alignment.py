@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dvo.models.step import Measurement, Revision, UpdateState
-from dvo.nets.alignment import AlignmentOptions, accept, align_patches, patch_warps
-from dvo.nets.config import ModelConfig
+from dvo.nets.alignment.alignment import AlignmentOptions, accept, align_patches, patch_warps
+from dvo.nets.patch.config import ModelConfig
 
 _GREY = (0.299, 0.587, 0.114)  # ITU-R BT.601, as OpenCV
 
@@ -16,7 +16,7 @@ _GREY = (0.299, 0.587, 0.114)  # ITU-R BT.601, as OpenCV
 class ClipAlignment:
     """Alignment of all edges of a batch of clips, as a :class:`dvo.models.step.Refinement`.
 
-    It is what :class:`dvo.odometry.window_alignment.WindowAlignment` does while tracking, without a cache. Gradients
+    It is what :class:`dvo.odometry.window.alignment.WindowAlignment` does while tracking, without a cache. Gradients
     pass from the aligned position through the iterations to the measurement of the network, and from the weight to its
     confidence; the decision between the two has none.
 

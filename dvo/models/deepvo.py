@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dvo.geometry import se3, so3
-from dvo.nets.deepvo import PRESETS, DeepVOConfig, PairEncoder, fit_images
+from dvo.nets.two_frame.deepvo import PRESETS, DeepVOConfig, PairEncoder, fit_images
 
 TRANSLATION_UNIT = 0.15
 """Length of a step for which the network's last layer gives 1, median depths; the unit of the loss as well.
@@ -38,7 +38,7 @@ class DeepVO(nn.Module):
     """Convolutional encoder of image pairs, recurrent layers, and a linear layer for the motion.
 
     Args:
-        config: sizes, see :class:`dvo.nets.deepvo.DeepVOConfig`.
+        config: sizes, see :class:`dvo.nets.two_frame.deepvo.DeepVOConfig`.
 
     Example:
         >>> model = DeepVO(DeepVO.presets["tiny"])
@@ -66,7 +66,8 @@ class DeepVO(nn.Module):
         """Regress the motion between neighbouring frames.
 
         Args:
-            images: uint8 RGB (or float in the same range), of any size; see :func:`dvo.nets.deepvo.fit_images`.
+            images: uint8 RGB (or float in the same range), of any size; see
+                :func:`dvo.nets.two_frame.deepvo.fit_images`.
             state: of the recurrent layers after the frames before; None at the beginning of a sequence.
 
         Returns:

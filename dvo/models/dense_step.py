@@ -17,13 +17,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dvo.ba.dense import dense_bundle_adjust, dense_patches, dense_plan, pixel_grid
 from dvo.ba.edges import EdgePlan
 from dvo.ba.kernels import Kernel
+from dvo.ba.layer.dense import dense_bundle_adjust, dense_patches, dense_plan, pixel_grid
 from dvo.ba.options import BADamping, BAOptions
 from dvo.geometry.projection import Reprojection, reproject
-from dvo.nets.dense_update import DenseUpdate
-from dvo.nets.frame_correlation import PairVolume
+from dvo.nets.correlation.frame_correlation import PairVolume
+from dvo.nets.droid.dense_update import DenseUpdate
 
 WEIGHT = 1e-3
 """Weight of a measurement of full confidence, pixels^-2 (DROID-SLAM): there are a thousand pixels in a map."""
@@ -120,7 +120,8 @@ class DenseState:
         targets: ``(B, E, h, w, 2)`` revised positions; None before the first step.
         confidence: ``(B, E, h, w, 2)`` in (0, 1); None before the first step.
         damping: ``(B, N, h, w)`` predicted for the inverse depths; None before the first step, and in mode ``flow``.
-        mask: ``(B, N, 576, h, w)`` for :func:`dvo.nets.dense_update.upsample_map`; None for a network without one.
+        mask: ``(B, N, 576, h, w)`` for :func:`dvo.nets.droid.dense_update.upsample_map`; None for a network without
+            one.
     """
 
     graph: FrameGraph

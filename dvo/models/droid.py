@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from dvo.ba.cold_start import COLD_UPDATES
 from dvo.ba.options import BADamping
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.dense_step import DAMPING, DenseMode, DenseOptions, DenseState, FrameGraph, dense_step, frame_graph
-from dvo.nets.correlation import CorrelationVolume
-from dvo.nets.dense_update import DenseUpdate
-from dvo.nets.droid import PRESETS, STRIDE, DroidConfig, DroidEncoder, standardise_images
+from dvo.nets.correlation.correlation import CorrelationVolume
+from dvo.nets.droid.dense_update import DenseUpdate
+from dvo.nets.droid.droid import PRESETS, STRIDE, DroidConfig, DroidEncoder, standardise_images
 
 __all__ = ["DroidFeatures", "DroidVO", "neighbour_edges"]
 
@@ -72,7 +72,7 @@ class DroidVO(nn.Module):
     """Encoders and update operator. The state dict of the ``full`` configuration has DROID-SLAM's names and shapes.
 
     Args:
-        config: sizes, see :class:`dvo.nets.droid.DroidConfig`.
+        config: sizes, see :class:`dvo.nets.droid.droid.DroidConfig`.
 
     Example:
         >>> model = DroidVO(preset("tiny"))

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from dvo.data.output import replaced
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.files.output import replaced
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights
 
@@ -48,7 +48,7 @@ def export_encoder(weights: str | Path, file: str | Path) -> OnnxEncoder:
     """Write the encoder as ONNX and compare it with torch on images of several sizes, on the CPU.
 
     The input ``images`` is ``(n, 3, H, W)`` float32, RGB in 0 to 255, H and W multiples of 4; the normalisation is in
-    the file. Outputs: :meth:`dvo.nets.frame_encoder.FrameEncoder.forward`. Number and size of images are free.
+    the file. Outputs: :meth:`dvo.nets.patch.frame_encoder.FrameEncoder.forward`. Number and size of images are free.
 
     Args:
         weights: shipped weights by name, or a safetensors file, of the architecture ``patch_vo``.

@@ -17,16 +17,16 @@ from torch import Tensor, nn
 
 from dvo.ba.cold_start import damping_at
 from dvo.geometry import se3
-from dvo.graph.edges import PatchGraph
+from dvo.map.edges import PatchGraph
 from dvo.models.clip_alignment import ClipAlignment
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
-from dvo.nets.config import PRESETS, ModelConfig
-from dvo.nets.correlation import Correlation, CorrelationVolume
-from dvo.nets.frame_encoder import FrameEncoder
-from dvo.nets.patchifier import Patchifier, normalise_images, patch_coordinates
-from dvo.nets.selection import SELECTIONS, PatchSelection
-from dvo.nets.update import UPDATE_OPERATORS
+from dvo.nets.correlation.correlation import Correlation, CorrelationVolume
+from dvo.nets.patch.config import PRESETS, ModelConfig
+from dvo.nets.patch.frame_encoder import FrameEncoder
+from dvo.nets.patch.patchifier import Patchifier, normalise_images, patch_coordinates
+from dvo.nets.patch.selection import SELECTIONS, PatchSelection
+from dvo.nets.update.update import UPDATE_OPERATORS
 
 __all__ = ["Mode", "PatchVO", "UpdateState"]
 
@@ -35,7 +35,7 @@ class PatchVO(nn.Module):
     """Encoder and update operator. The state dict of the ``full`` configuration has DPVO's names and shapes.
 
     Args:
-        config: sizes, see :class:`dvo.nets.config.ModelConfig`.
+        config: sizes, see :class:`dvo.nets.patch.config.ModelConfig`.
 
     Raises:
         DvoError: the selection ``learned`` without the head.
@@ -69,7 +69,7 @@ class PatchVO(nn.Module):
         """Patch selection by name.
 
         Args:
-            name: in :data:`dvo.nets.selection.SELECTIONS`; empty for that of the configuration.
+            name: in :data:`dvo.nets.patch.selection.SELECTIONS`; empty for that of the configuration.
 
         Raises:
             DvoError: no such selection.

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 MAX_BYTES = 2 * 1024**3
 """Largest file; the training state of the ``full`` network has 60 MB."""

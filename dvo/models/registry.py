@@ -7,8 +7,8 @@ from typing import Any, ClassVar, Protocol, Self, cast
 
 from torch import nn
 
-from dvo.errors import DvoError
-from dvo.registry import Registry
+from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
 
 DEFAULT_ARCHITECTURE = "patch_vo"
 """Architecture of weights files and training states that name none: they are older than the name."""

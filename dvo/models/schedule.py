@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dvo.graph.edges import Groups, PatchGraph, build_graph
+from dvo.map.edges import Groups, PatchGraph, build_graph
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def training_schedule(
         updates: number of updates.
         initial: frames of the first graph (None: all of them, the non-streaming recipe).
         settle: updates on the first graph before one frame is added at every update.
-        self_edges: see :class:`dvo.nets.config.ModelConfig`.
+        self_edges: see :class:`dvo.nets.patch.config.ModelConfig`.
         reach: see :func:`full_graph`.
 
     Returns:

@@ -1,7 +1,8 @@
 """One step of patch-flow visual odometry: reproject, correlate, update, bundle-adjust (DPVO 3.2, 3.3).
 
 Training unrolls this step on a clip (:meth:`dvo.models.patch_vo.PatchVO.unroll`), the tracker applies it once or more
-per frame (:class:`dvo.odometry.tracker.PatchOdometry`). A step maps a state to a state. All differences between the two
+per frame (:class:`dvo.odometry.patch.tracker.PatchOdometry`). A step maps a state to a state. All differences between
+the two
 loops are arguments: the edges and the poses and depths to start from (in the state), the implementation of the
 correlation (the lookup), which poses are fixed and how strongly bundle adjustment is damped (the options).
 """
@@ -19,10 +20,10 @@ from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor
 from dvo.ba.solve import solve
 from dvo.geometry.projection import reproject
-from dvo.graph.edges import PatchGraph
-from dvo.nets.correlation import CorrelationLookup
-from dvo.nets.masks import in_sight
-from dvo.nets.update import UpdateOperator
+from dvo.map.edges import PatchGraph
+from dvo.nets.correlation.correlation import CorrelationLookup
+from dvo.nets.patch.masks import in_sight
+from dvo.nets.update.update import UpdateOperator
 
 Mode = Literal["joint", "structure", "flow"]
 """``joint`` refines poses and depths, ``structure`` depths alone; ``flow`` skips bundle adjustment."""
@@ -85,7 +86,7 @@ class StepOptions:
         fixed: number of leading poses that bundle adjustment holds.
         iterations: Gauss-Newton iterations.
         damping: of bundle adjustment.
-        bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.bundle_adjust`.
+        bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.layer.bundle_adjust`.
         check: indices and weights, see :class:`dvo.ba.options.BAOptions`.
         factors: further measurements for bundle adjustment, for example of depth or of an inertial sensor.
         kernel: robust kernel of the weighted residuals in bundle adjustment.

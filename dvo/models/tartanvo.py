@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import so3
-from dvo.nets.flow_pose_net import FlowPoseNet
-from dvo.nets.flow_pyramid import STRIDE, Flows, MatchingNetwork
-from dvo.nets.pwc_net import PWCNet
-from dvo.nets.tartanvo import PRESETS, PoseNetwork, TartanVOConfig, derotate
+from dvo.nets.two_frame.flow_pose_net import FlowPoseNet
+from dvo.nets.two_frame.flow_pyramid import STRIDE, Flows, MatchingNetwork
+from dvo.nets.two_frame.pwc_net import PWCNet
+from dvo.nets.two_frame.tartanvo import PRESETS, PoseNetwork, TartanVOConfig, derotate
 
 __all__ = ["TartanVO", "TwoFrameMotion"]
 
@@ -56,10 +56,10 @@ class TwoFrameMotion:
 class TartanVO(nn.Module):
     """Matching network and pose network.
 
-    Images of any size from :attr:`dvo.nets.tartanvo.TartanVOConfig.smallest_side` on, and any pinhole camera.
+    Images of any size from :attr:`dvo.nets.two_frame.tartanvo.TartanVOConfig.smallest_side` on, and any pinhole camera.
 
     Args:
-        config: sizes, see :class:`dvo.nets.tartanvo.TartanVOConfig`.
+        config: sizes, see :class:`dvo.nets.two_frame.tartanvo.TartanVOConfig`.
 
     Example:
         >>> model = TartanVO(preset("tiny"))
@@ -133,7 +133,7 @@ class TartanVO(nn.Module):
     def motion(
         self, flow: Float[Tensor, "B 2 h w"], intrinsics: Float[Tensor, "B 4"]
     ) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]]:
-        """Motion of the camera from a flow, see :class:`dvo.nets.tartanvo.PoseNetwork`.
+        """Motion of the camera from a flow, see :class:`dvo.nets.two_frame.tartanvo.PoseNetwork`.
 
         Args:
             flow: at a quarter of the resolution, feature pixels.
@@ -149,8 +149,9 @@ class TartanVO(nn.Module):
     ) -> tuple[tuple[Float[Tensor, "B 3"], Float[Tensor, "B 3"]], ...]:
         """Motion of the camera from a flow after each pass of the pose network (:attr:`TartanVOConfig.passes`).
 
-        A pass reads what the rotation of the passes before it leaves of the flow (:func:`dvo.nets.tartanvo.derotate`),
-        so that it sees a smaller motion and corrects the rotation; the gradient of each stays in its pass.
+        A pass reads what the rotation of the passes before it leaves of the flow
+        (:func:`dvo.nets.two_frame.tartanvo.derotate`), so that it sees a smaller motion and corrects the rotation; the
+        gradient of each stays in its pass.
 
         Args:
             flow: at a quarter of the resolution, feature pixels.

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.pickles import check_plain, load_pickle
 from dvo.models.published import read_published
 from dvo.models.registry import (

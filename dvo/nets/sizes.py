@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self, TypeVar, get_origin, get_type_hints
 
-from dvo.errors import DvoError
-from dvo.settings import check_names, shown
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_names, shown
 
 C = TypeVar("C")
 

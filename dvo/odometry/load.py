@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from dvo.core.settings import check_seed
+from dvo.core.threads import settle_threads
 from dvo.models.weights import FOLDER, LoadedWeights, load_weights
-from dvo.odometry.config import PRESETS, TRACKER_PRESETS, TrackerConfig, with_changes
+from dvo.odometry.patch.config import PRESETS, TRACKER_PRESETS, TrackerConfig, with_changes
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.registry import odometry_builder
-from dvo.settings import check_seed
-from dvo.threads import settle_threads
 
 if TYPE_CHECKING:
     import torch
 
-    from dvo.odometry.tracker import PatchOdometry
+    from dvo.odometry.patch.tracker import PatchOdometry
 
 
 def load(
@@ -28,16 +28,17 @@ def load(
     """Load weights and build their odometry, for one sequence.
 
     The architecture in the metadata of the file selects the odometry, see :data:`dvo.odometry.registry.ODOMETRIES`. The
-    first call in a process sets the number of threads, see :func:`dvo.threads.settle_threads`.
+    first call in a process sets the number of threads, see :func:`dvo.core.threads.settle_threads`.
 
     Args:
         weights: name of weights that ship with dvo, or a file.
         device: of all computation.
         seed: of all random numbers of the odometry. The same seed on the same machine gives the same trajectory, bit
             for bit on the CPU with a fixed number of threads.
-        config: settings, for ``patch_vo`` a :class:`dvo.odometry.config.TrackerConfig`; None for those of the preset.
-        overrides: single settings, for ``patch_vo`` by the names of :class:`dvo.odometry.config.TrackerConfig`, and
-            ``preset``: ``default``, ``fast`` or ``accurate`` (:data:`dvo.odometry.config.PRESETS`).
+        config: settings, for ``patch_vo`` a :class:`dvo.odometry.patch.config.TrackerConfig`; None for those of the
+            preset.
+        overrides: single settings, for ``patch_vo`` by the names of :class:`dvo.odometry.patch.config.TrackerConfig`,
+            and ``preset``: ``default``, ``fast`` or ``accurate`` (:data:`dvo.odometry.patch.config.PRESETS`).
 
     Returns:
         The odometry; its poses are ``T_wc`` in the world of the first keyframe, up to scale.
@@ -100,8 +101,8 @@ def patch_odometry(
         device: of all computation.
         seed: of the patch centres.
         config: settings; None for those of the weights.
-        preset: settings on top of these, a name in :data:`dvo.odometry.config.PRESETS`.
-        overrides: single settings, by the names of :class:`dvo.odometry.config.TrackerConfig`; they win.
+        preset: settings on top of these, a name in :data:`dvo.odometry.patch.config.PRESETS`.
+        overrides: single settings, by the names of :class:`dvo.odometry.patch.config.TrackerConfig`; they win.
 
     Returns:
         The tracker.
@@ -110,7 +111,7 @@ def patch_odometry(
         DvoError: an unknown or invalid setting.
     """
     from dvo.models.patch_vo import PatchVO
-    from dvo.odometry.tracker import PatchOdometry
+    from dvo.odometry.patch.tracker import PatchOdometry
 
     assert isinstance(weights.model, PatchVO), "the registry gave the builder of another architecture"
     config = config or TRACKER_PRESETS.get(weights.preset, TrackerConfig())

@@ -8,23 +8,23 @@ from typing import Any
 import numpy as np
 import torch
 
-from dvo.errors import DvoError
-from dvo.graph.map_file import MapReader, open_map_file
-from dvo.graph.places import LARGEST, PlaceIndex
-from dvo.graph.serialisation import GraphTable, read_graph
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_seed
+from dvo.core.threads import settle_threads
+from dvo.map.io.map_file import MapReader, open_map_file
+from dvo.map.io.serialisation import GraphTable, read_graph
+from dvo.map.places import LARGEST, PlaceIndex
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights, load_weights, tensor_digest
-from dvo.odometry.config import PRESETS, TrackerConfig, with_changes
-from dvo.odometry.frame_sequence import RequiredSize
+from dvo.odometry.frames.frame_sequence import RequiredSize
 from dvo.odometry.load import source_of
-from dvo.odometry.loop_closure import LoopCloser
-from dvo.odometry.loops import Loop
-from dvo.odometry.map_tables import LoopsTable, LoopTable, MapTable, WeightsTable
-from dvo.odometry.new_recording import images_size, take_places
-from dvo.odometry.old_maps import OLD_VERSION, OldLoops, OldTracker, close_old_sequence, old_table
-from dvo.odometry.tracker import PatchOdometry
-from dvo.settings import check_seed
-from dvo.threads import settle_threads
+from dvo.odometry.loops.closure import LoopCloser
+from dvo.odometry.loops.finder import Loop
+from dvo.odometry.patch.config import PRESETS, TrackerConfig, with_changes
+from dvo.odometry.patch.map_tables import LoopsTable, LoopTable, MapTable, WeightsTable
+from dvo.odometry.patch.new_recording import images_size, take_places
+from dvo.odometry.patch.old_maps import OLD_VERSION, OldLoops, OldTracker, close_old_sequence, old_table
+from dvo.odometry.patch.tracker import PatchOdometry
 
 
 def load_map(
@@ -49,8 +49,8 @@ def load_map(
         weights: of the network, if they are not found by the name in the file: a name, a file, or a network in memory.
         new_recording: what a map is loaded for; nothing else can be asked for.
         seed: of the patch centres of the recording; None for that of the map.
-        preset: settings on top of those of the map, a name in :data:`dvo.odometry.config.PRESETS`.
-        overrides: single settings, by the names of :class:`dvo.odometry.config.TrackerConfig`; they win.
+        preset: settings on top of those of the map, a name in :data:`dvo.odometry.patch.config.PRESETS`.
+        overrides: single settings, by the names of :class:`dvo.odometry.patch.config.TrackerConfig`; they win.
 
     Returns:
         The tracker. The result of a recording holds its poses alone, in the world and the scale of the map if it was
@@ -80,7 +80,7 @@ def load_map(
     with open_map_file(file) as source:
         is_old = source.version <= OLD_VERSION
         if ("tracker" if is_old else "map") not in source.description:
-            remedy = "dvo.graph.serialisation.load_graph reads it"
+            remedy = "dvo.map.io.serialisation.load_graph reads it"
             raise source.refused("holds a graph without a tracker", "map", remedy)
         if is_old:
             tracker, old_loops = old_table(source, OldTracker, "tracker"), old_table(source, OldLoops, "loops")

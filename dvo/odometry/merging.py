@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from dvo.errors import DvoError
-from dvo.graph.merging import append_graph
+from dvo.core.errors import DvoError
+from dvo.map.merging import append_graph
 from dvo.models.weights import LoadedWeights, tensor_digest
+from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.load_map import load_map
-from dvo.odometry.new_recording import begin_in_map, images_size
-from dvo.odometry.rolling_shutter import Shutter
+from dvo.odometry.patch.new_recording import begin_in_map, images_size
 
 if TYPE_CHECKING:
-    from dvo.odometry.tracker import PatchOdometry
+    from dvo.odometry.patch.tracker import PatchOdometry
 
 
 def merge_maps(

@@ -23,7 +23,7 @@ class Status(StrEnum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-    LOST = "lost"  # the result may have a pose all the same (:mod:`dvo.odometry.late_join`)
+    LOST = "lost"  # the result may have a pose all the same (:mod:`dvo.odometry.patch.late_join`)
 
 
 @dataclass(frozen=True)
@@ -37,20 +37,21 @@ class Estimate:
         status: state of the tracker.
         confidence: in [0, 1], 0 without a pose. Of the patch tracker, the probability that the error of the pose
             relative to the reference displaces the scene by less than half a pixel of an image of 320x240, in the RMS
-            over the image (:func:`dvo.odometry.displacement.confidence_of`): comparable between runs. Of other
-            odometries comparable within one run only.
+            over the image (:func:`dvo.odometry.uncertainty.displacement.confidence_of`): comparable between runs. Of
+            other odometries comparable within one run only.
         segment: number of the segment that the pose belongs to, from 0. Poses of two segments have different worlds and
             different scales.
         reason: cause of the status ``lost``, such as ``"black image"``; empty otherwise.
         recovered: the first pose after the segment was joined to an earlier world (of an earlier segment, or of a map):
             this pose and those after it are in that world and scale, earlier ones of the segment were not.
         covariance: ``(6, 6)`` float64 of the error ``xi`` of ``pose_wc`` relative to the pose of the reference, which
-            is held fixed, as is the scale of the segment (:mod:`dvo.odometry.uncertainty`). ``xi = [tau, phi]`` is a
+            is held fixed, as is the scale of the segment (:mod:`dvo.odometry.uncertainty.uncertainty`). ``xi = [tau,
+            phi]`` is a
             right tangent, in the coordinates of this camera: ``T_wc_true = T_wc Exp(xi)``, ``tau`` in units of the
             segment, ``phi`` in radians. (The left tangent of ``T_cw`` is ``-xi``, with the same covariance; that of
             ``T_wc`` has the covariance ``A C A^T`` with ``A = se3.adjoint(pose_wc)``.) Where the measurements fit two
-            motions about as well, it contains both (:mod:`dvo.odometry.second_solution`). None without a pose, where
-            the measurements do not determine it, and from odometries that have none.
+            motions about as well, it contains both (:mod:`dvo.odometry.uncertainty.second_solution`). None without a
+            pose, where the measurements do not determine it, and from odometries that have none.
         reference: timestamp of the reference, seconds: the oldest keyframe of the window that a measurement still
             reaches; None without one.
 
@@ -230,8 +231,8 @@ class Odometry(Protocol):
     """Interface of a streaming visual odometry. One object tracks one sequence.
 
     An object is used by one thread at a time, unless its class is :func:`dvo.odometry.exclusive.exclusive`, as those of
-    the networks of this package are; :class:`dvo.data.live.LiveFrames` takes what arrives in another one. Estimates and
-    results may be read in any thread.
+    the networks of this package are; :class:`dvo.data.streams.live.LiveFrames` takes what arrives in another one.
+    Estimates and results may be read in any thread.
 
     Attributes:
         name: of the system, in reports.

@@ -2,8 +2,8 @@
 
 A trajectory that is wrong is often as smooth, and its measurements are as confident, as one that is right: the network
 may follow what moves before the camera, or what is fixed to it. What tells is whether measurements agree that have no
-part in it: corners that another method has followed (:mod:`dvo.odometry.check_pairs`), and measurements between frames
-that are far apart. The thresholds come from runs that were made to fail (``python -m eval.benchmarks.verdict``).
+part in it: corners that another method has followed (:mod:`dvo.odometry.checks.check_pairs`), and measurements between
+frames that are far apart. The thresholds come from runs that were made to fail (``python -m eval.benchmarks.verdict``).
 """
 
 from __future__ import annotations

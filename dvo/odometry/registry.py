@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Any, Protocol, cast
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.protocol import Odometry
-from dvo.registry import Registry
 
 ODOMETRIES = Registry(
     "odometry",
     "dvo.odometries",
     {
         "patch_vo": "dvo.odometry.load:patch_odometry",
-        "deepvo": "dvo.odometry.deepvo:deepvo_odometry",
-        "tartanvo": "dvo.odometry.tartanvo:tartan_odometry",
-        "droid": "dvo.odometry.droid:droid_odometry",
+        "deepvo": "dvo.odometry.two_frame.deepvo:deepvo_odometry",
+        "tartanvo": "dvo.odometry.two_frame.tartanvo:tartan_odometry",
+        "droid": "dvo.odometry.droid.droid:droid_odometry",
     },
 )
 """Architecture name to ``"module:function"`` or ``"module:Class"`` of an :class:`OdometryBuilder`."""

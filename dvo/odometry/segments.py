@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from dvo.data.trajectory import Trajectory
-from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.graph.keyframe_log import KeyframeLog
-from dvo.graph.recordings import Recording
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.keyframe_log import KeyframeLog
+from dvo.map.recordings import Recording
 from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
 

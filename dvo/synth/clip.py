@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth import salts

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import torch
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory, write_tum
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import NED_FROM_CAMERA, invert_rodrigues, pose_matrices, poses_from_matrices, split
 from dvo.geometry.undistort import needs_undistortion

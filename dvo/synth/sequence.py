@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth import salts
 from dvo.synth.motion.movers import random_bodies

@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 from dvo.geometry.camera import DistortionModel
-from dvo.settings import shown
 from dvo.synth.surroundings import check_surroundings
 
 MOST_FRAMES = 100_000

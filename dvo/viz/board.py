@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvo.boards.calibrate import BoardCalibration
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.undistort import Undistorter
 from dvo.viz.plot import ACCENT, INK, PAPER, START, TRUTH
 

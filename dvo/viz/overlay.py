@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
-from dvo.odometry.files import remove_empty
-from dvo.odometry.observer import graph_of, window_view
 from dvo.odometry.protocol import Estimate, Odometry, Status
-from dvo.odometry.session import Run
+from dvo.session.files import remove_empty
+from dvo.session.observer import graph_of, window_view
+from dvo.session.session import Run
 from dvo.viz.marks import pixels, shade
 
 RATE = 30.0  # frames per second of the video, whatever the times of the frames
@@ -20,7 +20,7 @@ _STATUS_COLOURS = {Status.TRACKING: (47, 143, 131), Status.INITIALISING: (227, 1
 
 
 class OverlayVideo:
-    """Observer that writes a video (:class:`dvo.odometry.observer.Observer`).
+    """Observer that writes a video (:class:`dvo.session.observer.Observer`).
 
     Args:
         file: video to write; its extension selects the container.

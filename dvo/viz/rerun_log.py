@@ -13,12 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
-from dvo.odometry.files import remove_empty
-from dvo.odometry.observer import WindowView, archived_lines, graph_of, window_view
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
-from dvo.odometry.session import Run
+from dvo.session.files import remove_empty
+from dvo.session.observer import WindowView, archived_lines, graph_of, window_view
+from dvo.session.session import Run
 from dvo.viz.marks import pixels, shade
 from dvo.viz.plot import COLOURS
 
@@ -47,7 +47,7 @@ def import_rerun() -> Any:
 
 
 class RerunLog:
-    """Observer that logs a run to a file or to the viewer (:class:`dvo.odometry.observer.Observer`).
+    """Observer that logs a run to a file or to the viewer (:class:`dvo.session.observer.Observer`).
 
     An odometry without a keyframe graph gives poses and images only.
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import quaternion_to_matrix
-from dvo.odometry.frame_table import SKIPPED, FrameRow
+from dvo.session.frame_table import SKIPPED, FrameRow
 from dvo.viz.plot import COLOURS
 
 ASSETS = Path(__file__).resolve().parent / "assets"

@@ -1,7 +1,7 @@
 """Benchmark of the BA layer: ``python -m eval.benchmarks.ba_layer [--batch 1 4] [--device cpu]``.
 
 Prints milliseconds of processor time (CPU) or wall time for two iterations, forward alone and with backward, the
-fastest of several runs, and the ratio to the dense reference implementation in :mod:`dvo.ba.reference`.
+fastest of several runs, and the ratio to the dense reference implementation in :mod:`dvo.ba.layer.reference`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.edges import plan_edges
-from dvo.ba.layer import bundle_adjust
-from dvo.ba.reference import bundle_adjust_reference
+from dvo.ba.layer.layer import bundle_adjust
+from dvo.ba.layer.reference import bundle_adjust_reference
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 

@@ -28,7 +28,7 @@ def main() -> None:
 
         counts = torch.get_num_threads(), cv2.getNumThreads()
     import dvo
-    from dvo.threads import current_threads
+    from dvo.core.threads import current_threads
 
     frames = list(islice(dvo.open(given.clip), given.frames))
     odometry = dvo.load(given.weights)

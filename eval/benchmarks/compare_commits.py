@@ -23,8 +23,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvo.data.root import data_root
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
 from eval.suites.suite import ROOT
 
 CLIPS = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr1_rpy_60")

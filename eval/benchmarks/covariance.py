@@ -4,7 +4,8 @@
 
 ``python -m eval.benchmarks.covariance --scale depth [--split calibration --clips 4]``
 
-After every frame the newest pose relative to the reference of its covariance (:mod:`dvo.odometry.uncertainty`) is
+After every frame the newest pose relative to the reference of its covariance
+(:mod:`dvo.odometry.uncertainty.uncertainty`) is
 compared with the truth, whose scale is fitted to what the covariance holds fixed: the RMS distance of the keyframes in
 between from the reference. Printed are, by sequence, by suite and for all, the normalised error squared
 ``xi^T C^-1 xi`` for each of the six degrees of freedom (its expectation is 1), the same of the rotation and of the
@@ -30,17 +31,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from dvo.core.errors import DvoError
+from dvo.core.threads import settle_threads
 from dvo.data.frame import Frame, StereoView
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry import se3
-from dvo.odometry.displacement import TOLERANCE, window_metric
 from dvo.odometry.load import load
-from dvo.odometry.tracker import PatchOdometry
-from dvo.odometry.window_gauge import relative_error, window_gauge
-from dvo.odometry.window_measurements import WindowMeasurements
+from dvo.odometry.patch.tracker import PatchOdometry
+from dvo.odometry.uncertainty.displacement import TOLERANCE, window_metric
+from dvo.odometry.uncertainty.gauge import relative_error, window_gauge
+from dvo.odometry.uncertainty.measurements import WindowMeasurements
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from dvo.threads import settle_threads
 from eval.benchmarks.weight_calibration import rendered_sequences
 
 SUITES = "plain,scale,textureless,fast,blur,rotation,lighting,dynamic,rolling_shutter,blackout,loop,low_light"
@@ -83,9 +84,9 @@ class Errors:
         """Record a pose.
 
         Args:
-            xi: ``(6,)`` error, see :func:`dvo.odometry.window_gauge.relative_error`.
+            xi: ``(6,)`` error, see :func:`dvo.odometry.uncertainty.gauge.relative_error`.
             covariance: ``(6, 6)`` of it.
-            metric: of :func:`dvo.odometry.displacement.flow_metric`.
+            metric: of :func:`dvo.odometry.uncertainty.displacement.flow_metric`.
             confidence: of the estimate.
         """
         for values, rows in ((self.joint, slice(6)), (self.position, slice(3)), (self.rotation, slice(3, 6))):

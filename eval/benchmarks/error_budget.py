@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.graph.window import Window
+from dvo.core.threads import settle_threads
+from dvo.map.window import Window
 from dvo.metrics import Metrics, evaluate
 from dvo.models.step import Measurement, Revision, UpdateState
 from dvo.odometry.load import load
-from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from dvo.threads import settle_threads
 from eval.benchmarks.true_positions import TruePositions
 from eval.suites.suite import read_suites
 

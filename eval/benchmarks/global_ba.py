@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.ba.kernels import Kernel
-from dvo.ba.levenberg import LMOptions
+from dvo.ba.sparse.global_adjust import GlobalBAOptions, global_bundle_adjust
+from dvo.ba.sparse.levenberg import LMOptions
 from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
 
@@ -28,7 +28,7 @@ RADIUS = 10.0
 
 @dataclass(frozen=True)
 class Graph:
-    """Arguments of :func:`dvo.ba.global_adjust.global_bundle_adjust`, and the true poses.
+    """Arguments of :func:`dvo.ba.sparse.global_adjust.global_bundle_adjust`, and the true poses.
 
     Attributes:
         poses_cw: ``(N, 7)`` initial world-to-camera poses.
@@ -51,7 +51,7 @@ class Graph:
     true_poses_cw: Tensor
 
     def arguments(self) -> tuple[Tensor, ...]:
-        """Positional arguments of :func:`dvo.ba.global_adjust.global_bundle_adjust`.
+        """Positional arguments of :func:`dvo.ba.sparse.global_adjust.global_bundle_adjust`.
 
         Returns:
             Poses, patches, intrinsics, targets, weights, ii, jj, kk.

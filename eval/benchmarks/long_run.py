@@ -19,12 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.errors import DvoError
+from dvo.core.threads import settle_threads
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
 from dvo.odometry.load import load
-from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
-from dvo.threads import settle_threads
 from eval.benchmarks.loops.runs import resident_bytes
 
 STEP = 100

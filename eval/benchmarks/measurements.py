@@ -91,7 +91,7 @@ def training() -> Callable[[], float]:
     try:
         from dvo.models.schedule import training_schedule
     except ImportError:  # before networks had a room of their own
-        from dvo.nets.schedule import training_schedule  # type: ignore[no-redef]
+        from dvo.models.schedule import training_schedule  # type: ignore[no-redef]
 
     clip = make_clip(0, 1, frames=8, height=120, width=160, flow_range=(1.0, 14.0))
     model = dvo.load_model("small").train()
@@ -144,7 +144,7 @@ def main() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     try:
-        from dvo.allocator import reuse_freed_memory  # as `dvo run` and training do
+        from dvo.core.allocator import reuse_freed_memory  # as `dvo run` and training do
 
         reuse_freed_memory()
     except ImportError:

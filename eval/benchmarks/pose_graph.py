@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.levenberg import LMOptions
 from dvo.ba.pose_graph import Chart, PoseGraphOptions, optimise_pose_graph
-from dvo.errors import DvoError
+from dvo.ba.sparse.levenberg import LMOptions
+from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3, so3
 
 HELD = 1.0

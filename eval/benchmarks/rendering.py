@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from dvo.allocator import reuse_freed_memory
+from dvo.core.allocator import reuse_freed_memory
+from dvo.core.yaml_files import read_yaml
 from dvo.synth import random_path, random_scene, render
 from dvo.synth.clip import make_clip
 from dvo.synth.scenes.families import SHARES
 from dvo.synth.textures.texture import texture_pool
-from dvo.yaml_files import read_yaml
 
 SIZES = ((120, 160), (240, 320), (480, 640))
 RECIPE = Path(__file__).resolve().parents[2] / "configs" / "train" / "small.yaml"

@@ -10,10 +10,10 @@ from __future__ import annotations
 import argparse
 import math
 
-from dvo.odometry.calibrate import CalibrationOptions, calibrate
-from dvo.odometry.camera_estimate import SelfCalibration
+from dvo.core.threads import settle_threads
+from dvo.odometry.calibrate.calibrate import CalibrationOptions, calibrate
+from dvo.odometry.calibrate.camera_estimate import SelfCalibration
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from dvo.threads import settle_threads
 
 FAMILIES = ("hall", "gallery", "courtyard")
 KINDS = ("handheld", "loop")

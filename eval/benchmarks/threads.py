@@ -6,7 +6,7 @@ Every measurement is a new process; the cases take turns, so that varying load o
 busy half, one endless loop per core runs beside it. The output is the median of the rounds:
 
 - ``before``: as torch comes, one spinning thread per core;
-- ``dvo``: what dvo chooses when nothing is set (:mod:`dvo.threads`);
+- ``dvo``: what dvo chooses when nothing is set (:mod:`dvo.core.threads`);
 - ``one thread``; and ``one per core, passive``.
 """
 
@@ -23,9 +23,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from dvo.data.root import data_root
-from dvo.errors import DvoError
-from dvo.threads import available_cores
+from dvo.core.errors import DvoError
+from dvo.core.threads import available_cores
+from dvo.data.files.root import data_root
 from eval.suites.suite import ROOT
 
 _SCRIPT = Path(__file__).with_name("clip_speed.py")

@@ -14,11 +14,11 @@ import time
 
 import torch
 
-from dvo.allocator import reuse_freed_memory
+from dvo.core.allocator import reuse_freed_memory
+from dvo.core.threads import settle_threads
 from dvo.odometry.load import load
-from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.synth.sequence import make_sequence
-from dvo.threads import settle_threads
 
 STAGES = {
     "encoder and patches": ("front_end.py", "observe"),

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from dvo.graph.window import Window
+from dvo.map.window import Window
 from dvo.synth.sequence import SyntheticSequence
 
 _OCCLUDED = 0.95  # a point this much farther away than what is seen there is hidden

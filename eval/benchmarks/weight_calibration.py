@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.threads import settle_threads
 from dvo.odometry.load import load
-from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.synth.sequence import SyntheticSequence, make_sequence
-from dvo.threads import settle_threads
 from eval.benchmarks.true_positions import TruePositions
 from eval.suites.suite import Sequence, read_suites
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from dvo.data.source import Source
-from dvo.odometry.results import jsonable
+from dvo.session.results import jsonable
 from eval.execution.predict import RECORD, Job, Prediction, predict, read_prediction
 from eval.execution.versions import code_digest, depends_on_threads, library_versions, reader_digest
 from eval.suites.suite import Sequence

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.execution.cache import commit, part_folder
 from eval.execution.predict import Job, Prediction, predict, read_prediction
 from eval.suites.suite import ROOT

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dvo.errors import DvoError
-from dvo.odometry.results import jsonable
+from dvo.core.errors import DvoError
+from dvo.session.results import jsonable
 from eval.execution.cache import SystemFacts, slug
 from eval.suites.selection import suite_from
 from eval.suites.suite import Sequence, Suite

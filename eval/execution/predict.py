@@ -18,15 +18,15 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
+from dvo.core.threads import process_environment
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory, read_tum, write_tum
-from dvo.errors import DvoError
+from dvo.metrics.segment_metrics import worlds_of
 from dvo.odometry.protocol import Estimate, Odometry, Segment
-from dvo.odometry.results import jsonable, peak_memory_mb
-from dvo.odometry.session import run
-from dvo.segment_metrics import worlds_of
-from dvo.threads import process_environment
+from dvo.session.results import jsonable, peak_memory_mb
+from dvo.session.session import run
 from eval.execution.process import run_limited
 from eval.scoring.blackout import dark_spans, is_dark, without_view
 from eval.suites.suite import ROOT, open_sequence

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import write_tum
-from dvo.errors import DvoError
-from dvo.odometry.results import jsonable
+from dvo.session.results import jsonable
 from eval.execution import process
 from eval.execution.cache import (
     SystemFacts,

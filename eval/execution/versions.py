@@ -10,8 +10,8 @@ from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
-from dvo.data.registry import READERS
-from dvo.registry import Registry
+from dvo.core.registry import Registry
+from dvo.data.readers.registry import READERS
 from eval.suites.suite import ROOT
 from eval.systems import plugin
 from eval.systems.system import System
@@ -26,7 +26,7 @@ WITHOUT = (
     "dvo.demo",
     "dvo.losses",
     "dvo.metrics",
-    "dvo.segment_metrics",
+    "dvo.metrics.segment_metrics",
 )
 TORCH_ROOMS = (ROOT / "dvo" / "ba", ROOT / "dvo" / "nets")
 _OWN = ("dvo", "eval")
@@ -50,7 +50,7 @@ def source_files(system: System) -> list[Path]:
         _follow(place, found, (*_OWN, place.split(".")[0]))
     if "dvo.odometry.load" in found:  # weights name a network, which other packages may bring
         from dvo.models.registry import ARCHITECTURES
-        from dvo.nets.update import UPDATE_OPERATORS
+        from dvo.nets.update.update import UPDATE_OPERATORS
         from dvo.odometry.registry import ODOMETRIES
 
         for registry in (ARCHITECTURES, ODOMETRIES, UPDATE_OPERATORS):

@@ -17,8 +17,8 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import align_trajectory, associate, relative_rotation_errors
+from dvo.metrics.segment_metrics import World, match_worlds, scored_worlds
 from dvo.odometry.protocol import Segment
-from dvo.segment_metrics import World, match_worlds, scored_worlds
 from dvo.viz.plot import INK, PAPER, plan_axes, with_gaps
 from eval.scoring.summary import quartiles
 from eval.suites.suite import Suite
@@ -141,7 +141,7 @@ def drawn_tracks(segments: Sequence[Segment], worlds: Sequence[World]) -> list[T
 
     Args:
         segments: of a run.
-        worlds: of them, see :func:`dvo.segment_metrics.match_worlds`.
+        worlds: of them, see :func:`dvo.metrics.segment_metrics.match_worlds`.
     """
     tracks = []
     for world in scored_worlds(worlds):

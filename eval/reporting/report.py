@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import read_tum
-from dvo.errors import DvoError
 from dvo.odometry.protocol import Segment
 from eval.execution.cache import slug
 from eval.execution.plan import Manifest, groundtruth_file

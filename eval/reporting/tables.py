@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
-from dvo.segment_metrics import FRAMES_PER_WORLD, SEGMENT_POSES
+from dvo.metrics.segment_metrics import FRAMES_PER_WORLD, SEGMENT_POSES
 from eval.execution.plan import Manifest
 from eval.scoring.score import COLUMNS, Row
 from eval.scoring.summary import (

@@ -10,8 +10,8 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, associate, fit_alignment, transform
+from dvo.metrics.segment_metrics import worlds_of
 from dvo.odometry.protocol import Segment
-from dvo.segment_metrics import worlds_of
 
 DARK_MEAN, DARK_SPREAD = 20.0, 6.0  # grey levels of 255
 WHITE_MEAN = 235.0
@@ -53,7 +53,7 @@ def is_dark(image: np.ndarray) -> bool:
 def without_view(image: np.ndarray) -> bool:
     """Return True if a ``(H, W, 3)`` uint8 image is black, white, or noise: no pose can be found from it.
 
-    Independent of the criteria of the systems that are judged by it (:mod:`dvo.odometry.evidence`).
+    Independent of the criteria of the systems that are judged by it (:mod:`dvo.odometry.window.evidence`).
 
     Args:
         image: RGB.

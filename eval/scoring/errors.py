@@ -1,9 +1,10 @@
 """All errors of one run: its segments, aligned world by world, against the reference.
 
-Rules for a run of several segments (:mod:`dvo.segment_metrics` says how values are combined): cutting a trajectory
-lowers its ATE, so only as many worlds are scored as :func:`dvo.segment_metrics.most_worlds` allows, the longest first,
-each of ten poses or more, and a run whose scored part is too small fails (:func:`eval.scoring.score.score`). Pairs of
-frames of a relative error never lie in two segments; the relative-pose AUC counts those in two worlds as missed.
+Rules for a run of several segments (:mod:`dvo.metrics.segment_metrics` says how values are combined): cutting a
+trajectory lowers its ATE, so only as many worlds are scored as :func:`dvo.metrics.segment_metrics.most_worlds` allows,
+the longest first, each of ten poses or more, and a run whose scored part is too small fails
+(:func:`eval.scoring.score.score`). Pairs of frames of a relative error never lie in two segments; the relative-pose AUC
+counts those in two worlds as missed.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, Metrics, evaluate, transform
-from dvo.odometry.protocol import Segment
-from dvo.relative_pose import join_segments
-from dvo.segment_metrics import (
+from dvo.metrics.relative_pose import join_segments
+from dvo.metrics.segment_metrics import (
     SegmentMetrics,
     World,
     evaluate_segments,
@@ -28,6 +28,7 @@ from dvo.segment_metrics import (
     match_worlds,
     scored_worlds,
 )
+from dvo.odometry.protocol import Segment
 from eval.scoring.blackout import BlackoutErrors, blackout_errors
 from eval.scoring.metrics import (
     Aligned,

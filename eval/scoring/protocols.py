@@ -15,7 +15,7 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.metrics import associate
-from dvo.relative_pose import relative_pose_errors
+from dvo.metrics.relative_pose import relative_pose_errors
 
 KITTI_LENGTHS = tuple(range(100, 801, 100))  # metres
 KITTI_STEP = 10  # frames between the starts of two segments
@@ -85,7 +85,7 @@ def relative_pose_auc(
 ) -> dict[float, float]:
     """Area under the recall curve of relative poses up to 1, 2, 5 and 10 degrees, in [0, 1]; scale plays no part.
 
-    The errors are those of :func:`dvo.relative_pose.relative_pose_errors`. The area under a curve of steps is
+    The errors are those of :func:`dvo.metrics.relative_pose.relative_pose_errors`. The area under a curve of steps is
     ``mean(max(0, 1 - error / threshold))``. A pair that the estimate lacks fails, and so does one whose frames lie in
     two segments: this area cannot be raised by cutting a trajectory.
 

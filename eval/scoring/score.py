@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.trajectory import Trajectory, read_tum
+from dvo.metrics.segment_metrics import most_worlds, worlds_of
 from dvo.odometry.protocol import Segment
-from dvo.segment_metrics import most_worlds, worlds_of
 from eval.execution.plan import Manifest, Run, groundtruth_file
 from eval.execution.predict import RECORD, Prediction, read_prediction, read_segments
 from eval.scoring.blackout import dark_spans

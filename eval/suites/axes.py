@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from dvo.errors import DvoError
-from dvo.settings import Range, from_table
+from dvo.core.errors import DvoError
+from dvo.core.settings import Range, from_table
 
 Table = dict[str, Any]
 _SEED = (0, 2**53)

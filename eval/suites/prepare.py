@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.suites.rendered import RECORD, place_of, rendered_folder
 from eval.suites.suite import Suite
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
+from dvo.data.readers.tum import RIGHT
 from dvo.data.trajectory import write_tum
-from dvo.data.tum import RIGHT
-from dvo.errors import DvoError
 
 RECORD = "sequence.json"
 STALE = 24 * 3600.0  # seconds after which an unfinished folder belongs to no running process

@@ -6,9 +6,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from dvo.data.registry import is_dataset
-from dvo.data.root import data_root
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
+from dvo.data.readers.registry import is_dataset
 from eval.suites.suite import SUITES, Sequence, Suite, read_suites
 
 

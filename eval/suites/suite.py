@@ -8,14 +8,14 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from dvo.data.depth_source import with_depth
-from dvo.data.right_source import with_right
+from dvo.core.errors import DvoError
+from dvo.core.settings import Range, from_table
+from dvo.core.yaml_files import read_yaml
+from dvo.data.companions.depth_source import with_depth
+from dvo.data.companions.right_source import with_right
 from dvo.data.source import Source, open_source
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.metrics import Alignment, associate
-from dvo.settings import Range, from_table
-from dvo.yaml_files import read_yaml
 from eval.suites.axes import Axes, choose, expand, read_axes
 from eval.suites.rendered import rendered_folder
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 
 def version(weights: str) -> str:

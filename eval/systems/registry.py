@@ -22,9 +22,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from dvo.errors import DvoError
-from dvo.registry import Registry, is_target
-from dvo.yaml_files import parse_yaml
+from dvo.core.errors import DvoError
+from dvo.core.registry import Registry, is_target
+from dvo.core.yaml_files import parse_yaml
 from eval.systems import plugin
 from eval.systems.system import System, package_facts
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import dvo
+from dvo.core.registry import resolve_target
 from dvo.odometry.protocol import Odometry
-from dvo.registry import resolve_target
 from eval.systems import plugin
 
 _OWN = ("dvo", "eval")

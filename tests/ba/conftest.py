@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dvo.ba.layer import BAOptions, BAResult, bundle_adjust
+from dvo.ba.layer.layer import BAOptions, BAResult, bundle_adjust
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 

@@ -12,7 +12,7 @@ import torch
 
 from dvo.ba.bal import PointProblem, read_bal
 from dvo.ba.points import residuals, solve_points
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 
 FILES = ["dubrovnik-3-7-pre.txt", "problem-21-11315-pre.txt", "problem-49-7776-pre.txt"]

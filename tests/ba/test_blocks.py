@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 
 from dvo.ba.blocks import INVERSE_DEPTHS, POSES, vector_block
-from dvo.ba.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.ba.kernels import Kernel
-from dvo.ba.layer import BADamping, BAOptions, bundle_adjust
-from dvo.ba.levenberg import LMOptions
+from dvo.ba.layer.layer import BADamping, BAOptions, bundle_adjust
+from dvo.ba.layer.reference import bundle_adjust_reference
 from dvo.ba.problem import Factor, Linearisation
-from dvo.ba.reference import bundle_adjust_reference
+from dvo.ba.sparse.global_adjust import GlobalBAOptions, global_bundle_adjust
+from dvo.ba.sparse.levenberg import LMOptions
 from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
-from dvo.nets.patchifier import patch_coordinates
+from dvo.nets.patch.patchifier import patch_coordinates
 
 N, M = 5, 8
 

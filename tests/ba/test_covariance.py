@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from dvo.ba.covariance import pose_covariance, size_gradient
-from dvo.ba.layer import BADamping, BAOptions, make_problem
+from dvo.ba.layer.layer import BADamping, BAOptions, make_problem
+from dvo.ba.layer.reference import dense_rows
 from dvo.ba.patch_problem import PatchProblem
-from dvo.ba.reference import dense_rows
 from dvo.geometry import se3
 
 F64 = torch.float64

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from dvo.ba.layer import BADamping
+from dvo.ba.layer.layer import BADamping
 from dvo.geometry import se3
 
 Maker = Callable[..., Any]

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from dvo.ba.dense import dense_bundle_adjust, dense_patches, dense_plan, pixel_grid
 from dvo.ba.edges import plan_edges
 from dvo.ba.factors import DepthDamping
-from dvo.ba.layer import bundle_adjust
+from dvo.ba.layer.dense import dense_bundle_adjust, dense_patches, dense_plan, pixel_grid
+from dvo.ba.layer.layer import bundle_adjust
 from dvo.ba.options import BADamping, BAOptions
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject

@@ -14,15 +14,15 @@ from dvo.ba.blocks import POSES
 from dvo.ba.covariance import pose_covariance
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.kernels import Kernel
-from dvo.ba.layer import BADamping, BAOptions, Sensors, bundle_adjust, make_problem
+from dvo.ba.layer.layer import BADamping, BAOptions, Sensors, bundle_adjust, make_problem
+from dvo.ba.layer.reference import bundle_adjust_reference, dense_rows
+from dvo.ba.layer.step import gauss_newton
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Linearisation, Problem
-from dvo.ba.reference import bundle_adjust_reference, dense_rows
-from dvo.ba.step import gauss_newton
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from dvo.odometry.config import TrackerConfig
+from dvo.odometry.patch.config import TrackerConfig
 
 F64 = torch.float64
 Maker = Callable[..., Any]

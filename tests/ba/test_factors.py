@@ -15,12 +15,12 @@ from torch import Tensor
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, inverse_depth_block, pose_block, sim3_block
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.kernels import Kernel
-from dvo.ba.layer import BAOptions, Sensors, make_problem
-from dvo.ba.linearisation import adjoint_term, assemble
+from dvo.ba.layer.layer import BAOptions, Sensors, make_problem
+from dvo.ba.layer.linearisation import adjoint_term, assemble
+from dvo.ba.layer.step import gauss_newton
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import AdjointConstants, Factor, Problem, State
-from dvo.ba.step import gauss_newton
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3
 
 F64 = torch.float64

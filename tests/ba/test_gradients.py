@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.factors import DepthPrior, PosePrior
-from dvo.ba.layer import BADamping, BAOptions, bundle_adjust
+from dvo.ba.layer.layer import BADamping, BAOptions, bundle_adjust
 from dvo.geometry import se3
 
 DAMPING = BADamping(pose=0.1, relative=0.2, depth=1e-2)

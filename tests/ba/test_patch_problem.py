@@ -8,14 +8,14 @@ import torch
 
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
 from dvo.ba.factors import PosePrior
-from dvo.ba.global_adjust import GlobalBAOptions
 from dvo.ba.kernels import Kernel
-from dvo.ba.layer import bundle_adjust
-from dvo.ba.levenberg import LMOptions
+from dvo.ba.layer.layer import bundle_adjust
 from dvo.ba.options import BADamping, BAOptions, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.solve import solve
-from dvo.errors import DvoError
+from dvo.ba.sparse.global_adjust import GlobalBAOptions
+from dvo.ba.sparse.levenberg import LMOptions
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 
 

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from dvo.ba.factors import RelativePose
 from dvo.ba.kernels import Kernel
-from dvo.ba.levenberg import LMOptions
 from dvo.ba.pose_graph import (
     Chart,
     PoseGraphOptions,
@@ -23,7 +22,8 @@ from dvo.ba.pose_graph import (
     residuals_and_jacobians,
     right_jacobian,
 )
-from dvo.errors import DvoError
+from dvo.ba.sparse.levenberg import LMOptions
+from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3
 from eval.benchmarks.pose_graph import PoseGraph, read_g2o
 

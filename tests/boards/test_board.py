@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from dvo.boards.board import CharucoBoard, Checkerboard
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import distort
 

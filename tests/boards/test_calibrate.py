@@ -7,8 +7,8 @@ from numpy.testing import assert_allclose
 
 from dvo.boards.board import CharucoBoard, Checkerboard
 from dvo.boards.calibrate import BoardOptions, calibrate_board
+from dvo.core.errors import DvoError
 from dvo.data import read_calibration
-from dvo.errors import DvoError
 
 CASES = {
     "radtan": ("RADTAN", Checkerboard(7, 5, 0.03), {}),

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data import open_source
-from dvo.errors import DvoError
 from dvo.geometry.poses import pose_matrices
 
 S = np.sqrt(0.5)

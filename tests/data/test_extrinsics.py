@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import dvo
+from dvo.core.errors import DvoError
 from dvo.data.extrinsics import base_trajectory, pose_of_numbers, read_extrinsics
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry.poses import compose_poses, invert_poses, pose_from, pose_matrices, so3_exp
 
 POSE = pose_from(so3_exp(np.array([0.3, -1.2, 0.8])), np.array([0.5, -0.1, 1.2]))

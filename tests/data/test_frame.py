@@ -4,8 +4,8 @@ import pickle
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data import Frame, InertialSamples, StereoView
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.models.patch_vo import PatchVO
-from dvo.nets.config import preset
-from dvo.odometry import session
-from dvo.odometry.config import TrackerConfig
-from dvo.odometry.tracker import PatchOdometry
+from dvo.nets.patch.config import preset
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.tracker import PatchOdometry
+from dvo.session import session
 
 CAMERA = Camera(50, 50, 31.5, 23.5, 64, 48)
 RGB = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)

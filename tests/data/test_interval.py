@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dvo.core.errors import DvoError
 from dvo.data import Calibration, open_source
 from dvo.data.interval import Interval
-from dvo.data.live_source import open_stream
 from dvo.data.recording import ImageRecording
-from dvo.errors import DvoError
+from dvo.data.streams.live_source import open_stream
 
 CALIB = Calibration(50, 50, 31, 23)
 LARGE = Calibration(100, 100, 80, 60)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 import dvo
+from dvo.core.errors import DvoError
 from dvo.data import READERS, read_calibration, read_kitti_poses, read_tum
-from dvo.data.depth import read_depth
-from dvo.data.euroc import read_inertial, read_state_groundtruth
-from dvo.data.groundtruth import read_groundtruth
-from dvo.data.images import list_images, read_image
-from dvo.data.kitti import read_projections
+from dvo.data.files.stamps import read_times, times_from_names
+from dvo.data.images.images import list_images, read_image
+from dvo.data.readers.euroc import read_inertial, read_state_groundtruth
+from dvo.data.readers.groundtruth import read_groundtruth
+from dvo.data.readers.kitti import read_projections
+from dvo.data.readers.tartanair import read_ned_poses
 from dvo.data.recording import rows_of_images
-from dvo.data.stamps import read_times, times_from_names
-from dvo.data.streams import stream
-from dvo.data.tartanair import read_ned_poses
-from dvo.errors import DvoError
+from dvo.data.sensors.depth import read_depth
+from dvo.data.streams.streams import stream
 from dvo.geometry.camera import Camera
 
 DIGITS = "9" * 5000

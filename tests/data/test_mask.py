@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data import Calibration, open_source
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.data.live_source import open_stream
 from dvo.data.mask import read_mask
-from dvo.errors import DvoError
+from dvo.data.streams.live_source import open_stream
 from dvo.geometry.camera import Camera
 
 CALIB = Calibration(50, 50, 31, 23)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import dvo
+from dvo.core.errors import DvoError
 from dvo.data import Calibration, open_source, write_kitti_poses
-from dvo.data.depth_source import with_depth
-from dvo.data.files import is_folder
-from dvo.data.right_source import with_right
-from dvo.errors import DvoError
+from dvo.data.companions.depth_source import with_depth
+from dvo.data.companions.right_source import with_right
+from dvo.data.files.files import is_folder
 
 
 def test_missing_source(tmp_path):

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dvo.core.errors import DvoError
 from dvo.data import Trajectory, interpolate, read_kitti_poses, read_tum, write_kitti_poses, write_tum
-from dvo.errors import DvoError
 from dvo.geometry.poses import (
     compose_poses,
     invert_poses,

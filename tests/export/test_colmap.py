@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dvo
+from dvo.data.files.stamps import read_times
 from dvo.data.frame import Frame
-from dvo.data.stamps import read_times
 from dvo.export.colmap import write_colmap, write_colmap_text
 from dvo.export.reconstruction import reconstruct
 from dvo.geometry.camera import Camera

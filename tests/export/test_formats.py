@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import dvo
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory, read_tum
-from dvo.errors import DvoError
 from dvo.export.formats import (
     MAP_FORMATS,
     check_formats,
@@ -16,9 +16,9 @@ from dvo.export.formats import (
     export_run,
     export_trajectory,
 )
-from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Result, Segment, SparseMap
-from dvo.odometry.tracker import PatchOdometry
 from tests.support.archived_walk import archived_walk
 from tests.support.command_line import names
 from tests.support.reconstructions import walk

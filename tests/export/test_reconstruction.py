@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.export.reconstruction import PointOptions, longest_segment, reconstruct
-from dvo.graph.keyframe_log import FrameRecord
+from dvo.map.keyframe_log import FrameRecord
 from tests.support.archived_walk import INTRINSICS, M
 from tests.support.reconstructions import SIDE, image, walk
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dvo.data.euroc import read_state_groundtruth
-from dvo.data.stamps import read_times
+from dvo.data.files.stamps import read_times
+from dvo.data.readers.euroc import read_state_groundtruth
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.export.trajectories import write_euroc_trajectory, write_kitti_trajectory, write_tum_trajectory
 from dvo.geometry.poses import pose_matrices

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from tests.fuzz.target import Target
 from tests.fuzz.worker import Outcome, run_cases, warm
 

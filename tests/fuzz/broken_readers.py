@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from tests.fuzz.target import Target, check_trajectory
 
 

@@ -13,7 +13,7 @@ from dvo.geometry.camera import Camera
 from tests.fuzz.readers_data import HEIGHT, WIDTH, lines, picture
 from tests.fuzz.target import Target, require
 
-MODULES = ("torch", "dvo.odometry.load", "dvo.odometry.tracker", "dvo.models.patch_vo", "dvo.data.frame_checks")
+MODULES = ("torch", "dvo.odometry.load", "dvo.odometry.patch.tracker", "dvo.models.patch_vo", "dvo.data.frame_checks")
 CAMERA = Camera(50.0, 51.0, 31.5, 23.5, WIDTH, HEIGHT)
 
 

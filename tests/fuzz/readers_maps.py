@@ -22,7 +22,7 @@ SETTINGS = {
     "search_updates": 1,
 }  # fmt: skip
 WIDTH, HEIGHT, COUNT = 96, 72, 10
-OLD = Path(__file__).parent.parent / "odometry" / "version_2.dvo"
+OLD = Path(__file__).parent.parent / "odometry" / "patch" / "version_2.dvo"
 
 
 def _frames() -> list[Frame]:
@@ -49,7 +49,7 @@ def _build_in_progress(folder: Path) -> None:
 
 def _read(folder: Path, random: np.random.Generator | None) -> None:
     """Load, and use everything that was loaded: a file that is accepted must not fail later."""
-    from dvo.graph.serialisation import load_graph
+    from dvo.map.io.serialisation import load_graph
     from dvo.odometry.load_map import load_map
 
     file = folder / "a.dvo"
@@ -81,7 +81,7 @@ def _build_old(folder: Path) -> None:
 
 def _read_old(folder: Path, random: np.random.Generator | None) -> None:
     """Its network is too small to recognise a place, so that it takes no recording."""
-    from dvo.graph.serialisation import load_graph
+    from dvo.map.io.serialisation import load_graph
     from dvo.models.weights import LoadedWeights
     from dvo.odometry.load_map import load_map
 
@@ -106,7 +106,7 @@ def mutate_map(folder: Path, random: np.random.Generator) -> str:
     """
     if random.random() < 0.25:
         return mutate_folder(folder, random)
-    from dvo.graph.map_file import open_map_file, write_map_file
+    from dvo.map.io.map_file import open_map_file, write_map_file
 
     file = folder / "a.dvo"
     with open_map_file(file) as source, np.load(file) as held:
@@ -189,7 +189,7 @@ def _mutate_array(arrays: dict[str, np.ndarray], name: str, random: np.random.Ge
     return said
 
 
-ALL = (*MODULES, "dvo.odometry.load_map", "dvo.graph.serialisation")
+ALL = (*MODULES, "dvo.odometry.load_map", "dvo.map.io.serialisation")
 TARGETS = (
     Target("map", _build, _read, mutate_map, ALL),
     Target("map_in_progress", _build_in_progress, _read, mutate_map, ALL),

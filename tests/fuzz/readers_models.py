@@ -14,7 +14,7 @@ from tests.fuzz.mutations import mutate_folder
 from tests.fuzz.target import Target, chance, require
 
 MODULES = ("torch", "safetensors.torch", "dvo.models.weights", "dvo.models.patch_vo", "dvo.odometry.load",
-           "dvo.odometry.tracker")  # fmt: skip
+           "dvo.odometry.patch.tracker")  # fmt: skip
 TRAINING = (*MODULES, "train.engine.export", "train.engine.checkpoint", "train.tasks.patch_vo.task",
             "train.validation.validate")  # fmt: skip
 

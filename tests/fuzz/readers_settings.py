@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dvo.settings import parse_settings, read_settings
+from dvo.core.settings import parse_settings, read_settings
 from tests.fuzz.mutations import mutate_folder, mutate_text
 from tests.fuzz.readers_data import lines
 from tests.fuzz.target import CleanExit, Target, require
@@ -38,13 +38,13 @@ TRAINING = [
 
 
 def _settings(folder: Path, random: np.random.Generator | None) -> None:
-    from dvo.odometry.config import TrackerConfig
+    from dvo.odometry.patch.config import TrackerConfig
 
     TrackerConfig.from_dict(read_settings(folder / "settings.yaml"))
 
 
 def _items(folder: Path, random: np.random.Generator | None) -> None:
-    from dvo.odometry.config import TrackerConfig
+    from dvo.odometry.patch.config import TrackerConfig
 
     text = (folder / "set.items").read_bytes().decode("utf-8", errors="surrogateescape")
     TrackerConfig.from_dict(parse_settings(text[:10_000_000].splitlines()))
@@ -114,13 +114,13 @@ def _copy(folder: Path, name: str, source: Path) -> None:
 def _one(name: str, file: str, rows: list[str], read: Any, *modules: str) -> Target:
     mutate = mutate_text if file.endswith(".items") else mutate_folder
     write = partial(_write, name=file, rows=rows)
-    return Target(name, write, read, mutate, ("yaml", "dvo.settings", *modules))
+    return Target(name, write, read, mutate, ("yaml", "dvo.core.settings", *modules))
 
 
 TARGETS = (
-    _one("settings_yaml", "settings.yaml", SETTINGS, _settings, "dvo.odometry.config"),
-    _one("settings_set", "set.items", [row.replace(": ", "=") for row in SETTINGS], _items, "dvo.odometry.config"),
-    _one("eval_suite", "suite.yaml", SUITE, _suite, "eval.suites.selection"),
+    _one("settings_yaml", "settings.yaml", SETTINGS, _settings, "dvo.odometry.patch.config"),
+    _one("settings_set", "set.items", [row.replace(": ", "=") for row in SETTINGS], _items,
+    "dvo.odometry.patch.config"), _one("eval_suite", "suite.yaml", SUITE, _suite, "eval.suites.selection"),
     _one("eval_system", "systems.items", SYSTEMS, _system, "eval.systems.registry", "dvo.models.weights"),
     _one("train_fit", "train.yaml", TRAINING, _fit, "train.engine.cli", "train.tasks.patch_vo.task",
          "train.engine.callbacks", "train.data.clips"),

@@ -86,7 +86,7 @@ def test_a_seed_is_a_case(tmp_path):
 
 
 def test_headers_state_their_sizes():
-    from dvo.data.image_header import image_size
+    from dvo.data.images.image_header import image_size
 
     stated = {name: image_size(data) for name, data in headers(30_000, 20_000).items()}
     for name in ("PNG", "PNG of 16 bit", "BMP", "PGM", "PPM", "PAM", "TIFF", "JPEG"):

@@ -26,7 +26,7 @@ from typing import Literal
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from tests.fuzz.target import CleanExit, Target
 
 Verdict = Literal["refused", "accepted", "failed"]

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import sim3
 from dvo.geometry.alignment import align
 

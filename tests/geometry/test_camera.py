@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 
 CAMERA = Camera(500.0, 510.0, 319.5, 239.5, 640, 480, "radtan", (0.1, -0.05, 0.001, 0.002))

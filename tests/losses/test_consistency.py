@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.losses.consistency import Limits, masked_mean, trusted_edges
 
 NAN = float("nan")

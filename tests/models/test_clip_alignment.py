@@ -9,16 +9,16 @@ import torch
 
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from dvo.graph.edges import build_graph
+from dvo.map.edges import build_graph
 from dvo.models.clip_alignment import ClipAlignment
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
 from dvo.models.step import Revision, UpdateState
-from dvo.nets.alignment import AlignmentOptions
-from dvo.nets.config import preset
-from dvo.nets.patchifier import patch_coordinates
-from dvo.nets.selection import structure_selection
-from dvo.odometry.window_alignment import WindowAlignment
+from dvo.nets.alignment.alignment import AlignmentOptions
+from dvo.nets.patch.config import preset
+from dvo.nets.patch.patchifier import patch_coordinates
+from dvo.nets.patch.selection import structure_selection
+from dvo.odometry.window.alignment import WindowAlignment
 from dvo.synth.clip import make_clip
 
 PER_FRAME = 6

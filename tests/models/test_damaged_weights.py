@@ -9,12 +9,12 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models import weights
 from dvo.models.patch_vo import PatchVO
 from dvo.models.registry import build_network
 from dvo.models.weights import import_checkpoint, load_weights, save_weights, weights_info
-from dvo.nets.config import preset
+from dvo.nets.patch.config import preset
 
 HUGE = {
     "channels": ({"hidden_channels": 10**9}, "hidden_channels"),

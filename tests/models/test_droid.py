@@ -7,7 +7,7 @@ import torch
 
 import dvo
 from dvo.ba.kernels import Kernel
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.models.dense_step import (
     DenseOptions,
@@ -20,8 +20,8 @@ from dvo.models.dense_step import (
 from dvo.models.droid import DroidVO, damping_of, neighbour_edges
 from dvo.models.registry import network_class
 from dvo.models.weights import import_checkpoint, load_weights, save_weights
-from dvo.nets.droid import preset
-from dvo.nets.frame_correlation import PairVolume
+from dvo.nets.correlation.frame_correlation import PairVolume
+from dvo.nets.droid.droid import preset
 
 
 def droid_table() -> dict[str, tuple[int, ...]]:

@@ -9,7 +9,7 @@ import torch
 
 import dvo
 from dvo.cli import main
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models import onnx_export
 
 

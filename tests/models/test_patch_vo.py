@@ -8,7 +8,7 @@ import torch
 from dvo.geometry import se3
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
-from dvo.nets.config import preset
+from dvo.nets.patch.config import preset
 
 
 @pytest.fixture

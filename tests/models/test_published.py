@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.published import read_published
 from dvo.models.tartanvo import TartanVO
 from dvo.models.weights import LoadedWeights, import_checkpoint, load_weights
-from dvo.nets.local_correlation import local_correlation
-from dvo.nets.pwc_net import PWCNet, warp_inside
-from dvo.nets.tartanvo import TartanVOConfig, preset
+from dvo.nets.correlation.local_correlation import local_correlation
+from dvo.nets.two_frame.pwc_net import PWCNet, warp_inside
+from dvo.nets.two_frame.tartanvo import TartanVOConfig, preset
 from dvo.odometry.load import build_odometry
 
 GOLDEN = json.loads(Path(__file__).with_name("tartanvo_published.json").read_text())

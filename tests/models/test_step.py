@@ -7,19 +7,19 @@ import torch
 
 from dvo.ba.cold_start import damping_at
 from dvo.ba.factors import DepthPrior
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
-from dvo.graph.window import Keyframe, Window
+from dvo.map.window import Keyframe, Window
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
 from dvo.models.step import StepOptions, UpdateState, recent_depth, revise, step
-from dvo.nets.config import preset
-from dvo.nets.correlation import Correlation, correlate_reference
-from dvo.nets.patchifier import normalise_images, patch_coordinates
-from dvo.nets.selection import random_centres
-from dvo.nets.update import UPDATE_OPERATORS
-from dvo.odometry.window_correlation import WindowCorrelation
-from dvo.odometry.window_step import WindowStep
+from dvo.nets.correlation.correlation import Correlation, correlate_reference
+from dvo.nets.patch.config import preset
+from dvo.nets.patch.patchifier import normalise_images, patch_coordinates
+from dvo.nets.patch.selection import random_centres
+from dvo.nets.update.update import UPDATE_OPERATORS
+from dvo.odometry.window.correlation import WindowCorrelation
+from dvo.odometry.window.step import WindowStep
 from dvo.synth.clip import make_clip
 
 FRAMES, PATCHES, UPDATES = 5, 12, 6

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.losses.two_frame import true_flow
 from dvo.models.registry import build_network, network_class
 from dvo.models.tartanvo import TartanVO, TwoFrameMotion
 from dvo.models.weights import save_weights
-from dvo.nets.tartanvo import PRESETS, preset
+from dvo.nets.two_frame.tartanvo import PRESETS, preset
 
 
 @pytest.fixture(scope="module")

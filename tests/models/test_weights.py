@@ -10,15 +10,15 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.patch_vo import PatchVO
 from dvo.models.registry import ARCHITECTURES, as_network
 from dvo.models.weights import import_checkpoint, load_weights, save_weights, weights_info
-from dvo.nets.config import PRESETS, ModelConfig, preset
-from dvo.nets.mamba import MambaUpdate
-from dvo.nets.update import Update
-from dvo.odometry.config import TRACKER_PRESETS
+from dvo.nets.patch.config import PRESETS, ModelConfig, preset
+from dvo.nets.update.mamba import MambaUpdate
+from dvo.nets.update.update import Update
 from dvo.odometry.load import build_odometry
+from dvo.odometry.patch.config import TRACKER_PRESETS
 
 
 def dpvo_table() -> dict[str, tuple[int, ...]]:

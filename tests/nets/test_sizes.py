@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.registry import ARCHITECTURES, network_class
-from dvo.nets.config import ModelConfig
+from dvo.nets.patch.config import ModelConfig
 from dvo.nets.sizes import check_sizes, named_preset
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import dvo
-from dvo.graph.serialisation import load_graph, save_graph
-from dvo.odometry.scale_options import ScaleOptions
+from dvo.map.io.serialisation import load_graph, save_graph
+from dvo.odometry.depth.scale_options import ScaleOptions
 from tests.support.archived_walk import archived_walk
 from tests.support.saved_maps import check_saved_run
 from tests.support.stereo_wall import stereo_wall

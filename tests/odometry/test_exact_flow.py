@@ -10,11 +10,11 @@ from dvo.geometry.camera import Camera
 from dvo.geometry.projection import reproject
 from dvo.metrics import evaluate
 from dvo.models.patch_vo import PatchVO
-from dvo.nets.config import preset
-from dvo.nets.correlation import Correlation
-from dvo.odometry.config import TrackerConfig
+from dvo.nets.correlation.correlation import Correlation
+from dvo.nets.patch.config import preset
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Status
-from dvo.odometry.tracker import PatchOdometry
 from dvo.synth.clip import make_clip
 
 CONFIG = TrackerConfig(pixels=0, initial_motion=0.3, initial_parallax=0.3, keyframe_motion=2.0)

@@ -9,7 +9,7 @@ import pytest
 import dvo
 from dvo.odometry.exclusive import METHODS, exclusive
 from dvo.odometry.load import build_odometry
-from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.patch.tracker import PatchOdometry
 from tests.support.tiny_members import MEMBERS, SETTINGS, frames, network
 
 SOON = 0.3  # seconds in which a call that does not wait is done

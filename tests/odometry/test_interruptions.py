@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.metrics import evaluate
+from dvo.metrics.segment_metrics import worlds_of
 from dvo.odometry.protocol import Status
-from dvo.segment_metrics import worlds_of
 from dvo.synth.sequence import make_sequence
 from tests.support.changed_images import with_images
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.patch_vo import PatchVO
 from dvo.models.registry import ARCHITECTURES, network_class
 from dvo.models.weights import LoadedWeights
-from dvo.nets.config import ModelConfig, preset
-from dvo.odometry.config import PRESETS, TRACKER_PRESETS, TrackerConfig
+from dvo.nets.patch.config import ModelConfig, preset
 from dvo.odometry.load import build_odometry
+from dvo.odometry.patch.config import PRESETS, TRACKER_PRESETS, TrackerConfig
+from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.registry import ODOMETRIES, odometry_builder
-from dvo.odometry.tracker import PatchOdometry
 
 
 def test_shipped_weights_give_the_tracker_with_the_settings_of_their_preset():

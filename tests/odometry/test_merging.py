@@ -5,7 +5,7 @@ import pytest
 
 import dvo
 from dvo.cli import main
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.odometry.merging import merge_maps
 from tests.support.outcome import content
 from tests.support.recorded_walk import error_of_both, room, street, tracked, way_back

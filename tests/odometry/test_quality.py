@@ -7,9 +7,9 @@ import pytest
 
 import dvo
 from dvo.data.trajectory import Trajectory
+from dvo.odometry.checks.measures import count_jumps
 from dvo.odometry.protocol import Result, SparseMap
 from dvo.odometry.quality import LEAST_AGREEMENT, MOST_DEVIATION, Quality, judge
-from dvo.odometry.quality_measures import count_jumps
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.verdict.failures import before_still_camera, with_crowd, with_overlay, with_waves
 

@@ -4,10 +4,10 @@ import torch
 
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
-from dvo.graph.archive import ArchiveConfig
-from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.graph.window import Keyframe
-from dvo.nets.patchifier import patch_coordinates
+from dvo.map.archive import ArchiveConfig
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.window import Keyframe
+from dvo.nets.patch.patchifier import patch_coordinates
 
 M, REACH = 8, 6  # patches of a frame; frames that an edge reaches
 ROWS, INTERVAL = 60, 0.1  # height of the feature map; seconds between frames

@@ -9,7 +9,7 @@ import numpy as np
 
 import dvo
 from dvo.data.trajectory import Trajectory
-from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.loops.options import LoopOptions
 from dvo.synth.sequence import make_sequence
 
 THERE = 40

@@ -8,8 +8,8 @@ from dvo.export.reconstruction import Reconstruction
 from dvo.geometry import se3
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices
-from dvo.graph.archive import ArchiveConfig, encode_jpeg
-from dvo.graph.keyframe_graph import KeyframeGraph
+from dvo.map.archive import ArchiveConfig, encode_jpeg
+from dvo.map.keyframe_graph import KeyframeGraph
 from tests.support.archived_walk import ROWS, M, archived_walk
 
 SIDE = 4 * ROWS  # of the images of a walk, pixels

@@ -12,7 +12,7 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.metrics import evaluate
-from dvo.odometry.loop_options import LoopOptions
+from dvo.odometry.loops.options import LoopOptions
 from dvo.synth.sequence import make_sequence
 
 COUNT = 36
@@ -53,7 +53,7 @@ def _zoomed(frame: Frame, index: int, timestamp: float) -> Frame:
     return Frame(index, timestamp, np.ascontiguousarray(image), camera)
 
 
-def tracked(frames: list[Frame], **settings) -> dvo.odometry.tracker.PatchOdometry:
+def tracked(frames: list[Frame], **settings) -> dvo.odometry.patch.tracker.PatchOdometry:
     """Finished tracker of frames."""
     odometry = dvo.load("small", device="cpu", **SHORT, **settings)
     for frame in frames:

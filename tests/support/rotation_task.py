@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 from train.data.clips import Renderings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import dvo
-from dvo.graph.map_file import open_map_file, write_map_file
+from dvo.map.io.map_file import open_map_file, write_map_file
 from tests.support.outcome import content, told
 
 FAST = {"pixels": 160 * 120, "patches": 12, "lifetime": 5, "removal": 6, "initial_updates": 6, "final_updates": 2}

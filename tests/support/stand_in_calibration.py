@@ -5,10 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 from unittest.mock import create_autospec
 
-from dvo.odometry import calibrate
-from dvo.odometry.config import TrackerConfig
-from dvo.odometry.rolling_shutter import Shutter
-from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.calibrate.calibrate import calibrate
+from dvo.odometry.global_ba.rolling_shutter import Shutter
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.tracker import PatchOdometry
 
 
 def replace_tracking(monkeypatch, track, profile):

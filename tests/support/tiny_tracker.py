@@ -11,9 +11,9 @@ from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights
-from dvo.nets.config import preset
-from dvo.odometry.config import TrackerConfig
-from dvo.odometry.tracker import PatchOdometry
+from dvo.nets.patch.config import preset
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.tracker import PatchOdometry
 
 SMALL = TrackerConfig(
     pixels=96 * 72, patches=6, lifetime=4, removal=5, optimisation=4, initial_frames=5, initial_updates=3,

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import transform
+from dvo.metrics.segment_metrics import rows_of
 from dvo.odometry.protocol import Segment
-from dvo.segment_metrics import rows_of
 
 
 def moved(trajectory: Trajectory, scale: float, turn: float) -> Trajectory:

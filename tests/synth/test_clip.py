@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth.clip import Clip, induced_flow, make_clip
 from dvo.synth.conditions import draw_conditions

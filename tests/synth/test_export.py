@@ -10,7 +10,7 @@ import pytest
 
 import dvo
 from dvo.cli import main
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.poses import look_rotation, pose_from
 from dvo.synth import mesh_scene
 from dvo.synth.export import OCCLUDED, OUT_OF_VIEW, Layout, export_sequence, mesh_sequence, static_flow

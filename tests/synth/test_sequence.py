@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth import (
     ImuNoise,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth import CameraSpec, MotionSpec, SceneSpec, SequenceFormat, SequenceSpec, make_sequence, sequence_spec
 from dvo.synth.clip import ClipSpec, make_clip
 

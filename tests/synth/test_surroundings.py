@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.synth.sequence import make_sequence
 from dvo.synth.surroundings import SURROUNDINGS, Canvas, Style, drawings

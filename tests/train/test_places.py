@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import train.places
-from dvo.errors import DvoError
-from dvo.odometry.place_descriptors import load_descriptor
+from dvo.core.errors import DvoError
+from dvo.odometry.loops.place_descriptors import load_descriptor
 from dvo.synth.scenes.families import HELD_OUT, SHARES
 
 

@@ -12,8 +12,8 @@ import torch
 from dvo.cli import main
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
-from dvo.graph.keyframe_graph import KeyframeGraph
-from dvo.graph.window import Keyframe
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.window import Keyframe
 from dvo.odometry.protocol import Estimate, Status
 from dvo.viz.marks import pixels, shade
 from dvo.viz.overlay import OverlayVideo

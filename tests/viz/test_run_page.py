@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dvo.data.trajectory import Trajectory
-from dvo.odometry.frame_table import FrameRow
+from dvo.session.frame_table import FrameRow
 from dvo.viz.run_page import (
     ASSETS,
     MAX_FRAMES,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.settings import check_settings
+from dvo.core.settings import check_settings
 
 
 @dataclass(frozen=True)

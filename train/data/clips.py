@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.dataset import ClipDataset
 from dvo.synth.specs import check_share
 from train.data.real import RealClips, RealData

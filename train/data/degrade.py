@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from dvo.errors import DvoError
-from dvo.settings import check_settings
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_settings
 from train.data.augment import random_source
 
 

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dvo.data.depth import read_depth
-from dvo.data.fit import fit, fit_depth
+from dvo.core.errors import DvoError
+from dvo.data.images.fit import fit, fit_depth
+from dvo.data.readers.tartanair import depth_file
+from dvo.data.sensors.depth import read_depth
 from dvo.data.source import Source, open_source
-from dvo.data.tartanair import depth_file
 from dvo.data.trajectory import interpolate
-from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.synth.clip import induced_flow
 from train.data.tartanair import with_trajectories

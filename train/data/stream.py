@@ -10,7 +10,7 @@ import lightning as L
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from dvo.allocator import reuse_freed_memory
+from dvo.core.allocator import reuse_freed_memory
 from train.engine.provenance import Material
 
 

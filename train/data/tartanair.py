@@ -6,8 +6,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from dvo.data.tartanair import LAYOUTS
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.readers.tartanair import LAYOUTS
 
 _DEPTH = 5  # levels below the given folder: ENV/ENV/Easy/P000 of the archives as they are unpacked
 _POSES = frozenset(layout.poses for layout in LAYOUTS)

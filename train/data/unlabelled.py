@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dvo.data.fit import fit
+from dvo.core.errors import DvoError
+from dvo.data.images.fit import fit
 from dvo.data.source import Source, open_source
-from dvo.errors import DvoError
 
 TRIES = 8
 """Clips drawn until one moves as asked; then the one that comes nearest is taken."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any, get_args, get_type_hints
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.engine.program import EngineSettings, TrainingProgram
 from train.tasks.registry import DEFAULT_TASK, task_class
 from train.tasks.task import Task

@@ -10,7 +10,7 @@ from typing import Any
 import lightning as L
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.engine.run import LAST
 
 

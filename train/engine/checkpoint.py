@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from torch import nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.pickles import check_plain, load_pickle
 from dvo.models.registry import DEFAULT_ARCHITECTURE, build_network, network_class, preset_name
 from dvo.models.weights import LoadedWeights, load_weights

@@ -14,8 +14,8 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from dvo.errors import DvoError
-from dvo.settings import shown
+from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 from train.engine.build import program_factory
 from train.engine.callbacks import RefuseStandstill, StopGently
 from train.engine.config_files import check_files

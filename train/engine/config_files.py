@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dvo.yaml_files import read_yaml
+from dvo.core.yaml_files import read_yaml
 
 SUFFIXES = (".yaml", ".yml")
 
@@ -16,7 +16,7 @@ def check_files(arguments: list[str]) -> None:
         arguments: of the command line, without the name of the program.
 
     Raises:
-        DvoError: a file that is not valid YAML within the bounds of :mod:`dvo.yaml_files`.
+        DvoError: a file that is not valid YAML within the bounds of :mod:`dvo.core.yaml_files`.
     """
     before = ""
     for argument in arguments:

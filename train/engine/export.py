@@ -9,9 +9,9 @@ from typing import get_args
 
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.yaml_files import read_text
 from dvo.models.weights import save_weights
-from dvo.yaml_files import read_text
 from train.engine.checkpoint import Which, facts_of, network_of, portable, read_state
 
 

@@ -13,7 +13,7 @@ import torch
 from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.registry import as_network
 from dvo.models.weights import LoadedWeights
 from train.engine.provenance import KEY, Provenance, material_of

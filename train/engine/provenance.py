@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.weights import LoadedWeights
 
 KEY = "provenance"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.weights import LoadedWeights, load_weights
 from train.engine.checkpoint import SUFFIXES, State, network_of, read_state
 from train.engine.program import TrainingProgram, check_tensors

@@ -15,10 +15,10 @@ import torch
 
 import dvo.models.step as step_module
 import train.tasks.patch_vo.objective as objective
-from dvo.ba.step import GaussNewtonStep
-from dvo.nets import correlation
-from dvo.nets.patchifier import Patchifier
-from dvo.nets.update import Update
+from dvo.ba.layer.step import GaussNewtonStep
+from dvo.nets.correlation import correlation
+from dvo.nets.patch.patchifier import Patchifier
+from dvo.nets.update.update import Update
 from train.data.clips import CurriculumStage, MixedClips
 from train.engine.build import make_program
 from train.engine.program import TrainingProgram
@@ -155,7 +155,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--cpu-time", action="store_true", help="processor seconds: for a machine that does other work")
     options = parser.parse_args(arguments)
-    from dvo.allocator import reuse_freed_memory
+    from dvo.core.allocator import reuse_freed_memory
 
     reuse_freed_memory()
     torch.set_num_threads(options.threads)

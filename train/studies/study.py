@@ -19,7 +19,7 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.engine.build import task_settings
 from train.engine.checkpoint import network_of, read_state
 from train.engine.program import TrainingProgram

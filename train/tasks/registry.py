@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import cast
 
-from dvo.registry import Registry, is_target, resolve_target
+from dvo.core.registry import Registry, is_target, resolve_target
 from train.tasks.task import Task
 
 DEFAULT_TASK = "patch_vo"

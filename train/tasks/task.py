@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Protocol
 import lightning as L
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 Batch = dict[str, Tensor]
 """Clips stacked along the first dimension of every tensor."""

@@ -14,17 +14,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dvo.core.errors import DvoError
+from dvo.core.settings import parse_settings
+from dvo.data.files.root import data_root
 from dvo.data.frame import Frame
-from dvo.data.root import data_root
 from dvo.data.source import open_source
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.metrics import Metrics
+from dvo.metrics.segment_metrics import evaluate_segments, most_worlds, worlds_of
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Odometry
-from dvo.odometry.session import FrameCallback, Run, run
-from dvo.segment_metrics import evaluate_segments, most_worlds, worlds_of
-from dvo.settings import parse_settings
+from dvo.session.session import FrameCallback, Run, run
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 from train.engine.checkpoint import SUFFIXES, facts_of, load_any, read_state
 
@@ -35,7 +35,8 @@ SEQUENCES = ("kitti00_120", "7scenes_redkitchen_400", "tartanair_v1_60", "tum_fr
 def track_sequence(
     odometry: Odometry, frames: Iterable[Frame], truth: Trajectory, on_frame: FrameCallback | None = None
 ) -> tuple[Metrics, Run]:
-    """Track a clip and compare it with its ground truth, each segment aligned on its own (:mod:`dvo.segment_metrics`).
+    """Track a clip and compare it with its ground truth, each segment aligned on its own
+    (:mod:`dvo.metrics.segment_metrics`).
 
     Ctrl-C is passed on: a part of a clip is no measurement.
 

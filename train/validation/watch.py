@@ -15,8 +15,8 @@ import lightning as L
 import numpy as np
 import torch
 
+from dvo.data.files.root import data_root
 from dvo.data.frame import Frame
-from dvo.data.root import data_root
 from dvo.data.source import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics
@@ -24,7 +24,7 @@ from dvo.models.weights import LoadedWeights
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.odometry.registry import odometry_builder
-from dvo.odometry.session import Run
+from dvo.session.session import Run
 from train.validation.pictures import PatchFlow, draw, image_at, patch_flow
 from train.validation.validate import rendered_clip, track_sequence
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from dvo.data.image_header import MAX_PIXELS, image_size
-from dvo.data.images import is_complete
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.images.image_header import MAX_PIXELS, image_size
+from dvo.data.images.images import is_complete
 
 MAX_BYTES = 2 * 1024**3
 MAX_TRIANGLES = 4_000_000
@@ -163,7 +163,7 @@ def _check_pictures(tree: dict[str, Any], begin: int, path: Path) -> None:
 
 
 def check_picture(size: tuple[int, int] | None, file: object, field: str) -> None:
-    """Raise DvoError for a picture above :data:`dvo.data.image_header.MAX_PIXELS`.
+    """Raise DvoError for a picture above :data:`dvo.data.images.image_header.MAX_PIXELS`.
 
     Args:
         size: width and height, pixels; None if unknown.

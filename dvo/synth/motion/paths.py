@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.poses import look_rotation, pose_from, quaternion_to_matrix
 from dvo.synth import salts
 from dvo.synth.motion.motion import UP, Path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth import salts
 from dvo.synth.motion.motion import SplinePath
 from dvo.synth.motion.paths import KINDS, find_start

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
 from dvo.geometry.undistort import distort, in_range, needs_undistortion, undistort
 from dvo.synth.meshes.mesh import MeshScene

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.antialias import smooth_outlines
 from dvo.synth.render.meshes import mesh_depth, render_mesh, trace_mesh

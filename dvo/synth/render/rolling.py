@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.render.antialias import smooth_outlines
 from dvo.synth.render.quality import STANDARD, Quality
 from dvo.synth.render.renderer import PIECE, Rendering, cast, named, view_scene

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import compose_rodrigues, pose_from, quaternion_to_matrix, split
 from dvo.geometry.undistort import needs_undistortion

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.protocols import Motion
 from dvo.synth.scenes.scene import Scene
 

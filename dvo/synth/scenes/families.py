@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvo.errors import DvoError
-from dvo.registry import Registry
+from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
 from dvo.synth import salts
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.textures.texture import TexturePool, texture_pool

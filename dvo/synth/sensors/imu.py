@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.poses import split
 from dvo.synth import salts
 from dvo.synth.protocols import Motion

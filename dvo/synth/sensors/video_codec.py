@@ -7,7 +7,7 @@ import subprocess
 
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 LENGTH = 30
 """Frames that are coded together; the first of them is a whole picture, the others tell what has changed."""

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 from dvo.geometry.camera import Camera
-from dvo.settings import shown
 from dvo.synth import salts
 from dvo.synth.surroundings.canvas import Canvas, Drawing, Style
 from dvo.synth.surroundings.landscape import crowd, foliage, night, screen, sky, traffic, water

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dvo.data.image_header import MAX_PIXELS, image_size
-from dvo.data.images import is_complete
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.images.image_header import MAX_PIXELS, image_size
+from dvo.data.images.images import is_complete
 from dvo.synth import salts
 from dvo.synth.textures.patterns import PATTERNS, SPECIAL
 

@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 import dvo
-from dvo.data.root import data_root
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.odometry.protocol import Estimate, Odometry
 from eval.benchmarks.interruptions.scoring import Score, score
 from eval.benchmarks.interruptions.trials import (

@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 
-from dvo.errors import DvoError
-from dvo.odometry.results import jsonable
+from dvo.core.errors import DvoError
+from dvo.session.results import jsonable
 from eval.benchmarks.loops.processes import Alternating, alone
 from eval.benchmarks.loops.runs import Run, Task
 from eval.benchmarks.loops.tables import blackout_table, revisit_table

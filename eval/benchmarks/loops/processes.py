@@ -8,7 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing.synchronize import Semaphore
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.benchmarks.loops.runs import Run, Task, Turns, carry_out
 from eval.execution.process import die_with_parent
 

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
+from dvo.core.threads import settle_threads
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.metrics import associate, evaluate
+from dvo.metrics.segment_metrics import worlds_of
 from dvo.odometry.protocol import Estimate, Odometry, Result, Segment
-from dvo.segment_metrics import worlds_of
-from dvo.threads import settle_threads
 from eval.benchmarks.interruptions.trials import image_without_view
 from eval.execution.predict import drive
 from eval.scoring.score import score

@@ -25,12 +25,12 @@ import numpy as np
 import torch
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.threads import settle_threads
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_model
-from dvo.odometry.front_end import encode_image
+from dvo.odometry.frames.front_end import encode_image
 from dvo.synth.sequence import make_sequence
-from dvo.threads import settle_threads
 from eval.benchmarks.place_recognition.methods import Method, fit_vlad, grid_method, orb_method, vlad_method
 from eval.benchmarks.place_recognition.scoring import COUNTS, Recall, recall_of
 from eval.scoring.overlap import depth_maps, shared_view

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from dvo.odometry.place_descriptors import SHIPPED, load_descriptor
+from dvo.odometry.loops.place_descriptors import SHIPPED, load_descriptor
 from eval.systems.peers.vocabulary import Vocabulary, read_vocabulary
 
 FEATURES = 500

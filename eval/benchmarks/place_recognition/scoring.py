@@ -36,7 +36,7 @@ def recall_of(scores: np.ndarray, shared: np.ndarray, allowed: np.ndarray, apart
         scores: ``(N, N)`` of keyframes (rows) with candidates (columns).
         shared: ``(N, N)`` shared view.
         allowed: ``(N, N)`` bool, the pairs that are asked for.
-        apart: numbers of two candidates differ by more, see :meth:`dvo.graph.places.PlaceIndex.query`.
+        apart: numbers of two candidates differ by more, see :meth:`dvo.map.places.PlaceIndex.query`.
 
     Returns:
         The recall; of no queries nan.

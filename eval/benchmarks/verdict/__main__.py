@@ -21,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from dvo.threads import settle_threads
+from dvo.core.threads import settle_threads
 from eval.benchmarks.verdict.trials import KINDS, Outcome, Trial, carry_out
 
 

@@ -15,9 +15,9 @@ import dvo
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import evaluate
-from dvo.odometry import session
-from dvo.odometry.results import jsonable
-from dvo.odometry.tracker import PatchOdometry
+from dvo.odometry.patch.tracker import PatchOdometry
+from dvo.session import session
+from dvo.session.results import jsonable
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.verdict import failures
 from eval.systems.registry import find_system

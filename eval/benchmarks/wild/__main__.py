@@ -23,10 +23,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dvo.data.calibration import Calibration
-from dvo.data.right_source import VIDEO_SUFFIXES
-from dvo.errors import DvoError
-from dvo.threads import settle_threads
+from dvo.core.errors import DvoError
+from dvo.core.threads import settle_threads
+from dvo.data.calibration.calibration import Calibration
+from dvo.data.companions.right_source import VIDEO_SUFFIXES
 from eval.benchmarks.wild.measures import Expected, Measures, backward, difference, measure, read_expected
 from eval.benchmarks.wild.page import write_page
 from eval.benchmarks.wild.runs import Run, Task, Video, carry_out

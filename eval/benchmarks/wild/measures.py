@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
+from dvo.core.yaml_files import read_yaml
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.metrics import evaluate
-from dvo.yaml_files import read_yaml
 
 PARTS = 5
 """Equal parts of a clip whose mean speeds are compared."""

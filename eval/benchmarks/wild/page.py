@@ -6,8 +6,8 @@ import html
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.metrics import align_trajectory
 from dvo.viz.plot import Panel, Track, plot_panels
 from eval.benchmarks.wild.measures import backward

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 import dvo
-from dvo.data.calibration import Calibration
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
-from dvo.odometry import session
 from dvo.odometry.protocol import Estimate
+from dvo.session import session
 from eval.systems.registry import find_system
 
 PIXELS = 640 * 480

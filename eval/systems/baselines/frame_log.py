@@ -9,12 +9,12 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import poses_from_matrices
-from dvo.graph.keyframe_log import KeyframeLog
+from dvo.map.keyframe_log import KeyframeLog
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 
 
 class FrameLog:
-    """Frames of the sequence in order, in a :class:`dvo.graph.keyframe_log.KeyframeLog` of ``(4, 4)`` matrices.
+    """Frames of the sequence in order, in a :class:`dvo.map.keyframe_log.KeyframeLog` of ``(4, 4)`` matrices.
 
     Frames before the start of a map have no pose of their own; they get one in :meth:`result` from the rotations
     between frames.

@@ -16,8 +16,8 @@ from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import poses_from_matrices
 from dvo.geometry.undistort import Undistorter
+from dvo.metrics.segment_metrics import worlds_of
 from dvo.odometry.protocol import Result, Segment, SparseMap
-from dvo.segment_metrics import worlds_of
 
 WIDE = 560  # smaller images are doubled: these systems expect VGA, and do not even start on 320x240
 

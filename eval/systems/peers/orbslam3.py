@@ -31,10 +31,10 @@ from typing import Any, Literal, get_args
 import cv2
 import numpy as np
 
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
 from dvo.data.frame import Frame, StereoView
-from dvo.data.root import data_root
 from dvo.data.trajectory import Trajectory, read_tum
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.geometry.undistort import needs_undistortion

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.odometry.protocol import Estimate, Result, Status
 from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 FIRST_SEED = 4000  # of the sequences; those of the suites lie elsewhere
 # ORB-SLAM groups features by the node 4 levels above the depth that the file states, and matches within groups. A

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.benchmarks import compare_commits
 from eval.benchmarks.compare_commits import (
     Settings,

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dvo.geometry import se3
-from dvo.odometry.window_gauge import Gauge, relative_error
+from dvo.odometry.uncertainty.gauge import Gauge, relative_error
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks import covariance
 from eval.benchmarks.covariance import (

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.graph.archive import Archive
+from dvo.map.archive import Archive
 from eval.benchmarks.long_run import PARTS, STEP, Row, draw, measure, read_csv, table, there_and_back, write_csv
 
 CAMERA = Camera(1.0, 1.0, 2.0, 1.0, width=4, height=2)

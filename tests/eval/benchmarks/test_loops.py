@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
-from dvo.graph.storage import ArrayStorage
+from dvo.map.storage import ArrayStorage
 from dvo.odometry.protocol import Segment
 from eval.benchmarks.loops.__main__ import blackout_sequences, check_out, line, read_runs, run_all
 from eval.benchmarks.loops.processes import Alternating

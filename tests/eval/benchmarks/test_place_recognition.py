@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dvo.errors import DvoError
-from dvo.graph.places import PlaceIndex
+from dvo.core.errors import DvoError
+from dvo.map.places import PlaceIndex
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.place_recognition.methods import aggregate, bag_of_words, fit_vlad, score_words, vlad_method
 from eval.benchmarks.place_recognition.scoring import recall_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dvo.models.patch_vo import PatchVO
-from dvo.nets.config import preset
+from dvo.nets.patch.config import preset
 from eval.benchmarks.verdict import failures
 from eval.benchmarks.verdict.__main__ import interval, main, table
 from eval.benchmarks.verdict.trials import CHANGES, KINDS, Outcome, Trial

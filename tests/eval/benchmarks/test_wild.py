@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from eval.benchmarks.wild.__main__ import judge, main, tasks_of
 from eval.benchmarks.wild.measures import Expected, Measures, backward, difference, measure, read_expected
 from eval.benchmarks.wild.runs import Run, Video

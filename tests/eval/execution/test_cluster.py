@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.execution.cache import reusable
 from eval.execution.predict import Job, Prediction, predict_here
 from eval.execution.runner import predict_all

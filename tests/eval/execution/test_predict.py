@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory, read_tum
-from dvo.errors import DvoError
 from dvo.odometry.protocol import Break, Segment
 from eval.execution.predict import (
     RECORD,

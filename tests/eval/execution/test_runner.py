@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.__main__ import main
 from eval.execution.plan import read_manifest
 from eval.execution.predict import Job, predict_here

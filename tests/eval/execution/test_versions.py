@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dvo.data.registry import READERS
+from dvo.data.readers.registry import READERS
 from dvo.odometry.registry import ODOMETRIES
 from eval.execution.cache import system_facts
 from eval.execution.versions import code_digest, depends_on_threads, reader_digest, source_files
@@ -17,10 +17,10 @@ from eval.systems.registry import CATALOGUE, find_system
 def test_code_of_a_system_is_what_it_imports(monkeypatch):
     names = {str(file.relative_to(ROOT)) for file in source_files(find_system("klt-pnp"))}
     folder = "eval/systems/baselines"
-    assert {f"{folder}/klt_pnp.py", f"{folder}/klt.py", f"{folder}/two_view.py", "dvo/graph/keyframe_log.py"} <= names
+    assert {f"{folder}/klt_pnp.py", f"{folder}/klt.py", f"{folder}/two_view.py", "dvo/map/keyframe_log.py"} <= names
     assert f"{folder}/null.py" not in names and not any("dvo/nets" in name for name in names)
     learned = {str(file.relative_to(ROOT)) for file in source_files(find_system("dvo-small"))}
-    assert {"dvo/odometry/tracker.py", "dvo/models/patch_vo.py", "dvo/ba/layer.py"} <= learned
+    assert {"dvo/odometry/patch/tracker.py", "dvo/models/patch_vo.py", "dvo/ba/layer/layer.py"} <= learned
     assert depends_on_threads(find_system("dvo-small")) and not depends_on_threads(find_system("klt-pnp"))
 
     before = {name: code_digest(find_system(name)) for name in ("klt-pnp", "null")}

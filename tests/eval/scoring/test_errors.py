@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvo.data.trajectory import Trajectory
-from dvo.segment_metrics import evaluate_segments, rows_of
+from dvo.metrics.segment_metrics import evaluate_segments, rows_of
 from eval.scoring.errors import align_segments, all_errors
 from eval.scoring.metrics import Aligned, absolute_rmse, align_pair, metrics_of, path_errors
 from eval.scoring.protocols import kitti_errors, per_frame_scale, relative_pose_auc

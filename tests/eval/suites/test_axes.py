@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from dvo.errors import DvoError
-from dvo.yaml_files import read_yaml
+from dvo.core.errors import DvoError
+from dvo.core.yaml_files import read_yaml
 from eval.suites import suite as suites
 from eval.suites.axes import choose, expand, read_axes
 from eval.suites.suite import SUITES, read_suites

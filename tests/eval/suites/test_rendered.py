@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth import HELD_OUT, LONG_KINDS, make_sequence
 from dvo.synth.export import write_calibration
 from dvo.synth.surroundings import SURROUNDINGS

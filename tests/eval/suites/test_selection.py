@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory, read_tum, write_tum
-from dvo.errors import DvoError
 from dvo.geometry.poses import pose_matrices
 from dvo.metrics import evaluate
 from eval.suites.selection import config_names, folder_of_data, load_suites, settle, suite_from, suite_of_folder

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from dvo.data.root import data_root
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from eval.suites.selection import settle
 from eval.suites.suite import Sequence, open_sequence, read_suite, reference_for
 

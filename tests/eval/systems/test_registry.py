@@ -13,7 +13,7 @@ from io import StringIO
 import pytest
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.odometry.protocol import Odometry
 from eval.execution.cache import digest_of, job_key, system_facts
 from eval.execution.predict import predict_here

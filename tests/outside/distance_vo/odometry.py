@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth import load_mesh
 
 trimesh = pytest.importorskip("trimesh")

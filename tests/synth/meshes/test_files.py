@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.poses import look_rotation, pose_from
 from dvo.synth import load_mesh, mesh_scene, render
 from dvo.synth.meshes import files as mesh_files

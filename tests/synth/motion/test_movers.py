@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import compose_rodrigues, invert_rodrigues, split
 from dvo.synth import (

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dvo.core.errors import DvoError
 from dvo.data.source import open_source
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import Undistorter
-from dvo.odometry.working_image import working_image
+from dvo.odometry.frames.working_image import working_image
 from dvo.synth import Shot, make_sequence, mesh_scene, random_path, random_scene, render, trace
 from dvo.synth.export import export_sequence
 from dvo.synth.render.lens import distorted_pixels, plate_of, random_lens, render_lens, undistorted_pixels

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry.poses import invert_rodrigues, look_rotation, pose_from, split
 from dvo.synth import random_path, random_scene, render, trace
 from dvo.synth.render.quality import Quality

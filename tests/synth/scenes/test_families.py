@@ -8,9 +8,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
 from dvo.geometry.poses import pose_from
-from dvo.registry import Registry
 from dvo.synth import FAMILIES, HELD_OUT, Scene, make_sequence, random_scene, render
 from dvo.synth.motion.paths import find_start
 from dvo.synth.motion.walks import long_path

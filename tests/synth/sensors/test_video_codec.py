@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.sensors.video_codec import LENGTH, compressed_video
 from dvo.synth.sequence import make_sequence
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.textures.photographs import folder_photographs
 
 

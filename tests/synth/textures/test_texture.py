@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.textures.patterns import SPECIAL
 from dvo.synth.textures.texture import TexturePool, texture_pool
 

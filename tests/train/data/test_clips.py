@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.data.clips import CurriculumStage, MixedClips, Renderings
 
 

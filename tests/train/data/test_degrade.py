@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.data.degrade import Degradation, degrade, motion_blurred
 
 NOTHING = {"light": 0.0, "noise": 0.0, "blur": 0.0}

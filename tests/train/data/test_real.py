@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from dvo.data.root import data_root
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from train.data.real import RealClips, RealData

@@ -6,8 +6,8 @@ import pytest
 import torch
 import yaml
 
-from dvo.data.root import data_root
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.data.files.root import data_root
 from dvo.synth.export import export_sequence
 from dvo.synth.sequence import make_sequence
 from train.data.real import RealClips, RealData

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.synth import random_scene, render
 from dvo.synth.motion.paths import random_path

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.data.mixture import LabelledRenderings, Mixture
 from train.data.unlabelled import UnlabelledClips, UnlabelledData, apparent_motion
 

@@ -8,9 +8,9 @@ import torch
 from safetensors import safe_open
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.weights import load_weights
-from dvo.nets.config import PRESETS
+from dvo.nets.patch.config import PRESETS
 from train.data.clips import Renderings
 from train.engine import export
 from train.engine.build import make_program

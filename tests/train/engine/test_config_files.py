@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.__main__ import main
 from train.engine.config_files import check_files
 

@@ -6,7 +6,7 @@ import lightning as L
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.weights import LoadedWeights, load_weights, save_weights
 from train.engine.callbacks import RefuseStandstill, StopGently
 from train.engine.checkpoint import read_state

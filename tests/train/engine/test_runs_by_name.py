@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 import dvo.models.registry
-from dvo.data.root import data_root
+from dvo.data.files.root import data_root
 from dvo.models.weights import load_weights
 from train.__main__ import main
 from train.engine.checkpoint import read_state

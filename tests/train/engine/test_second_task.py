@@ -11,12 +11,12 @@ import yaml
 from safetensors import safe_open
 
 import dvo
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.models.registry import ARCHITECTURES
 from dvo.odometry.registry import ODOMETRIES
-from dvo.odometry.session import run
+from dvo.session.session import run
 from train.__main__ import main
 from train.engine.build import make_program
 from train.engine.checkpoint import load_any, read_state

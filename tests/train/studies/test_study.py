@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies import study
 from train.studies.config import StudyConfig
 from train.studies.report import table, write_report

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies import training
 from train.studies.training import StepClock, task_program
 

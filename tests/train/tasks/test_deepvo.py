@@ -9,7 +9,7 @@ import yaml
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.models.deepvo import TRANSLATION_UNIT, chain, true_steps
 from dvo.synth.sequence import make_sequence
 from train.data.augment import Augmentation

@@ -7,13 +7,13 @@ import torch
 import yaml
 
 import dvo
-from dvo.ba.dense import dense_patches
-from dvo.errors import DvoError
+from dvo.ba.layer.dense import dense_patches
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.losses.pose import edge_pose_errors
 from dvo.models.dense_step import DenseState, frame_graph
 from dvo.models.droid import DroidVO, neighbour_edges
-from dvo.nets.dense_update import MASK
+from dvo.nets.droid.dense_update import MASK
 from dvo.synth.clip import flow_field, make_clip
 from train.engine.build import make_program
 from train.engine.checkpoint import read_state

@@ -6,17 +6,17 @@ import pytest
 import torch
 
 from dvo.ba.cold_start import damping_at
-from dvo.ba.layer import BAOptions, bundle_adjust
+from dvo.ba.layer.layer import BAOptions, bundle_adjust
 from dvo.ba.multistart import COLD_STARTS, multistart
 from dvo.ba.patch_problem import PatchProblem
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.pose import pose_errors
 from dvo.models.patch_vo import UpdateState
 from dvo.models.schedule import full_graph
-from dvo.nets.patchifier import patch_coordinates
-from dvo.nets.selection import random_centres
+from dvo.nets.patch.patchifier import patch_coordinates
+from dvo.nets.patch.selection import random_centres
 from dvo.synth.clip import make_clip
 from train.data.augment import Augmentation
 from train.tasks.patch_vo.objective import LossConfig, clip_terms, true_reprojection, truth_of

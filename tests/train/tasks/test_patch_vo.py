@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.data.augment import Augmentation
 from train.engine.build import make_program
 from train.tasks.patch_vo.objective import LossConfig

@@ -9,7 +9,7 @@ import torch
 import yaml
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.losses.consistency import Limits
 from dvo.models.weights import save_weights
 from train.data.augment import Augmentation

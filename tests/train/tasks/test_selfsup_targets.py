@@ -11,7 +11,7 @@ from dvo.geometry.projection import reproject
 from dvo.losses.consistency import Limits
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import Stage, full_graph, training_schedule
-from dvo.nets.config import preset
+from dvo.nets.patch.config import preset
 from train.data.augment import crop_and_resize
 from train.tasks.patch_vo.objective import true_reprojection, truth_of
 from train.tasks.selfsup.objective import ConsistencyConfig, lesson_targets, photometric_term, student_loss

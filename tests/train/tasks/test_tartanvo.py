@@ -7,11 +7,11 @@ import torch
 import yaml
 
 import dvo
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3, so3
 from dvo.models.tartanvo import TwoFrameMotion
-from dvo.nets.flow_pyramid import Flows
-from dvo.nets.tartanvo import intrinsics_layer
+from dvo.nets.two_frame.flow_pyramid import Flows
+from dvo.nets.two_frame.tartanvo import intrinsics_layer
 from dvo.synth.clip import flow_field, make_clip
 from train.data.augment import Augmentation, crop_and_resize
 from train.engine.build import make_program

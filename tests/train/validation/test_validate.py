@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
+from dvo.core.errors import DvoError
+from dvo.core.settings import parse_settings
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.camera import Camera
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights
-from dvo.nets.config import preset
+from dvo.nets.patch.config import preset
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Result, Segment, SparseMap
-from dvo.settings import parse_settings
 from dvo.synth.clip import make_clip
 from train.validation.pictures import draw, image_at, patch_flow
 from train.validation.validate import track_sequence

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from dvo.errors import DvoError
-from dvo.settings import Range, from_table
-from dvo.yaml_files import read_yaml
+from dvo.core.errors import DvoError
+from dvo.core.settings import Range, from_table
+from dvo.core.yaml_files import read_yaml
 from train.tasks.registry import task_class
 
 NULL = "null"

@@ -16,11 +16,11 @@ from dvo.data.frame import Frame
 from dvo.data.source import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics
+from dvo.metrics.relative_pose import join_segments, relative_pose_errors
+from dvo.metrics.segment_metrics import evaluate_segments, most_worlds, worlds_of
 from dvo.odometry.protocol import Odometry, Segment
-from dvo.odometry.results import peak_memory_mb
-from dvo.odometry.session import run
-from dvo.relative_pose import join_segments, relative_pose_errors
-from dvo.segment_metrics import evaluate_segments, most_worlds, worlds_of
+from dvo.session.results import peak_memory_mb
+from dvo.session.session import run
 from dvo.synth.export import export_sequence
 from dvo.synth.sequence import make_sequence
 
@@ -31,7 +31,8 @@ class Measured:
 
     Attributes:
         metrics: after alignment of each world by Sim(3), with relative errors over two frames.
-        errors: degrees, of the pairs of frames by their gap, see :func:`dvo.relative_pose.relative_pose_errors`.
+        errors: degrees, of the pairs of frames by their gap, see
+            :func:`dvo.metrics.relative_pose.relative_pose_errors`.
         segments: number of worlds.
         fps: frames a second of the processor; nan if nothing was tracked.
     """

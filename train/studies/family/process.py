@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 
 
 def apart(function: Callable[..., None], *arguments: Any) -> None:
@@ -58,7 +58,7 @@ def use_one_thread() -> None:
     import cv2
     import torch
 
-    from dvo.allocator import reuse_freed_memory
+    from dvo.core.allocator import reuse_freed_memory
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies.family.config import NULL, FamilyConfig
 
 Row = dict[str, str]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies.family.config import NULL, FamilyConfig
 from train.studies.family.figure import draw
 from train.studies.family.records import Records
@@ -110,7 +110,7 @@ def method(config: FamilyConfig) -> list[str]:
         directions of the translations (the rotation alone where the camera moves less than a tenth of its median
         step). A pair with a frame without a pose, or with frames in two segments, has an infinite error. AUC is the
         area under the cumulative recall curve up to the threshold, divided by it, as in the evaluation of SuperGlue
-        and LoFTR (`dvo/relative_pose.py`), over the pairs of all sequences that lie
+        and LoFTR (`dvo/metrics/relative_pose.py`), over the pairs of all sequences that lie
         {" or ".join(str(gap) for gap in form.gaps)} frames apart.""",
         f"""**Other columns.** ATE: root mean square after alignment by Sim(3), in percent of the path, median over
         the sequences. Rotation: sum of the rotation errors over two frames, over the sum of the true rotations,

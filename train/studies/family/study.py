@@ -12,7 +12,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies.family.config import NULL, FamilyConfig
 from train.studies.family.evaluation import Measured, errors_of, held_out_sequence, measure, straight_line
 from train.studies.family.process import apart

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dvo.relative_pose import recall_area
+from dvo.metrics.relative_pose import recall_area
 from train.studies.family.records import Records, Row
 
 LIMITS = (1.0, 2.0, 5.0, 10.0)

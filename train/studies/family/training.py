@@ -11,10 +11,10 @@ from typing import Any
 
 import torch
 
+from dvo.metrics.relative_pose import recall_area
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.load import build_odometry
-from dvo.odometry.results import peak_memory_mb
-from dvo.relative_pose import recall_area
+from dvo.session.results import peak_memory_mb
 from train.engine.program import TrainingProgram
 from train.studies.clips import DiskClips, StudyClips
 from train.studies.family.config import FamilyConfig, Member, Phase

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
+from dvo.core.settings import check_settings
 from dvo.models.deepvo import TRANSLATION_UNIT
-from dvo.settings import check_settings
 
 
 @dataclass(frozen=True)

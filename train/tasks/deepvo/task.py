@@ -7,12 +7,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_seed, shown
 from dvo.geometry import se3
 from dvo.losses.pose import pose_errors
 from dvo.models.deepvo import DeepVO, chain, true_steps
 from dvo.nets.sizes import named_preset
-from dvo.settings import check_seed, shown
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
 from train.data.turns import Turns, turn_cameras

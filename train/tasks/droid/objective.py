@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dvo.ba.dense import dense_patches
+from dvo.ba.layer.dense import dense_patches
+from dvo.core.settings import check_settings
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.pose import edge_pose_errors, pose_errors
 from dvo.models.dense_step import DenseMode, DenseState
-from dvo.nets.dense_update import upsample_map
-from dvo.settings import check_settings
+from dvo.nets.droid.dense_update import upsample_map
 
 
 @dataclass(frozen=True)

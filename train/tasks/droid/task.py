@@ -12,7 +12,7 @@ from dvo.geometry import se3
 from dvo.losses.pose import pose_errors
 from dvo.models.dense_step import DenseMode
 from dvo.models.droid import DroidVO, neighbour_edges
-from dvo.nets.droid import preset
+from dvo.nets.droid.droid import preset
 from train.data.augment import Augmentation, augment, random_source
 from train.data.clips import Renderings
 from train.tasks.droid.matching import matching_loss

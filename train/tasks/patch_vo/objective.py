@@ -11,15 +11,15 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dvo.core.settings import check_settings
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
-from dvo.graph.edges import PatchGraph
 from dvo.losses.balance import PARAMETER
 from dvo.losses.flow import flow_error, flow_loss, weighted_flow_error
 from dvo.losses.pose import PoseErrors, pose_errors
+from dvo.map.edges import PatchGraph
 from dvo.models.patch_vo import Mode, UpdateState
-from dvo.nets.patchifier import crop_patches
-from dvo.settings import check_settings
+from dvo.nets.patch.patchifier import crop_patches
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.losses.balance import Coefficient, gradient
 from dvo.losses.pose import pose_errors
 from dvo.losses.trend import TrendPenalty
 from dvo.models.patch_vo import Mode, PatchVO
 from dvo.models.schedule import Stage, to_device, training_schedule
-from dvo.nets.config import preset
+from dvo.nets.patch.config import preset
 from train.data.augment import Augmentation, augment, random_source
 from train.data.clips import Renderings
 from train.engine.ranks import mean_over_ranks, rank
@@ -53,10 +53,10 @@ class PatchVOTask(Task):
         loss: weights of the terms.
         augmentation: random changes of the clips, None for none.
         patches: patches a frame; None: those of the preset.
-        selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; None: that of the preset.
+        selection: of the patches, a name in :data:`dvo.nets.patch.selection.SELECTIONS`; None: that of the preset.
         align_last: updates at the end of a clip whose measurements are aligned to a fraction of a pixel, see
             :meth:`dvo.models.patch_vo.PatchVO.unroll`.
-        update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`; None: that of the preset.
+        update_operator: name in :data:`dvo.nets.update.update.UPDATE_OPERATORS`; None: that of the preset.
         train_only: beginning of the names of the parameters that learn, the others are held; None: all.
 
     Attributes:

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_settings
 from dvo.geometry.projection import reproject
-from dvo.graph.edges import PatchGraph
 from dvo.losses.consistency import masked_mean
 from dvo.losses.flow import flow_loss, weighted_flow_error
 from dvo.losses.photometric import Photometric, photometric_error
 from dvo.losses.pose import pose_errors
+from dvo.map.edges import PatchGraph
 from dvo.models.patch_vo import UpdateState
-from dvo.nets.alignment import sample_images
-from dvo.nets.config import ModelConfig
-from dvo.settings import check_settings
+from dvo.nets.alignment.alignment import sample_images
+from dvo.nets.patch.config import ModelConfig
 from train.tasks.selfsup.teacher import Lesson
 
 

@@ -10,7 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.losses.consistency import Limits
 from dvo.models.patch_vo import PatchVO
@@ -50,8 +50,8 @@ class SelfSupervisedTask(Task):
         augmentation: random changes of the student's clip: crop-and-zoom, colours, exposure; None for none.
         degradation: little light, noise and blur in the student's clip; None for none.
         patches: patches a frame; None: those of the preset.
-        selection: of the patches, a name in :data:`dvo.nets.selection.SELECTIONS`; None: that of the preset.
-        update_operator: name in :data:`dvo.nets.update.UPDATE_OPERATORS`; None: that of the preset.
+        selection: of the patches, a name in :data:`dvo.nets.patch.selection.SELECTIONS`; None: that of the preset.
+        update_operator: name in :data:`dvo.nets.update.update.UPDATE_OPERATORS`; None: that of the preset.
 
     Raises:
         DvoError: a balance that follows gradients.

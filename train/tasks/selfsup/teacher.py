@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from dvo.core.settings import check_settings
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.consistency import Limits, trusted_edges
 from dvo.models.patch_vo import PatchVO, UpdateState
 from dvo.models.schedule import Stage
-from dvo.nets.selection import random_centres
-from dvo.settings import check_settings
+from dvo.nets.patch.selection import random_centres
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dvo.core.settings import check_settings
 from dvo.geometry import se3, so3
 from dvo.geometry.precision import full_precision
 from dvo.losses.two_frame import (
@@ -19,7 +20,6 @@ from dvo.losses.two_frame import (
     true_flow,
 )
 from dvo.models.tartanvo import TwoFrameMotion
-from dvo.settings import check_settings
 from train.tasks.tartanvo.virtual_motions import VirtualPairs
 
 Passes = Sequence[tuple[Tensor, Tensor]]

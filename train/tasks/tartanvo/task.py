@@ -7,10 +7,10 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_seed, shown
 from dvo.models.tartanvo import TartanVO, TwoFrameMotion
-from dvo.nets.tartanvo import preset
-from dvo.settings import check_seed, shown
+from dvo.nets.two_frame.tartanvo import preset
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
 from train.tasks.tartanvo.objective import (

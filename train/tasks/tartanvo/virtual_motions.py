@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.core.settings import check_settings
 from dvo.geometry import so3
 from dvo.losses.two_frame import true_flow
-from dvo.settings import check_settings
 from train.data.augment import random_source
 
 _RANGES = {

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from dvo.data.frame import Frame
+from dvo.odometry.frames.working_image import working_image
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.working_image import working_image
 from eval.systems.baselines.direct.align import Alignment, Reference, align
 from eval.systems.baselines.direct.depth import DepthConfig, DepthMap
 from eval.systems.baselines.direct.image import Level, pyramid

@@ -1,6 +1,6 @@
 """Loop closure of the keyframe system: likeness of images, ORB matches with PnP, and a pose graph in Sim(3).
 
-The pose graph is that of :mod:`dvo.ba.pose_graph`, the index of images that of :mod:`dvo.graph.places`; its
+The pose graph is that of :mod:`dvo.ba.pose_graph`, the index of images that of :mod:`dvo.map.places`; its
 descriptors are PTAM's small blurred images. Points move with the first keyframe that sees them.
 """
 
@@ -15,8 +15,8 @@ import torch
 from dvo.ba.pose_graph import optimise_pose_graph
 from dvo.geometry import se3, sim3, so3
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
-from dvo.graph.keyframe_log import KeyframeLog
-from dvo.graph.places import PlaceIndex
+from dvo.map.keyframe_log import KeyframeLog
+from dvo.map.places import PlaceIndex
 from eval.systems.baselines import two_view
 from eval.systems.baselines.keyframe.config import KeyframeConfig
 from eval.systems.baselines.keyframe.map import Keyframe, Map

@@ -19,8 +19,8 @@ import numpy as np
 
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
+from dvo.odometry.frames.working_image import working_image
 from dvo.odometry.protocol import Estimate, Result, Status
-from dvo.odometry.working_image import working_image
 from eval.systems.baselines.frame_log import map_of
 from eval.systems.baselines.klt import detect
 from eval.systems.baselines.monoslam.consensus import drop_inconsistent, find_consensus

@@ -11,7 +11,7 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import sim3
 from dvo.geometry.poses import poses_from_matrices
-from dvo.graph.keyframe_log import KeyframeLog
+from dvo.map.keyframe_log import KeyframeLog
 from eval.systems.baselines import two_view
 from eval.systems.baselines.keyframe import loops
 from eval.systems.baselines.keyframe.config import KeyframeConfig

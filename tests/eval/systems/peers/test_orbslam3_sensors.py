@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame, StereoView
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from eval.systems.peers import orbslam3
 from eval.systems.registry import find_system

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 import pytest
 
+from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
-from dvo.errors import DvoError
 from dvo.geometry.camera import Camera
 from dvo.odometry.protocol import Result
 from eval.systems.peers import colmap, orbslam3, svo

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from eval.__main__ import main
 from eval.systems.peers.orbslam3 import count_words
 from eval.systems.peers.vocabulary import (

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from dvo.synth.scenes.families import FAMILIES, SHARES
 from train.studies.family.config import FamilyConfig, HeldOut, Member, Phase
 from train.studies.family.training import member_program

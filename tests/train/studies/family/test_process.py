@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dvo.yaml_files import read_yaml
+from dvo.core.yaml_files import read_yaml
 from train.studies.family.process import apart
 
 

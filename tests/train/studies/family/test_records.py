@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies.family.records import Records, Table
 
 

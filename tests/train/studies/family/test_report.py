@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies.family.config import Member, Phase
 from train.studies.family.records import Records
 from train.studies.family.report import write_report

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from dvo.errors import DvoError
+from dvo.core.errors import DvoError
 from train.studies.family import study, training
 from train.studies.family.config import FamilyConfig
 from train.studies.family.records import Records

@@ -1,0 +1,284 @@
+"""Bundle adjustment of a whole graph: robust, sparse, with acceptance of steps; not differentiable.
+
+The global counterpart of :func:`dvo.ba.layer.layer.bundle_adjust`: same residuals, but memory and work grow with the
+number of edges, not with frames times patches, and each step has to lower the cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, inverse_depth_block, pose_block
+from dvo.ba.edges import check_index, plan_edges
+from dvo.ba.kernels import Kernel
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.problem import Factor, State, StateBlock
+from dvo.ba.sparse.block_parts import PART, BlockParts
+from dvo.ba.sparse.equations import SparseSystem
+from dvo.ba.sparse.global_edges import ReprojectionEdges
+from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
+from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
+from dvo.core.errors import DvoError
+from dvo.geometry.precision import full_precision
+
+
+@dataclass(frozen=True)
+class GlobalBAOptions:
+    """Settings of :func:`global_bundle_adjust`.
+
+    Attributes:
+        fixed: how many leading poses stay, or which: bool ``(N,)``. At least one, or a factor, has to hold the gauge;
+            scale is held by damping alone where one pose is fixed.
+        kernel: robust kernel on the weighted residual of an edge.
+        max_residual: pixels; an edge with a longer residual has a constant cost.
+        depth_range: inverse depths are clamped to it.
+        move_poses, move_depths: what is refined.
+        solver: of Levenberg-Marquardt and its linear systems.
+    """
+
+    fixed: int | Tensor | Sequence[bool] = 1
+    kernel: Kernel = field(default_factory=lambda: Kernel("huber", 2.0))
+    max_residual: float = 128.0
+    depth_range: tuple[float, float] = (1e-3, 10.0)
+    move_poses: bool = True
+    move_depths: bool = True
+    solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=20))
+
+
+@dataclass(frozen=True)
+class GlobalBAResult:
+    """Outcome of :func:`global_bundle_adjust`.
+
+    Attributes:
+        poses_cw: ``(N, 7)``.
+        patches: ``(K, 3, p, p)``.
+        initial_cost, cost: half the sum of robust squared residuals, pixels squared, before and after.
+        inliers: ``(E,)`` bool, edges that count at the result.
+        iterations: steps tried.
+        converged: whether a criterion was met before the limit of iterations.
+        stored_blocks: non-zero blocks of the normal equations.
+        blocks: values of the further state blocks, by name.
+    """
+
+    poses_cw: Tensor
+    patches: Tensor
+    initial_cost: float
+    cost: float
+    inliers: Tensor
+    iterations: int
+    converged: bool
+    stored_blocks: int
+    blocks: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+def global_bundle_adjust(
+    poses_cw: Tensor,
+    patches: Tensor,
+    intrinsics: Tensor,
+    targets: Tensor,
+    weights: Tensor,
+    ii: Tensor,
+    jj: Tensor,
+    kk: Tensor,
+    options: GlobalBAOptions = GlobalBAOptions(),  # noqa: B008 (frozen)
+    factors: Sequence[Factor] = (),
+    blocks: Mapping[str, StateBlock] | None = None,
+) -> GlobalBAResult:
+    """Refine all poses and inverse depths of a graph.
+
+    Args:
+        poses_cw: ``(N, 7)`` world to camera; their dtype, float32 or float64, is that of the computation.
+        patches: ``(K, 3, p, p)`` x, y (pixels) and inverse depth; all pixels of a patch share that of its centre.
+        intrinsics: ``(N, 4)`` fx fy cx cy in the same pixels.
+        targets: ``(E, 2)`` where the patch centres are seen, pixels of frame j.
+        weights: ``(E, 2)`` confidence per axis, not negative.
+        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, in any order. All edges of a patch
+            have the same source frame.
+        options: see :class:`GlobalBAOptions`.
+        factors: further measurements of the state blocks "poses" ``(1, N, 7)``, "inverse_depths" ``(1, K)`` and those
+            in ``blocks``; the elements that they touch must not change between linearisations. Their cost is half of
+            :meth:`dvo.ba.problem.Factor.cost`.
+        blocks: further unknowns that the factors concern, by name, each with a batch dimension of 1; see
+            :func:`dvo.ba.blocks.vector_block`.
+
+    Returns:
+        Poses and patches of the lowest cost found, and how it went.
+
+    Raises:
+        DvoError: shapes, indices or weights that do not fit, or a further block that is eliminated or a batch.
+
+    Example:
+        >>> result = global_bundle_adjust(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk)
+        >>> result.poses_cw, result.cost < result.initial_cost
+    """
+    given = poses_cw, patches, intrinsics, targets, weights, ii, jj, kk
+    return adjust_sparse(PatchProblem(*given, factors=tuple(factors), blocks=blocks or {}), options)
+
+
+def adjust_sparse(problem: PatchProblem, options: GlobalBAOptions) -> GlobalBAResult:
+    """The sparse solution of one graph; see :func:`global_bundle_adjust` and :func:`dvo.ba.solve.solve`."""
+    _check(problem)
+    with torch.no_grad(), full_precision(problem.poses_cw.device):
+        system = SparseProblem(problem, options)
+        move, solver = system.parts.moved, options.solver
+        outcome = levenberg_marquardt(system.state, system.linearise, system.cost, move, solver)
+        state = outcome.state
+        if options.move_depths:
+            problem = problem.with_values(inverse_depths=state[INVERSE_DEPTHS].value[0])
+        return GlobalBAResult(
+            state[POSES].value[0],
+            problem.patches,
+            outcome.initial_cost,
+            outcome.cost,
+            system.inliers(state),
+            outcome.iterations,
+            outcome.converged,
+            system.pattern.stored_blocks,
+            {name: state[name].value for name in problem.blocks},
+        )
+
+
+class SparseProblem:
+    """Cost and block-sparse normal equations of a graph; its measurements take the fast path with one camera.
+
+    Args:
+        problem: one graph.
+        options: what moves, kernel and longest residual.
+
+    Attributes:
+        state: the unknowns at the values of the problem.
+        pattern: of the normal equations.
+    """
+
+    def __init__(self, problem: PatchProblem, options: GlobalBAOptions) -> None:
+        like, count = problem.poses_cw, len(problem.patches)
+        names = ("patches", "intrinsics", "targets", "weights")
+        problem = problem.with_values(**{name: getattr(problem, name).to(like) for name in names})
+        one = problem.batched()
+        further = {name: block.with_value(block.value.to(like)) for name, block in problem.blocks.items()}
+        for name, block in further.items():
+            if block.eliminated or block.value.shape[0] != 1:
+                raise DvoError(f"{name!r} is eliminated or a batch", field="blocks", remedy="give vectors of one graph")
+        poses = pose_block(one.poses_cw, options.fixed, held=not options.move_poses)
+        depths = inverse_depth_block(one.inverse_depths, options.depth_range, held=not options.move_depths)
+        factors = [factor.with_tensors([x.to(like) for x in factor.tensors()]) for factor in problem.factors]
+        if problem.sensors is not None:
+            further[INTRINSICS] = intrinsics_block(one.intrinsics)
+            factors.insert(0, problem.reprojection(options.max_residual, None, options.kernel))
+        self.state = State({POSES: poses, **further, INVERSE_DEPTHS: depths})
+        self.parts, self.factors, self.moves_depths = BlockParts.of(self.state), factors, options.move_depths
+        source = torch.zeros(count, dtype=torch.long, device=problem.ii.device).index_copy_(0, problem.kk, problem.ii)
+        if bool((source[problem.kk] != problem.ii).any()):
+            raise DvoError(
+                "a patch has two source frames", field="ii", remedy="give each patch the frame it was cut of"
+            )
+        self.edges: ReprojectionEdges | None = None
+        if problem.sensors is None:
+            frames = torch.arange(len(like), device=like.device)
+            slots = self.parts.slots(self.state, POSES, frames) or [torch.full_like(frames, self.parts.count)]
+            self.edges = _fast_edges(problem, source, slots[0], self.parts.count, options)
+        self.pattern = self._pattern(source)
+        if self.edges is not None:
+            target, anchor = (self.pattern.find(end, self.edges.plan.kk) for end in self.edges.ends)
+            self.at = target, anchor
+
+    def _pattern(self, source: Tensor) -> SchurPattern:
+        """Where blocks are, by the elements that the factors touch now."""
+        frame, patch, pair_a, pair_b = [], [], [], []
+        free, values = self.parts.count, self.state.values()
+        if self.edges is not None:
+            plan = self.edges.plan
+            frame, patch = [*self.edges.ends], [plan.kk, plan.kk]
+            pair_a, pair_b = [self.edges.slot[plan.pair_j]], [self.edges.slot[plan.pair_i]]
+        for factor in self.factors:
+            parts, depths = self.parts.of_factor(factor.linearise(values), self.state)
+            pair_a += [a for a, _ in parts for _ in parts]
+            pair_b += [b for _ in parts for b, _ in parts]
+            for index, _ in depths:
+                frame += [torch.where(index < 0, free, a) for a, _ in parts]
+                patch += [index.clamp(min=0) for _ in parts]
+        none = [torch.zeros(0, dtype=torch.long, device=source.device)]
+        return make_schur_pattern(free, source, *(torch.cat(x or none) for x in (frame, patch, pair_a, pair_b)))
+
+    def cost(self, state: State) -> float:
+        """Half the sum of robust squared residuals, and of what the factors give as their cost."""
+        values = state.values()
+        own = self.edges.cost(*_fast_values(state)) if self.edges is not None else 0.0
+        return own + sum(0.5 * float(factor.cost(values)[0]) for factor in self.factors)
+
+    def inliers(self, state: State) -> Tensor:
+        """``(E,)`` bool, edges that count."""
+        if self.edges is not None:
+            return self.edges.inliers(*_fast_values(state))
+        return (self.factors[0].linearise(state.values()).weight[0] > 0).any(-1)
+
+    def linearise(self, state: State) -> SparseSystem:
+        """Normal equations at a state."""
+        pattern, zeros = self.pattern, state[POSES].value.new_zeros
+        count, free = state[INVERSE_DEPTHS].value.shape[1], self.parts.count
+        if self.edges is not None:
+            sums = self.edges.accumulate(*_fast_values(state), pattern, self.at)
+        else:
+            shapes = (pattern.h_pp.count, PART, PART), (len(pattern.keys), PART), (count,), (free, PART), (count,)
+            sums = tuple(map(zeros, shapes))  # type: ignore[assignment]
+        system = SparseSystem(pattern, *sums, self.moves_depths)
+        values = state.values()
+        for factor in self.factors:
+            linear = factor.linearise(values)
+            system.add(linear.residual[0], linear.weight[0], *self.parts.of_factor(linear, state))
+        if len(self.state.blocks) > 2:  # a pose has nothing filled up
+            system.h_pp.index_add_(0, pattern.h_pp.diagonal, torch.diag_embed(self.parts.filled))
+        return system
+
+
+def _fast_values(state: State) -> tuple[Tensor, Tensor]:
+    return state[POSES].value[0], state[INVERSE_DEPTHS].value[0]
+
+
+def _fast_edges(
+    problem: PatchProblem, source: Tensor, slot: Tensor, free: int, options: GlobalBAOptions
+) -> ReprojectionEdges:
+    focal, principal = problem.intrinsics.split(2, -1)
+    plan = problem.plan
+    if plan is None:
+        plan = plan_edges(problem.ii, problem.jj, problem.kk, len(problem.poses_cw), len(problem.patches))
+    return ReprojectionEdges(
+        plan,
+        (problem.centres - principal[source]) / focal[source],
+        (problem.targets - principal[problem.jj]) / focal[problem.jj],
+        problem.weights,
+        focal,
+        options.kernel,
+        options.max_residual,
+        slot,
+        free,
+    )
+
+
+def _check(problem: PatchProblem) -> None:
+    n, e, k = problem.poses_cw.shape[0], len(problem.ii), problem.patches.shape[0]
+    side, sensors = problem.patches.shape[-1], problem.sensors
+    cameras = n if sensors is None else sensors.from_body.shape[-2]
+    wanted = {"poses_cw": (n, 7), "patches": (k, 3, side, side), "intrinsics": (cameras, 4)}
+    wanted |= {"targets": (e, 2), "weights": (e, 2), "ii": (e,), "jj": (e,), "kk": (e,)}
+    for name, shape in wanted.items():
+        tensor = getattr(problem, name)
+        if tensor.shape != shape:
+            raise DvoError(
+                f"has shape {tuple(tensor.shape)}, not {shape}", field=name, remedy="give one graph, without batch"
+            )
+    if problem.poses_cw.dtype not in (torch.float32, torch.float64):
+        raise DvoError(f"has dtype {problem.poses_cw.dtype}", field="poses_cw", remedy="use float32 or float64")
+    if e == 0:
+        raise DvoError("a graph without edges", field="ii", remedy="give at least one edge")
+    indices = [("ii", problem.ii, n), ("jj", problem.jj, n), ("kk", problem.kk, k)]
+    if sensors is not None:
+        indices += [("sensors.source", sensors.source, cameras), ("sensors.target", sensors.target, cameras)]
+    for name, index, size in indices:
+        check_index(index, size, name)
+    if not bool(torch.isfinite(problem.weights).all() and (problem.weights >= 0).all()):
+        raise DvoError("negative or not finite", field="weights", remedy="give weights of zero or more")

@@ -1,0 +1,165 @@
+"""Files of another sensor for the images of any source: those of a folder, or of a list with times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.files.files import listed_files
+from dvo.data.files.stamps import times_from_names
+from dvo.data.images.images import list_images
+from dvo.data.recording import ImageRecording, Log, RawFrame
+from dvo.data.sensors.sensors import Finder, NearestInTime, SameNumbers, StereoRig
+
+
+@dataclass(frozen=True)
+class CompanionKind:
+    """Kind of files that belong to images.
+
+    Attributes:
+        noun: for messages, in the plural, such as ``depth images``.
+        option: of the command line that names them, for messages.
+        form: of the files of a folder, for messages.
+        arrays: suffixes of files that are no images.
+    """
+
+    noun: str
+    option: str
+    form: str
+    arrays: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _InOrder:
+    """File of the same place in the order."""
+
+    files: dict[Path, Path]
+
+    def __call__(self, image: Path) -> Path | None:
+        return self.files.get(image)
+
+
+class CompanionRecording:
+    """Video with files of another sensor in the order of its frames; everything else is that of another recording.
+
+    Args:
+        recording: of the images.
+        add: frame with what the file holds, from a frame, its file and the log of the pass.
+        files: of each frame.
+        stereo: reads the calibration of the right camera, if the files are right images.
+    """
+
+    def __init__(
+        self,
+        recording: Any,
+        add: Callable[[RawFrame, Path, Log], RawFrame],
+        files: list[Path],
+        stereo: Callable[[], StereoRig | None] | None = None,
+    ) -> None:
+        self._recording, self._add, self._files = recording, add, files
+        self.stereo = recording.stereo if stereo is None else stereo
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # of a copy that is not filled yet
+            raise AttributeError(name)
+        return getattr(self._recording, name)
+
+    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.recording.Recording`."""
+        for raw in self._recording.frames(log, stride):
+            yield self._add(raw, self._files[raw.index], log) if raw.index < len(self._files) else raw
+
+
+def companions_of_images(path: Path, recording: ImageRecording, kind: CompanionKind) -> Finder:
+    """Rule by which the files of a folder or a list belong to images.
+
+    A file belongs to the image with the nearest time stamp, up to half a frame interval, if it has one (in a list, or
+    as its name) and the images have times that are on the same clock; otherwise to the image whose name holds the same
+    numbers; otherwise, where there are as many files as images, to that of the same place in the order.
+
+    Args:
+        path: existing folder, or list of ``time file`` rows.
+        recording: of the images.
+        kind: of the files.
+
+    Returns:
+        Function from an image to its file.
+
+    Raises:
+        DvoError: no files, or files that belong to no image.
+    """
+    return _listed(path, recording, kind) if path.is_file() else _of_folder(path, recording, kind)
+
+
+def companions_of_frames(path: Path | None, frames: int | None, kind: CompanionKind) -> list[Path]:
+    """Files of a folder for the frames of a video, in order.
+
+    Args:
+        path: existing folder; None is refused.
+        frames: number of them, None if it is not known.
+        kind: of the files.
+
+    Raises:
+        DvoError: no folder, or another number of files.
+    """
+    if path is None or not path.is_dir():
+        message = f"a video has no {kind.noun.split()[0]} of its own, nor the times of a list"
+        remedy = f"give {kind.option} FOLDER, with a {kind.noun.removesuffix('s')} for each frame"
+        raise DvoError(message, field=kind.option, remedy=remedy)
+    files = _files(path, kind)
+    if frames is not None and frames != len(files):
+        raise _mismatch(path, len(files), f"{frames} frames", kind)
+    return files
+
+
+def _files(folder: Path, kind: CompanionKind) -> list[Path]:
+    files = list_images(folder) or sorted(file for file in folder.iterdir() if file.suffix in kind.arrays)
+    if not files:
+        remedy = f"give a folder of {kind.form}"
+        raise DvoError(f"no {kind.noun} in it", file=folder, field=kind.option, remedy=remedy)
+    return files
+
+
+def _of_folder(folder: Path, recording: ImageRecording, kind: CompanionKind) -> Finder:
+    files, images = _files(folder, kind), recording.images
+    stamps = times_from_names(files)
+    if stamps is not None:
+        nearest = _nearest(files, stamps, recording)
+        if any(nearest(image) for image in images):
+            return nearest
+    names = SameNumbers(folder)
+    if files[0].suffix not in kind.arrays and sum(names(image) is not None for image in images) == len(files):
+        return names
+    if len(files) == len(images):
+        return _InOrder(dict(zip(images, files, strict=True)))
+    raise _mismatch(folder, len(files), f"{len(images)} images", kind)
+
+
+def _listed(listing: Path, recording: ImageRecording, kind: CompanionKind) -> Finder:
+    """Nearest in time of the files of a list of ``time file`` rows."""
+    files, stamps = listed_files(listing, kind.noun)
+    nearest = _nearest(files, stamps, recording)
+    if not files or not any(nearest(image) for image in recording.images):
+        message = f"no {kind.noun.removesuffix('s')} is at the time of an image"
+        remedy = f"give the times of the images on the clock of the {kind.noun} (--times)"
+        raise DvoError(message, file=listing, field=kind.option, remedy=remedy)
+    return nearest
+
+
+def _nearest(files: list[Path], stamps: np.ndarray, recording: ImageRecording) -> NearestInTime:
+    order = np.argsort(stamps, kind="stable")
+    listed = [files[k] for k in order], stamps[order]
+    times = recording.timestamps
+    reach = float(np.median(np.diff(times))) / 2 if len(times) > 1 else 0.02
+    return NearestInTime(dict(zip(recording.images, times.tolist(), strict=True)), lambda: listed, reach)
+
+
+def _mismatch(folder: Path, count: int, images: str, kind: CompanionKind) -> DvoError:
+    message = f"{count} {kind.noun} for {images}, and neither times nor numbers in their names tell which belongs to "
+    remedy = f"give as many {kind.noun} as images, or a list of rows 'time file'"
+    return DvoError(message + "which", file=folder, field=kind.option, remedy=remedy)

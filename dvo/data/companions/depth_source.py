@@ -1,0 +1,93 @@
+"""Depth images for any source: those of a folder, or of a list with times."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration, read_calibration
+from dvo.data.companions.companions import CompanionKind, CompanionRecording, companions_of_frames, companions_of_images
+from dvo.data.opening import locate
+from dvo.data.readers.tum import DEPTH_SCALE
+from dvo.data.recording import ImageRecording, Log, RawFrame
+from dvo.data.sensors.depth import read_depth
+from dvo.data.source import Source
+
+MILLIMETRES = 1000.0
+"""Units of a metre in 16-bit depth images of a folder, unless it is a list in the layout of TUM RGB-D."""
+_KIND = CompanionKind("depth images", "--depth", "16-bit PNG files", (".npy", ".npz"))
+
+
+def with_depth(
+    source: Source,
+    depth: Path | str | None = None,
+    scale: float | None = None,
+    calib: Path | str | Calibration | None = None,
+) -> Source:
+    """Give the frames of a source depth.
+
+    A depth image belongs to the image with the nearest time stamp, up to half a frame interval, if it has one (in a
+    list, or as its name) and the images have times that are on the same clock; otherwise to the image whose name holds
+    the same numbers; otherwise, where there are as many depth images as images, to that of the same place in the order.
+    Depth is registered to the images, or of another size and the same aspect; or ``calib`` says of which camera it is.
+
+    Args:
+        source: opened with :func:`dvo.open`; not changed.
+        depth: folder of 16-bit PNG files (or other files of :func:`dvo.data.sensors.depth.read_depth`), or a list of
+            ``time file`` rows such as ``depth.txt`` of TUM RGB-D; None for the depth that the data set has itself.
+            Relative paths are looked up from the working directory, then from the source's folder.
+        scale: units of a metre in integers; None for that of the data set, of a list 5000, of a folder 1000.
+        calib: camera of the depth images, without distortion, whose centre and axes are taken for those of the camera;
+            None for registered ones.
+
+    Returns:
+        A source with the same frames, whose ``depth`` is read when it is first wanted.
+
+    Raises:
+        DvoError: nothing there, a source without depth of its own, or depth images that belong to no image.
+
+    Example:
+        >>> source = with_depth(dvo.open("video.mp4", calib="calib.txt"), "depth", scale=1000)
+        >>> result = dvo.run(dvo.load("small", scale={"depth": True}), source).result
+    """
+    if scale is not None and not 0 < scale < float("inf"):
+        raise DvoError(f"is {scale}", field="--depth-scale", remedy="give the units of a metre, such as 1000")
+    found, recording = copy.copy(source), source.recording
+    if calib is not None:
+        if not isinstance(calib, Calibration):
+            calib = read_calibration(locate(calib, source.path, "depth-calib"))
+        found.depth_calibration = calib
+    path = None if depth is None else locate(depth, source.path, "depth")
+    if not isinstance(recording, ImageRecording):
+        files = companions_of_frames(path, recording.frame_count, _KIND)
+        found.recording = CompanionRecording(recording, partial(_with_file, scale=scale or MILLIMETRES), files)
+        return found
+    own = recording.sensors
+    if path is None and own.depth is None:
+        remedy = "give --depth PATH: a folder of 16-bit PNG files, or a list such as depth.txt"
+        raise DvoError("the source has no depth of its own", file=source.path, field=_KIND.option, remedy=remedy)
+    sensors = replace(own, depth_scale=scale or own.depth_scale)
+    if path is not None:
+        finder = companions_of_images(path, recording, _KIND)
+        sensors = replace(own, depth=finder, depth_scale=scale or (DEPTH_SCALE if path.is_file() else MILLIMETRES))
+    changed = copy.copy(recording)
+    changed.sensors = sensors
+    found.recording = changed
+    return found
+
+
+def _with_file(raw: RawFrame, file: Path, log: Log, scale: float) -> RawFrame:
+    """Frame of a video with the depth of a file."""
+    return replace(raw, depth=partial(_depth, file, log, scale))
+
+
+def _depth(file: Path, log: Log, scale: float) -> np.ndarray | None:
+    depth = read_depth(file, scale)
+    if depth is None:
+        log.without.append(file.name)
+    return depth

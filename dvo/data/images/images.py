@@ -1,0 +1,189 @@
+"""Image files: listing in natural order, and decoding to 8-bit RGB."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.files.files import read_image_file
+from dvo.data.images.image_header import MAX_PIXELS, image_size
+from dvo.data.images.orientation import oriented
+from dvo.data.images.reduction import Reduction
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts ``img_2`` before ``img_10``.
+
+    Args:
+        name: of a file.
+    """
+    parts = re.split(r"([0-9]+)", name)
+    # "²" is a digit to str.isdigit, but no number to int
+    return [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part.lower()) for part in parts if part]
+
+
+def list_images(folder: Path) -> list[Path]:
+    """List the image files directly in a folder, in natural order; hidden ones left out.
+
+    Args:
+        folder: need not exist.
+    """
+    if not folder.is_dir():
+        return []
+    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def has_images(folder: Path) -> bool:
+    """True if at least one image file lies directly in the folder; does not list a large folder to its end.
+
+    Args:
+        folder: need not exist.
+    """
+    return folder.is_dir() and any(
+        path.suffix.lower() in SUFFIXES and not path.name.startswith(".") for path in folder.iterdir()
+    )
+
+
+def to_rgb8(image: np.ndarray) -> np.ndarray:
+    """Convert an image as OpenCV decodes it.
+
+    Grey is repeated, alpha dropped, 16 bit divided by 257 (a fixed factor: brightness stays comparable over frames).
+
+    Args:
+        image: ``(H, W)`` or ``(H, W, 1|3|4)`` uint8 or uint16, BGR order.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB.
+
+    Raises:
+        DvoError: another type of pixel (a depth map in float, say).
+    """
+    if image.dtype == np.uint16:
+        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise DvoError(f"pixels of type {image.dtype}", remedy="convert the images to 8 bit")
+    if image.ndim == 2 or image.shape[2] == 1:
+        return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_image(path: Path, reduction: Reduction | None = None, orientation: int = 1) -> np.ndarray | None:
+    """Decode an image file.
+
+    Args:
+        path: the file.
+        reduction: of the image, after it is turned; None for none.
+        orientation: by which it is turned, see :func:`dvo.data.images.orientation.oriented`; that of its own EXIF data
+            is not looked at.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB, or None if the file is missing, corrupt or cut short.
+
+    Raises:
+        DvoError: an image of more than :data:`dvo.data.images.image_header.MAX_PIXELS`, or a readable one with pixels
+            that are no colours (float).
+    """
+    image = decode(path, reduction, orientation)
+    if image is None:
+        return None
+    try:
+        return to_rgb8(image)
+    except DvoError as error:
+        raise DvoError(error.message, file=path, remedy=error.remedy) from None
+
+
+def decode(path: Path, reduction: Reduction | None = None, orientation: int = 1) -> np.ndarray | None:
+    """Decode an image file as it is; its size is taken from the header before.
+
+    Args:
+        path: the file.
+        reduction, orientation: as :func:`read_image`.
+
+    Returns:
+        ``(H, W)`` or ``(H, W, C)`` in OpenCV's order of channels; None if the file is missing, no regular file, of an
+        unknown format, corrupt or cut short.
+
+    Raises:
+        DvoError: an image of more than :data:`dvo.data.images.image_header.MAX_PIXELS`.
+    """
+    data = read_image_file(path)
+    return None if data is None else decode_bytes(data, path, reduction, orientation)
+
+
+def decode_bytes(
+    data: bytes, name: object, reduction: Reduction | None = None, orientation: int = 1
+) -> np.ndarray | None:
+    """Decode the bytes of an image file; see :func:`decode`.
+
+    Args:
+        data: the file.
+        name: of it, for messages.
+        reduction, orientation: as :func:`read_image`.
+
+    Returns:
+        As :func:`decode`.
+
+    Raises:
+        DvoError: as :func:`decode`.
+    """
+    import cv2
+
+    if not is_complete(data):
+        return None
+    size = image_size(data)
+    if size is None:
+        return None
+    if size[0] * size[1] > MAX_PIXELS:
+        raise DvoError(
+            f"image of {size[0]}x{size[1]} pixels, more than {MAX_PIXELS:,}", file=name, remedy="reduce the images"
+        )
+    mode = cv2.IMREAD_UNCHANGED
+    upright = size[::-1] if orientation > 4 else size
+    if reduction is not None and reduction.is_exact and reduction.recorded == upright and data.startswith(b"\xff\xd8"):
+        mode = _reduced_modes().get(reduction.factor, mode)  # the decoder of JPEG files does less work then
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), mode)
+    except cv2.error:
+        return None
+    if image is None or image.size == 0:
+        return None
+    image = oriented(image, orientation)
+    return image if reduction is None else reduction(image)
+
+
+def _reduced_modes() -> dict[int, int]:
+    """Modes of decoding by factors, without the orientation of EXIF data, which IMREAD_UNCHANGED ignores too."""
+    import cv2
+
+    modes = {2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8}
+    return {factor: mode | cv2.IMREAD_IGNORE_ORIENTATION for factor, mode in modes.items()}
+
+
+def is_complete(data: bytes) -> bool:
+    """True if the end mark of a PNG or JPEG file is there, and every chunk of a PNG lies inside the file.
+
+    The decoders return a cut file with its lower part grey, and no error; OpenCV allocates what a chunk states as its
+    length.
+
+    Args:
+        data: the bytes of an image file; of other formats any byte will do.
+    """
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" in data[-4096:] and _chunks_inside(data)
+    if data.startswith(b"\xff\xd8"):  # the first half may hold a thumbnail with its own end mark
+        return b"\xff\xd9" in data[len(data) // 2 :]
+    return len(data) > 0
+
+
+def _chunks_inside(data: bytes) -> bool:
+    at, kind = 8, b""
+    while kind != b"IEND" and at < len(data):
+        kind = data[at + 4 : at + 8]
+        at += int.from_bytes(data[at : at + 4], "big") + 12
+    return at <= len(data)

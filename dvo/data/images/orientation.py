@@ -1,0 +1,65 @@
+"""Images turned as the EXIF data of JPEG files ask for, such as those of a phone that was held upright."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dvo.data.files.files import is_file
+from dvo.data.images import exif
+
+_MIRRORED = (2, 4, 5, 7)
+_CLOCKWISE = {1: 0, 2: 0, 3: 180, 4: 180, 5: 270, 6: 90, 7: 90, 8: 270}  # after the mirroring
+
+
+def common_orientation(images: list[Path], warnings: list[str]) -> int:
+    """Orientation of the images of a recording.
+
+    The data of all images are read only if the first, the middle or the last one is to be turned. Where they differ
+    (the camera was turned while recording), images as stored have no jump between them and share one calibration.
+
+    Args:
+        images: files in order, at least one.
+        warnings: receives a sentence if the images do not agree.
+
+    Returns:
+        Orientation of EXIF, 1 to 8; 1 (as stored) if they do not agree.
+    """
+    some = {_orientation(images[index]) for index in (0, len(images) // 2, -1)}
+    if some == {1}:
+        return 1
+    found = some if len(some) > 1 else {_orientation(image) for image in images}
+    if len(found) == 1:
+        return found.pop()
+    warnings.append("the EXIF data of the images state different orientations: they are read as stored, not turned")
+    return 1
+
+
+def _orientation(file: Path) -> int:
+    return exif.orientation(file) if is_file(file) else 1
+
+
+def turn(orientation: int) -> int:
+    """Degrees clockwise by which images are turned, 0, 90, 180 or 270.
+
+    Args:
+        orientation: of EXIF, 1 to 8; mirrored ones are mirrored left to right before.
+    """
+    return _CLOCKWISE[orientation]
+
+
+def oriented(image: np.ndarray, orientation: int) -> np.ndarray:
+    """Turn an image for display.
+
+    Args:
+        image: ``(H, W)`` or ``(H, W, C)`` as stored.
+        orientation: of EXIF, 1 to 8.
+
+    Returns:
+        Image of the same type, ``(W, H)`` in size for the orientations 5 to 8.
+    """
+    if orientation == 1:
+        return image
+    mirrored = image[:, ::-1] if orientation in _MIRRORED else image
+    return np.ascontiguousarray(np.rot90(mirrored, -turn(orientation) // 90))

@@ -1,0 +1,66 @@
+"""Ground-truth files that a user names: one table of formats, recognised by their rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.files.files import read_rows
+from dvo.data.readers.icl_nuim import read_counted_poses
+from dvo.data.readers.tartanair import read_ned_poses
+from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
+
+
+def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
+    """Read camera-to-world poses of a recording.
+
+    ============================  ================================================================================
+    row                           format
+    ============================  ================================================================================
+    8 numbers                     TUM: ``timestamp tx ty tz qx qy qz qw``
+    8 numbers, ``*.freiburg``     ICL-NUIM: as TUM, but the stamp counts images from 1
+    12 numbers                    KITTI: a row-major 3x4 matrix, one row per image
+    7 numbers                     TartanAir: ``tx ty tz qx qy qz qw`` of the NED camera frame, one row per image
+    ============================  ================================================================================
+
+    Args:
+        file: the poses.
+        timestamps: ``(N,)`` seconds of all images of the recording; None if they are not known (a video).
+
+    Returns:
+        Poses with times; those of formats without times are the images'.
+
+    Raises:
+        DvoError: a malformed file, or rows without times that do not fit the images.
+    """
+    columns = _columns(file)
+    if file.suffix == ".freiburg" and columns == 8:
+        numbers, poses = read_counted_poses(file)
+        times = np.zeros(0) if timestamps is None else timestamps
+        inside = numbers < len(times)
+        if not inside.any():
+            raise _no_times(len(poses), times, file)
+        return Trajectory(np.asarray(times[numbers[inside]]), poses[inside])
+    if columns not in (7, 12):
+        return read_tum(file)
+    poses = read_kitti_poses(file) if columns == 12 else read_ned_poses(file)
+    times = np.zeros(0) if timestamps is None else timestamps
+    if len(times) != len(poses):
+        raise _no_times(len(poses), times, file)
+    return Trajectory(np.asarray(times), poses)
+
+
+def _columns(file: Path) -> int:
+    """Numbers in the first row."""
+    return next((len(fields) for _, fields in read_rows(file, "give an existing file", "groundtruth")), 0)
+
+
+def _no_times(rows: int, times: np.ndarray, file: Path) -> DvoError:
+    return DvoError(
+        f"{rows} rows without times for {len(times)} images",
+        file=file,
+        field="groundtruth",
+        remedy="give a TUM trajectory with times",
+    )

@@ -1,0 +1,246 @@
+"""Bags of ROS 1 (``.bag``) and ROS 2 (folder with ``metadata.yaml``, ``.mcap``, ``.db3``), read by the package rosbags.
+
+Times are the stamps of the headers. The calibration is that of the ``camera_info`` topic beside the image topic; frames
+carry the samples of the only ``sensor_msgs/Imu`` topic, without the pose of the sensor (no ``tf`` is read).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration, from_values
+from dvo.data.files.files import MAX_NUMBER, is_file, lookups
+from dvo.data.files.stamps import checked_rate, read_times
+from dvo.data.frame import InertialSamples
+from dvo.data.interval import Interval
+from dvo.data.readers.ros_images import decode_message
+from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.sensors.sensors import StereoRig
+from dvo.data.trajectory import Trajectory
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO, IMU = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu"
+
+
+def matches(path: Path) -> bool:
+    """True for a file named as a bag is, and for a folder with ``metadata.yaml`` and a ``.db3`` or ``.mcap`` file.
+
+    Args:
+        path: existing file or folder.
+    """
+    if not path.is_dir():
+        return path.suffix.lower() in SUFFIXES
+    return is_file(path / "metadata.yaml") and any(child.suffix in SUFFIXES for child in path.iterdir())
+
+
+def split_topic(source: Path | str, topic: str | None) -> tuple[Path, str | None]:
+    """Path and topic of ``bag.mcap:/camera/image``.
+
+    Args:
+        source: path, with or without a topic.
+        topic: given apart.
+
+    Raises:
+        DvoError: a topic for what is no bag, or a path that cannot be looked up.
+    """
+    path, (file, mark, name) = Path(source), str(source).partition(":/")
+    with lookups(path):
+        if mark and "://" not in str(source) and not path.exists() and Path(file).exists():
+            path, topic = Path(file), f"/{name}"
+        is_no_bag = topic is not None and path.exists() and not matches(path)
+    if is_no_bag:
+        raise DvoError("only bags have topics", file=path, field="topic", remedy="leave it out")
+    return path, topic
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Reader of rosbags; whatever it raises about a bag becomes one error."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        message = "the package rosbags is not installed"
+        raise DvoError(message, file=path, remedy="run pip install 'dvo[ros]'") from error
+    try:
+        # Bags in SQLite of ROS before Iron do not hold the definitions of their messages.
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            yield reader
+    except (DvoError, OSError):
+        raise
+    except Exception as error:  # damaged bags end in errors of many types
+        reason = " ".join(str(error).split()) or type(error).__name__
+        remedy = "check it with the tools of ROS (ros2 bag info, rosbag info, mcap doctor)"
+        raise DvoError(f"cannot be read as a bag ({reason[:200]})", file=path, remedy=remedy) from error
+
+
+def _seconds(message: Any) -> float:
+    return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+
+
+def _choose_topic(path: Path, topics: dict[str, Any], asked: str | None) -> str:
+    found = {name: info.msgcount for name, info in topics.items() if info.msgtype in IMAGES and info.msgcount}
+    found = {name: count for name, count in found.items() if not name.endswith("/compressedDepth")}
+    listed = ", ".join(f"{name} ({count})" for name, count in sorted(found.items())) or "none"
+    if asked is not None:
+        asked = f"/{asked.lstrip('/')}"
+        if asked not in found:
+            message = f"{asked[:80]} is no topic of images; those are: {listed}"
+            raise DvoError(message, file=path, field="topic", remedy="give one of them")
+        return asked
+    if not found:
+        raise DvoError("no images in this bag", file=path, remedy="record sensor_msgs/Image or CompressedImage")
+    if len(found) > 1:
+        message = f"several topics of images: {listed}"
+        raise DvoError(message, file=path, field="topic", remedy="give one with --topic")
+    return next(iter(found))
+
+
+class BagRecording:
+    """Images of one topic.
+
+    Raises:
+        DvoError: rosbags is not there, the bag cannot be read, or its topic of images is not clear.
+    """
+
+    kind = "rosbag"
+    interval = Interval()
+    groundtruth: Trajectory | None = None
+    stereo: Callable[[], StereoRig | None] | None = None
+
+    def __init__(self, path: Path, request: Request) -> None:
+        self.path, self.name = path, path.resolve().stem
+        self.warnings: list[str] = []
+        self._fps = checked_rate(request.fps)
+        with _opened(path) as reader:
+            topics = reader.topics
+            self.topic = _choose_topic(path, topics, request.topic)
+            self.frame_count: int | None = topics[self.topic].msgcount
+            self._times = read_times(request.times, self.frame_count) if request.times is not None else None
+            first = _first(reader, self.topic)
+            self._stamped = first is not None and _seconds(first) > 0
+            self.calibration: Calibration | None = None
+            if request.calibration is None:
+                self.calibration = self._read_calibration(reader, topics)
+            imu = [name for name, info in topics.items() if info.msgtype == IMU and info.msgcount]
+        has_clock = self._times is None and self._fps is None and self._stamped
+        if not self._stamped and self._times is None and self._fps is None:
+            self.warnings.append(f"headers of {self.topic} have no stamps: times of recording are used")
+        if len(imu) > 1:
+            self.warnings.append(f"several topics of inertial samples, none is used: {', '.join(sorted(imu))}")
+        is_usable = has_clock and len(imu) == 1
+        self.inertial: Callable[[], InertialSamples] | None = (
+            partial(read_inertial, path, imu[0]) if is_usable else None
+        )
+
+    def _read_calibration(self, reader: Any, topics: dict[str, Any]) -> Calibration | None:
+        """Calibration of the ``camera_info`` topic in the namespace of the images, if there is one."""
+        parts = self.topic.removesuffix("/compressed").split("/")
+        name = "/".join([*parts[:-1], "camera_info"])
+        info = _first(reader, name) if name in topics and topics[name].msgtype == INFO else None
+        if info is None:
+            return None
+        ros1 = hasattr(info, "K")
+        k, d, p = (list(getattr(info, key if ros1 else key.lower())) for key in "KDP")
+        values: dict[str, Any] = {"camera_matrix": k, "distortion_model": info.distortion_model, "D": d}
+        if "rect" in parts[-1]:
+            values = {"camera_matrix": [*p[0:3], *p[4:7], *p[8:11]]}
+        if not min(values["camera_matrix"][0], values["camera_matrix"][4]) > 0:
+            self.warnings.append(f"{name} is not calibrated")
+            return None
+        size = {key: getattr(info, key) for key in ("width", "height") if getattr(info, key)}
+        try:
+            return from_values({**values, **(size if len(size) == 2 else {})}, self.path)
+        except DvoError as error:
+            self.warnings.append(f"{name} was not used: {error.message}")
+            return None
+
+    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.recording.Recording`; messages passed over by the stride are not decoded."""
+        previous, late = -np.inf, False
+        with _opened(self.path) as reader:
+            numbered = ((index, *item) for index, item in enumerate(_messages(reader, self.topic)))
+
+            def time(item: tuple[int, Any, int, bytes]) -> float:
+                index, connection, recorded, data = item
+                return self._time(index, reader.deserialize(data, connection.msgtype), recorded)
+
+            for index, connection, recorded, data in self.interval.select(numbered, time, stride, self.path):
+                message = reader.deserialize(data, connection.msgtype)
+                timestamp = self._time(index, message, recorded)
+                if not timestamp > previous:
+                    if not late:
+                        log.notes.append(f"from image {index} on, images not later than the one before were dropped")
+                    late = True
+                    continue
+                origin = f"{self.path} {self.topic} image {index}"
+                image = decode_message(message, origin)
+                if image is None:
+                    log.unreadable.append(f"image {index}")
+                    continue
+                previous = timestamp
+                yield RawFrame(index, timestamp, image, origin)
+
+    def _time(self, index: int, message: Any, recorded: int) -> float:
+        if self._times is not None:
+            return float(self._times[index])
+        if self._fps is not None:
+            return index / self._fps
+        return _seconds(message) if self._stamped else recorded / 1e9
+
+
+def _messages(reader: Any, topic: str) -> Iterator[tuple[Any, int, bytes]]:
+    return reader.messages([connection for connection in reader.connections if connection.topic == topic])
+
+
+def _first(reader: Any, topic: str) -> Any:
+    for connection, _, data in _messages(reader, topic):
+        return reader.deserialize(data, connection.msgtype)
+    return None
+
+
+def read_inertial(path: Path, topic: str) -> InertialSamples:
+    """Read all samples of a topic.
+
+    Args:
+        path: of the bag.
+        topic: of type ``sensor_msgs/Imu``, rad/s and m/s^2.
+
+    Raises:
+        DvoError: the bag cannot be read.
+    """
+    rows = []
+    with _opened(path) as reader:
+        for connection, _, data in _messages(reader, topic):
+            message = reader.deserialize(data, connection.msgtype)
+            gyro, accel = message.angular_velocity, message.linear_acceleration
+            rows.append([_seconds(message), gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z])
+    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    table = table[(np.abs(table) <= MAX_NUMBER).all(axis=1)]  # false for nan too
+    _, first = np.unique(table[:, 0], return_index=True)  # sorted: messages may have been recorded out of order
+    table = table[first]
+    return InertialSamples(table[:, 0].copy(), table[:, 1:4].copy(), table[:, 4:].copy())
+
+
+def open_rosbag(path: Path, request: Request) -> Recording:
+    """Open a bag.
+
+    Args:
+        path: file or folder.
+        request: options of the user.
+
+    Raises:
+        DvoError: see :class:`BagRecording`.
+    """
+    return BagRecording(path, request)
+
+
+READER = Reader("rosbag", matches, open_rosbag)

@@ -1,0 +1,134 @@
+"""Sequence folder in the simplest layout: a folder of images, ``calib.txt`` and ``groundtruth_tum.txt`` beside it.
+
+Depth images (``depth`` beside the images, the same number in the name) and right images are used only where the
+calibration states their ``depth_scale`` or ``baseline``: neither can be guessed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration, read_calibration
+from dvo.data.files.stamps import choose_times
+from dvo.data.images.images import has_images
+from dvo.data.readers.folder import camera_images
+from dvo.data.recording import ImageRecording, Reader, Recording, Request
+from dvo.data.sensors.sensors import SameName, SameNumbers, Sensors, rectified
+from dvo.data.trajectory import Trajectory, read_tum
+
+IMAGE_FOLDERS = (
+    "image_0", "image_2", "image_left", "image_lcam_front", "rgb", "color", "colour", "images", "image", "imgs",
+    "frames", "left", "cam0", "cam0/data",
+)  # fmt: skip
+RIGHT_OF = {
+    "image_0": "image_1", "image_2": "image_3", "image_left": "image_right", "image_lcam_front": "image_rcam_front",
+    "left": "right", "cam0": "cam1", "cam0/data": "cam1/data",
+}  # fmt: skip
+CALIBRATIONS = ("calib.txt", "calibration.txt", "calib.yaml", "calibration.yaml", "camera.yaml", "intrinsics.txt")
+
+
+def image_folder(path: Path) -> Path | None:
+    """Folder of images in a sequence folder: a usual name, else the only one that holds images.
+
+    Args:
+        path: the sequence folder.
+
+    Raises:
+        DvoError: several, and none with a usual name.
+    """
+    usual = next((path / name for name in IMAGE_FOLDERS if has_images(path / name)), None)
+    if usual is not None:
+        return usual
+    others = sorted(child for child in path.iterdir() if child.is_dir() and has_images(child))
+    if len(others) > 1:
+        named = ", ".join(child.name for child in others)
+        raise DvoError(f"several folders of images: {named}", file=path, remedy="name one of them as the source")
+    return others[0] if others else None
+
+
+def find_calibration(path: Path) -> Calibration | None:
+    """Calibration that lies in a folder under a usual name, if any.
+
+    Args:
+        path: the folder.
+
+    Raises:
+        DvoError: a malformed file.
+    """
+    file = next((path / name for name in CALIBRATIONS if (path / name).is_file()), None)
+    return read_calibration(file) if file is not None else None
+
+
+def find_groundtruth(path: Path) -> Trajectory | None:
+    """Read ``groundtruth_tum.txt``, or the only file of a name such as ``keyframes_groundtruth_cam0_tum.txt``, if any.
+
+    Args:
+        path: the sequence folder.
+
+    Raises:
+        DvoError: a malformed file.
+    """
+    exact = path / "groundtruth_tum.txt"
+    files = [exact] if exact.is_file() else sorted(path.glob("*groundtruth*_tum.txt"))
+    return read_tum(files[0]) if len(files) == 1 else None
+
+
+def matches(path: Path) -> bool:
+    """True for a folder without images of its own and with one (or several) folders of images in it.
+
+    Args:
+        path: existing file or folder.
+    """
+    if not path.is_dir() or has_images(path):
+        return False
+    return any(has_images(path / name) for name in IMAGE_FOLDERS) or any(
+        child.is_dir() and has_images(child) for child in path.iterdir()
+    )
+
+
+def open_sequence(path: Path, request: Request) -> Recording:
+    """Read a sequence folder. Ground truth with a row per image also gives the times, if nothing else does.
+
+    Args:
+        path: the folder.
+        request: options of the user.
+
+    Raises:
+        DvoError: no images, or a malformed calibration, ground truth or list of times.
+    """
+    folder = image_folder(path)
+    if folder is None:
+        return ImageRecording("sequence", path, [], np.zeros(0))
+    warnings: list[str] = []
+    images = camera_images(folder, warnings)
+    groundtruth = find_groundtruth(path)
+
+    def times_of_groundtruth() -> np.ndarray | None:
+        return groundtruth.timestamps if groundtruth is not None and len(groundtruth) == len(images) else None
+
+    times = choose_times(
+        images, folder, times=request.times, fps=request.fps, warnings=warnings, fallback=times_of_groundtruth
+    )
+    calibration = find_calibration(path)
+    return ImageRecording(
+        "sequence", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
+        sensors=_sensors(path, folder, request.calibration or calibration),
+    )  # fmt: skip
+
+
+def _sensors(path: Path, folder: Path, calibration: Calibration | None) -> Sensors:
+    if calibration is None:
+        return Sensors()
+    depth = SameNumbers(path / "depth") if calibration.depth_scale and (path / "depth").is_dir() else None
+    right, rig = None, None
+    other = RIGHT_OF.get(folder.relative_to(path).as_posix())
+    if calibration.baseline and other and (path / other).is_dir():
+        right = SameName(path / other)
+        rig = rectified(calibration, calibration.baseline)
+    return Sensors(depth=depth, depth_scale=calibration.depth_scale, right=right, stereo=rig)
+
+
+READER = Reader("sequence", matches, open_sequence)

@@ -1,0 +1,221 @@
+"""Video files, decoded by OpenCV's FFmpeg."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import Calibration
+from dvo.data.files.files import is_file, lookups
+from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
+from dvo.data.frame import InertialSamples
+from dvo.data.images.image_header import MAX_PIXELS
+from dvo.data.images.images import SUFFIXES, to_rgb8
+from dvo.data.images.reduction import Reduction
+from dvo.data.interval import Interval
+from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.sensors.sensors import StereoRig
+from dvo.data.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import cv2
+
+# A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
+# Half a minute of 30 Hz video without a frame is taken for the end.
+_GIVE_UP_AFTER = 900
+_SECONDS = 4  # to open, and to find the next frame: gigabytes without one are no video
+
+
+def matches(path: Path) -> bool:
+    """True for any file; folders are for the other readers.
+
+    Args:
+        path: existing file or folder.
+    """
+    return path.is_file()
+
+
+@contextmanager
+def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+    """The opened video, closed again at the end."""
+    import cv2
+
+    if not is_file(path):  # a pipe or a device would never end, or never begin
+        raise DvoError("no video file", file=path, remedy="give a file; images of a camera go to dvo.stream")
+    with lookups(path), path.open("rb") as file:
+        file.read(1)  # a disk that sleeps wakes before time counts
+    if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
+        raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
+    # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)
+    try:
+        # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, limits)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    try:
+        if not capture.isOpened():
+            raise DvoError(
+                "this video does not decode",
+                file=path,
+                remedy="check that it plays; a recording that was cut off before its index was written must be "
+                "repaired first",
+            )
+        size = [capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if size[0] * size[1] > MAX_PIXELS:
+            message = f"frames of {size[0]:g}x{size[1]:g} pixels, more than {MAX_PIXELS:,}"
+            raise DvoError(message, file=path, remedy="reduce the video")
+        yield capture
+    except cv2.error as error:
+        raise DvoError(
+            f"this video does not decode ({str(error).splitlines()[0][:200]})", file=path, remedy="check that it plays"
+        ) from None
+    finally:
+        capture.release()
+
+
+def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
+    """``(index, container milliseconds, failed grabs just before)`` of every frame that decodes."""
+    import cv2
+
+    index, failed, failing_since = 0, 0, 0.0
+    while failed <= _GIVE_UP_AFTER:
+        if capture.grab():
+            yield index, capture.get(cv2.CAP_PROP_POS_MSEC), failed
+            failed = 0
+        else:
+            now = time.monotonic()
+            failing_since = failing_since if failed else now
+            if now - failing_since > _SECONDS:
+                return
+            failed += 1
+        index += 1
+
+
+class VideoRecording:
+    """Video file as a recording.
+
+    Times are the container's; where it has none that increase, the frame's number over the frame rate. A rate or
+    a list of times that the user gives overrides both.
+
+    Args:
+        path: the file.
+        request: options of the user.
+
+    Attributes:
+        interval: that is read, see :func:`dvo.data.interval.limit`; frames before it are decoded, but not converted.
+        reduction: of the images, see :func:`dvo.data.images.reduction.reduce_images`.
+        turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
+            rows of the sensor in the order in which it reads them.
+
+    Raises:
+        DvoError: it does not open, holds no frame, or ``times`` has another number of rows than it has frames.
+    """
+
+    kind = "video"
+    interval = Interval()
+    reduction: Reduction | None = None
+    calibration: Calibration | None = None
+    groundtruth: Trajectory | None = None
+    stereo: Callable[[], StereoRig | None] | None = None
+    inertial: Callable[[], InertialSamples] | None = None
+
+    def __init__(self, path: Path, request: Request) -> None:
+        import cv2
+
+        fps = checked_rate(request.fps)
+        self.path, self.name = path, path.stem
+        self.warnings: list[str] = []
+        with _capture(path) as capture:
+            announced, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+            angle = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 360
+            does_turn = capture.get(cv2.CAP_PROP_ORIENTATION_AUTO) and angle in (90, 180, 270)
+            self.turned = int(angle) if does_turn else 0
+            first = [milliseconds for (_, milliseconds, _), _ in zip(_grabs(capture), range(3), strict=False)]
+        if not first:
+            raise DvoError("no frame of this video decodes", file=path, remedy="check that it plays, or re-encode it")
+        # containers without a count give huge or negative numbers
+        self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
+        self._times = self._read_times(request.times) if request.times is not None else None
+        self._use_container = bool(request.fps is None and (np.diff(first) > 0).all() and np.isfinite(first).all())
+        self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
+        if self._times is None and not self._use_container and request.fps is None:
+            known = "the stated" if self._fps == rate else "a guessed"
+            self.warnings.append(
+                f"the video has no times: assuming {known} {self._fps:g} frames a second (or give --fps)"
+            )
+
+    def _read_times(self, file: Path) -> np.ndarray:
+        times = read_times(file, None)
+        if len(times) != self.frame_count:  # some containers only estimate: count, before calling the user wrong
+            with _capture(self.path) as capture:
+                last = max(index for index, _, _ in _grabs(capture))
+            return read_times(file, last + 1)
+        return times
+
+    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.recording.Recording`; only every ``stride``-th frame is converted."""
+        read, last, previous, dropped = 0, 0.0, -np.inf, 0
+
+        def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
+            nonlocal read, last
+            for index, milliseconds, failed in _grabs(capture):
+                log.unreadable.extend(f"frame {number}" for number in range(index - failed, index))
+                read, last = read + 1, milliseconds
+                yield index, milliseconds
+
+        with _capture(self.path) as capture:
+            for index, milliseconds in self.interval.select(
+                grabbed(capture), lambda item: self._time(*item), stride, self.path
+            ):
+                timestamp = self._time(index, milliseconds)
+                if timestamp is None or not previous < timestamp < np.inf:  # NaN fails too
+                    dropped += 1
+                    if dropped == 1:
+                        log.notes.append(f"from frame {index} on, frames not later than the one before were dropped")
+                    continue
+                decoded, image = capture.retrieve()
+                if not decoded or image is None:
+                    log.unreadable.append(f"frame {index}")
+                    continue
+                previous = timestamp
+                image = image if self.reduction is None else self.reduction(image)
+                yield RawFrame(index, timestamp, to_rgb8(image), f"{self.path} frame {index}")
+        missing = (self.frame_count or 0) - read - len(log.unreadable)
+        if self._use_container and missing > 0:  # of a variable rate the announced number may be rate times duration
+            missing = min(missing, round((self.frame_count or 0) - 1 - last / 1000 * self._fps))
+        if missing > 0 and self.interval.end is None:
+            # healthy files may be off by a frame or so: estimated counts, edit lists
+            verdict = ": it is cut short or damaged" if missing > max(1, (self.frame_count or 0) // 200) else ""
+            log.notes.append(f"the video announces {self.frame_count} frames, {read} could be read{verdict}")
+
+    def _time(self, index: int, milliseconds: float) -> float | None:
+        if self._times is not None:
+            return float(self._times[index]) if index < len(self._times) else None
+        return milliseconds / 1000 if self._use_container else index / self._fps
+
+
+def open_video(path: Path, request: Request) -> Recording:
+    """Open a video file.
+
+    Args:
+        path: the file.
+        request: options of the user.
+
+    Raises:
+        DvoError: see :class:`VideoRecording`.
+    """
+    return VideoRecording(path, request)
+
+
+READER = Reader("video", matches, open_video)

@@ -1,0 +1,133 @@
+"""Files that other sensors left beside the images of a recording, found for an image when they are first needed.
+
+The functions from an image file to the file that belongs to it are small frozen dataclasses, so that a source can be
+sent to the worker processes of a data loader.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from dvo.data.calibration.calibration import Calibration
+from dvo.data.files.files import is_file
+from dvo.data.frame import InertialSamples
+from dvo.data.images.images import list_images
+
+Finder = Callable[[Path], Path | None]
+"""Image file of the (left) camera to the file that belongs to it, None if there is none."""
+
+
+@dataclass(frozen=True)
+class StereoRig:
+    """Right camera of a stereo pair.
+
+    Attributes:
+        calibration: of the right images as recorded.
+        T_left_right: ``(7,)`` pose of the right camera in the coordinates of the left one, metres.
+    """
+
+    calibration: Calibration
+    T_left_right: np.ndarray
+
+
+def rectified(calibration: Calibration, baseline: float) -> Callable[[], StereoRig]:
+    """Loader of the right camera of a rectified pair: same intrinsics, parallel axes.
+
+    Args:
+        calibration: of both cameras.
+        baseline: metres from the left to the right camera, along x.
+    """
+    return partial(StereoRig, calibration, np.array([baseline, 0, 0, 0, 0, 0, 1.0]))
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Other sensors of a recording; all are optional. Nothing is read before it is needed.
+
+    Attributes:
+        depth: depth image of an image.
+        depth_scale: units of a metre in depth images of integers.
+        right: right image of an image; needs ``stereo``.
+        stereo: reads the calibration of the right camera; None from it if there is none.
+        inertial: reads all samples of the recording.
+    """
+
+    depth: Finder | None = None
+    depth_scale: float | None = None
+    right: Finder | None = None
+    stereo: Callable[[], StereoRig | None] | None = None
+    inertial: Callable[[], InertialSamples] | None = None
+
+
+@dataclass(frozen=True)
+class SameName:
+    """File of the same name in another folder.
+
+    Attributes:
+        folder: of the files.
+        old, new: part of the name that differs, in the image's name and in the file's.
+    """
+
+    folder: Path
+    old: str = ""
+    new: str = ""
+
+    def __call__(self, image: Path) -> Path | None:
+        name = image.name.replace(self.old, self.new) if self.old else image.name
+        file = self.folder / name
+        return file if is_file(file) else None
+
+
+@dataclass(frozen=True)
+class SameNumbers:
+    """Image of another folder whose name holds the same numbers, as ``7.depth.png`` does those of ``7.color.jpg``.
+
+    Attributes:
+        folder: of the files.
+    """
+
+    folder: Path
+
+    @cached_property
+    def _files(self) -> dict[tuple[str, ...], Path]:
+        return {_numbers(file): file for file in list_images(self.folder)}
+
+    def __call__(self, image: Path) -> Path | None:
+        return self._files.get(_numbers(image))
+
+
+def _numbers(file: Path) -> tuple[str, ...]:
+    return tuple(re.findall(r"[0-9]+", file.stem)) or (file.stem,)
+
+
+@dataclass(frozen=True)
+class NearestInTime:
+    """File with the nearest time stamp.
+
+    Attributes:
+        times: seconds of the images.
+        read: files and their ``(M,)`` increasing times in seconds; called once, when the first is needed.
+        max_dt: largest difference of time, seconds.
+    """
+
+    times: dict[Path, float]
+    read: Callable[[], tuple[list[Path], np.ndarray]]
+    max_dt: float = 0.02
+
+    @cached_property
+    def _listing(self) -> tuple[list[Path], np.ndarray]:
+        return self.read()
+
+    def __call__(self, image: Path) -> Path | None:
+        files, stamps = self._listing
+        time = self.times.get(image)
+        if time is None or not files:
+            return None
+        nearest = int(np.abs(stamps - time).argmin())
+        return files[nearest] if abs(stamps[nearest] - time) <= self.max_dt else None

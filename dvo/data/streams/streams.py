@@ -1,0 +1,168 @@
+"""Stream: images that come one after the other and only once, from a live camera, a socket or a generator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.files.stamps import checked_rate
+from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_image
+from dvo.data.trajectory import Trajectory
+from dvo.geometry.camera import Camera
+from dvo.geometry.undistort import Undistorter, needs_undistortion
+
+Item = np.ndarray | tuple[float, np.ndarray] | Frame
+"""One element of a stream: an image, a time in seconds with an image, or a frame."""
+
+
+class FrameStream:
+    """Frames that can be iterated once, otherwise used as a :class:`dvo.data.source.Source`. Made by :func:`stream`.
+
+    Attributes:
+        name: for the results folder.
+        kind: ``"stream"``.
+        frame_count: None, the number is not known.
+        groundtruth: camera-to-world poses, or None.
+        warnings: faults so far, a sentence each.
+    """
+
+    kind = "stream"
+    frame_count: int | None = None
+
+    def __init__(self, frames: Iterator[Frame], name: str, groundtruth: Trajectory | None = None) -> None:
+        self.name, self.groundtruth = name, groundtruth
+        self._frames: Iterator[Frame] | None = frames
+        self._late = 0
+        self._first_late = 0
+
+    @property
+    def warnings(self) -> list[str]:
+        """Faults so far, a sentence each."""
+        if not self._late:
+            return []
+        first = f"the first is {self._first_late}"
+        return [f"{self._late} images were not later than the one before and were dropped, {first}"]
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Frames with strictly increasing timestamps; those that are not later than the one before are dropped.
+
+        Raises:
+            DvoError: a second iteration, or an element that is no image or has no time.
+        """
+        if self._frames is None:
+            remedy = "make a new one, or collect its frames in a list"
+            raise DvoError("a stream can be read only once", file=self.name, remedy=remedy)
+        frames, self._frames = self._frames, None
+        return self._increasing(frames)
+
+    def _increasing(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        previous = -np.inf
+        for frame in frames:
+            if not frame.timestamp > previous:
+                self._first_late = self._first_late if self._late else frame.index
+                self._late += 1
+                continue
+            previous = frame.timestamp
+            yield frame
+
+
+def stream(
+    images: Iterable[Item],
+    camera: Camera | None = None,
+    *,
+    timestamps: Iterable[float] | None = None,
+    fps: float | None = None,
+    name: str = "stream",
+    groundtruth: Trajectory | None = None,
+    undistort: bool = True,
+) -> FrameStream:
+    """Wrap images in memory, or arriving, for :func:`dvo.session.session.run` and whatever else takes a source.
+
+    Args:
+        images: any iterable of ``(H, W, 3)`` uint8 RGB images, or others that
+            :func:`dvo.data.frame_checks.checked_frame` converts (grey, RGBA, uint16, float, torch tensors, PIL); of
+            pairs ``(seconds, image)``; or of :class:`Frame`, which is passed on as it is. Read once, one element at a
+            time.
+        camera: camera of the images; needed unless the elements are frames.
+        timestamps: seconds of the images, in the same order; may be endless.
+        fps: images a second, if there are no times.
+        name: for the results folder.
+        groundtruth: camera-to-world poses on the clock of the images.
+        undistort: resample to a pinhole camera; otherwise frames carry the distorted camera.
+
+    Returns:
+        Frames to iterate over once.
+
+    Raises:
+        DvoError: both or unusable ``timestamps`` and ``fps``. While iterating: an element that is no image of the
+            camera's size or cannot be converted, or that has no time.
+
+    Example:
+        >>> import numpy as np
+        >>> from dvo.geometry.camera import Camera
+        >>> images = (np.full((48, 64, 3), 10 * i, np.uint8) for i in range(3))
+        >>> frames = stream(images, Camera(50.0, 50.0, 31.5, 23.5, 64, 48), fps=10)
+        >>> [frame.timestamp for frame in frames]
+        [0.0, 0.1, 0.2]
+    """
+    if timestamps is not None and fps is not None:
+        raise DvoError("both timestamps and fps are given", field="timestamps", remedy="give one of them")
+    fps = checked_rate(fps)
+    undistorter = Undistorter(camera) if camera is not None and undistort and needs_undistortion(camera) else None
+    times = _iterator(timestamps, name, "timestamps") if timestamps is not None else None
+
+    def frames() -> Iterator[Frame]:
+        for index, item in enumerate(_iterator(images, name, "images")):
+            if isinstance(item, Frame):
+                yield item
+                continue
+            time, image = item if isinstance(item, tuple) and len(item) == 2 else (None, item)
+            if times is not None:
+                time = next(times, None)
+            elif time is None and fps is not None:
+                time = index / fps
+            seconds = _seconds(time, index, name)
+            if camera is None:
+                raise DvoError("no camera", file=name, field="camera", remedy="give the camera of the images")
+            pixels = _checked(image, camera, index, name)
+            if undistorter is None:
+                yield Frame(index, seconds, pixels, camera)
+            else:
+                yield Frame(index, seconds, undistorter(pixels), undistorter.camera)
+
+    return FrameStream(frames(), name, groundtruth)
+
+
+def _iterator(values: Any, name: str, field: str) -> Iterator[Any]:
+    try:
+        return iter(values)
+    except TypeError:
+        raise DvoError(f"not {field}: {type(values).__name__}", file=name, field=field, remedy="give a list") from None
+
+
+def _seconds(time: Any, index: int, name: str) -> float:
+    """A finite number of seconds."""
+    try:
+        seconds = float(time) if not isinstance(time, (str, bytes)) else np.nan
+    except (TypeError, ValueError, OverflowError):
+        seconds = np.nan
+    if not np.isfinite(seconds):
+        raise DvoError(
+            f"no time for image {index}",
+            file=name,
+            field="timestamps",
+            remedy="give timestamps=, fps=, or pairs (seconds, image)",
+        )
+    return seconds
+
+
+def _checked(image: Any, camera: Camera, index: int, name: str) -> np.ndarray:
+    """``(H, W, 3)`` uint8 RGB of the camera's size."""
+    try:
+        return checked_image(image, camera, f"frame {index}")
+    except DvoError as error:
+        raise DvoError(error.message, file=name, field=error.field, remedy=error.remedy) from error.__cause__

@@ -1,0 +1,284 @@
+"""Calibration of a camera from its own images: ``dvo.calibrate``.
+
+The beginning of a clip is tracked with a guess of the focal length, which is then estimated from the measurements
+(:mod:`dvo.odometry.global_ba.focal_length`); measurements made with a focal length far off are worse ones, so this is
+repeated with what was found, as long as no more frames are tracked than the clip has, and a few. The motion may not
+tell the focal length; then the guess is kept, and the result says so. The principal point is the middle of the image,
+unless the measurements tell it closely.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sized
+from copy import copy
+from dataclasses import dataclass, replace
+from itertools import islice, tee
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.core.settings import check_settings
+from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
+from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
+from dvo.odometry.calibrate.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
+from dvo.odometry.global_ba.focal_length import FocalProfile, find_focal
+from dvo.odometry.load import load
+from dvo.odometry.protocol import Estimate, Status
+
+if TYPE_CHECKING:
+    import torch
+
+    from dvo.odometry.patch.tracker import PatchOdometry
+
+_FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sides of the image, are not believed
+_RANGES = {
+    "frames": (3, 10**6),
+    "rounds": (1, 100),
+    "spare": (0, 10**6),
+    "interval": (0, 1e6),
+    "settled": (0, 10),
+    "min_contrast": (0, 100),
+    "max_deviation": (0, 10),
+    "inflation": (1, 1000),
+    "floor": (0, 1),
+    "max_aside": (0, 1),
+}
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Options of :func:`calibrate`.
+
+    Attributes:
+        frames: tracked frames that the focal length is estimated from. If they cannot tell it, twice as many are tried.
+        rounds: times that they are tracked, at most.
+        spare: frames that all rounds together track beyond as many as the clip has; of a clip whose length is not
+            known any number.
+        interval: seconds between frames, at least; of a faster camera frames are left out.
+        settled: change of the logarithm of the focal length in a round below which it has settled; the principal point
+            has, once it moves by less than ``max_aside``.
+        min_contrast: increase of the cost at focal lengths a fifth off below which the motion does not tell.
+        max_deviation: largest standard deviation of the logarithm of the focal length that is believed.
+        inflation: factor of the standard deviation that the curvature of the cost gives; measurements of a patch in
+            several frames share their errors.
+        floor: standard deviation, of the logarithm, of what is not modelled (distortion).
+        max_aside: largest standard deviation of a coordinate of the principal point that is believed, in longer sides
+            of the image; otherwise it is the middle of the image, as with 0.
+
+    Raises:
+        DvoError: a value of another type or out of range.
+    """
+
+    frames: int = 120
+    rounds: int = 4
+    spare: int = 60
+    interval: float = 0.03
+    settled: float = 0.02
+    min_contrast: float = 0.02
+    max_deviation: float = 0.1
+    inflation: float = 3.0
+    floor: float = 0.02
+    max_aside: float = 0.005
+
+    def __post_init__(self) -> None:
+        check_settings(self, _RANGES)
+
+
+def calibrate(
+    frames: Iterable[Frame],
+    guess: FocalGuess | None = None,
+    *,
+    weights: str = "small",
+    device: torch.device | str = "cpu",
+    seed: int = 0,
+    options: CalibrationOptions = CalibrationOptions(),  # noqa: B008 (frozen)
+    on_frame: Callable[[Frame, Estimate | None], None] | None = None,
+) -> SelfCalibration:
+    """Estimate the focal length of the camera that has recorded a clip.
+
+    Args:
+        frames: from the beginning of the clip: a :class:`dvo.data.Source`, or a list. Their cameras are not used, but
+            for the readout time. An iterator is read as far as needed and its frames are kept in memory.
+        guess: to begin with; None for that of the source, or the usual angle of view.
+        weights: of the architecture ``patch_vo``.
+        device, seed: as in :func:`dvo.load`.
+        options: number of frames, and what is believed.
+        on_frame: called after each frame of each round.
+
+    Returns:
+        The focal length with its standard deviation, or the guess if the images do not tell.
+
+    Raises:
+        DvoError: no frames, or weights of another architecture.
+
+    Example:
+        >>> source = dvo.open("video.mp4", guess=True)
+        >>> found = dvo.calibrate(source)
+        >>> print(found)
+        focal length 520 +- 16 px (self-calibrated from 60 frames)
+        >>> run = dvo.run(dvo.load("small"), source.recalibrated(found.calibration))
+    """
+    limit = 8 * options.frames  # with those that are left out or lost
+    kept = tee(frames, 1)[0] if isinstance(frames, Iterator) else None
+    first = next(_readable(frames if kept is None else copy(kept)), None)
+    if first is None:
+        raise DvoError("no frames", field="frames", remedy="give a video or a folder with images")
+    recorded = getattr(frames, "recorded_camera", first.camera)  # frames of large images are reduced
+    width, height = recorded.width, recorded.height
+    if guess is None:
+        guess = getattr(frames, "guess", None) or guess_from_angle(width, height)
+
+    def result(focal: float, deviation: float, source: str, count: int, *more: Any) -> SelfCalibration:
+        return SelfCalibration(focal, deviation, source, width, height, count, *more)
+
+    focal, aside, wanted, reason, count = guess.focal, (0.0, 0.0), options.frames, "", 0
+    walk: list[tuple[float, float]] = []
+    length = _length(frames)
+    left = math.inf if length is None else length + options.spare
+    for number in range(options.rounds):
+        odometry = _loaded(weights, device, seed)
+        clip = islice(_readable(frames if kept is None else copy(kept)), limit)
+        ratio = first.camera.width / width
+        seen, fed = _track(odometry, clip, focal * ratio, (aside[0] * ratio, aside[1] * ratio), wanted,
+                           options.interval, left, on_frame)  # fmt: skip
+        left -= fed
+        profile, count = _profile(odometry)
+        asked = [*walk, (math.log(focal), profile.minimum.value)]
+        slope = _slope(asked)
+        step = profile.minimum.value / slope
+        deviation = math.hypot(options.inflation * profile.minimum.deviation / slope, options.floor)
+        reason = _doubt(profile, deviation, focal * math.exp(step), guess, options)
+        is_last = number + 1 == options.rounds or left < min(wanted, math.inf if length is None else length) / 2
+        if reason:
+            if seen < wanted or wanted > options.frames or is_last:
+                break
+            focal, aside, wanted, walk = guess.focal, (0.0, 0.0), 2 * wanted, []
+            continue
+        walk = asked
+        before, (aside, unsure) = aside, _principal_point(profile, aside, focal, max(width, height), options)
+        focal *= math.exp(step)
+        if abs(step) > options.settled:  # the last round may end without having settled
+            deviation = math.hypot(deviation, step)
+        is_settled = abs(step) <= options.settled and math.dist(before, aside) <= options.max_aside * max(width, height)
+        if is_settled or is_last:
+            return result(focal, deviation * focal, SELF_CALIBRATED, count, "", guess, aside, unsure)
+    return result(guess.focal, guess.deviation, guess.source, count, reason, guess)
+
+
+def _length(frames: Iterable[Frame]) -> int | None:
+    """Number of frames; None if it is not known before they are read."""
+    count: int | None = getattr(frames, "frame_count", None)
+    return len(frames) if count is None and isinstance(frames, Sized) else count
+
+
+def _readable(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """Frames up to one that cannot be read, which the run itself will tell of; an error at the first one is raised."""
+    started = False
+    try:
+        for frame in frames:
+            checked = checked_frame(frame)
+            started = True
+            yield checked
+    except (DvoError, OSError):
+        if not started:
+            raise
+
+
+def _slope(walk: list[tuple[float, float]]) -> float:
+    """Share of the way to the focal length at which the measurements ask for no further step, that they ask for.
+
+    Measurements lean towards the focal length that they were tracked with, so that a step that they ask for is too
+    short; so is the deviation of the focal length that they tell. The secant through the last two rounds tells by how
+    much.
+
+    Args:
+        walk: logarithm of the focal length of each round, and the step that its measurements ask for.
+
+    Returns:
+        Divisor of the last step and its deviation, 0.4 to 1.
+    """
+    (at, step) = walk[-1]
+    if len(walk) == 1 or at == walk[-2][0]:
+        return 1.0
+    return min(max((walk[-2][1] - step) / (at - walk[-2][0]), 0.4), 1.0)
+
+
+def _track(
+    odometry: PatchOdometry,
+    frames: Iterable[Frame],
+    focal: float,
+    aside: tuple[float, float],
+    wanted: int,
+    interval: float,
+    most: float,
+    on_frame: Callable[[Frame, Estimate | None], None] | None,
+) -> tuple[int, int]:
+    """Track frames with a focal length until as many as wanted have a pose; numbers of these, and of all."""
+    tracked, fed, last = 0, 0, -math.inf
+    for frame in frames:
+        if frame.timestamp < last + interval:
+            continue
+        last, height, width = frame.timestamp, frame.camera.height, frame.camera.width
+        camera = replace(pinhole(focal, aside, width, height), readout=frame.camera.readout).camera(width, height)
+        estimate = odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera, mask=frame.mask))
+        if on_frame is not None:
+            on_frame(frame, estimate)
+        tracked, fed = tracked + (estimate.status is Status.TRACKING), fed + 1
+        if tracked >= wanted or fed >= most:
+            break
+    odometry.complete()
+    return tracked, fed
+
+
+def _loaded(weights: str, device: torch.device | str, seed: int) -> PatchOdometry:
+    """Odometry of weights that keeps its measurements."""
+    from dvo.odometry.patch.tracker import PatchOdometry
+
+    odometry = load(weights, device=device, seed=seed, loops=False)
+    if not isinstance(odometry, PatchOdometry):
+        raise DvoError(
+            f"the odometry {odometry.name} keeps no measurements", field="weights", remedy="use weights of patch_vo"
+        )
+    return odometry
+
+
+def _profile(odometry: PatchOdometry) -> tuple[FocalProfile, int]:
+    """Profile of the longest segment, and its number of frames."""
+    graph, state = odometry.graph, odometry.state
+    segments = state.adjustable or [0]
+    longest = max(segments, key=lambda segment: len(graph.members(segment)))
+    readout = state.info.get("readout", 0.0)
+    shutter = replace(state.shutter, readout=readout if isinstance(readout, float) else 0.0)
+    return find_focal(graph, longest, shutter, odometry.config.adjustment), len(graph.members(longest))
+
+
+def _principal_point(
+    profile: FocalProfile, aside: tuple[float, float], focal: float, side: int, options: CalibrationOptions
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Way from the middle of the image to the principal point and its deviations, pixels; 0 and inf if not believed."""
+    found = []
+    for start, minimum in zip(aside, profile.aside, strict=True):
+        deviation = options.inflation * minimum.deviation * focal
+        offset = start + minimum.value * focal
+        sure = deviation <= options.max_aside * side and abs(offset) <= _FARTHEST_ASIDE * side
+        if abs(offset - start) > options.max_aside * side:  # the last round may end without having settled
+            deviation = math.hypot(deviation, offset - start)
+        found.append((offset, deviation) if sure else (0.0, math.inf))
+    (x, dx), (y, dy) = found
+    return (x, y), (dx, dy)
+
+
+def _doubt(
+    profile: FocalProfile, deviation: float, focal: float, guess: FocalGuess, options: CalibrationOptions
+) -> str:
+    """Reason for not believing the focal length of a minimum, after the step; empty for one that is believed."""
+    if not np.isfinite(deviation) and profile.contrast == 0 and profile.minimum.gain == 0:
+        return "too few frames could be tracked"
+    if not (deviation <= options.max_deviation and profile.contrast >= options.min_contrast):  # nan fails too
+        return "the motion does not tell: the measurements fit a wide range of focal lengths"
+    if not abs(math.log(focal / guess.focal)) <= 4 * guess.deviation / guess.focal:
+        return f"the measurements fit {focal:.0f} px best, which is hardly possible"
+    return ""

@@ -1,0 +1,119 @@
+"""Camera that was found in its own images, with its standard deviations and its calibration file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.focal_guess import FocalGuess, centred
+from dvo.data.files.output import replaced
+
+SELF_CALIBRATED = "self-calibration"
+"""Source of a focal length that was found in the images."""
+
+_HEADER = "# focal length found by dvo; a run without a calibration replaces this file\n"
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """Focal length of a camera without a calibration.
+
+    Attributes:
+        focal: fx and fy, pixels.
+        deviation: standard deviation, pixels, with the set factor and floor of :class:`CalibrationOptions`.
+        source: ``self-calibration``, or that of the guess that was kept
+            (:class:`dvo.data.calibration.focal_guess.FocalGuess`).
+        width, height: of the images, pixels.
+        frames: number of frames that it was estimated from.
+        reason: cause for keeping the guess; empty for a focal length that was found.
+        guess: at the start.
+        aside: way from the middle of the image to the principal point, to the right and down, pixels; 0 where it is not
+            told.
+        aside_deviation: standard deviations of the two, pixels; inf where it is not told.
+    """
+
+    focal: float
+    deviation: float
+    source: str
+    width: int
+    height: int
+    frames: int
+    reason: str
+    guess: FocalGuess
+    aside: tuple[float, float] = (0.0, 0.0)
+    aside_deviation: tuple[float, float] = (math.inf, math.inf)
+
+    @property
+    def found(self) -> bool:
+        """True if the focal length was found in the images."""
+        return self.source == SELF_CALIBRATED
+
+    @property
+    def calibration(self) -> Calibration:
+        """Square pixels, the principal point at the centre or where it was found, no distortion."""
+        return pinhole(self.focal, self.aside, self.width, self.height)
+
+    def __str__(self) -> str:
+        """Sentence for people."""
+        value = f"{self.focal:.0f} +- {self.deviation:.0f} px"
+        if self.found:
+            return f"focal length {value} (self-calibrated from {self.frames} frames){self._principal_point()}"
+        origin = {"prior": "the usual angle of view", "exif": "EXIF data", "video": "metadata of the video"}
+        return f"focal length: cannot tell ({self.reason}): keeps {value}, from {origin.get(self.source, self.source)}"
+
+    def _principal_point(self) -> str:
+        """Further line for a principal point of which a coordinate was found; empty for one at the centre."""
+        if not any(map(math.isfinite, self.aside_deviation)):
+            return ""
+        c = self.calibration
+        words = [
+            f"{name} {value:.1f}" + (f" +- {deviation:.1f} px" if math.isfinite(deviation) else " px, the centre")
+            for name, value, deviation in zip(("cx", "cy"), (c.cx, c.cy), self.aside_deviation, strict=True)
+        ]
+        return f"\nprincipal point {', '.join(words)}"
+
+    def write(self, file: Path | str) -> bool:
+        """Write a calibration file for the next run, unless a file that somebody else has written is in its place.
+
+        Args:
+            file: text file, ``fx fy cx cy``.
+
+        Returns:
+            Whether it was written.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        if is_foreign(Path(file)):
+            return False
+        c = self.calibration
+        with replaced(Path(file)) as part:
+            told = str(self).replace("\n", "\n# ")
+            part.write_text(f"{_HEADER}# {told}\n{c.fx:.3f} {c.fy:.3f} {c.cx:.1f} {c.cy:.1f}\n", encoding="utf-8")
+        return True
+
+
+def is_foreign(file: Path) -> bool:
+    """True for a file that :meth:`SelfCalibration.write` has not written.
+
+    Args:
+        file: may be missing.
+    """
+    if not file.exists():
+        return False
+    with file.open("rb") as stream:
+        return stream.read(len(_HEADER)) != _HEADER.encode()
+
+
+def pinhole(focal: float, aside: tuple[float, float], width: int, height: int) -> Calibration:
+    """Calibration with square pixels and no distortion.
+
+    Args:
+        focal: fx and fy, pixels.
+        aside: way from the middle of the image to the principal point, to the right and down, pixels.
+        width, height: of the images, pixels.
+    """
+    middle = centred(focal, width, height)
+    return replace(middle, cx=middle.cx + aside[0], cy=middle.cy + aside[1])

@@ -1,0 +1,134 @@
+"""What a verdict on a result rests on (:mod:`dvo.odometry.quality`), measured when a sequence has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from dvo.geometry.projection import reproject
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.problem import graph_problem
+from dvo.map.recordings import increasing_times
+from dvo.odometry.checks.check_pairs import CheckPairs, epipolar_distances, median_displacement
+from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
+from dvo.odometry.protocol import Result
+from dvo.odometry.quality import Quality, judge
+from dvo.odometry.window.evidence import AGREEMENT, CONFIDENT
+
+FIELDS = (4, 3)
+"""Fields of the image, across and down, in which the spread of the measurements is counted."""
+NEAR_LINE = 1.0
+"""Distance of a corner from its epipolar line that agrees, pixels."""
+JUMP = 6.0
+"""Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
+
+
+def measure_quality(
+    graph: KeyframeGraph,
+    result: Result,
+    segments: Collection[int],
+    checks: CheckPairs,
+    *,
+    stride: int,
+    shutter: Shutter,
+    first: float | None,
+    fixed: float,
+) -> Quality:
+    """Measure what a result rests on, and find the verdict.
+
+    Args:
+        graph: everything is archived and adjusted.
+        result: of its last recording.
+        segments: numbers of those that were initialised.
+        checks: measurements that have no part in the poses.
+        stride: of the feature maps, pixels of the working image.
+        shutter: of the camera, or as it was estimated.
+        first: timestamp of the first measured pose; None if there is none.
+        fixed: share of the image that was left out as fixed to the camera.
+
+    Returns:
+        The quality.
+    """
+    cause = next((found.reason for found in result.breaks if found.reason), "")
+    quality = Quality("failed", initialised_at=first, fixed=fixed, jumps=count_jumps(result))
+    if len(result.trajectory):
+        quality = replace(quality, tracked=len(result.trajectory) / max(result.frames_read, 1))
+    found = [
+        part for segment in sorted({graph.world_of(k) for k in segments}) if (part := _inliers(graph, segment, shutter))
+    ]
+    if found:
+        total = np.array([part[0] for part in found]).sum(0)
+        longest = max(found, key=lambda part: part[0][0])
+        agreement = float(total[2] / total[1]) if total[1] else float("nan")
+        residual = float(np.median(np.concatenate([part[1] for part in found]))) * stride if total[1] else float("nan")
+        quality = replace(
+            quality, inliers=float(total[2] / total[0]), agreement=agreement, residual=residual, spread=longest[2]
+        )
+    pairs = _distances(graph, checks)
+    if pairs:
+        distances = np.concatenate([away for away, _ in pairs])
+        deviation = float(np.median(np.concatenate([away / moved for away, moved in pairs])))
+        agreed = float((distances < NEAR_LINE).mean())
+        quality = replace(quality, checks=len(pairs), deviation=deviation, check=agreed)
+    verdict, reason, remedy = judge(quality, result.frames_read, cause)
+    return replace(quality, verdict=verdict, reason=reason, remedy=remedy)
+
+
+def _inliers(graph: KeyframeGraph, segment: int, shutter: Shutter) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Numbers of measurements, confident ones and those that agree; residuals; spread. None without a measurement."""
+    p = graph_problem(graph, segment=segment)
+    across = p.ii != p.jj
+    if len(p.poses_cw) < 2 or not bool(across.any()):
+        return None
+    if shutter.readout > 0:
+        track = PoseTrack.through(increasing_times(graph, graph.members(segment)), p.poses_cw)
+        depths, rows = p.patches[:, 2, 0, 0].reshape(len(p.poses_cw), -1), torch.arange(len(p.poses_cw))
+        p = as_global_shutter(p, p.poses_cw, depths, rows, track, shutter)
+    ii, jj, kk = p.ii[across], p.jj[across], p.kk[across]
+    centre = reproject(p.poses_cw[None], p.patches[None], p.intrinsics[None], ii, jj, kk).coords[0, :, 0, 0]
+    residual = (p.targets[across] - centre).norm(dim=-1)
+    confident = p.weights[across].mean(-1) > CONFIDENT
+    agree = confident & (residual < AGREEMENT)
+    counts = np.array([len(ii), int(confident.sum()), int(agree.sum())])
+    size = 2 * p.intrinsics[:, 2:][jj]
+    place = (p.targets[across] / size * torch.tensor(FIELDS)).long().clamp(min=0)
+    fields = (place[:, 0].clamp(max=FIELDS[0] - 1) * FIELDS[1] + place[:, 1].clamp(max=FIELDS[1] - 1))[agree]
+    pairs = torch.unique(jj[agree] * 100 + fields)
+    spread = torch.bincount(pairs // 100, minlength=len(p.poses_cw)).double().median() / (FIELDS[0] * FIELDS[1])
+    return counts, residual[confident].numpy(), float(spread)
+
+
+def _distances(graph: KeyframeGraph, checks: CheckPairs) -> list[tuple[np.ndarray, float]]:
+    """Distances of the corners of each pair whose frames have poses in one world, and their displacement, pixels."""
+    log, found = graph.log, []
+    for pair in checks.pairs:
+        frames = [log.frames[number] for number in (pair.first, pair.second)]
+        poses = [log.pose(number) for number in (pair.first, pair.second)]
+        same = graph.world_of(frames[0].segment) == graph.world_of(frames[1].segment)
+        if not any(frame.lost for frame in frames) and same and poses[0] is not None and poses[1] is not None:
+            found.append((epipolar_distances(pair, poses[0], poses[1]), median_displacement(pair.points)))
+    return found
+
+
+def count_jumps(result: Result) -> int:
+    """Number of steps between two frames that are far longer than those before and after.
+
+    Args:
+        result: of a sequence.
+
+    Returns:
+        The number, over all segments.
+    """
+    jumps = 0
+    for segment in result.segments:
+        rows = segment.trajectory
+        intervals = np.maximum(np.diff(rows.timestamps), 1e-9)
+        steps = np.linalg.norm(np.diff(rows.positions, axis=0), axis=1) / intervals
+        if len(steps) < 5:
+            continue
+        beside = np.maximum(np.r_[0, steps[:-1]], np.r_[steps[1:], 0])
+        jumps += int((steps > JUMP * np.maximum(beside, np.median(steps))).sum())
+    return jumps

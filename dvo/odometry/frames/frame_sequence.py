@@ -1,0 +1,143 @@
+"""Order, size and intervals of the frames of a sequence."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from statistics import median
+
+from dvo.core.errors import DvoError
+from dvo.data.frame import Frame
+from dvo.odometry.frames.working_image import working_size
+
+RECENT = 30
+"""Number of intervals that the usual one is the median of."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Time without a new image.
+
+    Attributes:
+        seconds: its length.
+        frozen: frames were there, but with an old image.
+    """
+
+    seconds: float
+    frozen: bool
+
+    def __str__(self) -> str:
+        return f"image frozen for {self.seconds:.2f} s" if self.frozen else f"gap of {self.seconds:.2f} s"
+
+
+@dataclass(frozen=True)
+class RequiredSize:
+    """Size of the working images of the map that a recording is tracked in.
+
+    Attributes:
+        size: width and height.
+        pixels: of the working images of the recording, see :func:`dvo.odometry.frames.working_image.working_size`.
+    """
+
+    size: tuple[int, int]
+    pixels: int
+
+    def check(self, frame: Frame) -> None:
+        """Check the working size of the first frame.
+
+        Args:
+            frame: the frame.
+
+        Raises:
+            DvoError: it is another one.
+        """
+        height, width = frame.image.shape[:2]
+        found = working_size(width, height, self.pixels)
+        if found != self.size:
+            wanted = "x".join(map(str, self.size))
+            raise DvoError(
+                f"a working image of {found[0]}x{found[1]} from {width}x{height}, the images of the map are {wanted}",
+                field=f"frame {frame.index}",
+                remedy=f"give a recording of the same aspect and at least that size, or pixels={math.prod(self.size)}",
+            )
+
+
+class FrameSequence:
+    """Order, size and intervals of the frames of a sequence.
+
+    Args:
+        max_gap: time between two images above which they are separated by a gap, in medians of the recent intervals.
+
+    Attributes:
+        required: size of the working images, if a map demands one.
+
+    Example:
+        >>> sequence = FrameSequence(max_gap=4)
+        >>> [str(sequence.tick(time) or "") for time in (0.0, 0.1, 0.2, 5.2)]
+        ['', '', '', 'gap of 5.00 s']
+    """
+
+    def __init__(self, max_gap: float) -> None:
+        self.max_gap = max_gap
+        self.required: RequiredSize | None = None
+        self._intervals: deque[float] = deque(maxlen=RECENT)
+        self._size: tuple[int, int] | None = None
+        self._last: float | None = None  # time of the last frame
+        self._new = 0.0  # time of the first frame with the image of the last one
+
+    def check(self, frame: Frame) -> None:
+        """Check that a frame continues the sequence.
+
+        Args:
+            frame: the next frame.
+
+        Raises:
+            DvoError: a timestamp that does not increase, or an image of another size than the first.
+        """
+        if self._last is not None and frame.timestamp <= self._last:
+            raise DvoError(
+                f"time {frame.timestamp} does not come after {self._last}",
+                field=f"frame {frame.index}",
+                remedy="give frames in order of time",
+            )
+        size = (frame.image.shape[1], frame.image.shape[0])
+        if self._size not in (None, size):
+            raise DvoError(
+                f"is {size[0]}x{size[1]}, the frames before are {self._size[0]}x{self._size[1]}",
+                field=f"frame {frame.index}",
+                remedy="give frames of one size",
+            )
+        if self._size is None and self.required is not None:
+            self.required.check(frame)
+        self._size = size
+
+    def tick(self, time: float) -> Gap | None:
+        """Record a frame with a new image.
+
+        Args:
+            time: seconds.
+
+        Returns:
+            Gap since the image before it was first seen; None if there is none.
+        """
+        last, new, self._last, self._new = self._last, self._new, time, time
+        if last is None:
+            return None
+        usual = median(self._intervals) if len(self._intervals) > 1 else None
+        long = usual is not None and time - last > self.max_gap * usual
+        if not long:
+            self._intervals.append(time - last)
+        if usual is None or time - new <= self.max_gap * usual:
+            return None
+        return Gap(time - last, frozen=False) if long else Gap(last - new, frozen=True)
+
+    def repeat(self, time: float) -> None:
+        """Record a frame with the image of the frame before it.
+
+        Args:
+            time: seconds.
+        """
+        if self._last is not None:
+            self._intervals.append(time - self._last)
+        self._last = time

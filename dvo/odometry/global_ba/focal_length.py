@@ -1,0 +1,142 @@
+"""Focal length and principal point of a camera, from the measurements of a segment.
+
+As with the readout time (:mod:`dvo.odometry.global_ba.self_calibration`), the focal length is the one under which the
+measurements agree best: for a value of it poses and inverse depths are solved for, and the value with the lowest robust
+cost is wanted. Rotation and nearby structure tell it; for a camera that drives straight ahead a wrong focal length is
+nearly made up for by other depths, and the cost stays flat. The principal point is found in the same way, each of its
+coordinates on its own, at the focal length of least cost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.ba.patch_problem import PatchProblem
+from dvo.geometry import se3
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, solve_part
+from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
+from dvo.odometry.global_ba.self_calibration import Minimum, profile_minimum
+
+FEWEST = 20
+"""Frames of a segment below which nothing is concluded."""
+FARTHEST = 1.2
+"""Largest distance of the values that are tried from the first one, in logarithms."""
+ASIDE = 0.08
+"""Largest distance of a principal point that is tried from that of the graph, focal lengths."""
+
+FLAT = 0.005
+"""Contrast of the coarse minimum below which no finer one is looked for."""
+
+_STEPS = 0.08, 0.02  # distance of the values that are tried, in logarithms: coarse, then fine
+_ASIDE_STEP = 0.01  # distance of the principal points that are tried, focal lengths
+_ITERATIONS = 6
+_SHUTTER_ROUNDS = 2  # solutions with corrected measurements, each from the motion of the last
+
+
+_UNKNOWN = Minimum(0.0, np.inf, 0.0)
+
+
+@dataclass(frozen=True)
+class FocalProfile:
+    """Cost of the measurements over the focal length.
+
+    Attributes:
+        minimum: value and deviation are logarithms of the factor to the focal length of the graph.
+        contrast: relative increase of the cost from its minimum to a focal length that is longer, and to one that is
+            shorter, by a fifth, the lesser of the two; 0 for too few frames.
+        aside: value and deviation, in focal lengths, of the way from the principal point of the graph to that of least
+            cost, to the right and down; with infinite deviations if they were not looked for.
+    """
+
+    minimum: Minimum
+    contrast: float
+    aside: tuple[Minimum, Minimum] = field(default_factory=lambda: (_UNKNOWN, _UNKNOWN))
+
+
+def find_focal(
+    graph: KeyframeGraph,
+    segment: int,
+    shutter: Shutter,
+    options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
+    *,
+    principal_point: bool = True,
+) -> FocalProfile:
+    """Estimate the focal length, one factor of fx and fy, and if wanted the principal point.
+
+    Args:
+        graph: the segment is archived and adjusted; it is not changed.
+        segment: its number.
+        shutter: timing of the rows; a rolling shutter that is not corrected is taken for another focal length.
+        options: of the adjustment; its last kernel counts.
+        principal_point: False leaves it where it is.
+
+    Returns:
+        The profile; that of the coarse steps alone where it is flat (:data:`FLAT`). An infinite deviation if the cost
+        still falls at the end of the range, or for fewer than :data:`FEWEST` frames.
+    """
+    frames = graph.members(segment)
+    if len(frames) < FEWEST:
+        return FocalProfile(_UNKNOWN, 0.0)
+    part = graph.problem(True, segment)
+    solve = _Solver(
+        part, torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64), shutter,
+        replace(options, kernels=options.kernels[-1:], iterations=_ITERATIONS),
+    )  # fmt: skip
+    freedom = len(part.patches)
+    coarse = profile_minimum(solve, 0.0, _STEPS[0], -FARTHEST, FARTHEST, freedom)
+    if not np.isfinite(coarse.deviation):
+        return FocalProfile(coarse, 0.0)
+
+    def contrast_at(value: float) -> float:
+        sides = [solve(value + side * float(np.log(1.2))) for side in (-1, 1)]
+        return min(sides) / here - 1 if (here := solve(value)) > 0 else 0.0
+
+    flat = contrast_at(coarse.value)
+    if flat < FLAT:
+        return FocalProfile(coarse, flat)
+    fine = profile_minimum(solve, coarse.value, _STEPS[1], -FARTHEST, FARTHEST, freedom)
+    found = FocalProfile(replace(fine, gain=coarse.gain), contrast_at(fine.value))
+    if not principal_point:
+        return found
+
+    def aside(cost: Callable[[float], float]) -> Minimum:
+        return profile_minimum(cost, 0.0, _ASIDE_STEP, -ASIDE, ASIDE, freedom)
+
+    right = aside(lambda x: solve(fine.value, x))
+    at = right.value if np.isfinite(right.deviation) else 0.0
+    down = aside(lambda y: solve(fine.value, at, y))
+    return replace(found, aside=(right, down))
+
+
+class _Solver:
+    """Cost of the best poses and depths for an intrinsic matrix; begins from those of the nearest one."""
+
+    def __init__(self, part: PatchProblem, times: Tensor, shutter: Shutter, options: AdjustmentOptions) -> None:
+        self.part, self.times, self.shutter, self.options = part, times, shutter, options
+        self.index = torch.arange(len(part.poses_cw))
+        depths = part.patches[:, 2, 0, 0].reshape(len(part.poses_cw), -1)
+        self.known: dict[tuple[float, float, float], tuple[Tensor, Tensor]] = {(0.0, 0.0, 0.0): (part.poses_cw, depths)}
+
+    def __call__(self, log_factor: float, right: float = 0.0, down: float = 0.0) -> float:
+        focal, centre = self.part.intrinsics.split(2, 1)
+        wanted = log_factor, right, down
+        moved = centre + focal * torch.tensor([[right, down]], dtype=focal.dtype)
+        part = self.part.with_values(intrinsics=torch.cat([focal * float(np.exp(log_factor)), moved], 1))
+        nearest = min(self.known, key=lambda known: (math.dist(known, wanted), known))
+        poses, depths = self.known[nearest]
+        cost, fixed = 0.0, self.index < 1
+        for _ in range(_SHUTTER_ROUNDS if self.shutter.readout > 0 else 1):
+            seen = part
+            if self.shutter.readout > 0:
+                track = PoseTrack.through(self.times, poses)
+                seen = as_global_shutter(part, poses, depths, self.index, track, self.shutter)
+            poses, depths, cost = solve_part(seen, poses, depths, fixed, self.options)
+        self.known[wanted] = se3.normalise(poses), depths
+        return cost

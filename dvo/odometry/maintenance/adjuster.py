@@ -1,0 +1,126 @@
+"""Begin and end of global adjustments of a tracker: when they are done, and what is told about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
+from dvo.odometry.global_ba.graph_adjustment import Adjusted, AdjustmentLimits, AdjustmentRecord, Cause, apply, prepare
+from dvo.odometry.maintenance.background import Background, Task
+from dvo.odometry.patch.state import TrackerState
+
+
+@dataclass
+class Adjusting:
+    """Global adjustment in progress.
+
+    Attributes:
+        task: gives the solution.
+        left: frames until it is taken.
+        world: number of the world.
+        cause: of the adjustment.
+        begun: time of the frame that it was begun with, seconds.
+    """
+
+    task: Task[Adjusted]
+    left: int
+    world: int
+    cause: Cause
+    begun: float
+
+
+@dataclass
+class Adjuster:
+    """Global adjustments of a tracker.
+
+    Args:
+        graph: of the tracker; corrected in place.
+        state: of the tracker, whose shutter is that of the camera.
+        options: of the final adjustment.
+        after_loop: adjust a world after each correction by a loop.
+        limits: of the work beside tracking.
+
+    Attributes:
+        records: adjustments of the recording, in the order of their application.
+        wanted: worlds whose adjustment was requested, and waits for other work.
+        ended: nothing is begun any more, as the final adjustment follows.
+    """
+
+    graph: KeyframeGraph
+    state: TrackerState
+    options: AdjustmentOptions
+    after_loop: bool = False
+    limits: AdjustmentLimits = AdjustmentLimits()
+    records: list[AdjustmentRecord] = field(default_factory=list)
+    wanted: list[int] = field(default_factory=list)
+    ended: bool = False
+
+    def begin(
+        self, background: Background, world: int, cause: Cause, delay: int, limits: AdjustmentLimits | None
+    ) -> Adjusting:
+        """Begin the adjustment of a world, from a snapshot.
+
+        Args:
+            background: thread of the work.
+            world: number of the world.
+            cause: of the adjustment.
+            delay: frames until the solution is taken.
+            limits: bounds of the work; None for those of the final adjustment.
+        """
+        work = prepare(self.graph, world, self.state.shutter, self.options, limits)
+        return Adjusting(background.start(work.solve), delay, world, cause, self._time())
+
+    def begin_next(self, background: Background, corrected: int | None) -> Adjusting | None:
+        """Begin the next adjustment beside tracking, if there is one.
+
+        Args:
+            background: thread of the work.
+            corrected: world that a loop has just corrected, if one has.
+        """
+        if self.ended:
+            return None
+        if corrected is not None and self.after_loop:
+            return self.begin(background, corrected, "loop", self.limits.delay, self.limits)
+        if self.wanted:
+            return self.begin(background, self.wanted.pop(0), "request", self.limits.delay, self.limits)
+        return None
+
+    def take(self, work: Adjusting) -> dict[int, float]:
+        """Apply a solution that is there, if it lowers the cost.
+
+        Args:
+            work: whose result is there.
+
+        Returns:
+            New unit of each keyframe that has moved, in old ones
+            (:func:`dvo.odometry.global_ba.graph_adjustment.apply`).
+        """
+        found = work.task.result()
+        if len(found.identifiers):
+            self.records.append(found.record(work.begun, self._time(), work.cause))
+        return apply(self.graph, work.world, found) if found.better else {}
+
+    def want(self, worlds: Iterable[int]) -> None:
+        """Take up worlds that wait for their adjustment.
+
+        Args:
+            worlds: their numbers.
+        """
+        self.wanted += [world for world in worlds if world not in self.wanted]
+
+    def end(self) -> None:
+        """Begin nothing any more."""
+        self.ended = True
+        self.wanted.clear()
+
+    def information(self) -> dict[str, Any]:
+        """Adjustments for run.json; nothing if there are none and none are made after loops."""
+        if not (self.records or self.after_loop):
+            return {}
+        return {"adjustments": [asdict(record) for record in self.records]}
+
+    def _time(self) -> float:
+        return self.graph.log.frames[-1].timestamp

@@ -1,0 +1,216 @@
+"""Initialisation of the tracker: test for motion, the first joint optimisation, and its revision after some frames."""
+
+from __future__ import annotations
+
+from dvo.ba.cold_start import damping_at
+from dvo.ba.multistart import AS_THEY_ARE, COLD_STARTS, PRESENT, RESTARTS, Solution, multistart, preferred, present
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.window import Window
+from dvo.models.step import Revision, StepOptions
+from dvo.odometry.depth.depth_factor import MOST, match_window, measured_share
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.uncertainty.uncertainty import has_second_solution
+from dvo.odometry.window.evidence import NO_MATCH, last_unrelated, measured
+from dvo.odometry.window.motion import parallax
+from dvo.odometry.window.step import WindowStep
+
+RESTART_AGES = frozenset({4, 8, 16, 32})
+"""Numbers of frames after the initialisation at which its solution is compared with others."""
+AGAIN = 8
+"""Frames from one comparison to the next as long as another solution is nearly as good."""
+MOVED = 0.2
+"""Share of the patches that have to move: the others may be far away, or fixed to the camera."""
+SLOW = (0.3, 0.6)
+"""Shares of the motion and of the parallax that a slow start needs."""
+SLOW_AFTER = (4, 10)
+"""Frames without a start between which what is needed goes down to :data:`SLOW`."""
+NOT_INITIALISED = "not initialised: too little motion"
+"""Cause of the loss of the frames of a segment that was never initialised."""
+
+
+def needed(waited: int) -> tuple[float, float]:
+    """Shares of ``initial_motion`` and ``initial_parallax`` that a start needs.
+
+    Little motion over a long time is as sure as much over a short one: its measurements are better.
+
+    Args:
+        waited: frames with content since the segment has begun.
+
+    Returns:
+        From 1 to :data:`SLOW`.
+    """
+    slow = min(max((waited - SLOW_AFTER[0]) / (SLOW_AFTER[1] - SLOW_AFTER[0]), 0.0), 1.0)
+    return 1 - slow * (1 - SLOW[0]), 1 - slow * (1 - SLOW[1])
+
+
+def flow_revision(revision: Revision, window: Window) -> float:
+    """Revision of the flow from the last keyframe to the newest frame, at equal poses, that :data:`MOVED` exceed.
+
+    The median would stay at zero for ever where most of the picture is far, or fixed to the camera.
+
+    Args:
+        revision: output of the network for the edges of the window.
+        window: keyframes, the newest frame last.
+
+    Returns:
+        Feature pixels.
+    """
+    n = len(window)
+    edges = measured(window, revision.weights[0], (window.ii == n - 2) & (window.jj == n - 1))
+    return float(revision.delta[0][edges].norm(dim=-1).quantile(1 - MOVED)) if bool(edges.any()) else 0.0
+
+
+def newest_confidence(revision: Revision, window: Window) -> float:
+    """Mean confidence of the flow from the last keyframe to the newest frame.
+
+    Args:
+        revision: output of the network for the edges of the window.
+        window: keyframes, the newest frame last.
+
+    Returns:
+        In [0, 1].
+    """
+    n = len(window)
+    edges = measured(window, revision.weights[0], (window.ii == n - 2) & (window.jj == n - 1))
+    return float(revision.weights[0][edges].mean()) if bool(edges.any()) else 0.0
+
+
+def first_motion(revision: Revision, window: Window, config: TrackerConfig, waited: int) -> bool:
+    """Find out if the newest frame of a window that is not initialised yet has moved.
+
+    Args:
+        revision: output of the network for the edges of the window.
+        window: keyframes, the newest frame last.
+        config: settings of the tracker.
+        waited: frames since the segment has begun, see :func:`needed`.
+
+    Returns:
+        False for a confident frame with too little motion to initialise.
+    """
+    confident = newest_confidence(revision, window) >= config.lost_confidence
+    return not confident or flow_revision(revision, window) >= needed(waited)[0] * config.initial_motion
+
+
+def initialise(window: Window, step: WindowStep, config: TrackerConfig, waited: int) -> bool:
+    """Optimise the first window.
+
+    After half of the updates the window is also solved from identity poses with the current flow, and the better of the
+    solutions is kept (:data:`dvo.ba.multistart.COLD_STARTS`). With measured depths of most patches there is
+    no other solution to look for, and no parallax is needed.
+
+    Args:
+        window: the first keyframes; changed in place.
+        step: step of the model on the window.
+        config: settings of the tracker.
+        waited: frames since the segment has begun, see :func:`needed`.
+
+    Returns:
+        True if the parallax is sufficient for tracking.
+    """
+    measured = measured_share(window.measured) >= MOST
+    for age in range(config.initial_updates):
+        step(StepOptions(fixed=1, damping=damping_at(age)))
+        if age == config.initial_updates // 2 and not measured:
+            _solve_again(window, step)
+            match_window(window)
+    n = len(window)
+    if measured:
+        return True
+    seen = parallax(window, 0, n - 1, MOVED)
+    if n > config.initial_frames:
+        seen = max(seen, parallax(window, n // 2, n - 1, MOVED))
+    return seen >= needed(waited)[1] * config.initial_parallax
+
+
+def _solve_again(window: Window, step: WindowStep) -> None:
+    """Replace poses and depths by a solution from one pose for all frames, if it suits the current flow better."""
+    revision = step.revise()
+    problem = window.problem().with_values(targets=revision.targets[0], weights=revision.weights[0])
+    # Not solved further: a narrow kernel would fit the first, coarse flow.
+    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE))
+    if best.start != PRESENT:
+        _take(window, best)
+
+
+def _take(window: Window, solution: Solution) -> None:
+    """Give a window the poses and depths of a solution."""
+    problem = solution.problem
+    window.poses_cw, window.patches = problem.poses_cw.to(window.poses_cw), problem.patches.to(window.patches)
+
+
+def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, waited: int) -> bool:
+    """Optimise the first window without the frames that do not show the scene of the newest ones.
+
+    Where frames are removed, the others begin anew: poses and depths that were fitted to another scene, or to noise,
+    may be a minimum that they do not leave, and the test for motion needs equal poses.
+
+    Args:
+        graph: of the sequence; its window is changed in place.
+        step: step of the model on the window.
+        config: settings of the tracker.
+        waited: frames since the segment has begun, see :func:`needed`.
+
+    Returns:
+        True if the frames are as many as an initialisation needs, and the parallax is sufficient for tracking.
+    """
+    enough = initialise(graph.window, step, config, waited)
+    if drop_unrelated(graph, step, config):
+        graph.window.reset()
+        enough = len(graph.window) >= config.initial_frames and initialise(graph.window, step, config, waited)
+    return enough and len(graph.window) >= config.initial_frames
+
+
+def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> bool:
+    """Remove the frames of the first window that do not show the scene of the newest ones.
+
+    They are lost: nothing is known of the motion between them.
+
+    Args:
+        graph: of the sequence; the window is not initialised yet.
+        step: of the model on the window, after some steps.
+        config: settings of the tracker.
+
+    Returns:
+        True if frames were removed.
+    """
+    count = last_unrelated(step, config)
+    if count:
+        graph.reject(graph.window.frames[count].identifier, NO_MATCH)
+    return count > 0
+
+
+def restart_due(age: int, ambiguous: bool) -> bool:
+    """Tell if a second solution is looked for after a frame (:func:`leave_minimum`).
+
+    The first frames have too little parallax to tell a relief from the reversed one; later frames have more.
+
+    Args:
+        age: number of frames since the initialisation.
+        ambiguous: another solution was nearly as good the last time.
+
+    Returns:
+        True at :data:`RESTART_AGES`, and each :data:`AGAIN` frames as long as the window is ambiguous.
+    """
+    return age in RESTART_AGES or (ambiguous and age % AGAIN == 0)
+
+
+def leave_minimum(step: WindowStep, config: TrackerConfig) -> bool:
+    """Start the window anew if that leads to a better solution (:mod:`dvo.ba.multistart`).
+
+    Args:
+        step: of the model on the window of an initialised tracker; its poses and inverse depths are changed in place.
+        config: scale of the covariance.
+
+    Returns:
+        True if another solution is nearly as good as the one that is left
+        (:mod:`dvo.odometry.uncertainty.second_solution`).
+    """
+    window = step.window
+    if measured_share(window.measured) >= MOST:
+        return False
+    found = multistart(window.problem(), RESTARTS)
+    best = preferred(found)
+    if best.start != PRESENT:
+        _take(window, best)
+        match_window(window)
+    return has_second_solution(step, config, [best, *(other for other in found if other is not best)])

@@ -1,0 +1,421 @@
+"""Streaming tracker of patch-flow visual odometry over a keyframe graph (DPVO 3.4).
+
+For each frame: extract features and patches; predict the pose; add edges between its patches and recent frames, both
+ways; run the network and bundle adjustment on the window; and, a few frames later, keep or drop the frame as a
+keyframe. Keyframes that leave the window are archived (:mod:`dvo.map.keyframe_graph`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dvo.ba.cold_start import COLD_UPDATES, damping_at
+from dvo.core.errors import DvoError
+from dvo.core.threads import core_left
+from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
+from dvo.geometry import se3
+from dvo.map.archive import ArchiveConfig
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.keyframe_log import FrameRecord
+from dvo.map.window import Keyframe, Window
+from dvo.models.patch_vo import PatchVO
+from dvo.models.step import StepOptions
+from dvo.nets.patch.masks import visible_features
+from dvo.nets.patch.patchifier import patch_coordinates
+from dvo.odometry.depth.depth_factor import MOST, measured_share
+from dvo.odometry.depth.patch_depth import measure_depth
+from dvo.odometry.exclusive import exclusive
+from dvo.odometry.frames.frame_sequence import FrameSequence
+from dvo.odometry.frames.front_end import View, keyframe_of, observe
+from dvo.odometry.frames.working_image import masked_image
+from dvo.odometry.global_ba.rolling_shutter import Shutter
+from dvo.odometry.loops.closure import loop_closer
+from dvo.odometry.loops.relocalisation import REFRESH, Located, hold_to_map, invite
+from dvo.odometry.patch.adjusting import adjust
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
+from dvo.odometry.patch.initial_pose import first_depth, first_pose
+from dvo.odometry.patch.initialisation import (
+    NOT_INITIALISED,
+    first_motion,
+    initialise_related,
+    leave_minimum,
+    restart_due,
+)
+from dvo.odometry.patch.late_join import join_waiting
+from dvo.odometry.patch.new_recording import begin_in_map
+from dvo.odometry.patch.saving import save_map
+from dvo.odometry.patch.state import TrackerState
+from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.segments import result_of
+from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
+from dvo.odometry.window.alignment import WindowAlignment
+from dvo.odometry.window.correlation import WindowCorrelation
+from dvo.odometry.window.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
+from dvo.odometry.window.motion import flow_magnitude
+from dvo.odometry.window.step import WindowStep
+
+
+@exclusive
+class PatchOdometry:
+    """Odometry of one sequence with :class:`dvo.models.patch_vo.PatchVO`; calls from several threads wait in line.
+
+    Args:
+        model: the network; moved to ``device`` and used in evaluation mode.
+        config: see :class:`TrackerConfig`.
+        seed: of the patch centres. The same seed on the same machine gives the same trajectory, bit for bit on the
+            CPU with a fixed number of threads.
+        device: of all computation.
+        name: of the system, in reports.
+        archive: bound and content of the archive of keyframes.
+        weights: name or file of the network, by which :func:`dvo.load_map` finds it again.
+
+    Attributes:
+        graph: window, archive and log of frames.
+        state: all else that a frame changes.
+        correlation, step: of the network on the window; what they cache is computed from the other two.
+
+    Example:
+        >>> odometry = PatchOdometry(dvo.load_model("small"), TrackerConfig())
+        >>> for frame in dvo.open("video.mp4", calib="calib.txt"):
+        ...     estimate = odometry.track(frame)
+        >>> trajectory = odometry.finish().trajectory
+    """
+
+    def __init__(
+        self,
+        model: PatchVO,
+        config: TrackerConfig,
+        *,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        name: str = "dvo",
+        archive: ArchiveConfig | None = None,
+        weights: str = "",
+    ) -> None:
+        self.name, self.config, self.seed, self.weights = name, config, seed, weights
+        self.device = torch.device(device)
+        self.model = model.to(self.device).eval()
+        self.archive = archive
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a new sequence as a new tracker with the same seed would; a map that it was loaded with is left."""
+        config, c = self.config, self.model.config
+        select = self.model.selection(config.selection)
+        self.state = TrackerState(torch.Generator().manual_seed(self.seed), FrameSequence(config.max_gap))
+        self.select = partial(select, patches=config.patches, generator=self.state.generator)
+        sizes = config.patches, c.patch_size, c.hidden_channels
+        self.graph = KeyframeGraph(*sizes, self.device, self.archive, lambda edges: self.step.finalise(edges))
+        self.correlation = WindowCorrelation(self.window, c, self.device)
+        align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
+        self.step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final", config.kernel)
+        self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
+
+    @property
+    def window(self) -> Window:
+        """Active keyframes and edges."""
+        return self.graph.window
+
+    @torch.inference_mode()
+    def track(self, frame: Frame) -> Estimate:
+        """Process the next frame.
+
+        A frame without content, or whose pose its measurements do not bear out (:mod:`dvo.odometry.window.evidence`),
+        is lost and leaves the graph. Those after it are joined with the window if there is evidence for it, and may
+        bring it back (:mod:`dvo.odometry.patch.late_join`); after ``config.patience`` frames with content that could
+        not be joined, these begin the next segment. A loop (:mod:`dvo.odometry.loops.closure`) also moves and scales
+        earlier frames.
+
+        Args:
+            frame: of the same size as the first, later than the one before, without lens distortion.
+
+        Returns:
+            Pose ``T_wc`` of the frame in the world of the first keyframe of its segment, up to scale, and the state of
+            the tracker; no pose while the tracker is initialising or lost.
+
+        Raises:
+            DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
+                increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
+        """
+        if self.state.finished:
+            raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
+        with core_left(self.loops.occupies_core):
+            return self._track(checked_frame(frame))
+
+    def _track(self, frame: Frame) -> Estimate:
+        """Process a frame."""
+        state = self.state
+        image, camera, mask = masked_image(frame, self.config.pixels)
+        state.shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
+        state.sequence.check(frame)
+        if state.map is not None:
+            begin_in_map(self.graph, self.loops.finder, state)
+        record = self.graph.log.add(frame.timestamp)
+        if state.last is not None and np.array_equal(image, state.last[0]):
+            state.sequence.repeat(frame.timestamp)
+            return self._repeat(record)
+        gap = state.sequence.tick(frame.timestamp)
+        if problem := missing_content(image, mask):
+            estimate = self._lose(record, problem)
+        else:
+            if gap and state.initialised and not state.joining:
+                state.joining, state.skipped = str(gap), not gap.frozen
+            mask = self._without_fixed(image, mask)
+            seen = observe(self.model, image, camera, self.select, self.device, mask=mask)
+            seen = measure_depth(self.model, seen, frame, self.config)
+            state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
+            state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
+            estimate = self._take(View([record], seen))
+            if len(state.waiting) >= self.config.patience:
+                estimate = self._begin_segment()
+        state.last = image, estimate
+        return estimate
+
+    @torch.inference_mode()
+    def finish(self) -> Result:
+        """Refine the last window and archive it. Frames are refused afterwards; a second call gives the same result.
+
+        Returns:
+            Trajectories ``T_wc`` of all segments and the sparse map of the longest, each in the world of its first
+            keyframe, up to scale. Of a map without a frame of a new recording, the result of the map.
+        """
+        state = self.state
+        if self.complete():
+            state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
+        return replace(self._result({}), quality=state.quality)
+
+    @torch.inference_mode()
+    def complete(self) -> bool:
+        """Archive and adjust everything, for those who want the graph alone: no result, no verdict.
+
+        Returns:
+            False if it was done before, or for a map without a frame of a new recording.
+        """
+        state = self.state
+        begun, state.finished = not state.finished and state.map is None, True
+        if begun:
+            if len(state.waiting) >= self.config.initial_frames:
+                self._begin_segment()
+            self._close_segment()
+            self.loops.complete(state.adjustable)
+            state.info |= finish_segments(self.graph, state, self.config, self.loops)
+        return begun
+
+    @torch.inference_mode()
+    def current(self) -> Result:
+        """Result so far, without the final optimisation; tracking goes on.
+
+        Returns:
+            As :meth:`finish`; the map has no points of the keyframes in the window.
+        """
+        poses = self.window.poses_cw.double().cpu().numpy()
+        known = {frame.identifier: pose for frame, pose in zip(self.window.frames, poses, strict=True)}
+        return self._result(known if self.state.initialised else {})
+
+    def save(self, file: str | Path) -> None:
+        """Write the map to a file, for other recordings of the place (:func:`dvo.load_map`) or other programs.
+
+        Between two frames it is the map so far: in the file, the window is closed with its present poses, without the
+        final optimisation. Tracking goes on as if nothing had been saved.
+
+        Args:
+            file: to write, by convention ``*.dvo``; replaced as a whole.
+
+        Raises:
+            DvoError: the file cannot be written.
+        """
+        save_map(file, self)
+
+    adjust = adjust
+
+    def _result(self, poses: dict[int, np.ndarray]) -> Result:
+        return result_of(self.graph, run_information(self.graph, self.state, self.config, self.loops, self.seed), poses)
+
+    def _take(self, view: View) -> Estimate:
+        """Add a frame with content to the window, and estimate its pose."""
+        window, config, state, record = self.window, self.config, self.state, view.records[0]
+        if not state.initialised and (estimate := self._relocalise(view)):
+            return estimate
+        keyframe = self._append(view)
+        self.step.forget(window.connect_newest(config.lifetime, self.model.config.self_edges))
+        if not state.initialised:
+            return self._initialise(view, keyframe)
+        before = window.snapshot()
+        evidence = self._updated(config.search_updates if state.joining else config.updates)
+        supported = evidence.supports(config, joining=bool(state.joining))
+        if not (supported or state.joining):  # a fast motion may need more updates, but then has to be found for sure
+            evidence = self._updated(config.search_updates)
+            supported = evidence.supports(config, searched=True)
+        if not supported:
+            window.restore(before)
+            self.graph.discard(len(window) - 1)  # so that the next frames are joined with those before it
+            if estimate := self._relocalise(view):
+                return estimate
+            state.waiting.append(view)
+            return self._lose(record, NO_MATCH)
+        record.place(keyframe.identifier, self.graph.segment, state.joining if state.skipped else "")
+        state.joining, state.skipped = "", False
+        state.tracked += 1
+        if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
+            state.ambiguous = leave_minimum(self.step, config)
+        join_waiting(self.graph, self.step, state, config, record)
+        if self.graph.located is not None and state.tracked % REFRESH == 0:
+            hold_to_map(self.graph, self.step, self.loops.finder)
+        self._reduce()  # may correct the window
+        return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
+
+    def _relocalise(self, view: View) -> Estimate | None:
+        """Begin a segment with a frame that shows a known place, in its world and scale; None if it shows none."""
+        graph, state, record = self.graph, self.state, view.records[0]
+        found = self.loops.locate(view, state.keyframes)
+        if found is None:
+            return None
+        reason = state.joining or record.reason
+        self._close_segment()
+        state.waiting, state.initialised = [], True
+        graph.join(graph.segment, graph.segment_of(found.loop.old))
+        invite(self.step, found.guests)
+        keyframe = self._append(view, found)
+        graph.located = found.loop.old
+        self.loops.relocalised(found.loop)
+        state.adjustable.append(graph.segment)
+        self.step.forget(self.window.connect_newest(self.config.lifetime, self.model.config.self_edges))
+        self._updated(self.config.search_updates)
+        record.place(keyframe.identifier, graph.segment, reason)
+        return self._estimate(record, self._pose_wc(len(self.window) - 1), Status.TRACKING)
+
+    def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
+        """Add a frame to a window that is not initialised yet, and try to initialise it."""
+        window, config, state, record = self.window, self.config, self.state, view.records[0]
+        state.joining, state.waited = "", state.waited + 1
+        if len(window) > 1:
+            revision = self.step.revise()
+            if not first_motion(revision, window, config, state.waited):
+                # Too little motion to initialise: until the final adjustment it shares the pose of the last keyframe.
+                self.step.store(revision)
+                self.graph.drop(len(window) - 1, still=True)
+                record.place(keyframe.identifier, self.graph.segment)
+                return self._estimate(record, None, Status.INITIALISING)
+        record.place(keyframe.identifier, self.graph.segment)
+        if len(window) >= config.initial_frames:
+            enough = initialise_related(self.graph, self.step, config, state.waited)
+            state.initialised = enough and newest_evidence(self.step).supports(config)
+            state.adjustable += [self.graph.segment] * state.initialised
+            if state.initialised and config.restart:
+                state.ambiguous = measured_share(window.measured) < MOST  # until it is tried
+        self._reduce()
+        pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
+        return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)
+
+    def _without_fixed(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
+        """Mask of a frame without the pixels that are fixed to it, in which measurements of the window end too."""
+        fixed = self.state.fixed
+        if fixed.see(image):
+            size, unfixed = self.model.config.patch_size, fixed.mask
+            self.window.unfixed = None if unfixed is None else visible_features(unfixed, size, self.device)
+        left = fixed.mask if mask is None or fixed.mask is None else mask & fixed.mask
+        if left is None or missing_content(image, left):  # with too little left of the image, all of it is used
+            self.state.hidden, self.window.unfixed = 0.0, None
+            return mask
+        self.state.hidden = float((left.size if mask is None else mask.sum()) - left.sum()) / left.size
+        return left
+
+    def _repeat(self, record: FrameRecord) -> Estimate:
+        """Give a frame with the image of the frame before it the same pose and state."""
+        state, past = self.state, self.graph.log.frames[-2]
+        assert state.last is not None
+        record.follow(past)
+        if state.waiting and state.waiting[-1].records[-1] is past:
+            state.waiting[-1].records.append(record)
+        state.last = state.last[0], replace(state.last[1], timestamp=record.timestamp, recovered=False)
+        return state.last[1]
+
+    def _lose(self, record: FrameRecord, reason: str) -> Estimate:
+        """Mark a frame as lost; the next frame of an initialised segment has to be joined across it."""
+        record.anchor, record.lost = None, True
+        if self.state.initialised and not self.state.joining:
+            self.state.joining = reason
+        record.reason = self.state.joining or reason
+        return self._estimate(record, None, Status.LOST)
+
+    def _begin_segment(self) -> Estimate:
+        """Close the segment, and begin the next one with the frames that could not be joined with it."""
+        waiting, self.state.waiting, reason = self.state.waiting, [], self.state.joining
+        self._close_segment()
+        for view in waiting:
+            estimate = self._take(view)
+            for repeat in view.records[1:]:
+                repeat.follow(view.records[0])
+        if not waiting[0].records[0].lost:
+            waiting[0].records[0].reason = reason
+        return estimate
+
+    def _close_segment(self) -> None:
+        """Refine the window and archive it; a segment that was never initialised has no rows."""
+        keep = self.state.initialised
+        for _ in range(self.config.final_updates if keep and len(self.window) > 1 else 0):
+            self._update()
+        self.graph.begin_segment(self.state.keyframes, keep, NOT_INITIALISED)
+        self.state.begin_segment()
+
+    def _append(self, view: View, found: Located | None = None) -> Keyframe:
+        """Add a frame to the window: with predicted pose and the median depth of the frames before it, or as found."""
+        config, window, seen = self.config, self.window, view.seen
+        slot = window.free_map_slot()
+        self.step.keep_frame(slot, seen.image, seen.maps)
+        keyframe = keyframe_of(view, self.state.keyframes, slot)
+        self.state.keyframes += 1
+        self.loops.see(keyframe.identifier, seen.image, seen.maps)
+        if found is None:
+            depth = first_depth(window, config, self.state.initialised, seen.measured)
+            pose = first_pose(window, seen, keyframe.timestamp, config, self.state.initialised)
+        else:
+            depth, pose = found.depths[None].to(self.device), found.pose_cw.to(self.device, torch.float32)
+        window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
+        return keyframe
+
+    def _update(self) -> None:
+        """Take a step on the window of an initialised segment."""
+        fixed = self.window.fixed(self.config.optimisation)
+        self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)), align=True)
+
+    def _updated(self, count: int) -> Evidence:
+        for _ in range(count):
+            self._update()
+        return newest_evidence(self.step)
+
+    def _reduce(self) -> None:
+        """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
+        window, config = self.window, self.config
+        n, back = len(window), config.keyframe_index
+        if self.state.initialised and n > back + max(1, window.guests):
+            i, j = n - back - 1, n - back + 1
+            if (flow_magnitude(window, i, j) + flow_magnitude(window, j, i)) / 2 < config.keyframe_motion:
+                self.graph.drop(n - back)
+        newest, guests = len(window) - config.removal, window.guests
+        self.graph.keep_edges((window.ii >= newest) | ((window.ii < guests) & (window.jj >= newest)))
+        limit = config.removal + config.lifetime if self.state.initialised else config.initial_frames + 4
+        while len(window) - window.guests > limit:
+            self.graph.archive_oldest()
+        self.loops.advance(self.state.adjustable)
+
+    def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status) -> Estimate:
+        graph, state, reason = self.graph, self.state, record.reason if status is Status.LOST else ""
+        recovered = pose_wc is not None and state.enter(graph.segment, graph.world_of(graph.segment))
+        segment = graph.segment - graph.recording.segment
+        if pose_wc is None:
+            return Estimate(record.timestamp, None, status, 0.0, segment, reason, recovered)
+        state.started = record.timestamp if state.started is None else state.started
+        sure = LaterUncertainty(self.step, self.config, state.ambiguous)
+        return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
+                        sure.covariance, sure.reference)  # fmt: skip
+
+    def _pose_wc(self, position: int) -> np.ndarray:
+        return se3.inverse(self.window.poses_cw[position]).double().cpu().numpy()

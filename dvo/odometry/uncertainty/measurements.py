@@ -1,0 +1,58 @@
+"""Measurements of a window at a moment, for what is computed from them later, and only if somebody asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from dvo.ba.kernels import Kernel
+from dvo.ba.patch_problem import PatchProblem
+from dvo.map.measured_depths import depth_factors
+from dvo.map.window import Window
+from dvo.odometry.window.step import WindowStep
+
+
+@dataclass(frozen=True)
+class WindowMeasurements:
+    """Measurements of a window at a moment.
+
+    Attributes:
+        problem: of the patch centres, weighted by the confidence of the network, with measured depths as factors. It
+            shares tensors with the window, which replaces its own.
+        timestamps: of the frames, seconds.
+        bounds, kernel: of bundle adjustment.
+    """
+
+    problem: PatchProblem
+    timestamps: tuple[float, ...]
+    bounds: tuple[int, int]
+    kernel: Kernel
+
+    @classmethod
+    def of(cls, step: WindowStep) -> WindowMeasurements:
+        """Measurements of the window of a step.
+
+        Args:
+            step: of the model, after a step.
+
+        Returns:
+            What no later step changes.
+        """
+        window: Window = step.window
+        middle = window.patches.shape[-1] // 2
+        centres = window.patches[:, :, middle : middle + 1, middle : middle + 1].clone()
+        depths = depth_factors(window.measured)
+        problem = window.problem().with_values(patches=centres, weights=window.confidence, factors=depths)
+        return cls(problem, tuple(frame.timestamp for frame in window.frames), step.bounds, step.kernel)
+
+    def at(self, problem: PatchProblem) -> WindowMeasurements:
+        """Same measurements at another solution.
+
+        Args:
+            problem: at the solution.
+
+        Returns:
+            The measurements with its poses and patches.
+        """
+        own = self.problem
+        now = own.with_values(poses_cw=problem.poses_cw.to(own.poses_cw), patches=problem.patches.to(own.patches))
+        return replace(self, problem=now)

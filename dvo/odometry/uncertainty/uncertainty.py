@@ -1,0 +1,205 @@
+"""Uncertainty of the newest pose of a tracker: its covariance, from the marginal of the window, and a confidence.
+
+The covariance is that of the pose relative to the *reference*, held fixed: the oldest keyframe of the window that a
+measurement of bundle adjustment still reaches. (All measurements of the keyframes before it have left the window;
+these keyframes wait to be archived.) Scale is a gauge: the RMS distance from the reference of the keyframes between the
+two is held fixed as well, at its value in the segment, unless depths of the window are measured (by a depth camera or
+a right image): these determine the scale, and their priors are measurements like the others. All other poses and the
+inverse depths are marginalised.
+
+Measurements have the variance ``sigma^2 / confidence`` (:attr:`dvo.odometry.patch.config.TrackerConfig.sigma`). Their
+errors
+are not independent: a patch that is off is off in all frames. :attr:`TrackerConfig.covariance_scale`, the mean
+normalised error squared on rendered sequences, accounts for it (docs/uncertainty.md).
+
+While a window may have a second solution, covariance and confidence are those of the mixture of the two
+(:mod:`dvo.odometry.uncertainty.second_solution`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.ba.blocks import INVERSE_DEPTHS
+from dvo.ba.covariance import marginal_covariance, size_gradient
+from dvo.ba.layer.linearisation import NormalEquations
+from dvo.ba.layer.window_equations import window_equations
+from dvo.ba.multistart import Solution
+from dvo.ba.options import BADamping, BAOptions
+from dvo.ba.patch_problem import PatchProblem
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.uncertainty.displacement import confidence_of, window_metric
+from dvo.odometry.uncertainty.gauge import Gauge, window_gauge
+from dvo.odometry.uncertainty.measurements import WindowMeasurements
+from dvo.odometry.uncertainty.second_solution import second_solutions, window_solutions
+from dvo.odometry.window.step import WindowStep
+
+DAMPING = BADamping(pose=1e-6, relative=0.0)
+"""Prior of the marginal, which matters only to unknowns that nothing measures."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Uncertainty of the newest pose of a window.
+
+    Attributes:
+        covariance: ``(6, 6)`` float64, see :attr:`dvo.odometry.protocol.Estimate.covariance`; None if the measurements
+            do not determine the pose.
+        reference: time of the reference, seconds.
+        confidence: in [0, 1], see :func:`dvo.odometry.uncertainty.displacement.confidence_of`.
+    """
+
+    covariance: np.ndarray | None = None
+    reference: float | None = None
+    confidence: float = 0.0
+
+
+UNKNOWN = Uncertainty()
+"""Uncertainty without a pose."""
+
+
+class LaterUncertainty:
+    """:func:`newest_uncertainty` of the window as it is now, computed when a value of it is first read.
+
+    The bytes are those that it would have had at once. Until then the measurements of the window are held.
+
+    Args:
+        step, config, ambiguous: see :func:`newest_uncertainty`.
+    """
+
+    def __init__(self, step: WindowStep, config: TrackerConfig, ambiguous: bool = False) -> None:
+        self._compute: Callable[[], Uncertainty] | None
+        self._compute = partial(_uncertainty, WindowMeasurements.of(step), config, ambiguous)
+        self._found = UNKNOWN
+
+    def _value(self) -> Uncertainty:
+        compute = self._compute  # of two threads that ask at once, both compute the same
+        if compute is not None:
+            self._found = compute()
+            self._compute = None  # with the measurements
+        return self._found
+
+    def covariance(self) -> np.ndarray | None:
+        """See :attr:`Uncertainty.covariance`."""
+        return self._value().covariance
+
+    def reference(self) -> float | None:
+        """See :attr:`Uncertainty.reference`."""
+        return self._value().reference
+
+    def confidence(self) -> float:
+        """See :attr:`Uncertainty.confidence`."""
+        return self._value().confidence
+
+
+def newest_uncertainty(step: WindowStep, config: TrackerConfig, ambiguous: bool = False) -> Uncertainty:
+    """Uncertainty of the pose of the newest frame of a window. Nothing changes.
+
+    Args:
+        step: of the model on the window, after a step.
+        config: scale of the covariance.
+        ambiguous: the window may have a second solution, which is looked for.
+
+    Returns:
+        The uncertainty; without covariance and with a confidence of zero where the measurements do not determine the
+        pose.
+    """
+    return _uncertainty(WindowMeasurements.of(step), config, ambiguous)
+
+
+@torch.no_grad()
+def has_second_solution(step: WindowStep, config: TrackerConfig, solved: Sequence[Solution]) -> bool:
+    """Tell if another solution of a window is nearly as good as the present one.
+
+    Args:
+        step: of the model on the window, which is at the first of the solutions.
+        config: scale of the covariance.
+        solved: solutions of the window.
+
+    Returns:
+        True if covariance and confidence have to take another one into account.
+    """
+    window = WindowMeasurements.of(step)
+    gauge = window_gauge(window.problem)
+    if gauge is None or len(solved) < 2:
+        return False
+    covariance = _covariance(window, gauge, config)
+    return covariance is not None and bool(second_solutions(solved, gauge, covariance, window_metric(window)))
+
+
+@torch.no_grad()
+def _uncertainty(window: WindowMeasurements, config: TrackerConfig, ambiguous: bool) -> Uncertainty:
+    gauge = window_gauge(window.problem)
+    if gauge is None:
+        return UNKNOWN
+    reference = window.timestamps[gauge.reference]
+    covariance = _covariance(window, gauge, config)
+    if covariance is None:
+        return Uncertainty(None, reference)
+    metric = window_metric(window)
+    confidence = confidence_of(covariance, metric)
+    others = second_solutions(window_solutions(window.problem), gauge, covariance, metric) if ambiguous else []
+    if not others:
+        return Uncertainty(covariance, reference, confidence)
+    share = 1 - sum(other.probability for other in others)
+    mixture = share * covariance
+    for other in others:
+        own = _covariance(window.at(other.solution.problem), gauge, config)
+        own = covariance if own is None else own
+        mixture = mixture + other.probability * (own + np.outer(other.error, other.error))
+    return Uncertainty(mixture, reference, share * confidence)
+
+
+def _covariance(window: WindowMeasurements, gauge: Gauge, config: TrackerConfig) -> np.ndarray | None:
+    """Covariance ``(6, 6)`` of the newest pose, of one solution; None if the measurements do not determine it."""
+    covariance = config.sigma**2 * config.covariance_scale * _marginal(window, gauge)
+    return covariance if np.isfinite(covariance).all() else None
+
+
+def _marginal(w: WindowMeasurements, gauge: Gauge) -> np.ndarray:
+    """Covariance ``(6, 6)`` of the newest pose for measurements of the variance ``1 / confidence``; on the CPU.
+
+    The problem is that of the frames from the reference on. The weights are the confidence also where measurements are
+    aligned: ``sigma`` belongs to it.
+    """
+    p, first, m = w.problem, gauge.reference, w.problem.per_frame
+    n, kk = len(p.poses_cw), p.kk.cpu()
+    source = int(kk.min()) // m  # frame of the oldest patches with a measurement
+    prior = _depth_information(p)
+    # A scale that weak priors determine is a small difference of large sums.
+    kind = p.patches.dtype if prior is None else torch.float64
+    real = p.poses_cw[first:], p.intrinsics[first:], p.targets, p.weights, p.patches[source * m :, :, 0, 0]
+    poses, intrinsics, targets, confidence, centres = (x.cpu().to(kind) for x in real)
+    patches = centres.unflatten(0, (-1, m))
+    equations = window_equations(
+        poses, patches[..., :2], patches[..., 2], intrinsics, targets, confidence, p.jj.cpu() - first,
+        kk - source * m, source - first, BAOptions(bounds=w.bounds, kernel=w.kernel),
+    )  # fmt: skip
+    free = torch.tensor([*gauge.members, n - 1]) - first
+    rows = (6 * free[:, None] + torch.arange(6)).flatten()
+    h_pp, h_pl = equations.h_pp[0, rows][None, :, rows], equations.h_pl[:, rows]
+    h_ll = equations.h_ll + DAMPING.depth
+    size = None
+    if prior is None:
+        size = size_gradient(poses[None], 0, free[:-1].tolist())[:, free].flatten(1)
+    else:
+        h_ll = h_ll + prior[:, source * m :]
+    equations = NormalEquations(h_pp, h_pl, h_ll, equations.g_p[:, rows], equations.g_l)
+    found = marginal_covariance(equations, torch.arange(len(rows) - 6, len(rows)), DAMPING, size)[0]
+    return ((found + found.T) / 2).numpy()
+
+
+def _depth_information(problem: PatchProblem) -> Tensor | None:
+    """Weights ``(1, K)`` of the priors of measured depths, the robust kernel included; None without a measured one."""
+    depths = problem.inverse_depths.cpu().double()[None]
+    prior = torch.zeros_like(depths)
+    for factor in problem.factors:
+        linear = factor.exact().linearise({INVERSE_DEPTHS: depths})
+        prior[:, linear.indices[0]] += linear.weight[..., 0]
+    return prior if bool((prior > 0).any()) else None

@@ -1,0 +1,95 @@
+"""Motion of the window: prediction of the next pose, parallax and flow between frames."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dvo.geometry import se3
+from dvo.geometry.projection import reproject
+from dvo.map.window import Window
+
+
+def predict_pose(poses_cw: Tensor, times: list[float], time: float, damping: float) -> Tensor:
+    """Damped constant velocity: ``Exp(damping * dt / dt_last * Log(P1 P2^-1)) P1`` (motion model of DPVO).
+
+    Args:
+        poses_cw: ``(n, 7)`` poses ``T_cw`` of the window, the newest last.
+        times: their timestamps, seconds.
+        time: timestamp of the new frame, seconds.
+        damping: factor of the velocity, in [0, 1].
+
+    Returns:
+        ``(7,)`` predicted ``T_cw``: the identity without poses, the last pose with one.
+    """
+    if len(times) == 0:
+        return se3.identity(device=poses_cw.device)
+    if len(times) == 1:
+        return poses_cw[-1]
+    # Bounded, because a dropped keyframe or a gap in the video would extrapolate too far.
+    ratio = min(2.0, max(0.0, (time - times[-1]) / (times[-1] - times[-2])))
+    step = se3.log(se3.relative(poses_cw[-2], poses_cw[-1]))
+    return se3.retract(poses_cw[-1], damping * ratio * step)
+
+
+def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tensor, Tensor]:
+    """Patch centres of frame ``i`` reprojected into frame ``j``, and the same with a part of the motion alone.
+
+    Args:
+        window: keyframes.
+        i, j: positions in the window.
+        rotation: the part is the rotation (True) or the translation (False).
+
+    Returns:
+        ``(M, 2)`` positions under the whole motion and ``(M, 2)`` under the part, feature pixels.
+    """
+    m = window.per_frame
+    device = window.patches.device
+    patches = window.patches[None, i * m : (i + 1) * m]
+    motion = se3.relative(window.poses_cw[i], window.poses_cw[j])
+    part = motion.clone()
+    if rotation:
+        part[:3] = 0
+    else:
+        part[3:] = torch.tensor([0.0, 0, 0, 1], device=device)
+    poses = torch.stack([se3.identity(device=device), motion, part])[None]
+    intrinsics = window.intrinsics[[i, j, j]][None]
+    kk = torch.arange(m, device=device)
+    c = patches.shape[-1] // 2
+    targets = torch.tensor([1, 2], device=device).repeat_interleave(m)
+    there = reproject(poses, patches, intrinsics, torch.zeros_like(targets), targets, kk.repeat(2)).coords
+    whole, only = there[0, :, c, c].split(m)
+    return whole, only
+
+
+def parallax(window: Window, i: int, j: int, share: float = 0.5) -> float:
+    """Parallax of a frame pair: displacement that translation adds to the rotational flow.
+
+    Args:
+        window: keyframes.
+        i, j: positions of source and target frame in the window.
+        share: of the patches that have as much.
+
+    Returns:
+        Feature pixels.
+    """
+    whole, only = _displacement(window, i, j, rotation=True)
+    return float((whole - only).norm(dim=-1).quantile(1 - share))
+
+
+def flow_magnitude(window: Window, i: int, j: int) -> float:
+    """Mean flow of a frame pair, half of it without the rotation (``flow_mag`` of DPVO with beta 0.5).
+
+    Args:
+        window: keyframes.
+        i, j: positions of source and target frame in the window.
+
+    Returns:
+        Feature pixels.
+    """
+    whole, only = _displacement(window, i, j, rotation=False)
+    m = window.per_frame
+    c = window.patches.shape[-1] // 2
+    start = window.patches[i * m : (i + 1) * m, :2, c, c]
+    moved = 0.5 * (whole - start).norm(dim=-1) + 0.5 * (only - start).norm(dim=-1)
+    return float(moved.clamp(max=1e3).mean())

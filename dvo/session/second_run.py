@@ -1,0 +1,117 @@
+"""Second run over the beginning of a sequence, backward and with another seed, where the first one leaves doubt.
+
+Images and masks alone are tracked: with measured depths there is no second solution, and no second run.
+
+Measurements may fit a wrong motion nearly as well as the right one: of a flat scene, say, or a picture of which little
+moves. Which of them a run finds is then a matter of chance and of where it begins, so that two runs differ. Runs that
+agree prove nothing: what is fixed to the camera holds them all. Nor does one that fits its own measurements clearly
+worse, unless it is doubtful by itself: it then is the one that went wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+import torch
+
+from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
+from dvo.data.trajectory import Trajectory
+from dvo.geometry import sim3
+from dvo.geometry.alignment import align
+from dvo.odometry.frames.working_image import masked_image
+from dvo.odometry.protocol import Odometry, Result
+from dvo.odometry.quality import FILM, Quality, leaves_doubt
+
+FRAMES = 150
+"""Frames that are tracked again."""
+FEWEST = 10
+"""Common frames with poses that a comparison needs."""
+PIXELS = 640 * 480
+"""Size of the images that are kept for it, about, at most."""
+DIFFERENT = 3.0
+"""Largest RMS difference of the two after a similarity, percent of the path."""
+WORSE = 1.25
+"""Residual of a good second run over that of the first above which their difference says nothing about the first."""
+
+
+def can_be_read_again(source: object) -> bool:
+    """Tell if frames can be read a second time: a recording or a list, not what arrives as it is.
+
+    Args:
+        source: of frames.
+    """
+    return not isinstance(source, Iterator) and not hasattr(source, "stop")
+
+
+def is_due(result: Result, source: object) -> bool:
+    """Tell if a second run is to be made: the first one leaves doubt, measured no depths, and can be repeated.
+
+    Args:
+        result: of the first run.
+        source: of its frames.
+    """
+    measured = result.info.get("scale", {}).get("source") in ("depth", "stereo")
+    return leaves_doubt(result.quality) and not measured and can_be_read_again(source)
+
+
+def compare_again(
+    result: Result,
+    odometry: Odometry,
+    frames: Iterable[Frame],
+    stride: int = 1,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Quality:
+    """Track the beginning of a sequence again, from its end to its start, and compare.
+
+    Args:
+        result: of the first run, with its quality.
+        odometry: newly built, with another seed.
+        frames: of the sequence, from the first on.
+        stride: distance of tracked frames.
+        should_stop: called before each frame; True ends the second run, and what it has is compared.
+
+    Returns:
+        The quality with the difference; a doubtful one if it is large, unless the second run is good and fits its
+        measurements worse.
+    """
+    assert result.quality is not None
+    # Backward the rows are read from the last one on, which no camera states: without a readout time.
+    kept = [_kept(checked_frame(frame)) for frame in islice(frames, 0, FRAMES * stride, stride)]
+    times = {}
+    for frame in reversed(kept):
+        if should_stop():
+            break
+        time = kept[-1].timestamp - frame.timestamp
+        times[time] = frame.timestamp
+        odometry.track(replace(frame, timestamp=time))
+    again = odometry.finish()
+    found = again.trajectory
+    forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])
+    difference = _difference(forward, result.trajectory)
+    mine, other = result.quality, again.quality
+    worse = other is not None and other.verdict == "good" and other.residual > WORSE * mine.residual
+    if worse or not difference > DIFFERENT:  # NaN: nothing is known
+        return replace(result.quality, second=difference)
+    reason = f"a second run, backward with another seed, differs by {difference:.0f}% of the path"
+    return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
+
+
+def _kept(frame: Frame) -> Frame:
+    """Image of a frame and its mask, of few pixels, since many are kept; without a readout time (see above)."""
+    image, camera, mask = masked_image(frame, PIXELS)
+    return Frame(frame.index, frame.timestamp, image, replace(camera, readout=0.0), mask=mask)
+
+
+def _difference(one: Trajectory, other: Trajectory) -> float:
+    """RMS distance after a similarity, percent of the path of the second; NaN with fewer than ten common frames."""
+    _, i, j = np.intersect1d(one.timestamps, other.timestamps, return_indices=True)
+    source, target = one.positions[i], other.positions[j]
+    length = float(np.linalg.norm(np.diff(target, axis=0), axis=1).sum()) if len(j) else 0.0
+    if len(j) < FEWEST or length == 0:
+        return float("nan")
+    moved = sim3.act(align(source, target), torch.from_numpy(source)).numpy()
+    return 100 * float(np.sqrt(((moved - target) ** 2).sum(1).mean())) / length

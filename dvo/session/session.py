@@ -1,0 +1,248 @@
+"""Session: run an odometry over a source, from the first frame to the result."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.frame import Frame
+from dvo.data.frame_checks import checked_frame
+from dvo.data.trajectory import Trajectory, interpolate
+from dvo.odometry.protocol import Estimate, Odometry, Result
+from dvo.odometry.segments import find_breaks
+from dvo.session.second_run import compare_again, is_due
+
+FrameCallback = Callable[[Frame, Estimate | None], None]
+
+
+@dataclass(frozen=True)
+class Run:
+    """Record of a session.
+
+    Attributes:
+        result: result of the odometry, with rows for frames skipped by the stride; counts are frames of the source.
+        frames_fed: number of frames passed to the odometry (fewer than read, with a stride).
+        interrupted: True if the user stopped the run.
+        warnings: problems that did not end the run, a sentence each.
+        seconds: wall time of ``reading``, ``tracking`` and ``finishing``; of ``calibrating`` before them, if the focal
+            length was found in the images, and of ``checking`` after them, if there was a second run.
+        frame_seconds: wall time of each call of ``track``.
+    """
+
+    result: Result
+    frames_fed: int
+    interrupted: bool
+    warnings: tuple[str, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+    frame_seconds: tuple[float, ...] = ()
+
+    @property
+    def frames_per_second(self) -> float:
+        """Tracked frames per second of wall time, reading and finishing included."""
+        own = sum(value for part, value in self.seconds.items() if part not in ("calibrating", "checking"))
+        return self.frames_fed / max(own, 1e-9)
+
+
+def run(
+    odometry: Odometry,
+    source: Iterable[Frame],
+    *,
+    stride: int = 1,
+    on_frame: FrameCallback | None = None,
+    should_stop: Callable[[], bool] | None = None,
+    strict: bool = False,
+    again: Callable[[], Odometry] | None = None,
+) -> Run:
+    """Run an odometry over a source.
+
+    Every ``stride``-th frame and the last one are tracked; frames between them get interpolated poses, within a segment
+    only. After an interruption, or a frame that cannot be read or used, the frames tracked so far are finished and
+    returned with a warning. Every frame is checked and, where harmless, converted first
+    (:func:`dvo.data.frame_checks.checked_frame`).
+
+    Args:
+        odometry: newly built; an odometry tracks one sequence.
+        source: frames in order of time.
+        stride: distance of tracked frames, in frames of the source.
+        on_frame: called after each frame, outside the timings; the estimate is None for a skipped frame.
+        should_stop: called before each frame; True ends tracking. With it the caller handles Ctrl-C; without it a
+            KeyboardInterrupt ends tracking too.
+        strict: raise errors and interruptions instead.
+        again: builds the odometry with another seed. Where the result leaves doubt, and the source can be read again,
+            its beginning is tracked a second time, backward, and compared (:mod:`dvo.session.second_run`).
+
+    Returns:
+        The result with its timings. Poses are ``T_wc``.
+
+    Raises:
+        DvoError: a stride below 1, or a source without frames; with ``strict``, any error of the source or odometry.
+
+    Example:
+        >>> done = run(dvo.load("small"), dvo.open("video.mp4", calib="calib.txt"))  # doctest: +SKIP
+        >>> len(done.result.trajectory)  # doctest: +SKIP
+        1200
+    """
+    if stride < 1:
+        raise DvoError(f"must be 1 or more, got {stride}", field="stride", remedy="give a whole number of frames")
+    feeding = _Feeding(odometry, stride, on_frame)
+    interrupted = False
+    warnings: list[str] = []
+    frames = iter(source)
+    try:
+        while not (interrupted := should_stop is not None and should_stop()):
+            started = time.perf_counter()
+            frame = next(frames, None)
+            feeding.seconds["reading"] += time.perf_counter() - started
+            if frame is None:
+                interrupted = should_stop is not None and should_stop()  # a live source ends when it is stopped
+                break
+            feeding.take(frame)
+        feeding.flush()
+    except KeyboardInterrupt:
+        if strict or should_stop is not None:  # the caller handles the first one, so this is the second
+            raise
+        interrupted = True
+    except (DvoError, OSError) as error:
+        if strict or not feeding.fed:
+            raise
+        warnings.append(f"stopped at frame {feeding.frames_read}: {error}")
+    if interrupted:
+        warnings.append(f"interrupted after {feeding.frames_read} frames")
+    elif not feeding.frames_read:
+        raise DvoError("no frames", file=getattr(source, "name", None), remedy="give a video or a folder with images")
+
+    started = time.perf_counter()
+    result = odometry.finish()
+    feeding.seconds["finishing"] = time.perf_counter() - started
+    if again is not None and not interrupted and is_due(result, source):
+        started = time.perf_counter()
+        stop = should_stop or (lambda: False)
+        with contextlib.suppress(DvoError, OSError, KeyboardInterrupt):  # the result stands without it
+            beginning = itertools.takewhile(lambda _: not stop(), source)
+            result = replace(result, quality=compare_again(result, again(), beginning, stride, stop))
+        feeding.seconds["checking"] = time.perf_counter() - started
+    return Run(
+        result=over_source(result, np.array(feeding.fed), np.array(feeding.skipped), feeding.reasons),
+        frames_fed=len(feeding.fed),
+        interrupted=interrupted,
+        warnings=(*getattr(source, "warnings", ()), *warnings),
+        seconds=feeding.seconds,
+        frame_seconds=tuple(feeding.frame_seconds),
+    )
+
+
+def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: dict[float, str]) -> Result:
+    """Describe a result in frames of the source instead of frames of the odometry.
+
+    Args:
+        result: of the odometry.
+        fed: ``(F,)`` increasing timestamps of the frames passed to the odometry, seconds.
+        skipped: ``(S,)`` timestamps of the skipped frames, seconds.
+        reasons: causes of lost frames by timestamp, for an odometry that reports no breaks.
+
+    Returns:
+        The result with rows for skipped frames, each between two frames of one segment; with counts and breaks in
+        frames of the source; and with the breaks that the rows show if the odometry reports none.
+    """
+    longest, segments = result.longest, result.segments
+    if len(skipped):
+        segments = tuple(replace(s, trajectory=fill_skipped(s.trajectory, fed, skipped)) for s in segments)
+    times = np.sort(np.concatenate([fed, skipped]))
+    owner = np.full(len(times), -1)
+    for number, segment in enumerate(segments):
+        owner[np.isin(times, segment.trajectory.timestamps)] = number
+    causes = {time: cause for time, cause in reasons.items() if owner[np.searchsorted(times, time)] < 0}
+    breaks = result.breaks or find_breaks(times, owner, causes)
+    if len(skipped):
+        lost = times[owner < 0]
+        breaks = tuple(replace(b, frames=_count_between(lost, b.start, b.end)) for b in breaks)
+    return replace(
+        result,
+        trajectory=result.trajectory if longest is None else segments[longest].trajectory,
+        frames_read=len(times),
+        frames_lost=len(times) - sum(len(segment) for segment in segments),
+        segments=segments,
+        breaks=breaks,
+    )
+
+
+def _count_between(times: np.ndarray, start: float | None, end: float | None) -> int:
+    after = times > (-np.inf if start is None else start)
+    return int((after & (times < (np.inf if end is None else end))).sum())
+
+
+def fill_skipped(trajectory: Trajectory, fed: np.ndarray, skipped: np.ndarray) -> Trajectory:
+    """Add the frames skipped by a stride, interpolated between their neighbours.
+
+    A skipped frame gets a row if the tracked frames before and after it both have one.
+
+    Args:
+        trajectory: output of the odometry, poses ``T_wc``.
+        fed: ``(F,)`` increasing timestamps of the frames passed to the odometry, seconds.
+        skipped: ``(S,)`` timestamps of the skipped frames, seconds.
+
+    Returns:
+        Trajectory in order of time.
+    """
+    has_row = np.isin(fed, trajectory.timestamps)
+    after = np.searchsorted(fed, skipped)
+    inside = (after > 0) & (after < len(fed))
+    inside[inside] = has_row[after[inside] - 1] & has_row[after[inside]]
+    between = interpolate(trajectory, skipped[inside], max_gap=np.inf)
+    timestamps = np.concatenate([trajectory.timestamps, between.timestamps])
+    order = np.argsort(timestamps, kind="stable")
+    return Trajectory(timestamps[order], np.concatenate([trajectory.poses_wc, between.poses_wc])[order])
+
+
+class _Feeding:
+    """State of the loop over the frames: stride, timings and timestamps."""
+
+    def __init__(self, odometry: Odometry, stride: int, on_frame: FrameCallback | None) -> None:
+        self.odometry, self.stride, self.on_frame = odometry, stride, on_frame
+        self.fed: list[float] = []
+        self.skipped: list[float] = []
+        self.seconds = {"reading": 0.0, "tracking": 0.0, "finishing": 0.0}
+        self.frame_seconds: list[float] = []
+        self.reasons: dict[float, str] = {}
+        self.pending: Frame | None = None  # last skipped frame, tracked after all if the source ends with it
+
+    @property
+    def frames_read(self) -> int:
+        return len(self.fed) + len(self.skipped)
+
+    def take(self, frame: Frame) -> None:
+        frame = checked_frame(frame)
+        if self.frames_read % self.stride:
+            self.pending = frame
+            self.skipped.append(frame.timestamp)
+            self._report(frame, None)
+        else:
+            self.pending = None
+            self._report(frame, self._track(frame))
+
+    def flush(self) -> None:
+        """Track the last frame if it was skipped, so that the trajectory covers the whole source."""
+        if self.pending is not None:
+            self._track(self.pending)
+            self.skipped.pop()
+            self.pending = None
+
+    def _track(self, frame: Frame) -> Estimate:
+        started = time.perf_counter()
+        estimate = self.odometry.track(frame)
+        self.frame_seconds.append(time.perf_counter() - started)
+        self.seconds["tracking"] += self.frame_seconds[-1]
+        self.fed.append(frame.timestamp)
+        if estimate.reason:
+            self.reasons[frame.timestamp] = estimate.reason
+        return estimate
+
+    def _report(self, frame: Frame, estimate: Estimate | None) -> None:
+        if self.on_frame is not None:
+            self.on_frame(frame, estimate)

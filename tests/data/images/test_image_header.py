@@ -1,0 +1,83 @@
+"""Sizes by the headers of image files."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dvo.data.images.image_header import image_size
+from dvo.data.images.images import is_complete
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm", ".ppm", ".pam"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_size_of_what_opencv_writes(tmp_path: Path, suffix: str, channels: int) -> None:
+    if (suffix, channels) in ((".pgm", 3), (".ppm", 1)):
+        pytest.skip("not a combination of this format")
+    file = tmp_path / f"image{suffix}"
+    assert cv2.imwrite(str(file), np.zeros((37, 53, channels), np.uint8))
+    assert image_size(file) == (53, 37)
+    assert image_size(file.read_bytes()) == (53, 37)
+
+
+def test_size_behind_other_segments_of_a_jpeg() -> None:
+    code = cv2.imencode(".jpg", np.zeros((37, 53, 3), np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    thumbnail = b"\xff\xe1" + struct.pack(">H", 60_002) + b"\xff\xc0" * 30_000  # holds marks of a frame header
+    assert image_size(code[:2] + thumbnail + b"\xff\xff" + code[2:]) == (53, 37)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_size_of_a_tiff_of_either_byte_order(order: str) -> None:
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    entries = struct.pack(f"{order}HHIHH", 256, 3, 1, 53, 0) + struct.pack(f"{order}HHII", 257, 4, 1, 37)
+    assert image_size(mark + struct.pack(f"{order}IH", 8, 2) + entries) == (53, 37)
+
+
+def test_size_of_a_huge_image_without_its_pixels(tmp_path: Path) -> None:
+    head = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    file = tmp_path / "huge.png"
+    file.write_bytes(b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + head + struct.pack(">I", zlib.crc32(head)))
+    assert image_size(file) == (30_000, 30_000)
+    assert image_size(b"P6\n# made by hand\n30000 30000\n255\n") == (30_000, 30_000)
+    assert image_size(b"BM" + bytes(12) + struct.pack("<Iii", 40, 30_000, -30_000)) == (30_000, 30_000)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp", ".ppm"])
+def test_cut_headers_have_no_size(suffix: str) -> None:
+    code = cv2.imencode(suffix, np.zeros((37, 53, 3), np.uint8))[1].tobytes()
+    for length in range(10):
+        assert image_size(code[:length]) is None
+
+
+@pytest.mark.parametrize("content", [b"", b"GIF89a", b"text", b"P6\nx y\n", b"P7\nWIDTH", b"\xff\xd8" + b"\xff" * 99])
+def test_no_image(tmp_path: Path, content: bytes) -> None:
+    assert image_size(content) is None
+    assert image_size(tmp_path) is None
+    assert image_size(tmp_path / "missing.png") is None
+
+
+def test_damaged_headers_never_raise() -> None:
+    generator = np.random.default_rng(0)
+    for suffix in (".png", ".jpg", ".bmp", ".tif", ".webp", ".ppm"):
+        code = cv2.imencode(suffix, np.zeros((37, 53, 3), np.uint8))[1].tobytes()
+        for _ in range(200):
+            damaged = bytearray(code)
+            for place in generator.integers(0, min(len(code), 400), 8):
+                damaged[place] = generator.integers(0, 256)
+            found = image_size(bytes(damaged))
+            assert found is None or (len(found) == 2 and min(found) >= 0)
+
+
+def test_a_png_whose_chunk_is_longer_than_the_file_is_not_complete() -> None:
+    """The decoder would allocate what a chunk states, up to 4 GB."""
+    code = bytearray(cv2.imencode(".png", np.zeros((37, 53, 3), np.uint8))[1].tobytes())
+    at = code.index(b"IDAT") - 4
+    assert is_complete(bytes(code)) and is_complete(bytes(code) + b"text behind the end")
+    for length in (len(code), 2**31 + 5, 2**32 - 1):
+        code[at : at + 4] = struct.pack(">I", length)
+        assert not is_complete(bytes(code))

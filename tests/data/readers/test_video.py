@@ -1,0 +1,177 @@
+import struct
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from dvo.core.errors import DvoError
+from dvo.data import Calibration, open_source
+
+CALIB = Calibration(100, 100, 80, 60)
+
+
+@pytest.mark.parametrize(("name", "codec"), [("v.mp4", "mp4v"), ("v.avi", "MJPG")])
+def test_frames_times_and_colours(make, name, codec):
+    source = open_source(make.video(name, codec), calib=CALIB)
+    frames = list(source)
+    assert (source.kind, source.name, len(source), len(frames)) == ("video", "v", 20, 20)
+    assert [frame.timestamp for frame in frames] == pytest.approx(np.arange(20) / 20)
+    assert source.warnings == [] and source.skipped == 0
+    error = np.abs(frames[7].image.astype(int) - make.image(7, 160, 120)[..., ::-1])
+    assert error.mean() < 12 < np.abs(frames[7].image.astype(int) - make.image(7, 160, 120)).mean()  # RGB, not BGR
+    assert [frame.index for frame in source] == list(range(20))  # again
+
+
+def test_stride_fps_and_times(make):
+    video = make.video("v.mp4", "mp4v")
+    source = open_source(video, calib=CALIB, stride=8)
+    assert [(frame.index, frame.timestamp) for frame in source] == [(0, 0.0), (8, 0.4), (16, 0.8)]
+    assert len(source) == 3
+    assert [f.timestamp for f in open_source(video, calib=CALIB, fps=5)] == pytest.approx(np.arange(20) / 5)
+    times = make.text("t.txt", "".join(f"{100 + i * i}\n" for i in range(20)))
+    assert [f.timestamp for f in open_source(video, calib=CALIB, times=times)] == [100 + i * i for i in range(20)]
+
+
+def test_wrong_number_of_times(make):
+    video = make.video("v.mp4", "mp4v")
+    with pytest.raises(DvoError, match="19 rows for 20 images"):
+        open_source(video, calib=CALIB, times=make.text("t.txt", "".join(f"{i}\n" for i in range(19))))
+
+
+def test_times_for_what_can_be_read_of_a_truncated_video(make):
+    video = make.video("v.avi", "MJPG")
+    video.write_bytes(video.read_bytes()[: video.stat().st_size * 6 // 10])
+    count = len(list(open_source(video, calib=CALIB)))
+    times = make.text("t.txt", "".join(f"{i}\n" for i in range(count)))
+    assert [f.timestamp for f in open_source(video, calib=CALIB, times=times)] == list(range(count))
+
+
+def test_truncated_video_yields_what_can_be_read_and_says_so(make):
+    video = make.video("v.avi", "MJPG")
+    video.write_bytes(video.read_bytes()[: video.stat().st_size * 6 // 10])
+    source = open_source(video, calib=CALIB)
+    frames = list(source)
+    assert 9 <= len(frames) <= 13
+    assert [frame.timestamp for frame in frames] == pytest.approx(np.arange(len(frames)) / 20)
+    assert f"announces 20 frames, {len(frames)} could be read: it is cut short" in source.warnings[-1]
+
+
+@pytest.mark.parametrize("junk", ["zeros", "noise"])
+def test_corrupt_middle_of_an_mp4_is_skipped_counted_and_keeps_its_time(make, junk):
+    video = make.video("v.mp4", "mp4v")
+    data = bytearray(video.read_bytes())
+    start, length = len(data) * 4 // 10, len(data) // 8
+    noise = np.random.default_rng(0).integers(0, 256, length, dtype=np.uint8).tobytes()
+    data[start : start + length] = noise if junk == "noise" else bytes(length)
+    video.write_bytes(data)
+    source = open_source(video, calib=CALIB)
+    frames = list(source)
+    assert 12 <= len(frames) < 20 and frames[-1].index == 19  # reading went on behind the damage
+    assert source.skipped == 20 - len(frames)
+    assert f"{source.skipped} images could not be read" in source.warnings[0]
+    assert [frame.timestamp for frame in frames] == pytest.approx([frame.index / 20 for frame in frames])
+
+
+def test_corrupt_middle_of_an_avi(make):
+    video = make.video("v.avi", "MJPG")
+    data = bytearray(video.read_bytes())
+    start, length = len(data) * 4 // 10, len(data) // 8
+    data[start : start + length] = bytes(length)
+    video.write_bytes(data)
+    source = open_source(video, calib=CALIB)
+    frames = list(source)
+    assert 14 <= len(frames) < 20 and source.warnings
+    assert np.all(np.diff([frame.timestamp for frame in frames]) > 0)
+
+
+@pytest.mark.parametrize("content", ["empty", "noise", "headless mp4", "png"])
+def test_files_that_are_no_video(make, content, capfd):
+    video = make.video("v.mp4", "mp4v")
+    if content == "headless mp4":  # the index is written last
+        video.write_bytes(video.read_bytes()[:5000])
+    elif content == "png":  # OpenCV takes a numbered image for a video of all its siblings
+        video = make.images("images", ["0001.png", "0002.png"]) / "0001.png"
+    else:
+        video.write_bytes(b"" if content == "empty" else bytes(np.random.default_rng(0).bytes(5000)))
+    capfd.readouterr()
+    with pytest.raises(
+        DvoError, match="does not decode|no frame of this video decodes|one image is no video"
+    ) as caught:
+        list(open_source(video, calib=CALIB))
+    assert caught.value.file == video and caught.value.remedy
+    assert "VIDEOIO" not in capfd.readouterr().err
+
+
+def test_no_calibration(make):
+    with pytest.raises(DvoError, match="--calib FILE"):
+        open_source(make.video("v.mp4", "mp4v"))
+
+
+def test_intrinsics_of_another_video(make):
+    with pytest.raises(DvoError, match="160x120"):
+        open_source(make.video("v.mp4", "mp4v"), calib=Calibration(500, 500, 320, 240))
+
+
+class StampsLike:
+    """A capture whose container gives the milliseconds that a test wants."""
+
+    def __init__(self, milliseconds):
+        self.milliseconds, self.position = milliseconds, -1
+
+    def isOpened(self):
+        return True
+
+    def grab(self):
+        self.position += 1
+        return self.position < len(self.milliseconds)
+
+    def get(self, key):
+        facts = {cv2.CAP_PROP_FRAME_COUNT: len(self.milliseconds), cv2.CAP_PROP_FPS: 25.0}
+        return facts.get(key, self.milliseconds[max(self.position, 0)] if key == cv2.CAP_PROP_POS_MSEC else 0.0)
+
+    def retrieve(self):
+        return True, np.zeros((120, 160, 3), np.uint8)
+
+    def release(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("milliseconds", "times", "warned"),
+    [
+        ([0, 33, 66, 150, 160], [0, 0.033, 0.066, 0.15, 0.16], None),  # variable rate
+        ([0, 0, 0, 0], [0, 0.04, 0.08, 0.12], "the stated 25 frames"),
+        ([0, 40, 80, 80, 60, 120], [0, 0.04, 0.08, 0.12], "dropped"),
+    ],
+    ids=["variable", "none", "backwards"],
+)
+def test_times_of_the_container(make, monkeypatch, milliseconds, times, warned):
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: StampsLike(milliseconds))
+    source = open_source(make.text("v.mp4", "stand-in"), calib=CALIB)
+    assert [frame.timestamp for frame in source] == pytest.approx(times)
+    assert any(warned in warning for warning in source.warnings) if warned else source.warnings == []
+
+
+def turn(video, degrees):
+    """Ask players, in the header of an MP4's track, to turn the frames clockwise."""
+    data = bytearray(video.read_bytes())
+    at = data.index(b"tkhd") + 4 + 40  # the matrix a b u, c d v, x y w; version 0 of the header
+    one = 1 << 16
+    a, b = {90: (0, one), 180: (-one, 0), 270: (0, -one)}[degrees]
+    data[at : at + 36] = struct.pack(">9i", a, b, 0, -b, a, 0, 0, 0, 1 << 30)
+    video.write_bytes(data)
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_a_turned_video_has_no_rows_to_read_out(make, degrees):
+    video = make.video("v.mp4", "mp4v")
+    if degrees:
+        turn(video, degrees)
+    calib = Calibration(100, 100, 60, 60, readout=0.02)
+    source = open_source(video, calib=calib)
+    frame = next(iter(source))
+    assert frame.image.shape[:2] == ((160, 120) if degrees in (90, 270) else (120, 160))
+    assert frame.camera.readout == (0 if degrees else 0.02)
+    assert any("readout" in warning for warning in source.warnings) == bool(degrees)
+    assert open_source(video, calib=CALIB if degrees in (0, 180) else replace(calib, readout=0.0)).warnings == []

@@ -1,0 +1,108 @@
+"""Each fast correlation equals the plain one, in value and gradient."""
+
+import pytest
+import torch
+
+from dvo.nets.correlation.correlation import CorrelationVolume, correlate_reference
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+from dvo.nets.patch.patchifier import pool_levels
+
+
+def problem(batch=2, seed=0, spread=2.0):
+    g = torch.Generator().manual_seed(seed)
+    patches = torch.randn(batch, 6, 8, 3, 3, generator=g, dtype=torch.float64, requires_grad=True)
+    maps = torch.randn(batch, 3, 8, 12, 14, generator=g, dtype=torch.float64, requires_grad=True)
+    kk = torch.randint(6, (11,), generator=g)
+    jj = torch.randint(3, (11,), generator=g)
+    # Inside, across the border, and far outside the 14 x 12 map.
+    coords = torch.rand(batch, 11, 1, 1, 2, generator=g, dtype=torch.float64) * 34 - 10
+    coords = coords + spread * torch.rand(batch, 11, 3, 3, 2, generator=g, dtype=torch.float64)
+    return patches, maps, coords, kk, jj
+
+
+def test_channel_order_against_a_hand_computed_case():
+    """One feature channel that is 1 at map pixel (5, 4): the only hit is where offset + position meet it."""
+    patches = torch.zeros(1, 1, 1, 3, 3)
+    patches[0, 0, 0, 2, 1] = 1.0  # patch row 2, column 1
+    maps = torch.zeros(1, 1, 1, 9, 10)
+    maps[0, 0, 0, 4, 5] = 1.0
+    coords = torch.zeros(1, 1, 3, 3, 2)
+    coords[0, 0, 2, 1] = torch.tensor([3.0, 5.0])  # so the offsets that hit are x +2, y -1
+    index = torch.tensor([0])
+    fine, coarse = correlate_reference(patches, maps, coords, index, index)
+    # idx = ((((x_off*7 + y_off)*3 + row)*3 + col), offsets counted from -3
+    expected = ((5 * 7 + 2) * 3 + 2) * 3 + 1
+    assert fine.flatten().nonzero().flatten().tolist() == [expected]
+    assert coarse.shape == fine.shape
+
+
+def test_volume_equals_reference_in_value_and_gradient():
+    patches, maps, coords, kk, jj = problem()
+    slow = torch.cat(correlate_reference(patches, maps, coords, kk, jj), -1)
+    fast = torch.cat(CorrelationVolume(patches, maps).lookup(coords, kk, jj), -1)
+    torch.testing.assert_close(fast, slow)
+    weight = torch.randn(slow.shape, generator=torch.Generator().manual_seed(1), dtype=slow.dtype)
+    for a, b in zip(
+        torch.autograd.grad((slow * weight).sum(), (patches, maps)),
+        torch.autograd.grad((fast * weight).sum(), (patches, maps)),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b)
+
+
+def test_gradients_of_many_lookups_add_up():
+    patches, maps, coords, kk, jj = problem()
+    volume = CorrelationVolume(patches, maps)
+    fast = sum((step + 1) * torch.cat(volume.lookup(coords + step, kk, jj), -1).sum() for step in range(3))
+    slow = sum((s + 1) * torch.cat(correlate_reference(patches, maps, coords + s, kk, jj), -1).sum() for s in range(3))
+    for a, b in zip(
+        torch.autograd.grad(slow, (patches, maps)), torch.autograd.grad(fast, (patches, maps)), strict=True
+    ):
+        torch.testing.assert_close(a, b)
+
+
+def test_only_the_chosen_edges_train_the_features():
+    patches, maps, coords, kk, jj = problem(batch=1, seed=3)
+    learn = torch.tensor([2, 7])
+    chosen = torch.autograd.grad(sum(c.sum() for c in CorrelationVolume(patches, maps).lookup(coords, kk, jj, learn)),
+                                 (patches, maps))  # fmt: skip
+    few = correlate_reference(patches, maps, coords[:, learn], kk[learn], jj[learn])
+    expected = torch.autograd.grad(sum(c.sum() for c in few), (patches, maps))
+    for a, b in zip(chosen, expected, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def as_dpvo(channels):
+    """Channels ordered pixel, y, x -> x, y, pixel."""
+    return channels.view(-1, 9, 7, 7).permute(0, 3, 2, 1).flatten(1)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_cached_windows_equal_reference(seed):
+    patches, maps, coords, kk, jj = problem(batch=1, seed=seed)
+    features = patches.detach()[0].flatten(2)
+    torch.set_default_dtype(torch.float64)
+    try:
+        caches = [EdgeCorrelation(1, 9, 3, 14, "cpu"), EdgeCorrelation(4, 9, 3, 12, "cpu")]
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for cache, level in zip(caches, pool_levels(maps.detach(), (1, 4)), strict=True):
+        for frame in range(3):
+            cache.keep_map(frame, level[0, frame])
+    for cache in caches:
+        cache.forget(torch.arange(20))
+    slots = torch.randperm(20, generator=torch.Generator().manual_seed(seed))[: len(kk)]
+    generator = torch.Generator().manual_seed(seed)
+    for step in range(6):  # small steps stay inside the cached windows, the large one leaves them
+        size = 12.0 if step == 3 else 0.5
+        coords = coords + size * torch.randn(1, len(kk), 1, 1, 2, generator=generator, dtype=coords.dtype)
+        slow = [c[0] for c in correlate_reference(patches, maps, coords, kk, jj)]
+        kept = [as_dpvo(cache.lookup(coords[0], slots, features, kk, jj)) for cache in caches]
+        for a, b in zip(slow, kept, strict=True):
+            torch.testing.assert_close(b, a)
+
+
+def test_far_away_positions_are_zero_not_an_overflow():
+    patches, maps, coords, kk, jj = problem(batch=1)
+    for channels in CorrelationVolume(patches, maps).lookup(coords + 1e18, kk, jj):
+        assert torch.equal(channels, torch.zeros_like(channels))

@@ -1,0 +1,103 @@
+"""Corners followed between images, and their distance from the epipolar lines of two poses."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dvo.geometry import se3
+from dvo.odometry.checks.check_pairs import (
+    FEWEST,
+    GAPS,
+    MOST,
+    MOVED,
+    CheckPair,
+    CheckPairs,
+    epipolar_distances,
+    followed,
+)
+
+K = np.array([200.0, 190.0, 80.0, 60.0])
+
+
+@pytest.fixture(scope="module")
+def wall():
+    rng = np.random.default_rng(0)
+    grey = sum(
+        share * cv2.resize(rng.uniform(0, 255, (n, 4 * n)), (640, 160), interpolation=cv2.INTER_CUBIC)
+        for n, share in ((8, 0.4), (40, 0.6))
+    )
+    return cv2.cvtColor(grey.clip(0, 255).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+
+
+def film(wall, count, step):
+    return [wall[20:140, round(k * step) % 460 :][:, :160] for k in range(count)]
+
+
+def pairs_of(images, mask=None):
+    checks = CheckPairs()
+    for number, image in enumerate(images):
+        checks.see(number, image, K, mask)
+    return checks.pairs
+
+
+def test_corners_move_as_the_picture_does(wall):
+    a, b = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in film(wall, 2, 7))
+    points = followed(a, b)
+    assert len(points) > 3 * FEWEST
+    np.testing.assert_allclose(np.median(points[:, 2:] - points[:, :2], axis=0), [-7, 0], atol=0.05)
+    half = np.zeros(a.shape, bool)
+    half[:, 80:] = True
+    assert (followed(a, b, half)[:, 0] >= 79).all()
+
+
+def test_the_gap_follows_the_motion(wall):
+    """Fast motion has pairs of neighbours, slow motion those that are further apart; a still camera has none."""
+    fast, slow, still = (pairs_of(film(wall, 60, step)) for step in (12, 0.6, 0))
+    assert max(p.second - p.first for p in fast[3:]) <= 2 < min(p.second - p.first for p in slow)
+    assert len(fast) > len(slow) > 3 and not still
+    for pair in slow:
+        assert np.median(np.linalg.norm(pair.points[:, 2:] - pair.points[:, :2], axis=1)) >= MOVED[0]
+        assert pair.second - pair.first <= GAPS[1]
+
+
+def test_what_cannot_be_followed_gives_no_pair():
+    rng = np.random.default_rng(0)
+    assert not pairs_of([rng.integers(0, 255, (120, 160, 3), np.uint8) for _ in range(12)])
+    assert not pairs_of([np.full((120, 160, 3), 90, np.uint8)] * 12)
+
+
+def test_a_long_sequence_keeps_a_bounded_number(wall, monkeypatch):
+    monkeypatch.setattr("dvo.odometry.checks.check_pairs.MOST", 8)
+    pairs = pairs_of(film(wall, 250, 3))
+    assert MOST > 8 >= len(pairs) >= 4 and pairs[0].first < 20 and pairs[-1].second > 180
+
+
+@given(st.lists(st.floats(-0.15, 0.15), min_size=12, max_size=12), st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_projections_of_points_lie_on_the_epipolar_lines(motions, seed):
+    """With the poses that they were seen from; without translation too."""
+    rng = np.random.default_rng(seed)
+    poses = [se3.exp(torch.tensor(motions[k : k + 6], dtype=torch.float64)) for k in (0, 6)]
+    points = torch.from_numpy(rng.uniform([-1, -1, 4], [1, 1, 8], (40, 3)))
+
+    def seen(pose):
+        x, y, z = se3.act(pose, points).numpy().T
+        return np.column_stack([K[0] * x / z + K[2], K[1] * y / z + K[3]])
+
+    for a, b in (poses, (poses[0], poses[0])):
+        pair = CheckPair(0, 1, np.hstack([seen(a), seen(b)]), K)
+        assert epipolar_distances(pair, a.numpy(), b.numpy()).max() < 1e-3
+        aside = CheckPair(0, 1, np.hstack([seen(a), seen(b) + rng.normal(0, 1, (40, 2))]), K)
+        assert epipolar_distances(aside, a.numpy(), b.numpy()).max() < 6
+
+
+def test_corners_across_the_lines_of_a_motion_to_the_side():
+    """The distance is that of both images together: half of the square of 9 pixels each."""
+    first, second = (np.array([x, 0, 0, 0, 0, 0, 1.0]) for x in (0.0, 0.5))
+    points = np.random.default_rng(0).uniform(20, 100, (30, 2))
+    square = np.array([200.0, 200.0, 80.0, 60.0])
+    pair = CheckPair(0, 1, np.hstack([points, points + [15, 9]]), square)
+    np.testing.assert_allclose(epipolar_distances(pair, first, second), 9 / np.sqrt(2))

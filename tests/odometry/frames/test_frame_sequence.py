@@ -1,0 +1,69 @@
+"""Order, size and intervals of frames."""
+
+import numpy as np
+import pytest
+
+from dvo.core.errors import DvoError
+from dvo.data.frame import Frame
+from dvo.geometry.camera import Camera
+from dvo.odometry.frames.frame_sequence import FrameSequence
+
+
+def ticks(times, max_gap=4.5):
+    sequence = FrameSequence(max_gap)
+    return [sequence.tick(time) for time in times]
+
+
+def test_a_gap_is_told_by_the_usual_interval():
+    *regular, gap = ticks([0.0, 0.1, 0.2, 0.3, 5.3])
+    assert regular == [None] * 4
+    assert gap.seconds == pytest.approx(5.0) and not gap.frozen and "gap of 5.00 s" in str(gap)
+
+
+def test_a_variable_frame_rate_has_no_gaps():
+    rng = np.random.default_rng(0)
+    assert ticks(np.cumsum(rng.uniform(0.02, 0.06, 200))) == [None] * 200
+
+
+def test_a_lower_frame_rate_is_a_gap_only_until_it_is_usual():
+    times = [*np.arange(0, 1, 0.1), *np.arange(2, 60, 1.0)]
+    found = [gap is not None for gap in ticks(times)]
+    assert found[10] and not any(found[:10])
+
+
+def test_first_frames_of_any_interval_are_no_gap():
+    assert ticks([0.0, 7.0]) == [None, None]
+
+
+def test_repeated_images_are_no_gap_in_time_but_a_frozen_image():
+    sequence = FrameSequence(4.5)
+    for time in (0.0, 0.1, 0.2):
+        assert sequence.tick(time) is None
+    for time in np.arange(0.3, 3.0, 0.1):
+        sequence.repeat(time)
+    gap = sequence.tick(3.0)
+    assert gap.frozen and "frozen" in str(gap)
+    assert gap.seconds == pytest.approx(2.7, abs=0.11)
+
+
+def test_every_second_image_repeated_is_no_gap():
+    sequence = FrameSequence(4.5)
+    for step in range(40):
+        assert sequence.tick(step / 30) is None
+        sequence.repeat(step / 30 + 1 / 60)
+
+
+def test_order_and_size():
+    def frame(time, width=64):
+        image = np.zeros((48, width, 3), np.uint8)
+        return Frame(3, time, image, Camera(50.0, 50.0, width / 2, 24.0, width, 48))
+
+    sequence = FrameSequence(4.5)
+    sequence.check(frame(1.0))
+    sequence.tick(1.0)
+    for time in (1.0, 0.5):
+        with pytest.raises(DvoError, match="frame 3: time .* does not come after"):
+            sequence.check(frame(time))
+    with pytest.raises(DvoError, match="is 80x48, the frames before are 64x48"):
+        sequence.check(frame(2.0, width=80))
+    sequence.check(frame(2.0))

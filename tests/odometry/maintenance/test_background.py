@@ -1,0 +1,96 @@
+"""Work beside tracking."""
+
+import os
+import sys
+import threading
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dvo.odometry.maintenance.background import Background, Steps, all_steps
+
+
+def counted(number, taken):
+    """Work of some steps before the result."""
+    for k in range(number):
+        taken.append(k)
+        yield
+    taken.append(torch.is_inference_mode_enabled())
+    return "done"
+
+
+@given(number=st.integers(0, 6), early=st.integers(0, 8))
+def test_steps_are_taken_one_by_one_or_all_for_the_result(number, early):
+    taken = []
+    steps = Steps(counted(number, taken))
+    for call in range(number + 1):
+        if call == early:
+            assert steps.result() == "done" and len(taken) == number + 1 and steps.step()
+        elif call < early:
+            assert len(taken) == call
+            assert steps.step() == (call == number)
+    assert steps.result() == "done"
+    assert taken == [*range(number), True] and all_steps(counted(number, [])) == "done"
+
+
+def test_an_error_of_a_step_is_raised_by_it():
+    def fails():
+        yield
+        raise ValueError("no")
+
+    steps = Steps(fails())
+    assert not steps.step()
+    with pytest.raises(ValueError, match="no"):
+        steps.step()
+
+
+def test_work_is_done_in_order_in_another_thread_without_gradients():
+    background, order = Background(), []
+
+    def work(number):
+        order.append(number)
+        return number, threading.get_ident(), torch.is_inference_mode_enabled()
+
+    tasks = [background.start(lambda k=k: work(k)) for k in range(5)]
+    results = [task.result() for task in tasks]
+    assert order == [0, 1, 2, 3, 4] == [result[0] for result in results] and all(task.done for task in tasks)
+    assert len({result[1] for result in results}) == 1 and results[0][1] != threading.get_ident()
+    assert all(result[2] for result in results) and not torch.is_inference_mode_enabled()
+
+
+def test_a_task_is_not_done_before_its_work():
+    release = threading.Event()
+    task = Background().start(lambda: release.wait(60))
+    assert not task.done
+    release.set()
+    assert task.result() is True and task.done
+
+
+def test_an_error_of_the_work_is_that_of_the_result():
+    def fail():
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        Background().start(fail).result()
+
+
+def test_the_thread_gives_way_to_tracking():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        background = Background()
+        assert background.start(torch.get_num_threads).result() == 1
+        assert torch.get_num_threads() == 3
+        later = []
+        thread = threading.Thread(target=lambda: later.append(torch.get_num_threads()))
+        thread.start()
+        thread.join()
+        assert later == [3] and background.start(torch.get_num_threads).result() == 1
+    finally:
+        torch.set_num_threads(before)
+    if sys.platform.startswith("linux"):
+        own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        there = background.start(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id())).result()
+        assert there == min(own + 5, 19)

@@ -1,0 +1,73 @@
+"""Revision of the first solution some frames after the initialisation."""
+
+from types import SimpleNamespace
+
+import torch
+
+from dvo.ba.kernels import Kernel
+from dvo.ba.multistart import multistart, reversed_relief
+from dvo.geometry import se3
+from dvo.odometry.depth.depth_factor import MOST, measured_share
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.initialisation import RESTART_AGES, leave_minimum, restart_due
+from tests.support.archived_walk import archived_walk, pose_at
+
+CONFIG = TrackerConfig(sigma=0.2, covariance_scale=1.0)  # of measurements whose weights are not those of a network
+
+
+def _step(window):
+    window.confidence = window.weights
+    return SimpleNamespace(window=window, bounds=(60, 60), kernel=Kernel("cauchy", 0.3))
+
+
+def _reversed_window(unit=0.0):
+    """Window of six frames with the second solution of its measurements, and the true poses."""
+    graph, _ = archived_walk(frames=6, interval=0.03, archived=False, unit=unit)
+    window = graph.window
+    true = pose_at(0.03 * torch.arange(6, dtype=torch.float64))
+    window.poses_cw = true.float()
+    (wrong,) = multistart(window.problem(), {"reversed": reversed_relief})
+    window.poses_cw, window.patches = wrong.problem.poses_cw.float(), wrong.problem.patches.float()
+    return window, true.float()
+
+
+def _error(poses, true):
+    return float(se3.log(se3.relative(poses, true))[:, 3:].norm(dim=1).max())
+
+
+def test_a_window_with_reversed_relief_is_started_anew():
+    window, true = _reversed_window()
+    assert _error(window.poses_cw, true) > 0.01
+    assert not leave_minimum(_step(window), CONFIG), "the measurements tell the two apart"
+    assert _error(window.poses_cw, true) < 0.001 and window.poses_cw.dtype == window.patches.dtype == torch.float32
+    before = window.poses_cw.clone(), window.patches.clone()
+    assert not leave_minimum(_step(window), CONFIG)  # the right solution stays as it is
+    assert torch.equal(window.poses_cw, before[0]) and torch.equal(window.patches, before[1])
+
+
+def test_a_window_that_the_measurements_do_not_decide_is_ambiguous():
+    """Errors of the size of the little parallax: the reversed relief fits about as well."""
+    window, _ = _reversed_window()
+    generator = torch.Generator().manual_seed(0)
+    window.targets = window.targets + 0.5 * torch.randn(window.targets.shape, generator=generator)
+    assert leave_minimum(_step(window), CONFIG)
+
+
+def test_frames_at_which_a_second_solution_is_looked_for():
+    assert {age for age in range(1, 200) if restart_due(age, False)} == RESTART_AGES
+    assert {age for age in range(33, 200) if restart_due(age, True)} == set(range(40, 200, 8))
+
+
+def test_nothing_is_tried_where_depths_are_measured():
+    window, true = _reversed_window(unit=1.0)
+    poses = window.poses_cw
+    assert measured_share(window.measured) >= MOST and _error(poses, true) > 0.01
+    assert not leave_minimum(_step(window), CONFIG) and window.poses_cw is poses
+
+
+def test_settings_turn_kernel_and_restart_off():
+    config = TrackerConfig(robust=0, restart=False)
+    assert config.kernel == Kernel("none") and config.adjustment.restart_frames == 0
+    assert TrackerConfig(robust=0.2).kernel == Kernel("cauchy", 0.2)
+    assert TrackerConfig().adjustment == AdjustmentOptions()

@@ -1,0 +1,166 @@
+"""Late join: frames that could not be joined get a pose once a later frame has been, and only with evidence for it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import dvo
+from dvo.metrics import align_trajectory
+from dvo.odometry.patch import late_join
+from dvo.odometry.patch.tracker import PatchOdometry
+from dvo.odometry.protocol import Status
+from dvo.odometry.window.evidence import Evidence, evidence_of, newest_evidence
+from dvo.synth.sequence import make_sequence
+from tests.support.changed_images import with_images
+from tests.support.outcome import content, told
+from tests.support.saved_maps import FAST
+
+CUT, DARK, END = 16, 6, 32
+BACK = CUT + DARK  # first frame after the darkness
+SIZE = {"height": 120, "width": 160, "fps": 15.0, "sensor": False}
+
+
+@pytest.fixture(scope="module")
+def film():
+    return make_sequence(61, frames=END, family="room", kind="handheld", speed=3.0, **SIZE)
+
+
+@pytest.fixture(scope="module")
+def dark(film):
+    """Frames of a room with some black ones."""
+    clear = list(film)
+    return with_images(clear, [np.zeros_like(clear[0].image)] * DARK, CUT)
+
+
+@pytest.fixture(scope="module")
+def foreign():
+    return make_sequence(62, frames=1, family="corridor", kind="handheld", **SIZE).frame(0).image
+
+
+def refuse(monkeypatch, *times):
+    """Refuse frames when they are the newest of the window, as measurements of a bad first try would."""
+    real = PatchOdometry._updated
+
+    def updated(odometry, count):
+        found = real(odometry, count)
+        return Evidence(0.0, 0.0) if odometry.window.frames[-1].timestamp in times else found
+
+    monkeypatch.setattr(PatchOdometry, "_updated", updated)
+
+
+def count_tries(monkeypatch):
+    """Whether each late try was successful, a list that grows."""
+    real, tries = late_join._join, []
+    monkeypatch.setattr(late_join, "_join", lambda *given: tries.append(real(*given)) or tries[-1])
+    return tries
+
+
+def track(frames, weights="small", **settings):
+    odometry = dvo.load(weights, device="cpu", **{**FAST, **settings})
+    return [odometry.track(frame) for frame in frames], odometry.finish(), odometry
+
+
+def lost_frames(frames, result):
+    rows = np.concatenate([segment.trajectory.timestamps for segment in result.segments])
+    return np.flatnonzero(~np.isin([frame.timestamp for frame in frames], rows)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("weights", "settings"), [("small", {}), ("mamba", {}), ("small", {"preset": "fast", "align": "always"})]
+)
+def test_the_frame_after_the_dark_gets_a_pose_with_the_next_one(film, dark, monkeypatch, weights, settings):
+    first = dark[BACK].timestamp
+    refuse(monkeypatch, first)
+    estimates, result, odometry = track(dark, weights, **settings)
+    assert estimates[BACK].status is Status.LOST and estimates[BACK].pose_wc is None
+    assert estimates[BACK + 1].status is Status.TRACKING
+    assert lost_frames(dark, result) == list(range(CUT, BACK)) and result.frames_lost == DARK
+    assert len(result.segments) == 1
+    assert [(b.start, b.end, b.frames) for b in result.breaks] == [(dark[CUT - 1].timestamp, first, DARK)]
+    # As exact as its neighbours.
+    aligned = align_trajectory(result.trajectory, film.groundtruth)
+    rows = np.searchsorted(film.groundtruth.timestamps, aligned.timestamps)
+    error = np.linalg.norm(aligned.positions - film.groundtruth.positions[rows], axis=1)
+    late = int(np.flatnonzero(aligned.timestamps == first)[0])
+    assert error[late] < 3 * max(error[late - 3 : late].max(), error[late + 1 : late + 4].max())
+    # A dropped keyframe in the order of time, relative to an earlier one, with measurements.
+    dropped = next(frame for frame in odometry.graph.archive if frame.timestamp == first)
+    assert dropped.anchor is not None and dropped.anchor < dropped.identifier
+    times = [frame.timestamp for frame in odometry.graph.archive]
+    assert times == sorted(times)
+    edges = odometry.graph.archive.edges()
+    own = dropped.identifier
+    assert {*edges.target[edges.source == own]} & {*edges.source[edges.target == own]}
+
+
+def test_the_newest_views_are_tried_again_up_to_one_that_fails(dark, foreign, monkeypatch):
+    refuse(monkeypatch, *(frame.timestamp for frame in dark[BACK : BACK + 3]))
+    assert lost_frames(dark, track(dark, join_inliers=0.2)[1]) == list(range(CUT, BACK + 1))
+    other = with_images(dark, [foreign], BACK + 1)
+    assert lost_frames(other, track(other, join_inliers=0.2)[1]) == list(range(CUT, BACK + 2))
+
+
+@pytest.mark.parametrize("align", ["final", "always"])
+def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch, tmp_path, align):
+    """Results and files are those of a tracker that does not try again, byte for byte."""
+    frames = with_images(dark, [foreign], BACK)
+    tries, kept = count_tries(monkeypatch), []
+    for name in ("tried", "not"):
+        if name == "not":
+            monkeypatch.setattr(late_join, "_join", lambda *given: False)
+        odometry = dvo.load("small", device="cpu", **FAST, align=align)
+        estimates = []
+        for frame in frames:
+            estimates.append(told(odometry.track(frame)))
+            if len(estimates) == BACK + 2:
+                odometry.save(tmp_path / f"{name}.dvo")
+        kept.append((estimates, content(odometry.finish())))
+    assert tries == [False]
+    assert kept[0] == kept[1]
+    assert (tmp_path / "tried.dvo").read_bytes() == (tmp_path / "not.dvo").read_bytes()
+
+
+def test_a_pose_that_would_cost_the_newest_frame_its_own_is_refused(dark, monkeypatch):
+    refuse(monkeypatch, dark[BACK].timestamp)
+    real = late_join.evidence_of
+    newest = lambda step, k: Evidence(1.0, 0.0) if k == len(step.window) - 1 else real(step, k)  # noqa: E731
+    monkeypatch.setattr(late_join, "evidence_of", newest)
+    assert BACK in lost_frames(dark, track(dark)[1])
+
+
+def test_later_frames_are_no_evidence(dark):
+    """What counts for a frame is what counted when it was the newest."""
+    odometry = dvo.load("small", device="cpu", **FAST)
+    for frame in dark[:14]:
+        odometry.track(frame)
+    step, window = odometry.step, odometry.window
+    k = len(window) - 3
+    whole = evidence_of(step, k)
+    assert whole.inliers > 0 and evidence_of(step, len(window) - 1) == newest_evidence(step)
+    into = window.jj == k
+    for among, same in ((into & (window.ii > k), True), (into & (window.ii < k), False)):
+        assert bool(among.any())
+        kept, window.confidence = window.confidence, torch.where(among[:, None], 0.01, window.confidence)
+        assert (evidence_of(step, k) == whole) is same
+        window.confidence = kept
+
+
+def test_a_repetition_of_a_view_that_was_joined_late_shares_its_pose(dark, monkeypatch):
+    frames = with_images(dark, [dark[BACK].image], BACK + 1)
+    refuse(monkeypatch, frames[BACK].timestamp)
+    tries = count_tries(monkeypatch)
+    _, result, _ = track(frames)
+    assert tries == [True] and lost_frames(frames, result) == list(range(CUT, BACK))
+    poses = dict(zip(result.trajectory.timestamps, result.trajectory.poses_wc.tolist(), strict=True))
+    assert poses[frames[BACK].timestamp] == poses[frames[BACK + 1].timestamp]
+
+
+def test_a_gap_in_time_is_told_before_the_frame_that_was_joined_late(film, monkeypatch):
+    clear = list(film)
+    later = [replace(frame, timestamp=frame.timestamp + 5.0) for frame in clear[CUT + 3 :]]
+    refuse(monkeypatch, later[0].timestamp)
+    _, result, _ = track([*clear[:CUT], *later])
+    told = [(b.start, b.end, b.frames, b.reason[:3]) for b in result.breaks]
+    assert told == [(clear[CUT - 1].timestamp, later[0].timestamp, 0, "gap")]

@@ -1,0 +1,180 @@
+"""Alignment of a window's edges: what is aligned when, and what the tracker makes of it."""
+
+import numpy as np
+import pytest
+import torch
+
+import dvo
+from dvo.geometry import se3
+from dvo.geometry.projection import reproject
+from dvo.map.window import Keyframe, Window
+from dvo.metrics import evaluate
+from dvo.models.step import Revision, UpdateState
+from dvo.nets.alignment.alignment import AlignmentOptions, align_patches, patch_warps
+from dvo.nets.patch.patchifier import patch_coordinates
+from dvo.odometry.depth.patch_depth import followed_planes
+from dvo.odometry.window import alignment as window_alignment
+from dvo.odometry.window.alignment import WindowAlignment
+from dvo.session.session import run
+from dvo.synth.sequence import make_sequence
+
+SIZE, SHIFT = (96, 128), 3  # the second image is the first, shifted to the right by so many pixels
+
+
+def picture():
+    generator = np.random.default_rng(0)
+    coarse = generator.uniform(0, 255, (32, 48))
+    return np.kron(coarse, np.ones((4, 4)))[:96, :160].astype(np.uint8)
+
+
+@pytest.fixture
+def two_frames():
+    """A window of two frames of a plane, its alignment, and a function that gives the state before a step."""
+    wide = picture()
+    images = [np.repeat(wide[:, at : at + 128, None], 3, -1) for at in (16, 16 - SHIFT)]
+    window = Window.empty(4, 3, 8, torch.device("cpu"))
+    alignment = WindowAlignment(window, AlignmentOptions(), torch.device("cpu"))
+    centres = torch.tensor([[[[8, 6], [16, 12], [24, 16], [0, 12]]]])
+    patches = patch_coordinates(centres, torch.ones(1, 4), 3)[0]
+    for i, image in enumerate(images):
+        slot = window.free_map_slot()
+        alignment.keep_image(slot, image)
+        frame = Keyframe(i, float(i), slot, torch.zeros(4, 1), torch.zeros(4, 8), torch.zeros(4, 3), torch.ones(4))
+        window.append(frame, se3.identity(), patches)
+    kk = torch.arange(4)
+    alignment.forget(window.connect(kk, torch.ones_like(kk)))
+
+    def before(error):
+        """State, and a network that measures the true shift with an error, feature pixels."""
+        state = UpdateState(window.edges, window.poses_cw[None], window.patches[None], window.intrinsics[None],
+                            window.context[None], window.hidden[None])  # fmt: skip
+        coords = window.patches[None, window.kk].permute(0, 1, 3, 4, 2)[..., :2]
+        delta = torch.tensor([SHIFT / 4, 0.0]) + error
+        weights = torch.full((1, len(window.kk), 2), 0.5)
+        return state, Revision(coords, window.hidden[None], delta.expand(1, len(window.kk), 2), weights)
+
+    return window, alignment, before
+
+
+def test_measurements_are_replaced_where_the_images_agree(two_frames):
+    window, alignment, before = two_frames
+    state, revision = before(torch.tensor([0.15, -0.1]))
+    measured = alignment(state, revision)
+    truth = window.patches[:4, :2, 1, 1] + torch.tensor([SHIFT / 4, 0.0])
+    error = (measured.targets[0] - truth).norm(dim=-1)
+    assert (error[:3] < 0.01).all()
+    assert torch.equal(measured.weights[0, :3], torch.full((3, 2), 5.0))  # ten times the confidence
+    assert torch.equal(measured.targets[0, 3], revision.targets[0, 3])  # its window is not inside the image
+    assert torch.equal(measured.weights[0, 3], torch.full((2,), 0.5))
+
+
+def test_only_new_and_moved_edges_are_aligned(two_frames, monkeypatch):
+    window, alignment, before = two_frames
+    asked = []
+
+    def spy(images, source, target, centres, *rest):
+        asked.append((centres[:, 0] / 4).tolist())
+        return align_patches(images, source, target, centres, *rest)
+
+    monkeypatch.setattr(window_alignment, "align_patches", spy)
+    first = alignment(*before(torch.tensor([0.1, 0.0])))
+    again = alignment(*before(torch.tensor([0.15, 0.0])))  # has moved by less than a tenth
+    assert torch.equal(first.targets[0, :3], again.targets[0, :3])
+    alignment(*before(torch.tensor([0.25, 0.0])))
+    alignment.forget(window.edge_slots[1:2])
+    alignment(*before(torch.tensor([0.25, 0.0])))
+    assert asked == [[8, 16, 24, 0], [8, 16, 24, 0], [16]]  # columns of the centres
+
+
+def test_an_alignment_that_the_network_has_left_is_not_used(two_frames):
+    window, alignment, before = two_frames
+    alignment.options = AlignmentOptions(moved=100)
+    alignment(*before(torch.tensor([0.1, 0.0])))
+    state, far = before(torch.tensor([1.0, 0.0]))
+    measured = alignment(state, far)
+    assert torch.equal(measured.targets, far.targets) and torch.equal(measured.weights, far.weights)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return make_sequence(77, frames=24, height=192, width=256, fps=15.0, family="street", kind="handheld", apart=True)
+
+
+def tracked(clip, **settings):
+    done = run(dvo.load("small", seed=0, selection="structure", **settings), clip)
+    return done.result.trajectory
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "adjusted"), [("always", False), ("final", True)])
+def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip, mode, adjusted):
+    plain, aligned, again = (tracked(clip, align=align, final_adjustment=adjusted) for align in ("none", mode, mode))
+    assert np.array_equal(aligned.poses_wc, again.poses_wc)
+    errors = [evaluate(x, clip.groundtruth, rpe_gap=2).rpe_rot_deg for x in (plain, aligned)]
+    assert len(aligned) == 24 and errors[1] < 0.75 * errors[0]
+
+
+@pytest.mark.slow
+def test_slopes_of_surfaces_are_found_from_all_edges_of_a_patch():
+    """In a hall, mostly seen at an angle: the slopes are those of the rendered depth, and the poses more exact."""
+    walk = make_sequence(77003, frames=60, height=240, width=320, fps=15.0, family="hall", kind="handheld", apart=True)
+    images, errors = list(walk), []
+    for slope in (0.0, 0.03):
+        odometry = dvo.load("small", seed=0, loops=False, align_slope=slope)
+        for frame in images:
+            odometry.track(frame)
+        window = odometry.window
+        if slope == 0:
+            assert window.slopes is None
+        else:
+            found, true = [], []
+            for k, frame in enumerate(window.frames[:-4]):  # the newest have been seen from about one place only
+                if frame.slopes is not None:
+                    centres = window.patches[k * window.per_frame : (k + 1) * window.per_frame, :2, 1, 1].numpy() * 4
+                    depth = walk.rendering(round(frame.timestamp * 15)).depth[0].numpy()
+                    metres, slopes = followed_planes(depth, frame.image.mean(2), centres.astype(float))
+                    told = np.isfinite(metres) & (frame.slopes != 0).any(1).numpy()
+                    found.append(frame.slopes.numpy()[told])
+                    true.append(4 * slopes[told])
+            found, true = np.concatenate(found), np.concatenate(true)
+            wrong, none = (np.median(np.abs(x).max(1)) for x in (found - true, true))
+            assert len(found) > 30 and none > 0.04 and wrong < 0.3 * none
+        errors.append(evaluate(odometry.finish().trajectory, walk.groundtruth).ate_rmse)
+    assert errors[1] < 0.8 * errors[0], errors
+
+
+def test_measurements_that_leave_the_window_are_replaced_once(two_frames):
+    window, alignment, before = two_frames
+    error = torch.tensor([0.15, -0.1])
+    window.targets = before(error)[1].targets[0]
+    window.weights = torch.full((4, 2), 0.5)
+    alignment.finalise(torch.tensor([0, 2, 3]))
+    truth = window.patches[:4, :2, 1, 1] + torch.tensor([SHIFT / 4, 0.0])
+    found = (window.targets - truth).norm(dim=-1)
+    assert (found[[0, 2]] < 0.01).all() and torch.allclose(found[[1, 3]], error.norm())
+    assert window.weights[:, 0].tolist() == [5.0, 0.5, 5.0, 0.5]  # edge 3: its window is not inside the image
+
+
+def test_the_warp_of_a_slanted_surface_is_that_of_its_plane():
+    """By reprojection of the corners of a window with the inverse depths of the plane."""
+    slopes = torch.tensor([[0.03, -0.02], [0.0, 0.0]])
+    window = Window.empty(2, 3, 8, torch.device("cpu"))
+    alignment = WindowAlignment(window, AlignmentOptions(), torch.device("cpu"))
+    focal = torch.tensor([20.0, 21.0, 16.0, 12.0])
+    patches = patch_coordinates(torch.tensor([[[[9.0, 7.0], [20.0, 15.0]]]]), torch.tensor([[0.5, 0.25]]), 3)[0]
+    for i in range(2):
+        none = torch.zeros(2, 1)
+        frame = Keyframe(i, float(i), i, none, torch.zeros(2, 8), none, focal, slopes=slopes if i == 0 else None)
+        window.append(frame, se3.exp(i * torch.tensor([0.3, 0.1, -0.2, 0.02, -0.03, 0.05])), patches)
+    window.connect(torch.arange(2), torch.ones(2, dtype=torch.long))
+    at = window.poses_cw[None], window.intrinsics[None], window.ii, window.jj, window.kk
+    flat = reproject(at[0], window.patches[None], *at[1:]).coords[0]
+    found = patch_warps(flat, alignment.tilts(torch.arange(2)))
+    tilted = window.patches.clone()
+    offsets = tilted[:, :2] - tilted[:, :2, 1:2, 1:2]
+    tilted[:, 2] *= 1 + torch.einsum("kc,kcpq->kpq", window.slopes, offsets)
+    torch.testing.assert_close(found, patch_warps(reproject(at[0], tilted[None], *at[1:]).coords[0]), atol=1e-4, rtol=0)
+    assert (found - patch_warps(flat)).abs().amax((1, 2)).tolist() == [pytest.approx(0.09, abs=0.06), 0]
+    for frame in window.frames:
+        frame.slopes = None
+    assert alignment.tilts(torch.arange(2)) is None

@@ -1,0 +1,117 @@
+"""Second run, backward and with another seed: when it is made, what it says, and that nothing is lost by it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dvo
+from dvo.core.errors import DvoError
+from dvo.data.streams.live import LiveFrames
+from dvo.data.trajectory import Trajectory
+from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
+from dvo.odometry.quality import Quality, leaves_doubt
+from dvo.session import second_run
+from dvo.session.second_run import can_be_read_again, compare_again, is_due
+from tests.support.tiny_tracker import frames
+
+SURE = Quality("good", tracked=1.0, agreement=1.0, deviation=0.0, check=1.0, checks=9)
+UNSURE = replace(SURE, deviation=0.05)
+
+
+class Walk:
+    """Odometry of a known path, scaled and bent, with a quality."""
+
+    name = "walk"
+
+    def __init__(self, bend=0.0, quality=UNSURE, fail=False):
+        self.bend, self.quality, self.fail, self.times, self.numbers, self.sizes = bend, quality, fail, [], [], set()
+
+    def track(self, frame):
+        if self.fail:
+            raise DvoError("broken")
+        self.times.append(frame.timestamp)
+        self.numbers.append(frame.index)
+        self.sizes.add((*frame.image.shape[:2], frame.camera.height, frame.camera.width))
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    def finish(self):
+        t, times = 0.1 * np.array(self.numbers), np.array(self.times)
+        positions = np.column_stack([t, np.sin(t) + self.bend * t**2, np.zeros_like(t)]) * (1 + self.bend)
+        poses = np.column_stack([positions, np.tile([0.0, 0, 0, 1], (len(t), 1))])
+        return Result(Trajectory(times, poses), SparseMap(), len(t), 0, quality=self.quality)
+
+
+def ran(again, first=UNSURE, source=None, **options):
+    return dvo.run(Walk(quality=first), frames(30) if source is None else source, again=again, **options)
+
+
+def test_it_is_made_where_a_good_result_leaves_doubt():
+    assert leaves_doubt(UNSURE) and not leaves_doubt(SURE) and not leaves_doubt(None)
+    assert not leaves_doubt(replace(UNSURE, verdict="doubtful", deviation=0.5))
+    never = lambda: pytest.fail("a second run of a sure result")  # noqa: E731
+    assert "checking" not in ran(never, first=SURE).seconds
+    ran(never, source=iter(frames(30)))
+
+
+def test_measured_depths_need_none():
+    first = Walk().finish()
+    assert is_due(first, frames(3)) and not is_due(first, iter(frames(3)))
+    for source, due in (("stereo", False), ("depth", False), ("height", True)):
+        assert is_due(replace(first, info={"scale": {"source": source}}), frames(3)) is due
+
+
+def test_runs_that_agree_stay_good():
+    done = ran(lambda: Walk(0.0))
+    assert done.result.quality.verdict == "good" and done.result.quality.second == pytest.approx(0, abs=1e-6)
+    assert done.seconds["checking"] > 0 and done.frames_fed == 30
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_runs_that_differ_are_doubtful(stride):
+    quality = ran(lambda: Walk(2.0), stride=stride).result.quality
+    assert quality.verdict == "doubtful" and quality.second > 3 and quality.remedy
+    assert f"differs by {quality.second:.0f}% of the path" in quality.reason
+
+
+def test_a_second_run_that_fits_its_measurements_worse_says_nothing_of_the_first():
+    """Unless it is doubtful by itself."""
+    for own, residual, verdict in (
+        ("good", 0.25, "doubtful"), ("good", 0.4, "good"), ("doubtful", 0.4, "doubtful"), ("good", np.nan, "doubtful")
+    ):  # fmt: skip
+        again = Walk(2.0, quality=replace(UNSURE, verdict=own, residual=residual))
+        quality = ran(lambda again=again: again, first=replace(UNSURE, residual=0.3)).result.quality
+        assert quality.verdict == verdict and quality.second > 3
+
+
+def test_the_beginning_alone_is_tracked_again(monkeypatch):
+    monkeypatch.setattr(second_run, "FRAMES", 5)
+    other = Walk()
+    compare_again(Walk().finish(), other, frames(30), stride=2)
+    assert other.times == [pytest.approx(0.2 * k) for k in range(5)] and other.numbers == [8, 6, 4, 2, 0]
+
+
+def test_large_images_are_kept_small(monkeypatch):
+    monkeypatch.setattr(second_run, "PIXELS", 40 * 30)
+    other = Walk()
+    assert compare_again(Walk().finish(), other, frames(12)).verdict == "good"
+    ((height, width, *camera),) = other.sizes
+    assert height * width <= 1.1 * 40 * 30 and camera == [height, width]
+
+
+def test_a_second_run_that_fails_or_is_stopped_leaves_the_first():
+    assert ran(lambda: Walk(fail=True)).result.quality == UNSURE
+    pressed = []
+    other = Walk()
+
+    def begin():
+        pressed.append(True)
+        return other
+
+    done = ran(begin, should_stop=lambda: bool(pressed))
+    assert done.result.quality.verdict == "good" and not other.times and len(done.result.trajectory) == 30
+
+
+def test_what_arrives_once_is_not_read_again():
+    assert can_be_read_again(frames(3)) and not can_be_read_again(iter(frames(3)))
+    assert not can_be_read_again(LiveFrames(frames(3)))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from dvo.ba.options import BADamping, BAOptions, BAResult
     from dvo.data.extrinsics import base_trajectory
     from dvo.data.frame import Frame
-    from dvo.data.source import open_source as open
+    from dvo.data.open import open_source as open
     from dvo.data.streams.live import LiveFrames
     from dvo.data.streams.live_source import open_stream
     from dvo.data.streams.streams import stream
@@ -77,7 +77,7 @@ _LAZY = {
     "load_map": ("dvo.odometry.load_map", "load_map"),
     "load_model": ("dvo.models.weights", "load_model"),
     "losses": ("dvo.losses", ""),
-    "open": ("dvo.data.source", "open_source"),
+    "open": ("dvo.data.open", "open_source"),
     "open_stream": ("dvo.data.streams.live_source", "open_stream"),
     "run": ("dvo.session.session", "run"),
     "se3": ("dvo.geometry.se3", ""),

@@ -127,7 +127,7 @@ class BoardCalibration:
         return list(self.parameters.items())[start:stop]
 
     def write(self, file: Path | str) -> None:
-        """Write a calibration file that :func:`dvo.data.calibration.calibration.read_calibration` reads.
+        """Write a calibration file that :func:`dvo.data.calibration.read.read_calibration` reads.
 
         Args:
             file: text, ``fx fy cx cy k1 k2 p1 p2 [k3]``; a name that ends in ``.yaml`` for YAML, which a fisheye needs.

@@ -12,20 +12,20 @@ from typing import Protocol
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.frame import InertialSamples
 from dvo.data.images.images import read_image
 from dvo.data.images.orientation import common_orientation, turn
 from dvo.data.images.reduction import Reduction
 from dvo.data.interval import Interval
 from dvo.data.sensors.depth import read_depth
-from dvo.data.sensors.sensors import Sensors, StereoRig
+from dvo.data.sensors.sensors import Sensors
 from dvo.data.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
 class Request:
-    """Options of :func:`dvo.data.source.open_source` that concern a reader.
+    """Options of :func:`dvo.data.open.open_source` that concern a reader.
 
     Attributes:
         times: file with the time of every image.

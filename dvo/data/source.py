@@ -3,30 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration, read_calibration
-from dvo.data.calibration.focal_guess import FocalGuess, guess_focal
-from dvo.data.files.files import lookups
-from dvo.data.files.stamps import checked_rate
+from dvo.data.calibration.calibration import Calibration, StereoRig
+from dvo.data.calibration.focal_guess import FocalGuess
 from dvo.data.frame import Frame, InertialSamples, StereoView
-from dvo.data.images.reduction import MAX_PIXELS, Reduction, reduce_images
-from dvo.data.interval import Bound, Interval, expected_frames, limit
-from dvo.data.mask import Masks, open_masks
-from dvo.data.opening import check_invert, check_stride, first_frame, locate, no_calibration
-from dvo.data.readers.groundtruth import read_groundtruth
-from dvo.data.readers.registry import find_reader
-from dvo.data.readers.rosbag import split_topic
-from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request
+from dvo.data.images.reduction import Reduction
+from dvo.data.interval import expected_frames
+from dvo.data.mask import Masks
+from dvo.data.recording import ImageRecording, Log, RawFrame, Recording
 from dvo.data.sensors.depth import registered_depth, resized_depth
-from dvo.data.sensors.sensors import StereoRig
-from dvo.data.streams.capture import is_stream
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.geometry.field_of_view import notice_of_cut
@@ -34,7 +24,7 @@ from dvo.geometry.undistort import Undistorter, needs_undistortion
 
 
 class Source:
-    """Frames of one recording, to be iterated any number of times. Made by :func:`open_source`.
+    """Frames of one recording, to be iterated any number of times. Made by :func:`dvo.data.open.open_source`.
 
     Depth, right images and inertial samples, where the recording has them, are read when a frame's field is first read.
 
@@ -214,130 +204,3 @@ class Source:
 
     def _inertial(self, previous: float, timestamp: float) -> InertialSamples | None:
         return None if self._samples is None else self._samples.between(previous, timestamp)
-
-
-def open_source(
-    source: Path | str,
-    *,
-    calib: Path | str | Calibration | None = None,
-    times: Path | str | None = None,
-    fps: float | None = None,
-    stride: int = 1,
-    groundtruth: Path | str | None = None,
-    undistort: bool = True,
-    reader: str | None = None,
-    guess: bool = False,
-    queue: int | None = None,
-    topic: str | None = None,
-    start: Bound | None = None,
-    end: Bound | None = None,
-    mask: Path | str | None = None,
-    mask_invert: bool = False,
-    max_pixels: int | None = MAX_PIXELS,
-) -> Source:
-    """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
-    ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it), a bag of ROS; or a stream:
-    ``webcam:0``, ``rtsp://...``, ``http://...`` or ``-``, see :func:`dvo.data.streams.live_source.open_stream`.
-
-    Relative paths of the options are looked up from the working directory, then from the source's folder, so that
-    ``--calib ../calib.txt`` beside an image folder is found from anywhere.
-
-    Args:
-        source: path to a file or folder.
-        calib: calibration that wins over the dataset's own; see
-            :func:`dvo.data.calibration.calibration.read_calibration`.
-        times: file with the time of every image in its first column.
-        fps: frames a second, where nothing else gives times; for a video it overrides the container.
-        stride: read every ``stride``-th frame.
-        groundtruth: TUM trajectory (camera to world), or a format without times for the images of a folder, see
-            :func:`dvo.data.readers.groundtruth.read_groundtruth`; wins over the data set's own.
-        undistort: resample images, depth and right images to pinhole cameras; otherwise frames carry the distorted
-            cameras.
-        reader: name of the reader (``dvo.data.readers.registry.READERS``); None: the first whose layout matches.
-        guess: where there is no calibration, guess the focal length (:mod:`dvo.data.calibration.focal_guess`), for
-            :func:`dvo.calibrate`.
-        queue: of a stream, frames that may wait.
-        topic: of the images in a bag of ROS, if there are several; ``bag.mcap:/camera/image`` names it too.
-        start, end: read from the first of these until before the second: seconds since the first frame, or the number
-            of a frame, such as ``"120f"``. Indices and times of the frames stay those of the whole recording, and
-            ``stride`` counts from the start. Frames before the start are not decoded; those of a video are, since only
-            that finds a frame exactly, but not converted.
-        mask: image that is white where the recorded images are used and black where they are ignored, or a folder with
-            one for each image (:func:`dvo.data.mask.open_masks`); for ``Frame.mask``.
-        mask_invert: white is ignored and black used.
-        max_pixels: images with more are reduced by area right after they are decoded, by the smallest whole factor that
-            suffices (:mod:`dvo.data.images.reduction`); calibration and masks remain those of the recorded images. None
-            for never; streams and bags of ROS are never reduced.
-
-    Returns:
-        Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
-
-    Raises:
-        DvoError: nothing there, unknown layout, no frame that decodes, no calibration, intrinsics that do not fit the
-            images, malformed files.
-
-    Example:
-        ::
-
-            source = dvo.open("rgbd_dataset_freiburg1_xyz", stride=2)
-            for frame in source:
-                print(frame.timestamp, frame.image.shape, frame.depth is not None)
-    """
-    if is_stream(source):
-        from dvo.data.streams.live_source import open_stream
-
-        for field, value in dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start).items():
-            if value is not None:
-                raise DvoError("not for a stream", field=field, remedy="leave it out")
-        options: dict[str, Any] = dict(calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort, end=end)
-        return open_stream(source, **options, mask=mask, mask_invert=mask_invert)
-    if queue is not None:
-        raise DvoError("frames of a recording do not wait", field="queue", remedy="leave it out")
-    path, topic = split_topic(source, topic)
-    with lookups(path):
-        is_there = path.exists()
-    if not is_there:
-        raise DvoError("no such file or folder", file=path, remedy="give a video, a folder of images or a sequence")
-    check_stride(stride)
-    check_invert(mask, mask_invert)
-    interval = Interval.of(start, end)
-    if times is not None and fps is not None:
-        raise DvoError("both times and fps are given", field="times", remedy="give --times or --fps, not both")
-    request = Request(
-        locate(times, path, "times") if times is not None else None,
-        checked_rate(fps),
-        calib if calib is None or isinstance(calib, Calibration) else read_calibration(locate(calib, path, "calib")),
-        topic,
-    )
-    with lookups(path):
-        recording = find_reader(path, reader).open(path, request)
-    first = first_frame(recording)
-    limit(recording, interval)
-    calibration = recording.calibration if request.calibration is None else request.calibration
-    height, width = first.image.shape[:2]
-    guessed = None
-    if calibration is None:
-        if not guess:
-            raise no_calibration(path)
-        guessed = guess_focal(recording.images[0] if isinstance(recording, ImageRecording) else path, width, height)
-        calibration = guessed.calibration
-    turned = getattr(recording, "turned", 0)
-    doubts = calibration.doubts(width, height)
-    if turned and calibration.readout:  # rows of the images are columns of the sensor, or come in reverse order
-        calibration = replace(calibration, readout=0.0)
-        what = "images are" if isinstance(recording, ImageRecording) else "video is"
-        doubts.append(f"the {what} turned by {turned} degrees: the readout of the calibration was not used")
-    camera = calibration.camera(width, height)
-    reduction = reduce_images(recording, width, height, max_pixels)
-    size, masks = (width, height), None
-    if mask is not None:
-        masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
-    truth = recording.groundtruth
-    if groundtruth is not None:
-        truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
-    try:
-        found = Source(recording, camera, truth, stride, undistort, doubts)
-        found.calibration, found.guess, found.masks = calibration, guessed, masks
-        return found
-    except DvoError as error:  # the lens model does not know its file
-        raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None

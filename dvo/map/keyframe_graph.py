@@ -22,8 +22,8 @@ from dvo.map.archive import Archive, ArchiveConfig, ArchivedKeyframe, encode_jpe
 from dvo.map.heap import release_free_memory
 from dvo.map.keyframe_log import KeyframeLog
 from dvo.map.measurements import ArchivedEdges
-from dvo.map.problem import graph_problem
-from dvo.map.recordings import Recording
+from dvo.map.problem import archive_problem
+from dvo.map.recording import Recording
 from dvo.map.window import Keyframe, Window
 
 NEAR = 0.05
@@ -336,7 +336,8 @@ class KeyframeGraph:
         Returns:
             The problem of the :meth:`members`, on the CPU.
         """
-        return graph_problem(self, dropped, segment, first, last)
+        members, m = self.members(segment), self.window.per_frame
+        return archive_problem(self.archive, members, self.poses_cw, m, dropped, first, last)
 
     def _archive_edges(self, mask: Tensor) -> None:
         """Archive the edges where ``mask (E,)`` is True, without those that have not been updated yet."""

@@ -1,41 +1,46 @@
-"""Bundle adjustment problem of a keyframe graph."""
+"""Bundle adjustment problem of archived keyframes."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from dvo.ba.patch_problem import PatchProblem
+from dvo.map.archive import Archive, ArchivedKeyframe
 from dvo.map.measured_depths import depth_factors
 
-if TYPE_CHECKING:
-    from dvo.map.archive import ArchivedKeyframe
-    from dvo.map.keyframe_graph import KeyframeGraph
 
+def archive_problem(
+    archive: Archive, members: Sequence[ArchivedKeyframe], poses_cw: Callable[[np.ndarray], Tensor], m: int,
+    dropped: bool = True, first: int = 0, last: int | None = None,
+) -> PatchProblem:  # fmt: skip
+    """Bundle adjustment problem of keyframes and the edges between them.
 
-def graph_problem(
-    graph: KeyframeGraph, dropped: bool = True, segment: int = 0, first: int = 0, last: int | None = None
-) -> PatchProblem:
-    """Bundle adjustment problem of the archived keyframes and edges of a segment; see :meth:`KeyframeGraph.problem`."""
-    edges = graph.archive.edges(first, last)
+    Args:
+        archive: of the edges.
+        members: the keyframes, by increasing identifier.
+        poses_cw: poses of identifiers.
+        m: patches of a keyframe.
+        dropped, first, last: see :meth:`dvo.map.keyframe_graph.KeyframeGraph.problem`.
+    """
+    edges = archive.edges(first, last)
     linked = set(np.unique(np.concatenate([edges.source, edges.target])).tolist()) if first > 0 else set()
     frames = [
         frame
-        for frame in graph.members(segment)
+        for frame in members
         if (frame.identifier >= first or frame.identifier in linked)
         and (last is None or frame.identifier <= last)
         and (dropped or frame.anchor is None)
     ]
-    m = graph.window.per_frame
     identifiers = np.array([frame.identifier for frame in frames], dtype=np.int64)
     edges = edges.select(np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers))
     ii, jj = np.searchsorted(identifiers, edges.source), np.searchsorted(identifiers, edges.target)
     patches = [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
     return PatchProblem(
-        poses_cw=graph.poses_cw(identifiers),
+        poses_cw=poses_cw(identifiers),
         patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(len(frames) * m, 3, 1, 1),
         intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(-1, 4)),
         targets=torch.from_numpy(edges.position.astype(np.float64)),

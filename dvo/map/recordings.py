@@ -8,31 +8,14 @@ which does not move them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from dvo.map.archive import ArchivedKeyframe
-    from dvo.map.keyframe_graph import KeyframeGraph
-
-
-@dataclass(frozen=True)
-class Recording:
-    """Beginning of a recording.
-
-    Attributes:
-        frame: position of its first frame in the log.
-        keyframe: identifier of its first keyframe; those from it on belong to it, or to later recordings.
-        segment: number of its first segment.
-    """
-
-    frame: int = 0
-    keyframe: int = 0
-    segment: int = 0
+from dvo.map.archive import ArchivedKeyframe
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.recording import Recording
 
 
 def begin_recording(graph: KeyframeGraph) -> Recording:

@@ -13,7 +13,7 @@ import torch
 from dvo.map.archive import ArchiveConfig, ArchivedKeyframe
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.measurements import PackedEdges
-from dvo.map.recordings import Recording
+from dvo.map.recording import Recording
 
 _UNBOUNDED = 2**62  # bytes: a copy of what is within the bound of an archive
 

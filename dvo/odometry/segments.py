@@ -11,7 +11,7 @@ import numpy as np
 from dvo.data.trajectory import Trajectory
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import KeyframeLog
-from dvo.map.recordings import Recording
+from dvo.map.recording import Recording
 from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
 

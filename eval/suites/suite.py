@@ -13,7 +13,8 @@ from dvo.core.settings import Range, from_table
 from dvo.core.yaml_files import read_yaml
 from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
-from dvo.data.source import Source, open_source
+from dvo.data.open import open_source
+from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, associate
 from eval.suites.axes import Axes, choose, expand, read_axes

@@ -12,11 +12,11 @@ import pytest
 import dvo
 from dvo.core.errors import DvoError
 from dvo.data import READERS, read_calibration, read_kitti_poses, read_tum
+from dvo.data.calibration.kitti import read_projections
 from dvo.data.files.stamps import read_times, times_from_names
 from dvo.data.images.images import list_images, read_image
 from dvo.data.readers.euroc import read_inertial, read_state_groundtruth
 from dvo.data.readers.groundtruth import read_groundtruth
-from dvo.data.readers.kitti import read_projections
 from dvo.data.readers.tartanair import read_ned_poses
 from dvo.data.recording import rows_of_images
 from dvo.data.sensors.depth import read_depth

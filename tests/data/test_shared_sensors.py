@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dvo.data import Frame, open_source
-from dvo.data.calibration.calibration import read_calibration
+from dvo.data.calibration.read import read_calibration
 from dvo.geometry.poses import pose_matrices
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dvo.data.source import open_source
+from dvo.data.open import open_source
 from tests.fuzz.target import Target, chance, check_frames, check_trajectory, require
 
 WIDTH, HEIGHT, COUNT = 64, 48, 4

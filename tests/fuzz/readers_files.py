@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dvo.data.calibration.calibration import read_calibration
+from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import read_times
+from dvo.data.open import open_source
 from dvo.data.readers.groundtruth import read_groundtruth
-from dvo.data.source import open_source
 from dvo.data.streams.streams import stream
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.geometry.camera import Camera

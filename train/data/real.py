@@ -16,9 +16,10 @@ from torch.utils.data import Dataset
 
 from dvo.core.errors import DvoError
 from dvo.data.images.fit import fit, fit_depth
+from dvo.data.open import open_source
 from dvo.data.readers.tartanair import depth_file
 from dvo.data.sensors.depth import read_depth
-from dvo.data.source import Source, open_source
+from dvo.data.source import Source
 from dvo.data.trajectory import interpolate
 from dvo.geometry import se3
 from dvo.synth.clip import induced_flow

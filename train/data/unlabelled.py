@@ -13,7 +13,8 @@ from torch.utils.data import Dataset
 
 from dvo.core.errors import DvoError
 from dvo.data.images.fit import fit
-from dvo.data.source import Source, open_source
+from dvo.data.open import open_source
+from dvo.data.source import Source
 
 TRIES = 8
 """Clips drawn until one moves as asked; then the one that comes nearest is taken."""

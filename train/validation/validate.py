@@ -18,7 +18,7 @@ from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame
-from dvo.data.source import open_source
+from dvo.data.open import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics
 from dvo.metrics.segment_metrics import evaluate_segments, most_worlds, worlds_of

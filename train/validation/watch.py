@@ -17,7 +17,7 @@ import torch
 
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame
-from dvo.data.source import open_source
+from dvo.data.open import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics
 from dvo.models.weights import LoadedWeights

@@ -69,7 +69,7 @@ def split_camera(path: Path) -> tuple[Path, int | None]:
 
 
 def is_calibration_file(path: Path) -> bool:
-    """True for what :func:`dvo.data.calibration.calibration.read_calibration` can open: a file, ``FILE:ID``, a pipe of
+    """True for what :func:`dvo.data.calibration.read.read_calibration` can open: a file, ``FILE:ID``, a pipe of
     the shell.
 
     Args:

@@ -9,36 +9,17 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import read_text
-from dvo.data.calibration.calibration import Calibration, from_values, load_yaml
+from dvo.data.calibration.calibration import Calibration, StereoRig
+from dvo.data.calibration.euroc import read_rig
+from dvo.data.calibration.kitti import projection_rig, read_projections
+from dvo.data.calibration.values import from_values, load_yaml
 from dvo.data.extrinsics import pose_of_numbers
 from dvo.data.files.files import is_file
-from dvo.data.readers.euroc import read_rig
-from dvo.data.readers.kitti import projection_calibration, projection_rig, read_projections
-from dvo.data.sensors.sensors import StereoRig
 from dvo.geometry.poses import compose_poses, invert_poses
 
 _PAIRS = {"image_2": ("P2", "P3"), "image_02": ("P2", "P3"), "image_1": None, "image_01": None,
           "image_3": None, "image_03": None}  # fmt: skip
 _NO_RIGID = "give a rigid 4x4 matrix, row by row"
-
-
-def kitti_calibration(path: Path) -> Calibration:
-    """Calibration of the rectified cameras of KITTI, if all have the same intrinsics, as in the odometry data set.
-
-    Args:
-        path: KITTI's ``calib.txt``, of rows ``P0:`` to ``P3:``, or some of them.
-
-    Raises:
-        DvoError: cameras of different intrinsics, or a malformed row.
-    """
-    rows = list(read_projections(path).values())
-    if not rows or any((row[:, :3] != rows[0][:, :3]).any() for row in rows):
-        raise DvoError(
-            "this is KITTI's calibration of several cameras",
-            file=path,
-            remedy="open the KITTI sequence folder itself, or write the fx fy cx cy of one camera into a file",
-        )
-    return projection_calibration(rows[0], path)
 
 
 def right_camera(calibration: Calibration, images: str) -> StereoRig | None:

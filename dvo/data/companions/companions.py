@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import StereoRig
 from dvo.data.files.files import listed_files
 from dvo.data.files.stamps import times_from_names
 from dvo.data.images.images import list_images
 from dvo.data.recording import ImageRecording, Log, RawFrame
-from dvo.data.sensors.sensors import Finder, NearestInTime, SameNumbers, StereoRig
+from dvo.data.sensors.sensors import Finder, NearestInTime, SameNumbers
 
 
 @dataclass(frozen=True)

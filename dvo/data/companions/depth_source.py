@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration, read_calibration
+from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.read import read_calibration
 from dvo.data.companions.companions import CompanionKind, CompanionRecording, companions_of_frames, companions_of_images
 from dvo.data.opening import locate
 from dvo.data.readers.tum import DEPTH_SCALE

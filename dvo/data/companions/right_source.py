@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import Calibration, StereoRig, rectified
 from dvo.data.calibration.stereo import right_camera
 from dvo.data.companions.companions import CompanionKind, CompanionRecording, companions_of_frames, companions_of_images
 from dvo.data.images.images import read_image
@@ -21,7 +21,7 @@ from dvo.data.opening import locate
 from dvo.data.readers.registry import find_reader
 from dvo.data.readers.sequence import RIGHT_OF
 from dvo.data.recording import ImageRecording, Log, RawFrame, Request
-from dvo.data.sensors.sensors import Finder, StereoRig, rectified
+from dvo.data.sensors.sensors import Finder
 from dvo.data.source import Source
 
 T = TypeVar("T")

@@ -14,11 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.core.yaml_files import read_text
-from dvo.data.calibration.calibration import Calibration, load_yaml, read_calibration
+from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.euroc import read_extrinsics, read_rig
+from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import (
-    MAX_NUMBER,
-    is_file,
     listed_file,
     parse_nanoseconds,
     parse_number,
@@ -29,9 +28,9 @@ from dvo.data.files.stamps import choose_times, read_times
 from dvo.data.frame import InertialSamples
 from dvo.data.readers.folder import camera_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-from dvo.data.sensors.sensors import SameName, Sensors, StereoRig
+from dvo.data.sensors.sensors import SameName, Sensors
 from dvo.data.trajectory import Trajectory, interpolate, unit_quaternions
-from dvo.geometry.poses import compose_poses, invert_poses, poses_from_matrices
+from dvo.geometry.poses import compose_poses, invert_poses
 
 
 def _mav(path: Path) -> Path | None:
@@ -45,36 +44,6 @@ def matches(path: Path) -> bool:
         path: existing file or folder.
     """
     return _mav(path) is not None
-
-
-def read_extrinsics(sensor: Path) -> np.ndarray | None:
-    """Read the pose of a sensor on the body.
-
-    Args:
-        sensor: ``sensor.yaml``.
-
-    Returns:
-        ``(7,)`` pose ``T_BS``, sensor to body, metres; None if there is no such file or key.
-
-    Raises:
-        DvoError: ``T_BS`` is no rigid 4x4 matrix.
-    """
-    if not is_file(sensor):
-        return None
-    data = load_yaml(read_text(sensor, "use EuRoC's sensor.yaml"), sensor)
-    value = data.get("T_BS") if isinstance(data, dict) else None
-    if value is None:
-        return None
-    try:
-        matrix = np.array(value["data"] if isinstance(value, dict) else value, dtype=np.float64).reshape(4, 4)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        matrix = np.zeros((4, 4))
-    if not (np.abs(matrix) <= MAX_NUMBER).all():  # NaN fails too
-        matrix = np.zeros((4, 4))
-    rotation = matrix[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise DvoError("not a rigid 4x4 matrix", file=sensor, field="T_BS", remedy="give 16 numbers, row by row")
-    return poses_from_matrices(matrix)
 
 
 def read_state_groundtruth(path: Path) -> Trajectory:
@@ -124,25 +93,6 @@ def read_inertial(path: Path, T_camera_imu: np.ndarray | None = None) -> Inertia
     """
     nanoseconds, table, _ = _timed_rows(path, 6, "ns, wx, wy, wz, ax, ay, az")
     return InertialSamples(nanoseconds / 1e9, table[:, :3], table[:, 3:], T_camera_imu)
-
-
-def read_rig(mav: Path) -> StereoRig | None:
-    """Right camera ``cam1`` of a stereo pair, not rectified.
-
-    Args:
-        mav: folder with ``cam0/sensor.yaml`` and ``cam1/sensor.yaml``.
-
-    Returns:
-        None if one of the cameras has no extrinsics.
-
-    Raises:
-        DvoError: a malformed file.
-    """
-    body_left, body_right = (read_extrinsics(mav / name / "sensor.yaml") for name in ("cam0", "cam1"))
-    if body_left is None or body_right is None:
-        return None
-    T_left_right = compose_poses(invert_poses(body_left), body_right)
-    return StereoRig(read_calibration(mav / "cam1" / "sensor.yaml"), T_left_right)
 
 
 def _inertial(mav: Path) -> InertialSamples:

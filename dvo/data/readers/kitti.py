@@ -9,47 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration
-from dvo.data.files.files import is_file, lookups, parse_number, read_lines
+from dvo.data.calibration.kitti import pose_in_camera_0, projection_calibration, projection_rig, read_projections
+from dvo.data.files.files import is_file, lookups
 from dvo.data.files.stamps import choose_times, read_times
 from dvo.data.images.images import has_images, list_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
-from dvo.data.sensors.sensors import SameName, Sensors, StereoRig
+from dvo.data.sensors.sensors import SameName, Sensors
 from dvo.data.trajectory import Trajectory, read_kitti_poses
 from dvo.geometry.poses import compose_poses
 
 CAMERAS = ("image_0", "image_2", "image_1", "image_3")
 RIGHT_OF = {"image_0": "image_1", "image_2": "image_3"}
 KITTI_FPS = 1 / 0.1037  # the laser scanner that triggers the cameras
-
-
-def read_projections(path: Path) -> dict[str, np.ndarray]:
-    """Read the projections of the four rectified cameras.
-
-    Args:
-        path: KITTI's ``calib.txt``.
-
-    Returns:
-        Name ``P0`` to ``P3``, those that are there, to a ``(3, 4)`` float64 matrix ``K [I | t]``.
-
-    Raises:
-        DvoError: such a row without 12 finite numbers, or whose matrix K is singular or not that of a pinhole camera.
-    """
-    found: dict[str, np.ndarray] = {}
-    for _, line in read_lines(path, "use KITTI's calib.txt"):
-        name, colon, rest = line.partition(":")
-        name = name.strip()
-        if not colon or name not in ("P0", "P1", "P2", "P3"):
-            continue
-        try:
-            matrix = np.array([parse_number(value) for value in rest.split()]).reshape(3, 4)
-        except ValueError:
-            raise DvoError("not 12 numbers", file=path, field=name, remedy="use KITTI's calib.txt") from None
-        K = matrix[:, :3]
-        if min(K[0, 0], K[1, 1]) < 1e-3 or (K[[1, 2, 2], [0, 0, 1]] != 0).any() or K[2, 2] != 1:
-            raise DvoError("not the projection of a camera", file=path, field=name, remedy="use KITTI's calib.txt")
-        found[name] = matrix
-    return found
 
 
 def _split(path: Path) -> tuple[Path, Path] | None:
@@ -120,30 +91,12 @@ def open_kitti(path: Path, request: Request) -> Recording:
         if rows is None:
             warnings.append(f"{poses_file} has {len(poses)} rows for {len(images)} images: not used as ground truth")
         else:
-            groundtruth = Trajectory(times, compose_poses(poses[rows], _pose_in_camera_0(projection)))
+            groundtruth = Trajectory(times, compose_poses(poses[rows], pose_in_camera_0(projection)))
     name = sequence.resolve().name
     return ImageRecording(
         "kitti", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
         name=f"kitti{name}" if name.isdigit() else name, sensors=_sensors(sequence, folder, projections),
     )  # fmt: skip
-
-
-def projection_calibration(projection: np.ndarray, file: Path) -> Calibration:
-    """Calibration of a rectified camera.
-
-    Args:
-        projection: ``(3, 4)``, see :func:`read_projections`.
-        file: that it comes from.
-    """
-    fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Calibration(fx, fy, cx, cy, file=file)
-
-
-def _pose_in_camera_0(projection: np.ndarray) -> np.ndarray:
-    """``(7,)`` pose of a camera in the coordinates of camera 0; the rectified cameras are parallel."""
-    pose = np.array([0, 0, 0, 0, 0, 0, 1.0])
-    pose[:3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
-    return pose
 
 
 def _sensors(sequence: Path, folder: Path, projections: dict[str, np.ndarray]) -> Sensors:
@@ -152,18 +105,6 @@ def _sensors(sequence: Path, folder: Path, projections: dict[str, np.ndarray]) -
         return Sensors()
     left, right = projections[f"P{folder.resolve().name[-1]}"], projections[f"P{name[-1]}"]
     return Sensors(right=SameName(sequence / name), stereo=partial(projection_rig, left, right, sequence / "calib.txt"))
-
-
-def projection_rig(left: np.ndarray, right: np.ndarray, file: Path) -> StereoRig:
-    """Right camera of two rectified cameras, which are parallel.
-
-    Args:
-        left, right: ``(3, 4)`` projections, see :func:`read_projections`.
-        file: that they come from.
-    """
-    T_left_right = _pose_in_camera_0(right)
-    T_left_right[:3] -= _pose_in_camera_0(left)[:3]
-    return StereoRig(projection_calibration(right, file), T_left_right)
 
 
 def _times(sequence: Path, folder: Path, images: list[Path], request: Request, warnings: list[str]) -> np.ndarray:

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration, from_values
+from dvo.data.calibration.calibration import Calibration, StereoRig
+from dvo.data.calibration.values import from_values
 from dvo.data.files.files import MAX_NUMBER, is_file, lookups
 from dvo.data.files.stamps import checked_rate, read_times
 from dvo.data.frame import InertialSamples
 from dvo.data.interval import Interval
 from dvo.data.readers.ros_images import decode_message
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
-from dvo.data.sensors.sensors import StereoRig
 from dvo.data.trajectory import Trajectory
 
 SUFFIXES = (".bag", ".mcap", ".db3")

@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration, read_calibration
+from dvo.data.calibration.calibration import Calibration, rectified
+from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import choose_times
 from dvo.data.images.images import has_images
 from dvo.data.readers.folder import camera_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-from dvo.data.sensors.sensors import SameName, SameNumbers, Sensors, rectified
+from dvo.data.sensors.sensors import SameName, SameNumbers, Sensors
 from dvo.data.trajectory import Trajectory, read_tum
 
 IMAGE_FOLDERS = (

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import Calibration, rectified
 from dvo.data.files.files import is_file
 from dvo.data.files.stamps import checked_rate, read_times
 from dvo.data.images.images import has_images, list_images
 from dvo.data.readers.sequence import find_calibration
 from dvo.data.recording import ImageRecording, Reader, Recording, Request, rows_of_images
-from dvo.data.sensors.sensors import SameName, Sensors, rectified
+from dvo.data.sensors.sensors import SameName, Sensors
 from dvo.data.trajectory import Trajectory, read_numbers, unit_quaternions
 from dvo.geometry.poses import ned_to_camera
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import Calibration, rectified
 from dvo.data.files.files import listed_files
 from dvo.data.files.stamps import choose_times, read_times, times_from_names
 from dvo.data.images.images import has_images, list_images
 from dvo.data.readers.folder import camera_images
 from dvo.data.readers.sequence import find_calibration
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-from dvo.data.sensors.sensors import NearestInTime, SameName, Sensors, rectified
+from dvo.data.sensors.sensors import NearestInTime, SameName, Sensors
 from dvo.data.trajectory import Trajectory, interpolate, read_tum
 
 # The colour cameras as published with the benchmark (file_formats page); freiburg3 is delivered undistorted.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import is_file, lookups
 from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.frame import InertialSamples
@@ -21,7 +21,6 @@ from dvo.data.images.images import SUFFIXES, to_rgb8
 from dvo.data.images.reduction import Reduction
 from dvo.data.interval import Interval
 from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
-from dvo.data.sensors.sensors import StereoRig
 from dvo.data.trajectory import Trajectory
 
 if TYPE_CHECKING:

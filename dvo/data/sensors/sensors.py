@@ -9,41 +9,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import StereoRig
 from dvo.data.files.files import is_file
 from dvo.data.frame import InertialSamples
 from dvo.data.images.images import list_images
 
 Finder = Callable[[Path], Path | None]
 """Image file of the (left) camera to the file that belongs to it, None if there is none."""
-
-
-@dataclass(frozen=True)
-class StereoRig:
-    """Right camera of a stereo pair.
-
-    Attributes:
-        calibration: of the right images as recorded.
-        T_left_right: ``(7,)`` pose of the right camera in the coordinates of the left one, metres.
-    """
-
-    calibration: Calibration
-    T_left_right: np.ndarray
-
-
-def rectified(calibration: Calibration, baseline: float) -> Callable[[], StereoRig]:
-    """Loader of the right camera of a rectified pair: same intrinsics, parallel axes.
-
-    Args:
-        calibration: of both cameras.
-        baseline: metres from the left to the right camera, along x.
-    """
-    return partial(StereoRig, calibration, np.array([baseline, 0, 0, 0, 0, 0, 1.0]))
 
 
 @dataclass(frozen=True)

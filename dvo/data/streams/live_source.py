@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration, read_calibration
+from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.focal_guess import guess_from_angle
+from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import checked_rate
 from dvo.data.frame import InertialSamples
 from dvo.data.images.images import decode_bytes, to_rgb8
@@ -23,7 +24,6 @@ from dvo.data.interval import Bound, Interval, limit
 from dvo.data.mask import open_masks
 from dvo.data.opening import check_invert, check_stride
 from dvo.data.recording import Log, RawFrame
-from dvo.data.sensors.sensors import StereoRig
 from dvo.data.source import Source
 from dvo.data.streams.capture import STANDARD_INPUT, Capture, StreamClock, is_stream, shown
 from dvo.data.streams.image_pipe import pipe_reader, split_images
@@ -200,7 +200,7 @@ def open_stream(
         undistort: resample images to a pinhole camera.
         end: seconds since the first frame that is processed, or the number of frames, such as ``"120f"``, after which
             the stream is closed.
-        mask, mask_invert: one mask for all images, see :func:`dvo.data.source.open_source`.
+        mask, mask_invert: one mask for all images, see :func:`dvo.data.open.open_source`.
 
     Returns:
         Frames to iterate over once.

@@ -26,7 +26,8 @@ from dvo.map.io.old_window import archive_old_window
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord, KeyframeLog
 from dvo.map.measurements import ArchivedEdges
-from dvo.map.recordings import Recording, increase
+from dvo.map.recording import Recording
+from dvo.map.recordings import increase
 
 Arrays = dict[str, np.ndarray]
 _LAST = 2**31 - 1  # largest number of a keyframe

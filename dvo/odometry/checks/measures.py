@@ -10,7 +10,6 @@ import torch
 
 from dvo.geometry.projection import reproject
 from dvo.map.keyframe_graph import KeyframeGraph
-from dvo.map.problem import graph_problem
 from dvo.map.recordings import increasing_times
 from dvo.odometry.checks.check_pairs import CheckPairs, epipolar_distances, median_displacement
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
@@ -79,7 +78,7 @@ def measure_quality(
 
 def _inliers(graph: KeyframeGraph, segment: int, shutter: Shutter) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Numbers of measurements, confident ones and those that agree; residuals; spread. None without a measurement."""
-    p = graph_problem(graph, segment=segment)
+    p = graph.problem(segment=segment)
     across = p.ii != p.jj
     if len(p.poses_cw) < 2 or not bool(across.any()):
         return None

@@ -26,7 +26,7 @@ from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.depth.stereo_depth import measure_stereo
 from dvo.odometry.frames.front_end import Observation
-from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.window.step import StepSettings
 
 _HALF = AlignmentOptions().window // 2  # of the window that a measurement follows, pixels of the working image
 _NOISE = 1.0  # squared gradient, (grey levels a pixel)^2, which every pixel has, so that a bare window has a mean
@@ -38,14 +38,17 @@ _ROUNDS = 3  # fits, all but the first with the outer values cut
 _NEAREST = 0.2  # metres; bundle adjustment leaves out points that are nearer (dvo.ba.layer.layer)
 
 
-def measure_depth(model: PatchVO, seen: Observation, frame: Frame, config: TrackerConfig) -> Observation:
+def measure_depth(
+    model: PatchVO, seen: Observation, frame: Frame, options: ScaleOptions, settings: StepSettings
+) -> Observation:
     """Measure the depths of the patches of a frame, if that is wanted.
 
     Args:
         model: the network, which measures in right images.
         seen: the patches.
         frame: of the same image; its depth or right image is read if it is used.
-        config: of the tracker, whose ``scale`` says what is used.
+        options: of the scale, which say what is used.
+        settings: of measurements in right images.
 
     Returns:
         The observation with ``measured`` and ``slopes``, of zeros for a frame without depth; unchanged without the
@@ -54,9 +57,8 @@ def measure_depth(model: PatchVO, seen: Observation, frame: Frame, config: Track
     Raises:
         DvoError: a depth or a right image that is not an image of the size of the frame.
     """
-    options = config.scale
     if options.stereo:
-        return measure_stereo(model, seen, frame, config)
+        return measure_stereo(model, seen, frame, settings, options.stereo_error)
     if not options.depth:
         return seen
     depth = checked_depth(frame)

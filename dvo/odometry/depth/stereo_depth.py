@@ -30,10 +30,9 @@ from dvo.models.step import StepOptions
 from dvo.nets.patch.patchifier import Features, patch_coordinates
 from dvo.odometry.depth.right_view import RightView, right_view
 from dvo.odometry.frames.front_end import Observation, encode_image
-from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.window.alignment import WindowAlignment
 from dvo.odometry.window.correlation import WindowCorrelation
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.step import StepSettings, WindowStep
 
 _UPDATES = 2  # of the network, from the best match along the epipolar line
 _SPACING = 0.5  # of the matches that are tried, feature pixels
@@ -71,14 +70,17 @@ class StereoMatches:
         return self.found & (self.residual < _RESIDUAL) & sure & near
 
 
-def measure_stereo(model: PatchVO, seen: Observation, frame: Frame, config: TrackerConfig) -> Observation:
+def measure_stereo(
+    model: PatchVO, seen: Observation, frame: Frame, settings: StepSettings, deviation: float
+) -> Observation:
     """Measure the depths of the patches of a frame in its right image.
 
     Args:
         model: the network.
         seen: the patches.
         frame: of the same image; its right image is read.
-        config: of the tracker: alignment and kernel.
+        settings: of the measurements: alignment and kernel.
+        deviation: standard deviation of a disparity, pixels (:attr:`ScaleOptions.stereo_error`).
 
     Returns:
         The observation with ``measured`` and ``slopes``, of zeros for a frame without a right image.
@@ -89,21 +91,24 @@ def measure_stereo(model: PatchVO, seen: Observation, frame: Frame, config: Trac
     view = right_view(frame, seen.image.shape[1], seen.image.shape[0])
     measured = slopes = seen.intrinsics.new_zeros(seen.centres.shape[2], 2)
     if view is not None:
-        found = match_right(model, seen, view, config)
+        found = match_right(model, seen, view, settings, deviation)
         values = torch.stack([found.inverse_depth, found.weight], 1).to(measured)
         measured = torch.where(found.good[:, None], values, measured)
         slopes = torch.where(found.good[:, None], found.slopes.to(measured), slopes)
     return replace(seen, measured=measured, slopes=slopes)
 
 
-def match_right(model: PatchVO, seen: Observation, view: RightView, config: TrackerConfig) -> StereoMatches:
+def match_right(
+    model: PatchVO, seen: Observation, view: RightView, settings: StepSettings, deviation: float
+) -> StereoMatches:
     """Match the patches of a frame with its right image.
 
     Args:
         model: the network.
         seen: the patches.
         view: right image of the size of the working image.
-        config: of the tracker: alignment and kernel.
+        settings: of the measurements: alignment and kernel.
+        deviation: standard deviation of a disparity, pixels (:attr:`ScaleOptions.stereo_error`).
 
     Returns:
         The measurements.
@@ -114,11 +119,11 @@ def match_right(model: PatchVO, seen: Observation, view: RightView, config: Trac
     pose = torch.from_numpy(view.pose_right_left).to(seen.intrinsics)
     focal, right = (seen.intrinsics, intrinsics), features.matching[0, 0]
     depth = search_line(seen.matching, seen.centres[0, 0].to(pose), right, focal, pose)[0][None]
-    step = _pair(model, seen, features, view.image, intrinsics, pose, depth, config)
+    step = _pair(model, seen, features, view.image, intrinsics, pose, depth, settings)
     for _ in range(_UPDATES):
         step(StepOptions(mode="structure", fixed=2, damping=damping_at(COLD_UPDATES)))
     step.finalise(torch.arange(len(step.window.kk), device=device))
-    return _fitted(step.window, seen.bounds, config.scale.stereo_error)
+    return _fitted(step.window, seen.bounds, deviation)
 
 
 def search_line(
@@ -193,13 +198,13 @@ def _pair(
     intrinsics: Tensor,
     pose: Tensor,
     depth: Tensor,
-    config: TrackerConfig,
+    settings: StepSettings,
 ) -> WindowStep:
     """Window of the left and the right image, with an edge from each patch into the right one."""
     c, device = model.config, seen.intrinsics.device
     window = Window.empty(seen.centres.shape[2], c.patch_size, c.hidden_channels, device)
-    align = WindowAlignment(window, replace(config.alignment, slope=_SLOPE), device)
-    step = WindowStep(model, window, WindowCorrelation(window, c, device), align, True, config.kernel)
+    align = WindowAlignment(window, replace(settings.alignment, slope=_SLOPE), device)
+    step = WindowStep(model, window, WindowCorrelation(window, c, device), align, True, settings.kernel)
     patches = patch_coordinates(seen.centres, depth, c.patch_size)[0]
     maps = seen.maps, features.matching
     both = (seen.image, seen.intrinsics, se3.identity().to(pose)), (image, intrinsics, pose)

@@ -27,51 +27,25 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from dvo.geometry import sim3, so3
 from dvo.map.archive import ArchivedKeyframe
 from dvo.map.keyframe_graph import KeyframeGraph
-from dvo.map.places import PlaceIndex
-from dvo.models.patch_vo import PatchVO
 from dvo.odometry.frames.front_end import View
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
 from dvo.odometry.loops import correction as loop_correction
 from dvo.odometry.loops.check import median_inverse_depth
 from dvo.odometry.loops.finder import Loop, LoopFinder
-from dvo.odometry.loops.joint_window import GroupMatcher
-from dvo.odometry.loops.place_descriptors import shipped_descriptor
 from dvo.odometry.loops.relocalisation import Located, locate
 from dvo.odometry.loops.work import Correcting, Searching, is_due
 from dvo.odometry.maintenance.adjuster import Adjuster, Adjusting
 from dvo.odometry.maintenance.background import Background, Steps, all_steps
-from dvo.odometry.patch.config import TrackerConfig
-from dvo.odometry.patch.state import TrackerState
 
 PATIENCE = 4
 """Searches after a loop within which a second one has to confirm it."""
 # A loop whose correction is smaller (in the same units) leaves the poses to the final adjustment.
 _SMALL = (0.01, 0.003, 0.01)
-
-
-def loop_closer(
-    model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device, state: TrackerState
-) -> LoopCloser:
-    """Loop closure of a tracker.
-
-    Args:
-        model: the network.
-        config: of the tracker.
-        graph: of the tracker.
-        device: of the computation.
-        state: of the tracker.
-    """
-    described = shipped_descriptor(model.config.feature_channels)
-    places = PlaceIndex(1 if described is None else described.dimensions)
-    finder = LoopFinder(graph, GroupMatcher(model, config, device), places, described, config.loop)
-    adjuster = Adjuster(graph, state, config.adjustment, config.adjust_after_loop)
-    return LoopCloser(graph, finder, config.loops, config.real_time, adjuster)
 
 
 @dataclass

@@ -25,11 +25,10 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.frames.front_end import encode_image
-from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.window.alignment import WindowAlignment
 from dvo.odometry.window.correlation import WindowCorrelation
 from dvo.odometry.window.evidence import related_share
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.step import StepSettings, WindowStep
 
 Group = tuple[ArchivedKeyframe, ...]
 """Keyframe with its neighbours."""
@@ -64,12 +63,12 @@ class GroupMatcher:
 
     Args:
         model: the network.
-        config: of the tracker: sub-pixel alignment and kernel.
+        settings: of the measurements.
         device: of the computation.
     """
 
-    def __init__(self, model: PatchVO, config: TrackerConfig, device: torch.device) -> None:
-        self.model, self.config, self.device = model, config, device
+    def __init__(self, model: PatchVO, settings: StepSettings, device: torch.device) -> None:
+        self.model, self.settings, self.device = model, settings, device
         self.maps = FeatureCache(lambda image: encode_image(model, image, device).matching, _MAPS)
 
     def can_match(self, frame: ArchivedKeyframe) -> bool:
@@ -129,10 +128,10 @@ class GroupMatcher:
 
     def _joint(self, old: Group, new: Group, poses_cw: Tensor) -> WindowStep:
         """Window of both groups with all edges but those within the older one."""
-        c, config, device = self.model.config, self.config, self.device
+        c, settings, device = self.model.config, self.settings, self.device
         window = Window.empty(len(new[0].centres), c.patch_size, c.hidden_channels, device)
-        align = None if config.align == "none" else WindowAlignment(window, config.alignment, device)
-        step = WindowStep(self.model, window, WindowCorrelation(window, c, device), align, True, config.kernel)
+        align = WindowAlignment(window, settings.alignment, device) if settings.align else None
+        step = WindowStep(self.model, window, WindowCorrelation(window, c, device), align, True, settings.kernel)
         for slot, frame in enumerate((*old, *new)):
             self._append(step, slot, frame, poses_cw[slot])
         m, n = window.per_frame, len(window)

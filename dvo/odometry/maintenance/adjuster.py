@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.graph_adjustment import Adjusted, AdjustmentLimits, AdjustmentRecord, Cause, apply, prepare
+from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.maintenance.background import Background, Task
-from dvo.odometry.patch.state import TrackerState
 
 
 @dataclass
@@ -38,7 +38,7 @@ class Adjuster:
 
     Args:
         graph: of the tracker; corrected in place.
-        state: of the tracker, whose shutter is that of the camera.
+        shutter: gives the timing of the rows of the last frame.
         options: of the final adjustment.
         after_loop: adjust a world after each correction by a loop.
         limits: of the work beside tracking.
@@ -50,7 +50,7 @@ class Adjuster:
     """
 
     graph: KeyframeGraph
-    state: TrackerState
+    shutter: Callable[[], Shutter]
     options: AdjustmentOptions
     after_loop: bool = False
     limits: AdjustmentLimits = AdjustmentLimits()
@@ -70,7 +70,7 @@ class Adjuster:
             delay: frames until the solution is taken.
             limits: bounds of the work; None for those of the final adjustment.
         """
-        work = prepare(self.graph, world, self.state.shutter, self.options, limits)
+        work = prepare(self.graph, world, self.shutter(), self.options, limits)
         return Adjusting(background.start(work.solve), delay, world, cause, self._time())
 
     def begin_next(self, background: Background, corrected: int | None) -> Adjusting | None:

@@ -15,6 +15,8 @@ from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.loops.options import LoopOptions
+from dvo.odometry.window.evidence import Thresholds
+from dvo.odometry.window.step import StepSettings
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -179,6 +181,23 @@ class TrackerConfig:
     def kernel(self) -> Kernel:
         """Robust kernel of bundle adjustment in ``track``."""
         return Kernel("cauchy", self.robust) if self.robust > 0 else Kernel()
+
+    @property
+    def measuring(self) -> StepSettings:
+        """How edges between images that are not in the window are measured."""
+        return StepSettings(self.kernel, self.alignment, self.align != "none")
+
+    @property
+    def thresholds(self) -> Thresholds:
+        """Thresholds of the evidence for a pose."""
+        return Thresholds(
+            self.lost_confidence, self.min_inliers, self.search_inliers, self.join_inliers, self.initial_inliers
+        )
+
+    @property
+    def variance(self) -> float:
+        """Variance that covariances are scaled by, feature pixels squared."""
+        return self.sigma**2 * self.covariance_scale
 
     @property
     def alignment(self) -> AlignmentOptions:

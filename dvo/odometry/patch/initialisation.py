@@ -173,7 +173,7 @@ def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig
     Returns:
         True if frames were removed.
     """
-    count = last_unrelated(step, config)
+    count = last_unrelated(step, config.thresholds)
     if count:
         graph.reject(graph.window.frames[count].identifier, NO_MATCH)
     return count > 0
@@ -213,4 +213,4 @@ def leave_minimum(step: WindowStep, config: TrackerConfig) -> bool:
     if best.start != PRESENT:
         _take(window, best)
         match_window(window)
-    return has_second_solution(step, config, [best, *(other for other in found if other is not best)])
+    return has_second_solution(step, config.variance, [best, *(other for other in found if other is not best)])

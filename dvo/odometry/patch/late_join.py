@@ -77,7 +77,7 @@ def _join(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, view: V
     options = StepOptions(fixed=window.fixed(config.optimisation), damping=damping_at(COLD_UPDATES))
     for _ in range(config.search_updates):
         step(options, align=True)
-    if all(evidence_of(step, k).supports(config, joining=True) for k in (position, position + 1)):
+    if all(evidence_of(step, k).supports(config.thresholds, joining=True) for k in (position, position + 1)):
         graph.drop(position)
         return True
     graph.discard(position)

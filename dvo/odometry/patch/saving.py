@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -19,18 +19,33 @@ from dvo.map.io.map_file import write_map_file
 from dvo.map.io.serialisation import graph_arrays
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.places import PlaceIndex
+from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import tensor_digest
 from dvo.odometry.loops.closure import LoopCloser
+from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import run_information
 from dvo.odometry.patch.initialisation import NOT_INITIALISED
 from dvo.odometry.patch.map_tables import LoopsTable, LoopTable, MapTable, WeightsTable
+from dvo.odometry.patch.state import TrackerState
 from dvo.odometry.scale.metric_scale import settle_scale
-
-if TYPE_CHECKING:
-    from dvo.odometry.patch.tracker import PatchOdometry
+from dvo.odometry.window.step import WindowStep
 
 
-def save_map(file: str | Path, odometry: PatchOdometry) -> None:
+class SavedTracker(Protocol):
+    """What is read of a tracker, see :class:`dvo.odometry.patch.tracker.PatchOdometry`."""
+
+    name: str
+    seed: int
+    weights: str
+    config: TrackerConfig
+    model: PatchVO
+    graph: KeyframeGraph
+    state: TrackerState
+    step: WindowStep
+    loops: LoopCloser
+
+
+def save_map(file: str | Path, odometry: SavedTracker) -> None:
     """Write the map of a tracker, between two frames or after the last one.
 
     Args:
@@ -61,7 +76,7 @@ def save_map(file: str | Path, odometry: PatchOdometry) -> None:
     write_map_file(file, description, arrays)
 
 
-def _closed(odometry: PatchOdometry) -> tuple[KeyframeGraph, LoopCloser, dict[str, Any]]:
+def _closed(odometry: SavedTracker) -> tuple[KeyframeGraph, LoopCloser, dict[str, Any]]:
     """Copies of graph and loops with the segment closed, and the scale for run.json."""
     state, config, graph = odometry.state, odometry.config, odometry.graph.copy()
     finder = odometry.loops.finder

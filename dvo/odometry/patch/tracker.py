@@ -34,10 +34,9 @@ from dvo.odometry.exclusive import exclusive
 from dvo.odometry.frames.frame_sequence import FrameSequence
 from dvo.odometry.frames.front_end import View, keyframe_of, observe
 from dvo.odometry.frames.working_image import masked_image
+from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
 from dvo.odometry.global_ba.rolling_shutter import Shutter
-from dvo.odometry.loops.closure import loop_closer
 from dvo.odometry.loops.relocalisation import REFRESH, Located, hold_to_map, invite
-from dvo.odometry.patch.adjusting import adjust
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
@@ -49,6 +48,7 @@ from dvo.odometry.patch.initialisation import (
     restart_due,
 )
 from dvo.odometry.patch.late_join import join_waiting
+from dvo.odometry.patch.loops import loop_closer
 from dvo.odometry.patch.new_recording import begin_in_map
 from dvo.odometry.patch.saving import save_map
 from dvo.odometry.patch.state import TrackerState
@@ -169,7 +169,7 @@ class PatchOdometry:
                 state.joining, state.skipped = str(gap), not gap.frozen
             mask = self._without_fixed(image, mask)
             seen = observe(self.model, image, camera, self.select, self.device, mask=mask)
-            seen = measure_depth(self.model, seen, frame, self.config)
+            seen = measure_depth(self.model, seen, frame, self.config.scale, self.config.measuring)
             state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
             state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
             estimate = self._take(View([record], seen))
@@ -233,7 +233,36 @@ class PatchOdometry:
         """
         save_map(file, self)
 
-    adjust = adjust
+    @torch.inference_mode()
+    def adjust(self) -> tuple[AdjustmentRecord, ...]:
+        """Adjust everything that has left the window, before, or between, any two frames of the sequence.
+
+        All worlds of the recording are adjusted one after the other, by the measurements of archived keyframes and
+        loops (:mod:`dvo.odometry.global_ba.graph_adjustment`); the window moves along. A solution that does not lower
+        the robust cost is not taken. Work in progress for loops is waited for. With the setting ``real_time`` nothing
+        is waited for: the adjustments are done beside tracking, within bounds, and applied when they are there. Poses
+            and depths may change, and the scale.
+
+        Returns:
+            One record for each world, with the cost before and after; none for a world with fewer than three archived
+            keyframes. Empty with ``real_time``; run.json lists the adjustments later.
+
+        Raises:
+            DvoError: the sequence is finished. ``finish`` has adjusted it.
+
+        Example:
+            >>> odometry = dvo.load("small")
+            >>> for number, frame in enumerate(dvo.open("video.mp4", calib="calib.txt"), 1):
+            ...     estimate = odometry.track(frame)
+            ...     if number % 500 == 0:
+            ...         for record in odometry.adjust():
+            ...             print(record.keyframes, record.cost_before, record.cost)
+        """
+        if self.state.finished:
+            raise DvoError("the sequence is finished and adjusted", field="adjust()", remedy="adjust before finish()")
+        if self.state.map is not None:  # which stays as it is
+            return ()
+        return tuple(self.loops.adjust(self.state.adjustable, wait=not self.config.real_time))
 
     def _result(self, poses: dict[int, np.ndarray]) -> Result:
         return result_of(self.graph, run_information(self.graph, self.state, self.config, self.loops, self.seed), poses)
@@ -249,10 +278,10 @@ class PatchOdometry:
             return self._initialise(view, keyframe)
         before = window.snapshot()
         evidence = self._updated(config.search_updates if state.joining else config.updates)
-        supported = evidence.supports(config, joining=bool(state.joining))
+        supported = evidence.supports(config.thresholds, joining=bool(state.joining))
         if not (supported or state.joining):  # a fast motion may need more updates, but then has to be found for sure
             evidence = self._updated(config.search_updates)
-            supported = evidence.supports(config, searched=True)
+            supported = evidence.supports(config.thresholds, searched=True)
         if not supported:
             window.restore(before)
             self.graph.discard(len(window) - 1)  # so that the next frames are joined with those before it
@@ -306,7 +335,7 @@ class PatchOdometry:
         record.place(keyframe.identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
             enough = initialise_related(self.graph, self.step, config, state.waited)
-            state.initialised = enough and newest_evidence(self.step).supports(config)
+            state.initialised = enough and newest_evidence(self.step).supports(config.thresholds)
             state.adjustable += [self.graph.segment] * state.initialised
             if state.initialised and config.restart:
                 state.ambiguous = measured_share(window.measured) < MOST  # until it is tried
@@ -413,7 +442,7 @@ class PatchOdometry:
         if pose_wc is None:
             return Estimate(record.timestamp, None, status, 0.0, segment, reason, recovered)
         state.started = record.timestamp if state.started is None else state.started
-        sure = LaterUncertainty(self.step, self.config, state.ambiguous)
+        sure = LaterUncertainty(self.step, self.config.variance, state.ambiguous)
         return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
                         sure.covariance, sure.reference)  # fmt: skip
 

@@ -33,7 +33,6 @@ from dvo.ba.layer.window_equations import window_equations
 from dvo.ba.multistart import Solution
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.patch_problem import PatchProblem
-from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty.displacement import confidence_of, window_metric
 from dvo.odometry.uncertainty.gauge import Gauge, window_gauge
 from dvo.odometry.uncertainty.measurements import WindowMeasurements
@@ -70,12 +69,12 @@ class LaterUncertainty:
     The bytes are those that it would have had at once. Until then the measurements of the window are held.
 
     Args:
-        step, config, ambiguous: see :func:`newest_uncertainty`.
+        step, variance, ambiguous: see :func:`newest_uncertainty`.
     """
 
-    def __init__(self, step: WindowStep, config: TrackerConfig, ambiguous: bool = False) -> None:
+    def __init__(self, step: WindowStep, variance: float, ambiguous: bool = False) -> None:
         self._compute: Callable[[], Uncertainty] | None
-        self._compute = partial(_uncertainty, WindowMeasurements.of(step), config, ambiguous)
+        self._compute = partial(_uncertainty, WindowMeasurements.of(step), variance, ambiguous)
         self._found = UNKNOWN
 
     def _value(self) -> Uncertainty:
@@ -98,28 +97,30 @@ class LaterUncertainty:
         return self._value().confidence
 
 
-def newest_uncertainty(step: WindowStep, config: TrackerConfig, ambiguous: bool = False) -> Uncertainty:
+def newest_uncertainty(step: WindowStep, variance: float, ambiguous: bool = False) -> Uncertainty:
     """Uncertainty of the pose of the newest frame of a window. Nothing changes.
 
     Args:
         step: of the model on the window, after a step.
-        config: scale of the covariance.
+        variance: of a measurement of confidence 1, and what is beyond it
+            (:attr:`dvo.odometry.patch.config.TrackerConfig.variance`), feature pixels squared.
         ambiguous: the window may have a second solution, which is looked for.
 
     Returns:
         The uncertainty; without covariance and with a confidence of zero where the measurements do not determine the
         pose.
     """
-    return _uncertainty(WindowMeasurements.of(step), config, ambiguous)
+    return _uncertainty(WindowMeasurements.of(step), variance, ambiguous)
 
 
 @torch.no_grad()
-def has_second_solution(step: WindowStep, config: TrackerConfig, solved: Sequence[Solution]) -> bool:
+def has_second_solution(step: WindowStep, variance: float, solved: Sequence[Solution]) -> bool:
     """Tell if another solution of a window is nearly as good as the present one.
 
     Args:
         step: of the model on the window, which is at the first of the solutions.
-        config: scale of the covariance.
+        variance: of a measurement of confidence 1, and what is beyond it
+            (:attr:`dvo.odometry.patch.config.TrackerConfig.variance`), feature pixels squared.
         solved: solutions of the window.
 
     Returns:
@@ -129,17 +130,17 @@ def has_second_solution(step: WindowStep, config: TrackerConfig, solved: Sequenc
     gauge = window_gauge(window.problem)
     if gauge is None or len(solved) < 2:
         return False
-    covariance = _covariance(window, gauge, config)
+    covariance = _covariance(window, gauge, variance)
     return covariance is not None and bool(second_solutions(solved, gauge, covariance, window_metric(window)))
 
 
 @torch.no_grad()
-def _uncertainty(window: WindowMeasurements, config: TrackerConfig, ambiguous: bool) -> Uncertainty:
+def _uncertainty(window: WindowMeasurements, variance: float, ambiguous: bool) -> Uncertainty:
     gauge = window_gauge(window.problem)
     if gauge is None:
         return UNKNOWN
     reference = window.timestamps[gauge.reference]
-    covariance = _covariance(window, gauge, config)
+    covariance = _covariance(window, gauge, variance)
     if covariance is None:
         return Uncertainty(None, reference)
     metric = window_metric(window)
@@ -150,15 +151,15 @@ def _uncertainty(window: WindowMeasurements, config: TrackerConfig, ambiguous: b
     share = 1 - sum(other.probability for other in others)
     mixture = share * covariance
     for other in others:
-        own = _covariance(window.at(other.solution.problem), gauge, config)
+        own = _covariance(window.at(other.solution.problem), gauge, variance)
         own = covariance if own is None else own
         mixture = mixture + other.probability * (own + np.outer(other.error, other.error))
     return Uncertainty(mixture, reference, share * confidence)
 
 
-def _covariance(window: WindowMeasurements, gauge: Gauge, config: TrackerConfig) -> np.ndarray | None:
+def _covariance(window: WindowMeasurements, gauge: Gauge, variance: float) -> np.ndarray | None:
     """Covariance ``(6, 6)`` of the newest pose, of one solution; None if the measurements do not determine it."""
-    covariance = config.sigma**2 * config.covariance_scale * _marginal(window, gauge)
+    covariance = variance * _marginal(window, gauge)
     return covariance if np.isfinite(covariance).all() else None
 
 

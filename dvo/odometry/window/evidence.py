@@ -12,7 +12,6 @@ from torch import Tensor
 from dvo.geometry.projection import reproject
 from dvo.map.window import Window
 from dvo.nets.patch.masks import MASK_MARGIN, shrunk
-from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.window.step import WindowStep
 
 CONFIDENT = 0.1
@@ -45,6 +44,17 @@ _UNLIKE = 24.0  # mean difference of two windows above which they do not show th
 
 
 @dataclass(frozen=True)
+class Thresholds:
+    """Thresholds of evidence, see :class:`dvo.odometry.patch.config.TrackerConfig`."""
+
+    lost_confidence: float
+    min_inliers: float
+    search_inliers: float
+    join_inliers: float
+    initial_inliers: float
+
+
+@dataclass(frozen=True)
 class Evidence:
     """Agreement of the measurements of a frame with those before it in the window.
 
@@ -57,11 +67,11 @@ class Evidence:
     confidence: float
     inliers: float
 
-    def supports(self, config: TrackerConfig, joining: bool = False, searched: bool = False) -> bool:
+    def supports(self, thresholds: Thresholds, joining: bool = False, searched: bool = False) -> bool:
         """Decide if the images bear out the pose.
 
         Args:
-            config: thresholds.
+            thresholds: for it.
             joining: the frame follows frames without a pose, or a gap in time: its pose relative to the window cannot
                 be checked by continuity, so that more agreement is required.
             searched: the pose was found by further updates, which requires more agreement too.
@@ -69,8 +79,9 @@ class Evidence:
         Returns:
             True if they do.
         """
-        inliers = config.join_inliers if joining else config.search_inliers if searched else config.min_inliers
-        return self.confidence >= config.lost_confidence and self.inliers >= inliers
+        least = thresholds.search_inliers if searched else thresholds.min_inliers
+        inliers = thresholds.join_inliers if joining else least
+        return self.confidence >= thresholds.lost_confidence and self.inliers >= inliers
 
 
 def missing_content(image: np.ndarray, mask: np.ndarray | None = None) -> str:
@@ -217,12 +228,12 @@ def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:
     return among if window.visible is None else among & (confidence != 0).any(dim=-1)  # NaN is evidence against
 
 
-def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
+def last_unrelated(step: WindowStep, thresholds: Thresholds) -> int:
     """Position after the last pair of consecutive frames of a window that do not show the same scene.
 
     Args:
         step: of the model on the window, after some steps.
-        config: thresholds.
+        thresholds: of evidence.
 
     Returns:
         Position of the first frame that all later ones are related to; 0 if all frames are.
@@ -236,7 +247,7 @@ def last_unrelated(step: WindowStep, config: TrackerConfig) -> int:
             continue
         pair = measured(window, window.confidence, pair)
         confidence, inliers = float(window.confidence[pair].mean()), _inliers(step, pair)
-        if confidence >= config.lost_confidence and inliers >= config.initial_inliers:
+        if confidence >= thresholds.lost_confidence and inliers >= thresholds.initial_inliers:
             continue
         # Where most of the picture is sky or water few patches agree, although both frames show the same.
         before, after = window.frames[position - 1].image, window.frames[position].image

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from torch import Tensor
@@ -12,8 +12,24 @@ from dvo.ba.kernels import Kernel
 from dvo.map.measured_depths import depth_factors
 from dvo.map.window import Window
 from dvo.models.step import Revision, StepModel, StepOptions, UpdateState, revise, step
+from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.window.alignment import WindowAlignment
 from dvo.odometry.window.correlation import WindowCorrelation
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """How the edges of a window are measured and weighted.
+
+    Attributes:
+        kernel: robust kernel of bundle adjustment.
+        alignment: options of the sub-pixel alignment.
+        align: measurements are aligned to a fraction of a pixel when they leave the window.
+    """
+
+    kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
+    alignment: AlignmentOptions = AlignmentOptions()  # noqa: RUF009 (frozen)
+    align: bool = True
 
 
 class WindowStep:

@@ -12,7 +12,7 @@ import numpy as np
 
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame
-from dvo.data.source import open_source
+from dvo.data.open import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.synth.sequence import make_sequence
 

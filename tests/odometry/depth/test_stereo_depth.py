@@ -60,7 +60,7 @@ def test_depths_of_a_rendered_pair(model, mount):
     """The cameras need not be parallel."""
     frame, depth = rendered_pair(mount)
     seen = observed(model, frame)
-    found = match_right(model, seen, right_view(frame, 320, 240), TrackerConfig(scale=STEREO))
+    found = match_right(model, seen, right_view(frame, 320, 240), TrackerConfig().measuring, STEREO.stereo_error)
     true, _ = followed_planes(depth, seen.image.mean(2), seen.centres[0, 0].double().numpy() * 4)
     known = np.isfinite(true) & found.good.numpy()
     assert known.sum() > 0.5 * np.isfinite(true).sum()
@@ -79,7 +79,7 @@ def test_slopes_of_floor_and_walls(model):
     """One image beside the other tells the slopes roughly: better than that there are none."""
     frame, depth = rendered_pair(PARALLEL, "hall")
     seen = observed(model, frame, 96)
-    found = match_right(model, seen, right_view(frame, 320, 240), TrackerConfig(scale=STEREO))
+    found = match_right(model, seen, right_view(frame, 320, 240), TrackerConfig().measuring, STEREO.stereo_error)
     metres, slopes = followed_planes(depth, seen.image.mean(2), seen.centres[0, 0].double().numpy() * 4)
     known = np.isfinite(metres) & found.good.numpy() & (metres < 5)
     true, slopes = 4 * slopes[known], found.slopes.numpy()[known]  # 1 / feature pixel
@@ -93,7 +93,9 @@ def test_a_right_image_of_another_place_gives_hardly_any_depth(model):
     frame, _ = rendered_pair(PARALLEL)
     other = np.ascontiguousarray(frame.right.image[::-1, ::-1])
     frame = replace(frame, right=replace(frame.right, image=other))
-    found = match_right(model, observed(model, frame), right_view(frame, 320, 240), TrackerConfig(scale=STEREO))
+    found = match_right(
+        model, observed(model, frame), right_view(frame, 320, 240), TrackerConfig().measuring, STEREO.stereo_error
+    )
     assert float(found.good.float().mean()) < 0.15
 
 

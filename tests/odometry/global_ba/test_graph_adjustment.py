@@ -12,7 +12,7 @@ import dvo
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.map.measurements import ArchivedEdges
-from dvo.map.recordings import Recording
+from dvo.map.recording import Recording
 from dvo.metrics import evaluate
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentLimits, apply, prepare
@@ -65,7 +65,7 @@ def test_the_cost_never_increases(wrong, iterations, frames):
     graph, _ = archived_walk(frames=frames, wrong=wrong)
     before = cost(graph)
     limits = AdjustmentLimits(iterations=iterations)
-    adjuster = Adjuster(graph, None, AdjustmentOptions())
+    adjuster = Adjuster(graph, Shutter, AdjustmentOptions())
     adjuster.take(Adjusting(Background().start(prepared(graph, limits).solve), 0, 0, "loop", 0.0))
     assert cost(graph) <= before * (1 + 1e-6)
     (record,) = adjuster.records
@@ -75,7 +75,7 @@ def test_the_cost_never_increases(wrong, iterations, frames):
 def test_a_solution_that_is_no_better_changes_nothing():
     graph, _ = archived_walk()
     before, found = state(graph), prepared(graph).solve()
-    adjuster = Adjuster(graph, None, AdjustmentOptions())
+    adjuster = Adjuster(graph, Shutter, AdjustmentOptions())
     worse = replace(found, cost=found.cost_before)
     assert adjuster.take(Adjusting(Background().start(lambda: worse), 0, 0, "request", 1.5)) == {}
     for mine, other in zip(before, state(graph), strict=True):
@@ -166,7 +166,7 @@ def test_a_rolling_shutter_is_taken_into_account():
 
 def test_a_short_or_unknown_world_is_left_alone():
     graph, _ = archived_walk(frames=2)
-    adjuster = Adjuster(graph, None, AdjustmentOptions())
+    adjuster = Adjuster(graph, Shutter, AdjustmentOptions())
     for world in (0, 5):
         task = Background().start(prepare(graph, world, GLOBAL, AdjustmentOptions()).solve)
         assert not task.result().better

@@ -106,8 +106,8 @@ def test_a_window_is_solved_as_its_problem_is():
 def test_covariance_and_confidence_are_those_of_the_mixture():
     step, _ = ambiguous_step()
     window, gauge = WindowMeasurements.of(step), window_gauge(step.window.problem())
-    plain = newest_uncertainty(step, TrackerConfig())
-    mixed = newest_uncertainty(step, TrackerConfig(), ambiguous=True)
+    plain = newest_uncertainty(step, TrackerConfig().variance)
+    mixed = newest_uncertainty(step, TrackerConfig().variance, ambiguous=True)
     others = second_solutions(window_solutions(window.problem), gauge, plain.covariance, window_metric(window))
     assert others and mixed.reference == plain.reference
     share = 1 - sum(other.probability for other in others)
@@ -116,11 +116,11 @@ def test_covariance_and_confidence_are_those_of_the_mixture():
         there = SimpleNamespace(**(vars(step) | {"window": replace(
             step.window, poses_cw=other.solution.problem.poses_cw.float(),
             patches=other.solution.problem.patches.float().expand_as(step.window.patches))}))  # fmt: skip
-        own = newest_uncertainty(there, TrackerConfig()).covariance
+        own = newest_uncertainty(there, TrackerConfig().variance).covariance
         expected = expected + other.probability * (own + np.outer(other.error, other.error))
     np.testing.assert_allclose(mixed.covariance, expected, rtol=1e-6)
     assert mixed.confidence == pytest.approx(share * plain.confidence)
-    later = LaterUncertainty(step, TrackerConfig(), ambiguous=True)
+    later = LaterUncertainty(step, TrackerConfig().variance, ambiguous=True)
     assert np.array_equal(later.covariance(), mixed.covariance) and later.confidence() == mixed.confidence
 
 
@@ -129,7 +129,7 @@ def test_the_true_pose_is_within_the_covariance_of_a_wrong_solution(seed):
     step, truth = ambiguous_step(seed)
     error = relative_error(step.window.poses_cw, truth, window_gauge(step.window.problem()))
     config = TrackerConfig(sigma=NOISE, covariance_scale=1.0)
-    plain, mixed = (newest_uncertainty(step, config, ambiguous) for ambiguous in (False, True))
+    plain, mixed = (newest_uncertainty(step, config.variance, ambiguous) for ambiguous in (False, True))
     before, after = (float(error @ np.linalg.solve(x.covariance, error)) / 6 for x in (plain, mixed))
     assert before > 20 and after < 2
     assert mixed.confidence < plain.confidence
@@ -137,4 +137,4 @@ def test_the_true_pose_is_within_the_covariance_of_a_wrong_solution(seed):
 
 def test_nothing_is_solved_where_there_is_one_solution(monkeypatch):
     monkeypatch.setattr(uncertainty, "window_solutions", lambda window: pytest.fail("solved"))
-    assert newest_uncertainty(ambiguous_step()[0], TrackerConfig()).covariance is not None
+    assert newest_uncertainty(ambiguous_step()[0], TrackerConfig().variance).covariance is not None

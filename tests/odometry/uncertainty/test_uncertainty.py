@@ -125,11 +125,11 @@ def test_measured_depths_are_in_it(tracked, share, error):
     config = TrackerConfig()
     inverse = torch.linalg.inv(hessian)[rows[-1]][:, rows[-1]].numpy()
     plain = config.sigma**2 * config.covariance_scale * inverse
-    found = newest_uncertainty(step, config)
+    found = newest_uncertainty(step, config.variance)
     scale = np.sqrt(np.outer(plain.diagonal(), plain.diagonal()))
     np.testing.assert_allclose(found.covariance / scale, plain / scale, atol=1e-6)
-    without = newest_uncertainty(tracked[1], config)
-    tight = newest_uncertainty(with_depths(tracked[1], 1.0, 1e-4), config)
+    without = newest_uncertainty(tracked[1], config.variance)
+    tight = newest_uncertainty(with_depths(tracked[1], 1.0, 1e-4), config.variance)
     sizes = [np.trace(x.covariance[:3, :3]) for x in (tight, found)]
     assert sizes[0] < sizes[1], "better depths, a surer scale"
     assert np.trace(tight.covariance[3:, 3:]) < np.trace(without.covariance[3:, 3:])
@@ -137,8 +137,8 @@ def test_measured_depths_are_in_it(tracked, share, error):
 
 
 def test_depths_that_are_not_measured_change_no_byte(tracked):
-    found = newest_uncertainty(with_depths(tracked[1], 0.0, 0.05), TrackerConfig())
-    plain = newest_uncertainty(tracked[1], TrackerConfig())
+    found = newest_uncertainty(with_depths(tracked[1], 0.0, 0.05), TrackerConfig().variance)
+    plain = newest_uncertainty(tracked[1], TrackerConfig().variance)
     assert found.covariance.tobytes() == plain.covariance.tobytes() and found.confidence == plain.confidence
 
 
@@ -166,9 +166,9 @@ def test_what_has_been_read_holds_no_window(tracked):
         gc.collect()
         return sum(type(one) is WindowMeasurements for one in gc.get_objects())
 
-    before, later = held(), LaterUncertainty(tracked[1], TrackerConfig())
+    before, later = held(), LaterUncertainty(tracked[1], TrackerConfig().variance)
     assert held() == before + 1
-    assert later.confidence() == newest_uncertainty(tracked[1], TrackerConfig()).confidence
+    assert later.confidence() == newest_uncertainty(tracked[1], TrackerConfig().variance).confidence
     assert held() == before
 
 
@@ -176,17 +176,17 @@ def test_scale_and_world_do_not_matter(tracked):
     """The tangent is in the camera, so another world changes nothing; another scale, the unit of the positions."""
     _, step, _ = tracked
     poses, patches = step.window.poses_cw, step.window.patches
-    plain = newest_uncertainty(step, TrackerConfig())
+    plain = newest_uncertainty(step, TrackerConfig().variance)
     scaled = torch.cat((4 * poses[:, :3], poses[:, 3:]), -1), torch.cat((patches[:, :2], patches[:, 2:] / 4), 1)
     units = np.diag([4.0, 4, 4, 1, 1, 1])
-    found = newest_uncertainty(copied(step, *scaled), TrackerConfig())
+    found = newest_uncertainty(copied(step, *scaled), TrackerConfig().variance)
     tolerance = 1e-2 * math.sqrt(np.abs(plain.covariance).max())
     np.testing.assert_allclose(found.covariance, units @ plain.covariance @ units, rtol=2e-2, atol=tolerance**2)
     assert found.confidence == pytest.approx(plain.confidence, abs=1e-2)
     world = se3.exp(torch.tensor([3.0, -2, 1, 0.5, 1.0, -0.7])).expand_as(poses)
     found = newest_uncertainty(copied(step, se3.compose(poses, world)), TrackerConfig())
     np.testing.assert_allclose(found.covariance, plain.covariance, rtol=2e-2, atol=tolerance**2)
-    wide = newest_uncertainty(step, TrackerConfig(sigma=0.122, covariance_scale=8.0))
+    wide = newest_uncertainty(step, TrackerConfig(sigma=0.122, covariance_scale=8.0).variance)
     factor = 4 * 8 / TrackerConfig().covariance_scale
     np.testing.assert_allclose(wide.covariance, factor * plain.covariance, rtol=1e-4)
     assert wide.confidence < plain.confidence
@@ -203,7 +203,7 @@ def test_the_gauge_leaves_out_frames_without_measurements(tracked):
     assert (gradient[[0, 1, 2, n - 1]] == 0).all() and (gradient[3 : n - 1, :3] != 0).any(-1).all()
     window.keep(window.touching(n - 2) & window.touching(n - 1))
     step = SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
-    assert window_gauge(window.problem()) is None and newest_uncertainty(step, TrackerConfig()) is UNKNOWN
+    assert window_gauge(window.problem()) is None and newest_uncertainty(step, TrackerConfig().variance) is UNKNOWN
 
 
 def test_no_pose_depends_on_it(tracked, monkeypatch):

@@ -56,10 +56,10 @@ def test_strong_noise_is_left_to_the_measurements():
 def test_a_frame_after_an_interruption_needs_more_evidence():
     config = TrackerConfig(lost_confidence=0.01, min_inliers=0.02, search_inliers=0.04, join_inliers=0.1)
     weak, strong = Evidence(0.05, 0.05), Evidence(0.05, 0.2)
-    assert weak.supports(config) and not weak.supports(config, joining=True)
-    assert strong.supports(config, joining=True) and weak.supports(config, searched=True)
-    assert not Evidence(0.05, 0.03).supports(config, searched=True)
-    assert not Evidence(0.005, 0.9).supports(config) and not Evidence(0.5, 0.01).supports(config)
+    assert weak.supports(config.thresholds) and not weak.supports(config.thresholds, joining=True)
+    assert strong.supports(config.thresholds, joining=True) and weak.supports(config.thresholds, searched=True)
+    assert not Evidence(0.05, 0.03).supports(config.thresholds, searched=True)
+    assert not Evidence(0.005, 0.9).supports(config.thresholds) and not Evidence(0.5, 0.01).supports(config.thresholds)
 
 
 def test_views_match_and_noise_and_other_scenes_do_not(view):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvo.data.calibration.calibration import read_calibration
+from dvo.data.calibration.read import read_calibration
 from dvo.data.recording import Log, RawFrame, Reader, Request
 
 

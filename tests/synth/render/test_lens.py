@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
-from dvo.data.source import open_source
+from dvo.data.open import open_source
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import Undistorter
 from dvo.odometry.frames.working_image import working_image

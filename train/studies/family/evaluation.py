@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dvo.data.frame import Frame
-from dvo.data.source import open_source
+from dvo.data.open import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics
 from dvo.metrics.relative_pose import join_segments, relative_pose_errors

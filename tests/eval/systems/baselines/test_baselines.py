@@ -87,7 +87,7 @@ def test_null_moves_straight_and_never_turns(film, path):
 
 
 def test_kitti_under_five_percent(data_root: Path):
-    from dvo.data.source import open_source
+    from dvo.data.open import open_source
 
     source = open_source(data_root / "kitti00_120")
     assert source.groundtruth is not None

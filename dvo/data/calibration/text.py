@@ -1,0 +1,52 @@
+"""Calibrations of plain text: numbers on one line, the same by name, or a matrix K on three lines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.calibration.calibration import EXPECTED, Calibration
+from dvo.data.calibration.kitti import kitti_calibration
+from dvo.data.calibration.named_values import read_named_values
+from dvo.data.calibration.values import from_matrix, from_values, load_yaml
+from dvo.geometry.camera import DistortionModel
+
+
+def from_text(text: str, path: Path) -> Calibration:
+    """Calibration of a plain text, see :func:`dvo.data.calibration.read.read_calibration`.
+
+    Args:
+        text: content of the file.
+        path: of the file, for messages.
+
+    Raises:
+        DvoError: other numbers than those of a calibration.
+    """
+    named = read_named_values(text, path, EXPECTED)
+    rows: list[list[float]] = [] if named is None else [named]
+    for line in text.splitlines() if named is None else ():
+        fields = line.split("#")[0].replace(",", " ").replace(";", " ").split()
+        if not fields:
+            continue
+        if fields[0].rstrip(":").upper() in ("P0", "P1", "P2", "P3", "P_RECT_00", "P_RECT_02"):
+            return kitti_calibration(path)
+        try:
+            rows.append([float(field) for field in fields])
+        except ValueError:
+            if ":" in line:  # a YAML with a .txt name
+                return from_values(load_yaml(text, path), path)
+            raise DvoError(
+                f"not a number in {line.strip()[:100]!r}", file=path, field="intrinsics", remedy=EXPECTED
+            ) from None
+    if [len(row) for row in rows] == [3, 3, 3]:
+        return from_matrix(np.array(rows), path)
+    if len(rows) != 1 or len(rows[0]) not in (4, 8, 9):
+        counts = " + ".join(str(len(row)) for row in rows[:10]) or "no"
+        raise DvoError(
+            f"{counts} numbers, expected 4, 8 or 9 on one line", file=path, field="intrinsics", remedy=EXPECTED
+        )
+    fx, fy, cx, cy, *coefficients = rows[0]
+    model: DistortionModel = "radtan" if any(coefficients) else "none"
+    return Calibration(fx, fy, cx, cy, model, tuple(coefficients) if model == "radtan" else (), file=path)

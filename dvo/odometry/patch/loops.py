@@ -1,0 +1,35 @@
+"""Loop closure as the settings of the tracker ask for it."""
+
+from __future__ import annotations
+
+import torch
+
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.places import PlaceIndex
+from dvo.models.patch_vo import PatchVO
+from dvo.odometry.loops.closure import LoopCloser
+from dvo.odometry.loops.finder import LoopFinder
+from dvo.odometry.loops.joint_window import GroupMatcher
+from dvo.odometry.loops.place_descriptors import shipped_descriptor
+from dvo.odometry.maintenance.adjuster import Adjuster
+from dvo.odometry.patch.config import TrackerConfig
+from dvo.odometry.patch.state import TrackerState
+
+
+def loop_closer(
+    model: PatchVO, config: TrackerConfig, graph: KeyframeGraph, device: torch.device, state: TrackerState
+) -> LoopCloser:
+    """Loop closure of a tracker.
+
+    Args:
+        model: the network.
+        config: of the tracker.
+        graph: of the tracker.
+        device: of the computation.
+        state: of the tracker.
+    """
+    described = shipped_descriptor(model.config.feature_channels)
+    places = PlaceIndex(1 if described is None else described.dimensions)
+    finder = LoopFinder(graph, GroupMatcher(model, config.measuring, device), places, described, config.loop)
+    adjuster = Adjuster(graph, lambda: state.shutter, config.adjustment, config.adjust_after_loop)
+    return LoopCloser(graph, finder, config.loops, config.real_time, adjuster)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from dvo.core.errors import DvoError
 from dvo.core.threads import wait_passively
+from dvo.moved import find_moved
 
 if TYPE_CHECKING:
     from dvo import losses
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from dvo.synth.dataset import ClipDataset
 
 wait_passively()
+find_moved()
 
 __version__ = "0.2.0"
 

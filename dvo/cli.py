@@ -188,7 +188,11 @@ def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
 
 def _tracking_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
-    parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
+    system = parser.add_mutually_exclusive_group()
+    system.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
+    system.add_argument(
+        "--system", metavar="NAME", help="an odometry without weights: keyframe, klt-pnp, direct or monoslam"
+    )
     parser.add_argument(
         "--device", metavar="D", default="auto", help="torch device (default: accelerator if available)"
     )

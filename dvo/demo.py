@@ -78,7 +78,7 @@ def demo(arguments: argparse.Namespace) -> int:
     seed_everything(arguments.seed)
     facts = {
         "source": f"rendered: {FAMILY}, seed {SCENE}",
-        "weights": arguments.weights,
+        "weights": arguments.weights if arguments.system is None else None,
         "device": str(device),
         "seed": arguments.seed,
         "stride": 1,

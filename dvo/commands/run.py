@@ -34,6 +34,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.export.formats import check_formats, export_run, remove_exports
 from dvo.odometry.calibrate.camera_estimate import is_foreign
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
+from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
 from dvo.session.frame_table import FrameTable
 from dvo.session.observer import Observer
@@ -101,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
         "calibration": arguments.calib,
         "readout": source.camera.readout,
         "groundtruth": arguments.groundtruth,
-        "weights": arguments.weights,
+        "weights": arguments.weights if arguments.system is None else None,
         "device": str(device),
         "seed": arguments.seed,
         "stride": arguments.stride,
@@ -167,14 +168,22 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     settings |= parse_settings(arguments.set)
     if arguments.preset is not None:
         settings["preset"] = arguments.preset
-    if arguments.no_loops:
+    if arguments.no_loops and arguments.system is None:
         settings["loops"] = False
     settings |= scale_settings(arguments)
     reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
     if reserved:
         raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")
     if getattr(arguments, "map", None) is not None:
+        if arguments.system is not None:
+            raise DvoError("a map is tracked in by weights", field="--system", remedy="leave out --system or --map")
         return load_in_map(arguments.map, arguments.weights, device, arguments.seed, settings)
+    if arguments.system is not None:
+        if arguments.system not in SYSTEMS:
+            raise DvoError(
+                f"no system {shown(arguments.system)}", field="--system", remedy=f"use one of {', '.join(SYSTEMS)}"
+            )
+        return build_system(arguments.system, arguments.seed, settings)
     return dvo.load(arguments.weights, device=device, seed=arguments.seed, **settings)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 from numbers import Integral
 from pathlib import Path
 from types import NoneType, UnionType
@@ -188,6 +188,22 @@ def check_names(kind: type, values: Mapping[str, Any]) -> None:
         raise DvoError(
             f"unknown setting of {kind.__name__}", field=", ".join(unknown), remedy=f"use one of {', '.join(names)}"
         )
+
+
+def changed(settings: T, values: Mapping[str, Any]) -> T:
+    """Settings with some of them changed.
+
+    Args:
+        settings: instance of a dataclass.
+        values: name to value.
+
+    Raises:
+        DvoError: an unknown name, or a value of another type.
+    """
+    check_names(type(settings), values)
+    new = replace(cast(Any, settings), **values)
+    check_settings(new, {})
+    return cast(T, new)
 
 
 def from_table(kind: type[T], entry: Any, file: Path, place: str = "") -> T:

@@ -1,4 +1,4 @@
-"""Construction of odometries from weights: ``dvo.load``."""
+"""Construction of odometries from weights, or of a system without, by name: ``dvo.load``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dvo.core.threads import settle_threads
 from dvo.models.weights import FOLDER, LoadedWeights, load_weights
 from dvo.odometry.patch.config import PRESETS, TRACKER_PRESETS, TrackerConfig, with_changes
 from dvo.odometry.protocol import Odometry
-from dvo.odometry.registry import odometry_builder
+from dvo.odometry.registry import SYSTEMS, build_system, odometry_builder
 
 if TYPE_CHECKING:
     import torch
@@ -25,14 +25,15 @@ def load(
     config: Any = None,
     **overrides: Any,
 ) -> Odometry:
-    """Load weights and build their odometry, for one sequence.
+    """Load weights and build their odometry, or build a classical one, for one sequence.
 
     The architecture in the metadata of the file selects the odometry, see :data:`dvo.odometry.registry.ODOMETRIES`. The
     first call in a process sets the number of threads, see :func:`dvo.core.threads.settle_threads`.
 
     Args:
-        weights: name of weights that ship with dvo, or a file.
-        device: of all computation.
+        weights: name of weights that ship with dvo, or a file; or name of a system without weights
+            (:data:`dvo.odometry.registry.SYSTEMS`): ``keyframe``, ``klt-pnp``, ``direct``, ``monoslam``.
+        device: of all computation; a system without weights computes on the CPU.
         seed: of all random numbers of the odometry. The same seed on the same machine gives the same trajectory, bit
             for bit on the CPU with a fixed number of threads.
         config: settings, for ``patch_vo`` a :class:`dvo.odometry.patch.config.TrackerConfig`; None for those of the
@@ -54,6 +55,9 @@ def load(
         >>> result = odometry.finish()
     """
     settle_threads()
+    if isinstance(weights, str) and weights in SYSTEMS:
+        check_seed(seed)
+        return build_system(weights, seed, overrides if config is None else {"config": config, **overrides})
     return build_odometry(load_weights(weights, device), device=device, seed=seed, config=config, **overrides)
 
 

@@ -1,7 +1,9 @@
-"""Registry of odometries by the architecture of their network."""
+"""Registries of odometries: of networks, by their architecture, and of systems without weights, by name."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Mapping
 from typing import Any, Protocol, cast
 
 from dvo.core.errors import DvoError
@@ -20,6 +22,19 @@ ODOMETRIES = Registry(
     },
 )
 """Architecture name to ``"module:function"`` or ``"module:Class"`` of an :class:`OdometryBuilder`."""
+
+_CLASSICAL = "dvo.odometry.classical"
+SYSTEMS = Registry(
+    "system",
+    "dvo.systems",
+    {
+        "klt-pnp": f"{_CLASSICAL}.klt_pnp:KltPnp",
+        "keyframe": f"{_CLASSICAL}.keyframe.system:KeyframeOdometry",
+        "direct": f"{_CLASSICAL}.direct.system:DirectOdometry",
+        "monoslam": f"{_CLASSICAL}.monoslam.slam:MonoSlam",
+    },
+)
+"""Name to ``"module:Class"`` of an odometry without weights, called with its settings and, if it takes it, the seed."""
 
 
 class OdometryBuilder(Protocol):
@@ -65,3 +80,26 @@ def odometry_builder(architecture: str) -> OdometryBuilder:
             remedy=f"use weights of {', '.join(ODOMETRIES)}, or dvo.load_model for the bare network",
         )
     return cast(OdometryBuilder, ODOMETRIES.resolve(architecture))
+
+
+def build_system(name: str, seed: int, settings: Mapping[str, Any]) -> Odometry:
+    """Build an odometry without weights, for one sequence.
+
+    Args:
+        name: in :data:`SYSTEMS`.
+        seed: of all random numbers of the odometry.
+        settings: by the names of its configuration.
+
+    Returns:
+        The odometry.
+
+    Raises:
+        DvoError: an unknown or invalid setting.
+    """
+    build = SYSTEMS.resolve(name)
+    taken = inspect.signature(build).parameters
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):
+        unknown = sorted(set(settings) - set(taken))
+        if unknown:
+            raise DvoError(f"unknown setting of {name}", field=unknown[0], remedy=f"use one of {', '.join(taken)}")
+    return cast(Odometry, build(**({"seed": seed} if "seed" in taken else {}), **settings))

@@ -32,17 +32,17 @@ DEFAULT = ("dvo-small", "klt-pnp", "null")
 LEARNED = "dvo:load"
 
 
-_BASELINES, _PEERS = "eval.systems.baselines", "eval.systems.peers"
+_CLASSICAL, _PEERS = "dvo.odometry.classical", "eval.systems.peers"
 CATALOGUE = (
-    System("klt-pnp", f"{_BASELINES}.klt_pnp:KltPnp",
+    System("klt-pnp", f"{_CLASSICAL}.klt_pnp:KltPnp",
            about="KLT tracks, five-point essential matrix, triangulation, PnP (OpenCV)"),
-    System("monoslam", f"{_BASELINES}.monoslam.slam:MonoSlam",
+    System("monoslam", f"{_CLASSICAL}.monoslam.slam:MonoSlam",
            about="filter: EKF over camera and inverse-depth points, active search, one-point RANSAC"),
-    System("keyframe", f"{_BASELINES}.keyframe.system:KeyframeOdometry",
+    System("keyframe", f"{_CLASSICAL}.keyframe.system:KeyframeOdometry",
            about="two-view start, PnP, keyframes, local bundle adjustment, relocalisation (after PTAM and ORB-SLAM)"),
-    System("keyframe-loops", f"{_BASELINES}.keyframe.system:KeyframeOdometry", {"loops": True},
+    System("keyframe-loops", f"{_CLASSICAL}.keyframe.system:KeyframeOdometry", {"loops": True},
            about="keyframe with loop closure: ORB matches, PnP, pose graph in Sim(3)"),
-    System("direct", f"{_BASELINES}.direct.system:DirectOdometry",
+    System("direct", f"{_CLASSICAL}.direct.system:DirectOdometry",
            about="semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)"),
     System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",
            about="ORB-SLAM3 (pyorbslam3), without the official vocabulary; monocular, or in metres with "
@@ -53,7 +53,7 @@ CATALOGUE = (
     System("colmap", f"{_PEERS}.colmap:Colmap", licence="BSD-3",
            about="COLMAP (pycolmap), offline, at most 60 frames of a sequence",
            version_from=f"{_PEERS}.colmap:version", missing_from=f"{_PEERS}.colmap:missing"),
-    System("null", f"{_BASELINES}.null:NullMotion",
+    System("null", "eval.systems.null:NullMotion",
            about="straight line at constant speed, no rotation, images unread"),
 )  # fmt: skip
 SYSTEMS = Registry("system", "dvo.systems", {system.name: system.target for system in CATALOGUE})

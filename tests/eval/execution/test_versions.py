@@ -16,7 +16,7 @@ from eval.systems.registry import CATALOGUE, find_system
 
 def test_code_of_a_system_is_what_it_imports(monkeypatch):
     names = {str(file.relative_to(ROOT)) for file in source_files(find_system("klt-pnp"))}
-    folder = "eval/systems/baselines"
+    folder = "dvo/odometry/classical"
     assert {f"{folder}/klt_pnp.py", f"{folder}/klt.py", f"{folder}/two_view.py", "dvo/map/keyframe_log.py"} <= names
     assert f"{folder}/null.py" not in names and not any("dvo/nets" in name for name in names)
     learned = {str(file.relative_to(ROOT)) for file in source_files(find_system("dvo-small"))}
@@ -51,9 +51,9 @@ def test_every_system_of_the_catalogue_has_code():
 
 
 def test_code_of_a_file_and_of_a_package(tmp_path, monkeypatch):
-    (tmp_path / "own.py").write_text("import torch\nfrom eval.systems.baselines.klt import detect\n")
+    (tmp_path / "own.py").write_text("import torch\nfrom dvo.odometry.classical.klt import detect\n")
     files = source_files(find_system(f"{tmp_path / 'own.py'}:Own"))
-    assert {tmp_path / "own.py", ROOT / "eval/systems/baselines/klt.py"} <= set(files)
+    assert {tmp_path / "own.py", ROOT / "dvo/odometry/classical/klt.py"} <= set(files)
     assert depends_on_threads(find_system(f"{tmp_path / 'own.py'}:Own"))
     package = tmp_path / "own_slam"
     package.mkdir()

@@ -21,7 +21,7 @@ from eval.suites.suite import ROOT
 from eval.systems.registry import add_system, find_system, list_systems, remove_system
 from eval.systems.system import System
 
-TARGET = "eval.systems.baselines.klt_pnp:KltPnp"
+TARGET = "dvo.odometry.classical.klt_pnp:KltPnp"
 
 
 def test_registry():
@@ -124,7 +124,7 @@ def test_a_class_of_another_package_needs_no_registration(job):
     assert find_system("no_such_package.slam:Slam").missing() == (
         "no module no_such_package.slam; install it, or set PYTHONPATH"
     )
-    system = find_system("eval.systems.baselines.null:NullMotion")
+    system = find_system("eval.systems.null:NullMotion")
     assert system.missing() is None and system.version() == dvo.__version__
     assert predict_here(replace(job, system=system.name)).status == "ok"
     assert find_system("numpy:ndarray").version() == metadata.version("numpy")
@@ -135,7 +135,7 @@ def test_a_package_announces_a_system_by_name(tmp_path, image_folder, suite_file
     """As ``pip install`` leaves it: a module, its metadata, an entry point. The worker process finds it too."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site/outside.py").write_text(
-        "from eval.systems.baselines.null import NullMotion\nclass Outside(NullMotion):\n    name = 'outside'\n"
+        "from eval.systems.null import NullMotion\nclass Outside(NullMotion):\n    name = 'outside'\n"
     )
     info = tmp_path / "site/outside-1.5.dist-info"
     info.mkdir()

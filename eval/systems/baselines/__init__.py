@@ -1,1 +1,0 @@
-"""Classical systems written here, one for each school of the field."""

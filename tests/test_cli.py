@@ -20,6 +20,7 @@ import dvo
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
 from dvo.odometry.quality import Quality
+from dvo.synth.sequence import make_sequence
 
 FILES = ["frames.csv", "map.ply", "run.json", "summary.html", "trajectory.png", "trajectory.txt"]
 
@@ -50,6 +51,26 @@ def test_settings_reach_the_odometry(given, image_folder, tmp_path, capsys):
 def test_a_wrong_setting_is_bad_input(setting, image_folder, tmp_path, capsys):
     assert main(arguments(image_folder, tmp_path / "out", "--set", setting)) == 2
     assert "patches" in capsys.readouterr().err
+
+
+def test_an_odometry_without_weights(tmp_path, capsys):
+    """``--system`` in place of ``--weights``, with settings of its own."""
+    sequence = make_sequence(4, frames=12, family="room", kind="sideways", height=120, width=160, fps=15.0)
+    images, camera = tmp_path / "images", sequence.camera
+    images.mkdir()
+    for frame in sequence:
+        cv2.imwrite(str(images / f"{frame.index:03d}.png"), frame.image[..., ::-1])
+    (tmp_path / "calib.txt").write_text(f"{camera.fx} {camera.fy} {camera.cx} {camera.cy}")
+    line = ["run", str(images), "--calib", str(tmp_path / "calib.txt"), "--fps", "15", "--no-loops"]
+    assert main([*line, "--out", str(tmp_path / "out"), "--system", "klt-pnp", "--set", "corners=300"]) == 0
+    assert summary(tmp_path / "out")["odometry"] == "klt-pnp" and summary(tmp_path / "out")["weights"] is None
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 12
+    assert main([*line, "--out", str(tmp_path / "other"), "--system", "klt"]) == 2
+    assert "Use one of klt-pnp, keyframe" in capsys.readouterr().err
+    assert main([*line, "--out", str(tmp_path / "other"), "--system", "klt-pnp", "--map", "room.dvo"]) == 2
+    with pytest.raises(SystemExit):
+        main([*line, "--system", "klt-pnp", "--weights", "tiny"])
+    assert "not allowed with" in capsys.readouterr().err
 
 
 def test_run_writes_the_results_folder(given, image_folder, tmp_path, capsys):

@@ -1,11 +1,14 @@
 """``dvo.load``: the odometry of an architecture, its settings and its name."""
 
+import sys
 from dataclasses import replace
+from types import ModuleType
 
 import pytest
 
 import dvo
 from dvo.core.errors import DvoError
+from dvo.metrics import evaluate
 from dvo.models.patch_vo import PatchVO
 from dvo.models.registry import ARCHITECTURES, network_class
 from dvo.models.weights import LoadedWeights
@@ -13,7 +16,8 @@ from dvo.nets.patch.config import ModelConfig, preset
 from dvo.odometry.load import build_odometry
 from dvo.odometry.patch.config import PRESETS, TRACKER_PRESETS, TrackerConfig
 from dvo.odometry.patch.tracker import PatchOdometry
-from dvo.odometry.registry import ODOMETRIES, odometry_builder
+from dvo.odometry.registry import ODOMETRIES, SYSTEMS, build_system, odometry_builder
+from dvo.synth.sequence import make_sequence
 
 
 def test_shipped_weights_give_the_tracker_with_the_settings_of_their_preset():
@@ -75,3 +79,40 @@ def test_presets_and_single_settings_of_every_odometry(architecture):
         build_odometry(weights, colour=1)
     with pytest.raises(DvoError, match="^max_gap: "):
         build_odometry(weights, max_gap=0.5)
+
+
+def test_odometries_without_weights_are_loaded_by_name():
+    sequence = make_sequence(4, frames=16, family="room", kind="sideways", height=120, width=160, fps=15.0)
+    for name in ("keyframe", "klt-pnp", "direct", "monoslam"):
+        assert name in SYSTEMS and dvo.load(name).name == name
+    result = dvo.run(dvo.load("keyframe", seed=2, corners=300), sequence).result
+    assert len(result.trajectory) == 16
+    assert evaluate(result.trajectory, sequence.groundtruth).ate_percent < 5
+    with pytest.raises(DvoError, match="keyframe_points.*nonsense|nonsense.*keyframe_points"):
+        dvo.load("keyframe", nonsense=3)
+    with pytest.raises(DvoError, match="corners: must be a whole number"):
+        dvo.load("klt-pnp", corners="many")
+    with pytest.raises(DvoError, match="seed"):
+        dvo.load("direct", seed=-1)
+
+
+def test_a_system_of_another_package_takes_the_settings_that_it_names(monkeypatch):
+    module = ModuleType("spare_package")
+    module.Spare = Spare
+    monkeypatch.setitem(sys.modules, "spare_package", module)
+    SYSTEMS.register("spare", "spare_package:Spare")
+    try:
+        assert build_system("spare", 1, {"size": 3}).size == 3
+        with pytest.raises(DvoError, match="colour: unknown setting of spare"):
+            build_system("spare", 1, {"colour": 3})
+    finally:
+        SYSTEMS.unregister("spare")
+
+
+class Spare:
+    """Odometry that takes no seed."""
+
+    name = "spare"
+
+    def __init__(self, size=1):
+        self.size = size

@@ -165,7 +165,7 @@ def measure(
             continue
         stamps = np.array([keyframe.timestamp for keyframe in window.frames])
         true_cw = poses_cw[np.abs(times - stamps[:, None]).argmin(1)]
-        pixels = window_metric(WindowMeasurements.of(odometry.step))
+        pixels = window_metric(WindowMeasurements.of(odometry.patch_window))
         xi = relative_error(window.poses_cw.cpu(), true_cw, gauge, metric)
         errors.add(xi, estimate.covariance, pixels, estimate.confidence)
     return errors

@@ -46,6 +46,9 @@ class TrueMeasurements:
     def __init__(self, window: Window, sequence: SyntheticSequence, depth: Tensor) -> None:
         self.window, self.truth = window, TruePositions(sequence, depth)
 
+    def snapshot(self, results: bool) -> None:
+        """Nothing is kept."""
+
     def keep_image(self, map_slot: int, image: np.ndarray) -> None:
         """Nothing: images are not needed."""
 
@@ -79,7 +82,7 @@ def measure(sequence: SyntheticSequence, depth: Tensor, case: str, weights: str,
     odometry = load(weights, seed=seed, **CASES[case])
     assert isinstance(odometry, PatchOdometry)
     if case.startswith("true"):
-        odometry.step.align = TrueMeasurements(odometry.window, sequence, depth)  # type: ignore[assignment]
+        odometry.patch_window.alignment = TrueMeasurements(odometry.window, sequence, depth)  # type: ignore[assignment]
     for frame in sequence:
         odometry.track(frame)
     return evaluate(odometry.finish().trajectory, sequence.groundtruth)

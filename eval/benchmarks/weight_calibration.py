@@ -108,9 +108,9 @@ class Recorder:
 
     def __init__(self, odometry: PatchOdometry, truth: TruePositions) -> None:
         self.window, self.truth = odometry.window, truth
-        self._finalise = odometry.step.finalise
+        self._finalise = odometry.patch_window.finalise
         self._parts: dict[str, list[Errors]] = {kind: [] for kind in KINDS}
-        odometry.step.finalise = self._record  # type: ignore[method-assign]
+        odometry.patch_window.finalise = self._record  # type: ignore[method-assign]
 
     def _record(self, edges: Tensor) -> None:
         window = self.window

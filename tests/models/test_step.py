@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,7 +10,7 @@ from dvo.ba.cold_start import damping_at
 from dvo.ba.factors import DepthPrior
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
-from dvo.map.window import Keyframe, Window
+from dvo.map.window import Keyframe
 from dvo.models.patch_vo import PatchVO
 from dvo.models.schedule import training_schedule
 from dvo.models.step import StepOptions, UpdateState, recent_depth, revise, step
@@ -18,8 +19,7 @@ from dvo.nets.patch.config import preset
 from dvo.nets.patch.patchifier import normalise_images, patch_coordinates
 from dvo.nets.patch.selection import random_centres
 from dvo.nets.update.update import UPDATE_OPERATORS
-from dvo.odometry.window.correlation import WindowCorrelation
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.patch_window import PatchWindow, StepSettings
 from dvo.synth.clip import make_clip
 
 FRAMES, PATCHES, UPDATES = 5, 12, 6
@@ -47,19 +47,19 @@ def as_window(model, clip, generator):
     centres = random_centres(FRAMES, PATCHES, h, w, generator, 1)
     matching, context = model.patchify.cut(features, centres)
     patches = patch_coordinates(centres, torch.ones(1, FRAMES * PATCHES), 3)[0]
-    window = Window.empty(PATCHES, 3, model.config.hidden_channels, torch.device("cpu"))
-    correlation = WindowCorrelation(window, model.config, torch.device("cpu"))
+    found = PatchWindow.empty(model, PATCHES, StepSettings(align="none"), torch.device("cpu"))
+    window, image = found.window, np.zeros((4 * h, 4 * w, 3), np.uint8)
     for i in range(FRAMES):
         part = slice(i * PATCHES, (i + 1) * PATCHES)
         slot = window.free_map_slot()
-        correlation.keep_maps(slot, features.matching[:, i : i + 1])
-        frame = Keyframe(i, 0.1 * i, slot, matching[0, part], context[0, part], torch.zeros(0), clip.intrinsics[i] / 4)
-        window.append(frame, se3.identity(), patches[part])
+        cut = matching[0, part], context[0, part], torch.zeros(0), clip.intrinsics[i] / 4, image
+        found.insert(
+            i, Keyframe(i, 0.1 * i, slot, *cut), features.matching[:, i : i + 1], se3.identity(), patches[part]
+        )
     graph = training_schedule(FRAMES, PATCHES, 1, self_edges=False)[0].graph
-    correlation.forget(window.connect(graph.kk, graph.jj))
-    stepper = WindowStep(model, window, correlation)
-    stepper.bounds = (w, h)
-    return window, stepper
+    found.connect_edges(graph.kk, graph.jj)
+    assert found.bounds == (w, h)
+    return window, found
 
 
 @torch.no_grad()
@@ -72,7 +72,7 @@ def test_both_loops_take_the_same_steps_on_one_graph(model, clip):
     )  # fmt: skip
     window, stepper = as_window(model, clip, torch.Generator().manual_seed(5))
     for update, state in enumerate(unrolled):
-        stepper(StepOptions(damping=damping_at(update)))
+        stepper.step(StepOptions(damping=damping_at(update)))
         for ours, theirs in (
             (window.poses_cw, state.poses_cw), (window.patches, state.patches), (window.hidden, state.hidden),
             (window.targets, state.targets), (window.weights, state.weights),

@@ -32,6 +32,9 @@ class TrueFlow:
     def forget(self, edge_slots):
         pass
 
+    def origins(self):
+        return torch.zeros(0)
+
     def __call__(self, coords, graph):
         window = self.odometry.window
         edges = (graph.ii, graph.jj, graph.kk)
@@ -42,7 +45,7 @@ class TrueFlow:
         exact[0, :, 2] = 1 / self.clip.depth[frame, y, x][:, None, None]
         true = reproject(self.clip.poses_cw[at][None], exact, window.intrinsics[None], *edges)
         target, centre = true.coords[:, :, 1, 1], coords[:, :, 1, 1]
-        w, h = coords.new_tensor(self.odometry.step.bounds)
+        w, h = coords.new_tensor(self.odometry.patch_window.bounds)
         inside = (target >= 0).all(-1) & (target[..., 0] < w) & (target[..., 1] < h)
         seen = true.valid[:, :, 1, 1] & inside
         return Correlation([torch.cat([target - centre, seen[..., None].float()], -1)])
@@ -62,7 +65,7 @@ def perfect(clip, config):
     model = PatchVO(preset("tiny"))
     model.update = Copy()
     odometry = PatchOdometry(model, config)
-    odometry.step.lookup = TrueFlow(odometry, clip)
+    odometry.patch_window.correlation = TrueFlow(odometry, clip)
     return odometry
 
 

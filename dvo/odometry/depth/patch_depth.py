@@ -26,7 +26,7 @@ from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.depth.stereo_depth import measure_stereo
 from dvo.odometry.frames.front_end import Observation
-from dvo.odometry.window.step import StepSettings
+from dvo.odometry.window.patch_window import StepSettings
 
 _HALF = AlignmentOptions().window // 2  # of the window that a measurement follows, pixels of the working image
 _NOISE = 1.0  # squared gradient, (grey levels a pixel)^2, which every pixel has, so that a bare window has a mean

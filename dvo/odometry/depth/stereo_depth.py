@@ -30,9 +30,7 @@ from dvo.models.step import StepOptions
 from dvo.nets.patch.patchifier import Features, patch_coordinates
 from dvo.odometry.depth.right_view import RightView, right_view
 from dvo.odometry.frames.front_end import Observation, encode_image
-from dvo.odometry.window.alignment import WindowAlignment
-from dvo.odometry.window.correlation import WindowCorrelation
-from dvo.odometry.window.step import StepSettings, WindowStep
+from dvo.odometry.window.patch_window import PatchWindow, StepSettings
 
 _UPDATES = 2  # of the network, from the best match along the epipolar line
 _SPACING = 0.5  # of the matches that are tried, feature pixels
@@ -119,11 +117,11 @@ def match_right(
     pose = torch.from_numpy(view.pose_right_left).to(seen.intrinsics)
     focal, right = (seen.intrinsics, intrinsics), features.matching[0, 0]
     depth = search_line(seen.matching, seen.centres[0, 0].to(pose), right, focal, pose)[0][None]
-    step = _pair(model, seen, features, view.image, intrinsics, pose, depth, settings)
+    pair = _pair(model, seen, features, view.image, intrinsics, pose, depth, settings)
     for _ in range(_UPDATES):
-        step(StepOptions(mode="structure", fixed=2, damping=damping_at(COLD_UPDATES)))
-    step.finalise(torch.arange(len(step.window.kk), device=device))
-    return _fitted(step.window, seen.bounds, deviation)
+        pair.step(StepOptions(mode="structure", fixed=2, damping=damping_at(COLD_UPDATES)))
+    pair.finalise(torch.arange(len(pair.window.kk), device=device))
+    return _fitted(pair.window, seen.bounds, deviation)
 
 
 def search_line(
@@ -199,22 +197,20 @@ def _pair(
     pose: Tensor,
     depth: Tensor,
     settings: StepSettings,
-) -> WindowStep:
+) -> PatchWindow:
     """Window of the left and the right image, with an edge from each patch into the right one."""
     c, device = model.config, seen.intrinsics.device
-    window = Window.empty(seen.centres.shape[2], c.patch_size, c.hidden_channels, device)
-    align = WindowAlignment(window, replace(settings.alignment, slope=_SLOPE), device)
-    step = WindowStep(model, window, WindowCorrelation(window, c, device), align, True, settings.kernel)
+    settings = replace(settings, alignment=replace(settings.alignment, slope=_SLOPE), align="final")
+    pair = PatchWindow.empty(model, seen.centres.shape[2], settings, device)
     patches = patch_coordinates(seen.centres, depth, c.patch_size)[0]
     maps = seen.maps, features.matching
     both = (seen.image, seen.intrinsics, se3.identity().to(pose)), (image, intrinsics, pose)
     for slot, (picture, focal, at) in enumerate(both):  # patches of the right image have no edges
-        step.keep_frame(slot, picture, maps[slot])
-        keyframe = Keyframe(slot, float(slot), slot, seen.matching, seen.context, seen.colors, focal)
-        window.append(keyframe, at, patches)
-    kk = torch.arange(window.per_frame, device=device)
-    step.forget(window.connect(kk, torch.ones_like(kk)))
-    return step
+        keyframe = Keyframe(slot, float(slot), slot, seen.matching, seen.context, seen.colors, focal, picture)
+        pair.insert(slot, keyframe, maps[slot], at, patches)
+    kk = torch.arange(pair.window.per_frame, device=device)
+    pair.connect_edges(kk, torch.ones_like(kk))
+    return pair
 
 
 def _fitted(window: Window, bounds: tuple[int, int], deviation: float) -> StereoMatches:

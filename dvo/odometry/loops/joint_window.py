@@ -25,10 +25,8 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.frames.front_end import encode_image
-from dvo.odometry.window.alignment import WindowAlignment
-from dvo.odometry.window.correlation import WindowCorrelation
 from dvo.odometry.window.evidence import related_share
-from dvo.odometry.window.step import StepSettings, WindowStep
+from dvo.odometry.window.patch_window import PatchWindow, StepSettings
 
 Group = tuple[ArchivedKeyframe, ...]
 """Keyframe with its neighbours."""
@@ -102,8 +100,8 @@ class GroupMatcher:
         if len(sizes) != 1 or None in sizes:  # an image that cannot be read, or images of two sizes
             return None
         yield
-        step = self._joint(old, new, poses_cw)
-        window, count = step.window, len(old)
+        joint = self._joint(old, new, poses_cw)
+        window, count = joint.window, len(old)
         across = (window.ii < count) != (window.jj < count)
         before = _newer(window, count)[1]
         share = 0.0
@@ -111,14 +109,14 @@ class GroupMatcher:
             for _ in range(number):
                 yield
                 start = _newer(window, count)
-                step(StepOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
+                joint.step(StepOptions(fixed=count, damping=damping_at(COLD_UPDATES)))
                 if row == len(decisions) - 1 and _is_settled(start, _newer(window, count)):
                     break
-            share = related_share(step, across)
+            share = related_share(window, across)
             if not share >= inliers:  # NaN fails too
                 return None
         yield
-        step.finalise(across.nonzero()[:, 0])
+        joint.finalise(across.nonzero()[:, 0])
         after = window.patches[count * window.per_frame :, 2, 0, 0]
         scale = float((before / after).median())
         poses = se3.normalise(window.poses_cw.double().cpu())
@@ -126,32 +124,29 @@ class GroupMatcher:
             return None
         return Match(share, poses, scale, after.float().cpu(), self._edges((*old, *new), window, across))
 
-    def _joint(self, old: Group, new: Group, poses_cw: Tensor) -> WindowStep:
+    def _joint(self, old: Group, new: Group, poses_cw: Tensor) -> PatchWindow:
         """Window of both groups with all edges but those within the older one."""
-        c, settings, device = self.model.config, self.settings, self.device
-        window = Window.empty(len(new[0].centres), c.patch_size, c.hidden_channels, device)
-        align = WindowAlignment(window, settings.alignment, device) if settings.align else None
-        step = WindowStep(self.model, window, WindowCorrelation(window, c, device), align, True, settings.kernel)
+        joint = PatchWindow.empty(self.model, len(new[0].centres), self.settings, self.device)
+        window, device = joint.window, self.device
         for slot, frame in enumerate((*old, *new)):
-            self._append(step, slot, frame, poses_cw[slot])
+            self._append(joint, slot, frame, poses_cw[slot])
         m, n = window.per_frame, len(window)
         pairs = [(i, j) for i, j in product(range(n), range(n)) if max(i, j) >= len(old)]
         kk = torch.cat([torch.arange(i * m, (i + 1) * m, device=device) for i, _ in pairs])
         jj = torch.tensor([j for _, j in pairs], device=device).repeat_interleave(m)
-        step.forget(window.connect(kk, jj))
-        return step
+        joint.connect_edges(kk, jj)
+        return joint
 
-    def _append(self, step: WindowStep, slot: int, frame: ArchivedKeyframe, pose_cw: Tensor) -> None:
+    def _append(self, joint: PatchWindow, slot: int, frame: ArchivedKeyframe, pose_cw: Tensor) -> None:
         device, image, maps = self.device, frame.image(), self.maps.maps(frame)
         assert image is not None and maps is not None and frame.matching is not None and frame.context is not None
         centres = torch.from_numpy(frame.centres)[None, None].to(device)
         matching, context = (torch.from_numpy(x).float().to(device) for x in (frame.matching, frame.context))
         intrinsics, colors = torch.from_numpy(frame.intrinsics).to(device), torch.from_numpy(frame.colors)
-        step.keep_frame(slot, image, maps)
-        keyframe = Keyframe(frame.identifier, frame.timestamp, slot, matching, context, colors, intrinsics)
+        keyframe = Keyframe(frame.identifier, frame.timestamp, slot, matching, context, colors, intrinsics, image)
         depth = torch.from_numpy(frame.inverse_depth)[None].to(device)
         patches = patch_coordinates(centres, depth, self.model.config.patch_size)[0]
-        step.window.append(keyframe, pose_cw.to(patches), patches)
+        joint.insert(slot, keyframe, maps, pose_cw.to(patches), patches)
 
     @staticmethod
     def _edges(group: Group, window: Window, across: Tensor) -> ArchivedEdges:

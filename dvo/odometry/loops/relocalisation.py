@@ -31,7 +31,7 @@ from dvo.odometry.loops.finder import Loop, LoopFinder
 from dvo.odometry.loops.guess import MATCHED, guess_pose
 from dvo.odometry.loops.joint_window import Group, Match
 from dvo.odometry.maintenance.background import all_steps
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.patch_window import PatchWindow
 
 NEAR = 12
 """Kept keyframes before and after a candidate among which its group is chosen."""
@@ -125,27 +125,25 @@ def _found_among(finder: LoopFinder, view: View, frame: ArchivedKeyframe) -> Loc
     return None
 
 
-def invite(step: WindowStep, guests: Sequence[Guest]) -> None:
+def invite(patch_window: PatchWindow, guests: Sequence[Guest]) -> None:
     """Add guests to a window, after those that it has.
 
     Args:
-        step: of the model on the window.
+        patch_window: the window.
         guests: that the window does not hold.
     """
-    window = step.window
+    window = patch_window.window
     for guest in guests:
         keyframe = replace(guest.keyframe, map_slot=window.free_map_slot())
-        assert keyframe.image is not None
-        step.keep_frame(keyframe.map_slot, keyframe.image, guest.maps)
-        window.insert(window.guests, keyframe, guest.pose_cw.to(window.poses_cw), guest.patches)
+        patch_window.insert(window.guests, keyframe, guest.maps, guest.pose_cw.to(window.poses_cw), guest.patches)
 
 
-def hold_to_map(graph: KeyframeGraph, step: WindowStep, finder: LoopFinder) -> None:
+def hold_to_map(graph: KeyframeGraph, patch_window: PatchWindow, finder: LoopFinder) -> None:
     """Choose the guests of a window again: keyframes of other segments that show what its newest one shows.
 
     Args:
         graph: of the tracker, whose segment was located; its window is changed.
-        step: of the model on the window.
+        patch_window: the window.
         finder: with the keyframes.
     """
     window = graph.window
@@ -158,19 +156,18 @@ def hold_to_map(graph: KeyframeGraph, step: WindowStep, finder: LoopFinder) -> N
     poses_cw = graph.poses_cw(np.array(missing, dtype=np.int64))
     before = window.guests
     guests = [_guest(finder, graph.archive[k], pose) for k, pose in zip(missing, poses_cw, strict=True)]
-    invite(step, [guest for guest in guests if guest is not None])
+    invite(patch_window, [guest for guest in guests if guest is not None])
     if window.guests > before:
-        step.forget(_connect(window, range(before, window.guests)))
+        patch_window.connect_edges(*_edges(window, range(before, window.guests)))
 
 
-def _connect(window: Window, guests: range) -> Tensor:
-    """Edges between new guests and the newest keyframe, both ways; their slots."""
+def _edges(window: Window, guests: range) -> tuple[Tensor, Tensor]:
+    """Edges between new guests and the newest keyframe, both ways: patches and target frames."""
     m, newest, device = window.per_frame, len(window) - 1, window.jj.device
     every = torch.tensor(list(guests), device=device)
     into = (every[:, None] * m + torch.arange(m, device=device)).flatten()
     own = torch.arange(newest * m, (newest + 1) * m, device=device).repeat(len(every))
-    kk, jj = torch.cat([into, own]), torch.cat([torch.full_like(into, newest), every.repeat_interleave(m)])
-    return window.connect(kk, jj)
+    return torch.cat([into, own]), torch.cat([torch.full_like(into, newest), every.repeat_interleave(m)])
 
 
 def _overlapping(graph: KeyframeGraph, finder: LoopFinder) -> list[int]:

@@ -15,14 +15,15 @@ from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.loops.options import LoopOptions
-from dvo.odometry.window.evidence import Thresholds
-from dvo.odometry.window.step import StepSettings
+from dvo.odometry.window.patch_window import InsertPolicy, Round, StepSettings
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 C = TypeVar("C", bound="DataclassInstance")
 
+Policy = Literal["continuous", "retry", "late", "located"]
+"""What a frame follows that is tried in the window."""
 InitialPose = Literal["motion", "nearest"]
 """First pose of a new frame: of the motion model, or from matches with the newest keyframe."""
 
@@ -185,14 +186,33 @@ class TrackerConfig:
     @property
     def measuring(self) -> StepSettings:
         """How edges between images that are not in the window are measured."""
-        return StepSettings(self.kernel, self.alignment, self.align != "none")
+        return replace(self.window, align="none" if self.align == "none" else "final")
 
     @property
-    def thresholds(self) -> Thresholds:
-        """Thresholds of the evidence for a pose."""
-        return Thresholds(
-            self.lost_confidence, self.min_inliers, self.search_inliers, self.join_inliers, self.initial_inliers
-        )
+    def window(self) -> StepSettings:
+        """How the edges of the window are measured."""
+        return StepSettings(self.kernel, self.alignment, self.align)
+
+    @property
+    def policies(self) -> dict[Policy, InsertPolicy]:
+        """How frames are tried in the window, by what they follow.
+
+        - ``continuous``: the frame before it. A fast motion may need more updates, but then has to be found for sure.
+        - ``retry``: frames without a pose, or a gap in time. Its pose relative to the window cannot be checked by
+          continuity, so that more agreement is required.
+        - ``late``: the same, once a frame after it is part of the window, which has to be supported again.
+        - ``located``: a place of the map that it was found at; its pose was checked there.
+        """
+        few, many = self.updates, self.search_updates
+        joined = (Round(many, self.join_inliers),)
+        searched = (Round(few, self.min_inliers), Round(many, self.search_inliers))
+        common = InsertPolicy(self.lifetime, self.optimisation, searched, self.lost_confidence)
+        return {
+            "continuous": common,
+            "retry": replace(common, rounds=joined),
+            "late": replace(common, rounds=joined, later=1),
+            "located": replace(common, rounds=(Round(many, 1.0),), checked=False),
+        }
 
     @property
     def variance(self) -> float:

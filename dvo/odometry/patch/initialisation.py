@@ -12,7 +12,7 @@ from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty.uncertainty import has_second_solution
 from dvo.odometry.window.evidence import NO_MATCH, last_unrelated, measured
 from dvo.odometry.window.motion import parallax
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.patch_window import PatchWindow
 
 RESTART_AGES = frozenset({4, 8, 16, 32})
 """Numbers of frames after the initialisation at which its solution is compared with others."""
@@ -91,7 +91,7 @@ def first_motion(revision: Revision, window: Window, config: TrackerConfig, wait
     return not confident or flow_revision(revision, window) >= needed(waited)[0] * config.initial_motion
 
 
-def initialise(window: Window, step: WindowStep, config: TrackerConfig, waited: int) -> bool:
+def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int) -> bool:
     """Optimise the first window.
 
     After half of the updates the window is also solved from identity poses with the current flow, and the better of the
@@ -99,19 +99,19 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig, waited: 
     no other solution to look for, and no parallax is needed.
 
     Args:
-        window: the first keyframes; changed in place.
-        step: step of the model on the window.
+        patch_window: the first keyframes; changed in place.
         config: settings of the tracker.
         waited: frames since the segment has begun, see :func:`needed`.
 
     Returns:
         True if the parallax is sufficient for tracking.
     """
+    window = patch_window.window
     measured = measured_share(window.measured) >= MOST
     for age in range(config.initial_updates):
-        step(StepOptions(fixed=1, damping=damping_at(age)))
+        patch_window.step(StepOptions(fixed=1, damping=damping_at(age)))
         if age == config.initial_updates // 2 and not measured:
-            _solve_again(window, step)
+            _solve_again(patch_window)
             match_window(window)
     n = len(window)
     if measured:
@@ -122,9 +122,9 @@ def initialise(window: Window, step: WindowStep, config: TrackerConfig, waited: 
     return seen >= needed(waited)[1] * config.initial_parallax
 
 
-def _solve_again(window: Window, step: WindowStep) -> None:
+def _solve_again(patch_window: PatchWindow) -> None:
     """Replace poses and depths by a solution from one pose for all frames, if it suits the current flow better."""
-    revision = step.revise()
+    window, revision = patch_window.window, patch_window.revise()
     problem = window.problem().with_values(targets=revision.targets[0], weights=revision.weights[0])
     # Not solved further: a narrow kernel would fit the first, coarse flow.
     best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE))
@@ -138,7 +138,7 @@ def _take(window: Window, solution: Solution) -> None:
     window.poses_cw, window.patches = problem.poses_cw.to(window.poses_cw), problem.patches.to(window.patches)
 
 
-def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig, waited: int) -> bool:
+def initialise_related(graph: KeyframeGraph, patch_window: PatchWindow, config: TrackerConfig, waited: int) -> bool:
     """Optimise the first window without the frames that do not show the scene of the newest ones.
 
     Where frames are removed, the others begin anew: poses and depths that were fitted to another scene, or to noise,
@@ -146,34 +146,34 @@ def initialise_related(graph: KeyframeGraph, step: WindowStep, config: TrackerCo
 
     Args:
         graph: of the sequence; its window is changed in place.
-        step: step of the model on the window.
+        patch_window: the window.
         config: settings of the tracker.
         waited: frames since the segment has begun, see :func:`needed`.
 
     Returns:
         True if the frames are as many as an initialisation needs, and the parallax is sufficient for tracking.
     """
-    enough = initialise(graph.window, step, config, waited)
-    if drop_unrelated(graph, step, config):
+    enough = initialise(patch_window, config, waited)
+    if drop_unrelated(graph, patch_window, config):
         graph.window.reset()
-        enough = len(graph.window) >= config.initial_frames and initialise(graph.window, step, config, waited)
+        enough = len(graph.window) >= config.initial_frames and initialise(patch_window, config, waited)
     return enough and len(graph.window) >= config.initial_frames
 
 
-def drop_unrelated(graph: KeyframeGraph, step: WindowStep, config: TrackerConfig) -> bool:
+def drop_unrelated(graph: KeyframeGraph, patch_window: PatchWindow, config: TrackerConfig) -> bool:
     """Remove the frames of the first window that do not show the scene of the newest ones.
 
     They are lost: nothing is known of the motion between them.
 
     Args:
         graph: of the sequence; the window is not initialised yet.
-        step: of the model on the window, after some steps.
+        patch_window: after some steps.
         config: settings of the tracker.
 
     Returns:
         True if frames were removed.
     """
-    count = last_unrelated(step, config.thresholds)
+    count = last_unrelated(graph.window, config.lost_confidence, config.initial_inliers)
     if count:
         graph.reject(graph.window.frames[count].identifier, NO_MATCH)
     return count > 0
@@ -194,18 +194,18 @@ def restart_due(age: int, ambiguous: bool) -> bool:
     return age in RESTART_AGES or (ambiguous and age % AGAIN == 0)
 
 
-def leave_minimum(step: WindowStep, config: TrackerConfig) -> bool:
+def leave_minimum(patch_window: PatchWindow, config: TrackerConfig) -> bool:
     """Start the window anew if that leads to a better solution (:mod:`dvo.ba.multistart`).
 
     Args:
-        step: of the model on the window of an initialised tracker; its poses and inverse depths are changed in place.
+        patch_window: of an initialised tracker; its poses and inverse depths are changed in place.
         config: scale of the covariance.
 
     Returns:
         True if another solution is nearly as good as the one that is left
         (:mod:`dvo.odometry.uncertainty.second_solution`).
     """
-    window = step.window
+    window = patch_window.window
     if measured_share(window.measured) >= MOST:
         return False
     found = multistart(window.problem(), RESTARTS)
@@ -213,4 +213,4 @@ def leave_minimum(step: WindowStep, config: TrackerConfig) -> bool:
     if best.start != PRESENT:
         _take(window, best)
         match_window(window)
-    return has_second_solution(step, config.variance, [best, *(other for other in found if other is not best)])
+    return has_second_solution(patch_window, config.variance, [best, *(other for other in found if other is not best)])

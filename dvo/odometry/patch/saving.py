@@ -28,7 +28,7 @@ from dvo.odometry.patch.initialisation import NOT_INITIALISED
 from dvo.odometry.patch.map_tables import LoopsTable, LoopTable, MapTable, WeightsTable
 from dvo.odometry.patch.state import TrackerState
 from dvo.odometry.scale.metric_scale import settle_scale
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.patch_window import PatchWindow
 
 
 class SavedTracker(Protocol):
@@ -41,7 +41,7 @@ class SavedTracker(Protocol):
     model: PatchVO
     graph: KeyframeGraph
     state: TrackerState
-    step: WindowStep
+    patch_window: PatchWindow
     loops: LoopCloser
 
 
@@ -84,8 +84,7 @@ def _closed(odometry: SavedTracker) -> tuple[KeyframeGraph, LoopCloser, dict[str
     finder = replace(finder, graph=graph, kept=list(finder.kept), places=places)
     loops = replace(odometry.loops, graph=graph, finder=finder, loops=list(odometry.loops.loops))
     with torch.inference_mode():
-        step = odometry.step.of_copy(graph.window, state.initialised)
-        graph.finalise = step.finalise
+        graph.finalise = odometry.patch_window.of_copy(graph.window, state.initialised).finalise
         graph.begin_segment(state.keyframes, state.initialised, NOT_INITIALISED)
         for frame in graph.archive.kept_after(finder.kept[-1] if finder.kept else -1):
             if graph.segment_of(frame.identifier) in state.adjustable:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from dvo.ba.cold_start import COLD_UPDATES, damping_at
 from dvo.core.errors import DvoError
 from dvo.core.threads import core_left
 from dvo.data.frame import Frame
@@ -23,20 +23,18 @@ from dvo.geometry import se3
 from dvo.map.archive import ArchiveConfig
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
-from dvo.map.window import Keyframe, Window
+from dvo.map.window import Window
 from dvo.models.patch_vo import PatchVO
-from dvo.models.step import StepOptions
 from dvo.nets.patch.masks import visible_features
-from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.depth.depth_factor import MOST, measured_share
 from dvo.odometry.depth.patch_depth import measure_depth
 from dvo.odometry.exclusive import exclusive
 from dvo.odometry.frames.frame_sequence import FrameSequence
-from dvo.odometry.frames.front_end import View, keyframe_of, observe
+from dvo.odometry.frames.front_end import View, observe
 from dvo.odometry.frames.working_image import masked_image
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
 from dvo.odometry.global_ba.rolling_shutter import Shutter
-from dvo.odometry.loops.relocalisation import REFRESH, Located, hold_to_map, invite
+from dvo.odometry.loops.relocalisation import REFRESH, hold_to_map, invite
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
@@ -55,11 +53,9 @@ from dvo.odometry.patch.state import TrackerState
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
 from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
-from dvo.odometry.window.alignment import WindowAlignment
-from dvo.odometry.window.correlation import WindowCorrelation
-from dvo.odometry.window.evidence import NO_MATCH, Evidence, missing_content, newest_evidence
+from dvo.odometry.window.evidence import NO_MATCH, missing_content, newest_evidence
 from dvo.odometry.window.motion import flow_magnitude
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.patch_window import PatchWindow
 
 
 @exclusive
@@ -79,7 +75,7 @@ class PatchOdometry:
     Attributes:
         graph: window, archive and log of frames.
         state: all else that a frame changes.
-        correlation, step: of the network on the window; what they cache is computed from the other two.
+        patch_window: the window with the network that measures it; what it caches is computed from the other two.
 
     Example:
         >>> odometry = PatchOdometry(dvo.load_model("small"), TrackerConfig())
@@ -112,10 +108,8 @@ class PatchOdometry:
         self.state = TrackerState(torch.Generator().manual_seed(self.seed), FrameSequence(config.max_gap))
         self.select = partial(select, patches=config.patches, generator=self.state.generator)
         sizes = config.patches, c.patch_size, c.hidden_channels
-        self.graph = KeyframeGraph(*sizes, self.device, self.archive, lambda edges: self.step.finalise(edges))
-        self.correlation = WindowCorrelation(self.window, c, self.device)
-        align = None if config.align == "none" else WindowAlignment(self.window, config.alignment, self.device)
-        self.step = WindowStep(self.model, self.window, self.correlation, align, config.align == "final", config.kernel)
+        self.graph = KeyframeGraph(*sizes, self.device, self.archive, lambda edges: self.patch_window.finalise(edges))
+        self.patch_window = PatchWindow(self.model, self.window, config.window, self.device)
         self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
 
     @property
@@ -272,31 +266,23 @@ class PatchOdometry:
         window, config, state, record = self.window, self.config, self.state, view.records[0]
         if not state.initialised and (estimate := self._relocalise(view)):
             return estimate
-        keyframe = self._append(view)
-        self.step.forget(window.connect_newest(config.lifetime, self.model.config.self_edges))
         if not state.initialised:
-            return self._initialise(view, keyframe)
-        before = window.snapshot()
-        evidence = self._updated(config.search_updates if state.joining else config.updates)
-        supported = evidence.supports(config.thresholds, joining=bool(state.joining))
-        if not (supported or state.joining):  # a fast motion may need more updates, but then has to be found for sure
-            evidence = self._updated(config.search_updates)
-            supported = evidence.supports(config.thresholds, searched=True)
-        if not supported:
-            window.restore(before)
-            self.graph.discard(len(window) - 1)  # so that the next frames are joined with those before it
+            return self._initialise(view)
+        identifier, (pose, depth) = self._name(view), self._begin(view)
+        policy = config.policies["retry" if state.joining else "continuous"]
+        if not self.patch_window.try_insert(view, len(window), identifier, pose, depth, policy).accepted:
             if estimate := self._relocalise(view):
                 return estimate
             state.waiting.append(view)
             return self._lose(record, NO_MATCH)
-        record.place(keyframe.identifier, self.graph.segment, state.joining if state.skipped else "")
+        record.place(identifier, self.graph.segment, state.joining if state.skipped else "")
         state.joining, state.skipped = "", False
         state.tracked += 1
         if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
-            state.ambiguous = leave_minimum(self.step, config)
-        join_waiting(self.graph, self.step, state, config, record)
+            state.ambiguous = leave_minimum(self.patch_window, config)
+        join_waiting(self.graph, self.patch_window, state, config, record)
         if self.graph.located is not None and state.tracked % REFRESH == 0:
-            hold_to_map(self.graph, self.step, self.loops.finder)
+            hold_to_map(self.graph, self.patch_window, self.loops.finder)
         self._reduce()  # may correct the window
         return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
 
@@ -310,32 +296,35 @@ class PatchOdometry:
         self._close_segment()
         state.waiting, state.initialised = [], True
         graph.join(graph.segment, graph.segment_of(found.loop.old))
-        invite(self.step, found.guests)
-        keyframe = self._append(view, found)
+        invite(self.patch_window, found.guests)
         graph.located = found.loop.old
         self.loops.relocalised(found.loop)
         state.adjustable.append(graph.segment)
-        self.step.forget(self.window.connect_newest(self.config.lifetime, self.model.config.self_edges))
-        self._updated(self.config.search_updates)
-        record.place(keyframe.identifier, graph.segment, reason)
+        identifier, policy = self._name(view), self.config.policies["located"]
+        pose, depth = found.pose_cw.to(self.device, torch.float32), found.depths[None].to(self.device)
+        self.patch_window.try_insert(view, len(self.window), identifier, pose, depth, policy)
+        record.place(identifier, graph.segment, reason)
         return self._estimate(record, self._pose_wc(len(self.window) - 1), Status.TRACKING)
 
-    def _initialise(self, view: View, keyframe: Keyframe) -> Estimate:
+    def _initialise(self, view: View) -> Estimate:
         """Add a frame to a window that is not initialised yet, and try to initialise it."""
         window, config, state, record = self.window, self.config, self.state, view.records[0]
+        identifier, (pose, depth) = self._name(view), self._begin(view)
+        self.patch_window.add(view, len(window), identifier, pose, depth)
+        self.patch_window.connect(len(window) - 1, config.lifetime)
         state.joining, state.waited = "", state.waited + 1
         if len(window) > 1:
-            revision = self.step.revise()
+            revision = self.patch_window.revise()
             if not first_motion(revision, window, config, state.waited):
                 # Too little motion to initialise: until the final adjustment it shares the pose of the last keyframe.
-                self.step.store(revision)
+                self.patch_window.store(revision)
                 self.graph.drop(len(window) - 1, still=True)
-                record.place(keyframe.identifier, self.graph.segment)
+                record.place(identifier, self.graph.segment)
                 return self._estimate(record, None, Status.INITIALISING)
-        record.place(keyframe.identifier, self.graph.segment)
+        record.place(identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
-            enough = initialise_related(self.graph, self.step, config, state.waited)
-            state.initialised = enough and newest_evidence(self.step).supports(config.thresholds)
+            enough = initialise_related(self.graph, self.patch_window, config, state.waited)
+            state.initialised = enough and newest_evidence(window).supports(config.lost_confidence, config.min_inliers)
             state.adjustable += [self.graph.segment] * state.initialised
             if state.initialised and config.restart:
                 state.ambiguous = measured_share(window.measured) < MOST  # until it is tried
@@ -390,35 +379,21 @@ class PatchOdometry:
         """Refine the window and archive it; a segment that was never initialised has no rows."""
         keep = self.state.initialised
         for _ in range(self.config.final_updates if keep and len(self.window) > 1 else 0):
-            self._update()
+            self.patch_window.update(self.config.optimisation)
         self.graph.begin_segment(self.state.keyframes, keep, NOT_INITIALISED)
         self.state.begin_segment()
 
-    def _append(self, view: View, found: Located | None = None) -> Keyframe:
-        """Add a frame to the window: with predicted pose and the median depth of the frames before it, or as found."""
-        config, window, seen = self.config, self.window, view.seen
-        slot = window.free_map_slot()
-        self.step.keep_frame(slot, seen.image, seen.maps)
-        keyframe = keyframe_of(view, self.state.keyframes, slot)
-        self.state.keyframes += 1
-        self.loops.see(keyframe.identifier, seen.image, seen.maps)
-        if found is None:
-            depth = first_depth(window, config, self.state.initialised, seen.measured)
-            pose = first_pose(window, seen, keyframe.timestamp, config, self.state.initialised)
-        else:
-            depth, pose = found.depths[None].to(self.device), found.pose_cw.to(self.device, torch.float32)
-        window.append(keyframe, pose, patch_coordinates(seen.centres, depth, self.model.config.patch_size)[0])
-        return keyframe
+    def _name(self, view: View) -> int:
+        """Give the keyframe of a view its identifier, by which loops know its image."""
+        identifier, self.state.keyframes = self.state.keyframes, self.state.keyframes + 1
+        self.loops.see(identifier, view.seen.image, view.seen.maps)
+        return identifier
 
-    def _update(self) -> None:
-        """Take a step on the window of an initialised segment."""
-        fixed = self.window.fixed(self.config.optimisation)
-        self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)), align=True)
-
-    def _updated(self, count: int) -> Evidence:
-        for _ in range(count):
-            self._update()
-        return newest_evidence(self.step)
+    def _begin(self, view: View) -> tuple[Tensor, Tensor]:
+        """Pose and inverse depths that a new frame begins with: predicted, and the median of the frames before it."""
+        window, config, seen, initialised = self.window, self.config, view.seen, self.state.initialised
+        depth = first_depth(window, config, initialised, seen.measured)
+        return first_pose(window, seen, view.records[0].timestamp, config, initialised), depth
 
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""
@@ -442,7 +417,7 @@ class PatchOdometry:
         if pose_wc is None:
             return Estimate(record.timestamp, None, status, 0.0, segment, reason, recovered)
         state.started = record.timestamp if state.started is None else state.started
-        sure = LaterUncertainty(self.step, self.config.variance, state.ambiguous)
+        sure = LaterUncertainty(self.patch_window, self.config.variance, state.ambiguous)
         return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
                         sure.covariance, sure.reference)  # fmt: skip
 

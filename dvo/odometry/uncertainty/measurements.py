@@ -8,7 +8,7 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.patch_problem import PatchProblem
 from dvo.map.measured_depths import depth_factors
 from dvo.map.window import Window
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.patch_window import PatchWindow
 
 
 @dataclass(frozen=True)
@@ -28,21 +28,22 @@ class WindowMeasurements:
     kernel: Kernel
 
     @classmethod
-    def of(cls, step: WindowStep) -> WindowMeasurements:
-        """Measurements of the window of a step.
+    def of(cls, window: PatchWindow) -> WindowMeasurements:
+        """Measurements of a window.
 
         Args:
-            step: of the model, after a step.
+            window: after a step.
 
         Returns:
             What no later step changes.
         """
-        window: Window = step.window
-        middle = window.patches.shape[-1] // 2
-        centres = window.patches[:, :, middle : middle + 1, middle : middle + 1].clone()
-        depths = depth_factors(window.measured)
-        problem = window.problem().with_values(patches=centres, weights=window.confidence, factors=depths)
-        return cls(problem, tuple(frame.timestamp for frame in window.frames), step.bounds, step.kernel)
+        data: Window = window.window
+        middle = data.patches.shape[-1] // 2
+        centres = data.patches[:, :, middle : middle + 1, middle : middle + 1].clone()
+        depths = depth_factors(data.measured)
+        problem = data.problem().with_values(patches=centres, weights=data.confidence, factors=depths)
+        times = tuple(frame.timestamp for frame in data.frames)
+        return cls(problem, times, window.bounds, window.settings.kernel)
 
     def at(self, problem: PatchProblem) -> WindowMeasurements:
         """Same measurements at another solution.

@@ -37,7 +37,7 @@ from dvo.odometry.uncertainty.displacement import confidence_of, window_metric
 from dvo.odometry.uncertainty.gauge import Gauge, window_gauge
 from dvo.odometry.uncertainty.measurements import WindowMeasurements
 from dvo.odometry.uncertainty.second_solution import second_solutions, window_solutions
-from dvo.odometry.window.step import WindowStep
+from dvo.odometry.window.patch_window import PatchWindow
 
 DAMPING = BADamping(pose=1e-6, relative=0.0)
 """Prior of the marginal, which matters only to unknowns that nothing measures."""
@@ -69,12 +69,12 @@ class LaterUncertainty:
     The bytes are those that it would have had at once. Until then the measurements of the window are held.
 
     Args:
-        step, variance, ambiguous: see :func:`newest_uncertainty`.
+        window, variance, ambiguous: see :func:`newest_uncertainty`.
     """
 
-    def __init__(self, step: WindowStep, variance: float, ambiguous: bool = False) -> None:
+    def __init__(self, window: PatchWindow, variance: float, ambiguous: bool = False) -> None:
         self._compute: Callable[[], Uncertainty] | None
-        self._compute = partial(_uncertainty, WindowMeasurements.of(step), variance, ambiguous)
+        self._compute = partial(_uncertainty, WindowMeasurements.of(window), variance, ambiguous)
         self._found = UNKNOWN
 
     def _value(self) -> Uncertainty:
@@ -97,11 +97,11 @@ class LaterUncertainty:
         return self._value().confidence
 
 
-def newest_uncertainty(step: WindowStep, variance: float, ambiguous: bool = False) -> Uncertainty:
+def newest_uncertainty(window: PatchWindow, variance: float, ambiguous: bool = False) -> Uncertainty:
     """Uncertainty of the pose of the newest frame of a window. Nothing changes.
 
     Args:
-        step: of the model on the window, after a step.
+        window: after a step.
         variance: of a measurement of confidence 1, and what is beyond it
             (:attr:`dvo.odometry.patch.config.TrackerConfig.variance`), feature pixels squared.
         ambiguous: the window may have a second solution, which is looked for.
@@ -110,15 +110,15 @@ def newest_uncertainty(step: WindowStep, variance: float, ambiguous: bool = Fals
         The uncertainty; without covariance and with a confidence of zero where the measurements do not determine the
         pose.
     """
-    return _uncertainty(WindowMeasurements.of(step), variance, ambiguous)
+    return _uncertainty(WindowMeasurements.of(window), variance, ambiguous)
 
 
 @torch.no_grad()
-def has_second_solution(step: WindowStep, variance: float, solved: Sequence[Solution]) -> bool:
+def has_second_solution(window: PatchWindow, variance: float, solved: Sequence[Solution]) -> bool:
     """Tell if another solution of a window is nearly as good as the present one.
 
     Args:
-        step: of the model on the window, which is at the first of the solutions.
+        window: at the first of the solutions.
         variance: of a measurement of confidence 1, and what is beyond it
             (:attr:`dvo.odometry.patch.config.TrackerConfig.variance`), feature pixels squared.
         solved: solutions of the window.
@@ -126,12 +126,12 @@ def has_second_solution(step: WindowStep, variance: float, solved: Sequence[Solu
     Returns:
         True if covariance and confidence have to take another one into account.
     """
-    window = WindowMeasurements.of(step)
-    gauge = window_gauge(window.problem)
+    measured = WindowMeasurements.of(window)
+    gauge = window_gauge(measured.problem)
     if gauge is None or len(solved) < 2:
         return False
-    covariance = _covariance(window, gauge, variance)
-    return covariance is not None and bool(second_solutions(solved, gauge, covariance, window_metric(window)))
+    covariance = _covariance(measured, gauge, variance)
+    return covariance is not None and bool(second_solutions(solved, gauge, covariance, window_metric(measured)))
 
 
 @torch.no_grad()

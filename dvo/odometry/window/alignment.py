@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
@@ -16,6 +18,21 @@ from dvo.nets.patch.slopes import SlopeEquations, slope_equations
 
 _ROUNDS = 2  # alignments that slopes are found from, each with those of the one before
 _STEEPEST = 0.3  # largest slope that is found, 1 / feature pixel
+
+
+@dataclass(frozen=True)
+class AlignmentSnapshot:
+    """State of an alignment, for :meth:`WindowAlignment.restore`.
+
+    Attributes:
+        images: ``(N, H, W)`` grey images by map slot. Their number, and what is in the slots that no frame has, takes
+            part in the rounding of a sampled grey level (:func:`dvo.nets.alignment.alignment.sample_images`).
+        results: of the edges of the window: ``(E, 2)`` measurements that were aligned, infinite for none, ``(E, 2)``
+            their alignments, ``(E,)`` bool for those that were accepted; None if they are not kept.
+    """
+
+    images: Tensor
+    results: tuple[Tensor, Tensor, Tensor] | None
 
 
 class WindowAlignment:
@@ -50,6 +67,8 @@ class WindowAlignment:
         if missing > 0:
             empty = grey.new_zeros(missing, *grey.shape)
             self._images = torch.cat([self._images, empty]) if len(self._images) else empty
+        else:
+            self._images = self._images.clone()  # a snapshot may hold it
         self._images[map_slot] = grey
 
     def forget(self, edge_slots: Tensor) -> None:
@@ -68,41 +87,27 @@ class WindowAlignment:
         self._measured[edge_slots] = torch.inf
         self._accepted[edge_slots] = False
 
-    @property
-    def images(self) -> np.ndarray:
-        """``(N, H, W)`` uint8 grey working images by map slot, those of frames that have left the window included."""
-        return self._images.cpu().numpy().astype(np.uint8)
-
-    def restore_images(self, images: np.ndarray) -> None:
-        """Set the images of all map slots.
-
-        Their number, and what is in the slots that no frame has, takes part in the rounding of a sampled grey level
-        (:func:`dvo.nets.alignment.alignment.sample_images`).
+    def snapshot(self, results: bool) -> AlignmentSnapshot:
+        """Record the images and, if they are wanted, the results of the edges of the window.
 
         Args:
-            images: see :attr:`images`.
-        """
-        self._images = torch.from_numpy(images).to(self._images)
-
-    def results(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Alignments of the edges of the window, for :meth:`restore`.
-
-        Returns:
-            ``(E, 2)`` measurements that were aligned, infinite for none; ``(E, 2)`` their alignments; and ``(E,)`` bool
-            for those that were accepted.
+            results: are wanted.
         """
         slots = self.window.edge_slots
-        return self._measured[slots], self._aligned[slots], self._accepted[slots]
+        kept = (self._measured[slots], self._aligned[slots], self._accepted[slots]) if results else None
+        return AlignmentSnapshot(self._images, kept)
 
-    def restore(self, measured: Tensor, aligned: Tensor, accepted: Tensor) -> None:
-        """Set the alignments of the edges of the window.
+    def restore(self, before: AlignmentSnapshot) -> None:
+        """Restore the images and, if they were recorded, the results of the edges of the window.
 
         Args:
-            measured, aligned, accepted: of :meth:`results`.
+            before: a snapshot of a window with the same frames and edges.
         """
-        slots = self.window.edge_slots
-        self.forget(slots)
-        self._measured[slots], self._aligned[slots], self._accepted[slots] = measured, aligned, accepted
+        self._images = before.images
+        if before.results is not None:
+            slots = self.window.edge_slots
+            self.forget(slots)
+            self._measured[slots], self._aligned[slots], self._accepted[slots] = before.results
 
     def __call__(self, state: UpdateState, revision: Revision) -> Measurement:
         """Replace the measurements of the network by the alignments that are accepted.

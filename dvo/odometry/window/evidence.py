@@ -12,7 +12,6 @@ from torch import Tensor
 from dvo.geometry.projection import reproject
 from dvo.map.window import Window
 from dvo.nets.patch.masks import MASK_MARGIN, shrunk
-from dvo.odometry.window.step import WindowStep
 
 CONFIDENT = 0.1
 """Confidence of a measurement above which it can be an inlier."""
@@ -44,17 +43,6 @@ _UNLIKE = 24.0  # mean difference of two windows above which they do not show th
 
 
 @dataclass(frozen=True)
-class Thresholds:
-    """Thresholds of evidence, see :class:`dvo.odometry.patch.config.TrackerConfig`."""
-
-    lost_confidence: float
-    min_inliers: float
-    search_inliers: float
-    join_inliers: float
-    initial_inliers: float
-
-
-@dataclass(frozen=True)
 class Evidence:
     """Agreement of the measurements of a frame with those before it in the window.
 
@@ -67,21 +55,16 @@ class Evidence:
     confidence: float
     inliers: float
 
-    def supports(self, thresholds: Thresholds, joining: bool = False, searched: bool = False) -> bool:
+    def supports(self, confidence: float, inliers: float) -> bool:
         """Decide if the images bear out the pose.
 
         Args:
-            thresholds: for it.
-            joining: the frame follows frames without a pose, or a gap in time: its pose relative to the window cannot
-                be checked by continuity, so that more agreement is required.
-            searched: the pose was found by further updates, which requires more agreement too.
+            confidence, inliers: that are needed at least.
 
         Returns:
             True if they do.
         """
-        least = thresholds.search_inliers if searched else thresholds.min_inliers
-        inliers = thresholds.join_inliers if joining else least
-        return self.confidence >= thresholds.lost_confidence and self.inliers >= inliers
+        return self.confidence >= confidence and self.inliers >= inliers
 
 
 def missing_content(image: np.ndarray, mask: np.ndarray | None = None) -> str:
@@ -178,29 +161,28 @@ def _small_grey(image: np.ndarray) -> np.ndarray:
     return (_DEVIATION * level + 128.0).clip(0, 255).astype(np.uint8)
 
 
-def newest_evidence(step: WindowStep) -> Evidence:
+def newest_evidence(window: Window) -> Evidence:
     """Evidence for the pose of the newest frame of a window, after a step.
 
     Args:
-        step: of the model on the window.
+        window: after a step.
 
     Returns:
         Evidence; zero for a window of one frame.
     """
-    return evidence_of(step, len(step.window) - 1)
+    return evidence_of(window, len(window) - 1)
 
 
-def evidence_of(step: WindowStep, position: int) -> Evidence:
+def evidence_of(window: Window, position: int) -> Evidence:
     """Evidence for the pose of a frame of a window, after a step; later frames do not count.
 
     Args:
-        step: of the model on the window.
+        window: after a step.
         position: of the frame in the window.
 
     Returns:
         Evidence; without inliers for the first frame.
     """
-    window = step.window
     into = (window.jj == position) & (window.ii <= position)
     if not bool(into.any()):
         return Evidence(0.0, 0.0)
@@ -211,7 +193,7 @@ def evidence_of(step: WindowStep, position: int) -> Evidence:
     earlier = into & (window.ii < position)
     if not bool(earlier.any()):
         return Evidence(confidence, 0.0)
-    return Evidence(confidence, _inliers(step, earlier))
+    return Evidence(confidence, _inliers(window, earlier))
 
 
 def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:
@@ -228,17 +210,16 @@ def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:
     return among if window.visible is None else among & (confidence != 0).any(dim=-1)  # NaN is evidence against
 
 
-def last_unrelated(step: WindowStep, thresholds: Thresholds) -> int:
+def last_unrelated(window: Window, least_confidence: float, least_inliers: float) -> int:
     """Position after the last pair of consecutive frames of a window that do not show the same scene.
 
     Args:
-        step: of the model on the window, after some steps.
-        thresholds: of evidence.
+        window: after some steps.
+        least_confidence, least_inliers: of two frames that show the same scene.
 
     Returns:
         Position of the first frame that all later ones are related to; 0 if all frames are.
     """
-    window = step.window
     found = 0
     for position in range(1, len(window)):
         pair = (window.ii == position - 1) & (window.jj == position)
@@ -246,8 +227,8 @@ def last_unrelated(step: WindowStep, thresholds: Thresholds) -> int:
         if not bool(pair.any()):  # its edges have left the window: nothing speaks against the two any more
             continue
         pair = measured(window, window.confidence, pair)
-        confidence, inliers = float(window.confidence[pair].mean()), _inliers(step, pair)
-        if confidence >= thresholds.lost_confidence and inliers >= thresholds.initial_inliers:
+        confidence, inliers = float(window.confidence[pair].mean()), _inliers(window, pair)
+        if confidence >= least_confidence and inliers >= least_inliers:
             continue
         # Where most of the picture is sky or water few patches agree, although both frames show the same.
         before, after = window.frames[position - 1].image, window.frames[position].image
@@ -256,22 +237,21 @@ def last_unrelated(step: WindowStep, thresholds: Thresholds) -> int:
     return found
 
 
-def related_share(step: WindowStep, among: Tensor) -> float:
+def related_share(window: Window, among: Tensor) -> float:
     """Share of the edges between different frames that are inliers.
 
     Args:
-        step: of the model on a window.
+        window: after a step.
         among: ``(E,)`` bool, edges that count.
 
     Returns:
         In [0, 1]; 0 without such an edge.
     """
-    edges = measured(step.window, step.window.confidence, among & (step.window.ii != step.window.jj))
-    return _inliers(step, edges) if bool(edges.any()) else 0.0
+    edges = measured(window, window.confidence, among & (window.ii != window.jj))
+    return _inliers(window, edges) if bool(edges.any()) else 0.0
 
 
-def _inliers(step: WindowStep, edges: Tensor) -> float:
-    w = step.window
+def _inliers(w: Window, edges: Tensor) -> float:
     seen = reproject(w.poses_cw[None], w.patches[None], w.intrinsics[None], w.ii[edges], w.jj[edges], w.kk[edges])
     centre = seen.coords.shape[2] // 2
     residual = (w.targets[edges] - seen.coords[0, :, centre, centre]).norm(dim=-1)

@@ -51,7 +51,7 @@ def test_measurements_are_compared_with_the_truth():
         odometry = load("small", align=align, final_adjustment=False, restart=False)
         recorder = Recorder(odometry, TruePositions(sequence, depth))
         if align == "always":
-            odometry.step.align = TrueMeasurements(odometry.window, sequence, depth)
+            odometry.patch_window.alignment = TrueMeasurements(odometry.window, sequence, depth)
         for frame in frames:
             odometry.track(frame)
         odometry.finish()

@@ -11,6 +11,7 @@ from dvo.odometry.depth.depth_factor import MOST, measured_share
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.initialisation import RESTART_AGES, leave_minimum, restart_due
+from dvo.odometry.window.patch_window import StepSettings
 from tests.support.archived_walk import archived_walk, pose_at
 
 CONFIG = TrackerConfig(sigma=0.2, covariance_scale=1.0)  # of measurements whose weights are not those of a network
@@ -18,7 +19,7 @@ CONFIG = TrackerConfig(sigma=0.2, covariance_scale=1.0)  # of measurements whose
 
 def _step(window):
     window.confidence = window.weights
-    return SimpleNamespace(window=window, bounds=(60, 60), kernel=Kernel("cauchy", 0.3))
+    return SimpleNamespace(window=window, bounds=(60, 60), settings=StepSettings(Kernel("cauchy", 0.3)))
 
 
 def _reversed_window(unit=0.0):

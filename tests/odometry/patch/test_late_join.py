@@ -9,9 +9,10 @@ import torch
 import dvo
 from dvo.metrics import align_trajectory
 from dvo.odometry.patch import late_join
-from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Status
+from dvo.odometry.window import patch_window
 from dvo.odometry.window.evidence import Evidence, evidence_of, newest_evidence
+from dvo.odometry.window.patch_window import PatchWindow
 from dvo.synth.sequence import make_sequence
 from tests.support.changed_images import with_images
 from tests.support.outcome import content, told
@@ -41,13 +42,15 @@ def foreign():
 
 def refuse(monkeypatch, *times):
     """Refuse frames when they are the newest of the window, as measurements of a bad first try would."""
-    real = PatchOdometry._updated
+    real = PatchWindow.try_insert
 
-    def updated(odometry, count):
-        found = real(odometry, count)
-        return Evidence(0.0, 0.0) if odometry.window.frames[-1].timestamp in times else found
+    def refused(self, view, *given):
+        policy = given[-1]
+        if not policy.later and view.records[0].timestamp in times:
+            policy = replace(policy, rounds=tuple(replace(one, inliers=2.0) for one in policy.rounds))
+        return real(self, view, *given[:-1], policy)
 
-    monkeypatch.setattr(PatchOdometry, "_updated", updated)
+    monkeypatch.setattr(PatchWindow, "try_insert", refused)
 
 
 def count_tries(monkeypatch):
@@ -124,9 +127,16 @@ def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch
 
 def test_a_pose_that_would_cost_the_newest_frame_its_own_is_refused(dark, monkeypatch):
     refuse(monkeypatch, dark[BACK].timestamp)
-    real = late_join.evidence_of
-    newest = lambda step, k: Evidence(1.0, 0.0) if k == len(step.window) - 1 else real(step, k)  # noqa: E731
-    monkeypatch.setattr(late_join, "evidence_of", newest)
+    try_insert, evidence = PatchWindow.try_insert, patch_window.evidence_of
+
+    def tried(self, *given):
+        late = given[-1].later
+        newest = lambda window, k: Evidence(1.0, 0.0) if late and k == len(window) - 1 else evidence(window, k)  # noqa: E731
+        with monkeypatch.context() as patch:
+            patch.setattr(patch_window, "evidence_of", newest)
+            return try_insert(self, *given)
+
+    monkeypatch.setattr(PatchWindow, "try_insert", tried)
     assert BACK in lost_frames(dark, track(dark)[1])
 
 
@@ -135,15 +145,15 @@ def test_later_frames_are_no_evidence(dark):
     odometry = dvo.load("small", device="cpu", **FAST)
     for frame in dark[:14]:
         odometry.track(frame)
-    step, window = odometry.step, odometry.window
+    window = odometry.window
     k = len(window) - 3
-    whole = evidence_of(step, k)
-    assert whole.inliers > 0 and evidence_of(step, len(window) - 1) == newest_evidence(step)
+    whole = evidence_of(window, k)
+    assert whole.inliers > 0 and evidence_of(window, len(window) - 1) == newest_evidence(window)
     into = window.jj == k
     for among, same in ((into & (window.ii > k), True), (into & (window.ii < k), False)):
         assert bool(among.any())
         kept, window.confidence = window.confidence, torch.where(among[:, None], 0.01, window.confidence)
-        assert (evidence_of(step, k) == whole) is same
+        assert (evidence_of(window, k) == whole) is same
         window.confidence = kept
 
 

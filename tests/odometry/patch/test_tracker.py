@@ -82,7 +82,7 @@ def test_window_does_not_grow():
     sizes = []
     for frame in frames(40):
         odometry.track(frame)
-        sizes.append((len(odometry.window), len(odometry.window.kk), odometry.correlation.capacity))
+        sizes.append((len(odometry.window), len(odometry.window.kk), odometry.patch_window.correlation.capacity))
     assert max(sizes[20:]) == max(sizes[15:20])
 
 

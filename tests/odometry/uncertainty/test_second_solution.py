@@ -19,6 +19,7 @@ from dvo.odometry.uncertainty.gauge import Gauge, relative_error, window_gauge
 from dvo.odometry.uncertainty.measurements import WindowMeasurements
 from dvo.odometry.uncertainty.second_solution import INDEPENDENT, second_solutions, window_solutions
 from dvo.odometry.uncertainty.uncertainty import LaterUncertainty, newest_uncertainty
+from dvo.odometry.window.patch_window import StepSettings
 from tests.support.archived_walk import archived_walk, pose_at
 
 SIZE = 60, 60
@@ -90,7 +91,7 @@ def ambiguous_step(seed=0):
     truth = pose_at(0.02 * torch.arange(6, dtype=torch.float64))
     (wrong,) = multistart(window.problem().with_values(poses_cw=truth.float()), {"reversed": reversed_relief})
     window.poses_cw, window.patches = wrong.problem.poses_cw.float(), wrong.problem.patches.float()
-    return SimpleNamespace(window=window, bounds=SIZE, kernel=Kernel("cauchy", 0.3)), truth
+    return SimpleNamespace(window=window, bounds=SIZE, settings=StepSettings(Kernel("cauchy", 0.3))), truth
 
 
 def test_a_window_is_solved_as_its_problem_is():

@@ -42,7 +42,7 @@ def tracked():
     odometry = dvo.load("small", **FAST)
     frames = walk()
     estimates = [odometry.track(frame) for frame in frames]
-    step = copied(odometry.step)
+    step = copied(odometry.patch_window)
     black = replace(frames[-1], timestamp=frames[-1].timestamp + 0.1, image=np.zeros_like(frames[-1].image))
     return odometry, step, [*estimates, odometry.track(black)]
 
@@ -52,7 +52,7 @@ def copied(step, poses_cw=None, patches=None):
     w = step.window
     window = replace(w, frames=list(w.frames), poses_cw=w.poses_cw if poses_cw is None else poses_cw,
                      patches=w.patches if patches is None else patches)  # fmt: skip
-    return SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
+    return SimpleNamespace(window=window, bounds=step.bounds, settings=step.settings)
 
 
 def test_every_pose_has_a_covariance_and_nothing_else_has(tracked):
@@ -76,7 +76,7 @@ def test_every_pose_has_a_covariance_and_nothing_else_has(tracked):
 def information(step, factors=()):
     """Dense information matrix of the poses after the reference and all depths, float64, and the rows of the poses."""
     window, gauge = step.window, window_gauge(step.window.problem())
-    options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, kernel=step.kernel)
+    options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, settings=step.settings)
     tensors = window.poses_cw, window.patches, window.intrinsics, window.targets, window.confidence
     edges = window.ii, window.jj, window.kk
     given = PatchProblem(*(x[None].double() for x in tensors), *edges, factors=factors)
@@ -114,7 +114,7 @@ def with_depths(step, share, error, scale=1.0):
     weight = torch.where(torch.rand(depth.shape, generator=g) < share, (SIGMA / (error * value)) ** 2, 0.0)
     measured = torch.stack((value * (weight > 0), weight), -1)
     window.frames = [replace(frame, measured=x) for frame, x in zip(window.frames, measured, strict=True)]
-    return SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
+    return SimpleNamespace(window=window, bounds=step.bounds, settings=step.settings)
 
 
 @pytest.mark.parametrize(("share", "error"), [(0.8, 0.05), (0.1, 0.3)])
@@ -202,7 +202,7 @@ def test_the_gauge_leaves_out_frames_without_measurements(tracked):
     gradient = size_gradient(window.poses_cw[None], 2, range(3, n - 1))[0]
     assert (gradient[[0, 1, 2, n - 1]] == 0).all() and (gradient[3 : n - 1, :3] != 0).any(-1).all()
     window.keep(window.touching(n - 2) & window.touching(n - 1))
-    step = SimpleNamespace(window=window, bounds=step.bounds, kernel=step.kernel)
+    step = SimpleNamespace(window=window, bounds=step.bounds, settings=step.settings)
     assert window_gauge(window.problem()) is None and newest_uncertainty(step, TrackerConfig().variance) is UNKNOWN
 
 

@@ -56,10 +56,18 @@ def test_strong_noise_is_left_to_the_measurements():
 def test_a_frame_after_an_interruption_needs_more_evidence():
     config = TrackerConfig(lost_confidence=0.01, min_inliers=0.02, search_inliers=0.04, join_inliers=0.1)
     weak, strong = Evidence(0.05, 0.05), Evidence(0.05, 0.2)
-    assert weak.supports(config.thresholds) and not weak.supports(config.thresholds, joining=True)
-    assert strong.supports(config.thresholds, joining=True) and weak.supports(config.thresholds, searched=True)
-    assert not Evidence(0.05, 0.03).supports(config.thresholds, searched=True)
-    assert not Evidence(0.005, 0.9).supports(config.thresholds) and not Evidence(0.5, 0.01).supports(config.thresholds)
+    continuous, retry, late = (config.policies[name] for name in ("continuous", "retry", "late"))
+    first, searched = continuous.rounds
+    (joined,) = retry.rounds
+    assert late.rounds == retry.rounds and (retry.later, late.later) == (0, 1)
+
+    def supports(evidence, inliers):
+        return evidence.supports(continuous.confidence, inliers)
+
+    assert supports(weak, first.inliers) and not supports(weak, joined.inliers)
+    assert supports(strong, joined.inliers) and supports(weak, searched.inliers)
+    assert not supports(Evidence(0.05, 0.03), searched.inliers)
+    assert not supports(Evidence(0.005, 0.9), first.inliers) and not supports(Evidence(0.5, 0.01), first.inliers)
 
 
 def test_views_match_and_noise_and_other_scenes_do_not(view):

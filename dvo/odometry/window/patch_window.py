@@ -1,0 +1,330 @@
+"""Window of keyframes that a network measures: keyframes, edges, correlation, alignment and the step in one object."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from dvo.ba.cold_start import COLD_UPDATES, damping_at
+from dvo.ba.kernels import Kernel
+from dvo.map.measured_depths import depth_factors
+from dvo.map.window import Keyframe, Window, WindowSnapshot
+from dvo.models.patch_vo import PatchVO
+from dvo.models.step import Revision, StepOptions, UpdateState, revise, step
+from dvo.nets.alignment.alignment import AlignmentOptions
+from dvo.nets.patch.patchifier import patch_coordinates
+from dvo.odometry.frames.front_end import View, keyframe_of
+from dvo.odometry.window.alignment import AlignmentSnapshot, WindowAlignment
+from dvo.odometry.window.correlation import WindowCorrelation
+from dvo.odometry.window.evidence import Evidence, evidence_of
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """How the edges of a window are measured and weighted.
+
+    Attributes:
+        kernel: robust kernel of bundle adjustment, which takes the influence from moving bodies and wrong matches.
+        alignment: options of the sub-pixel alignment.
+        align: which measurements are aligned to a fraction of a pixel: ``final``, those that leave the window;
+            ``always``, those of every step of an initialised window; ``none``.
+    """
+
+    kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
+    alignment: AlignmentOptions = AlignmentOptions()  # noqa: RUF009 (frozen)
+    align: Literal["none", "final", "always"] = "final"
+
+
+@dataclass(frozen=True)
+class Round:
+    """Updates of a frame that is tried, after which its pose is supported or not.
+
+    Attributes:
+        updates: number of recurrent updates.
+        inliers: share of the patches of earlier frames that have to be found in it.
+    """
+
+    updates: int
+    inliers: float
+
+
+@dataclass(frozen=True)
+class InsertPolicy:
+    """How a frame is tried in a window.
+
+    Attributes:
+        lifetime: number of frames on either side of it with which it is connected.
+        optimised: number of newest frames whose poses are solved for.
+        rounds: the first that supports the pose ends the try.
+        confidence: mean confidence of the edges into it that is needed.
+        later: number of frames after it that have to be supported again.
+        checked: refuse a frame whose pose is not supported; otherwise it is taken, as its pose was checked before.
+    """
+
+    lifetime: int
+    optimised: int
+    rounds: tuple[Round, ...]
+    confidence: float = 0.0
+    later: int = 0
+    checked: bool = True
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What has become of a frame that was tried.
+
+    Attributes:
+        accepted: the window holds it; otherwise the window is as it was before.
+        evidence: for its pose, after the last round.
+    """
+
+    accepted: bool
+    evidence: Evidence
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All of a window that a try changes, beside the frames and edges themselves.
+
+    Attributes:
+        window: poses, patches and edge states.
+        origins: of the correlations; a value that is interpolated in a cached window depends on them in its last bit.
+        alignment: images by map slot and, of an alignment in every step, its results; None without one.
+    """
+
+    window: WindowSnapshot
+    origins: Tensor
+    alignment: AlignmentSnapshot | None
+
+
+class PatchWindow:
+    """Keyframes and edges of a window with the network that measures them, changed in place.
+
+    Args:
+        model: the network.
+        window: keyframes and edges; see :meth:`empty`.
+        settings: of the measurements.
+        device: of the caches.
+
+    Attributes:
+        bounds: ``(width, height)`` of the feature map.
+
+    Example:
+        >>> window = PatchWindow.empty(model, 24, StepSettings(), device)
+        >>> position = window.append(keyframe, image, maps, pose_cw, patches)
+        >>> window.connect(position, lifetime=7)
+        >>> window.update(optimised=8)
+    """
+
+    def __init__(self, model: PatchVO, window: Window, settings: StepSettings, device: torch.device) -> None:
+        self.model, self.window, self.settings, self.device = model, window, settings, device
+        self.correlation = WindowCorrelation(window, model.config, device)
+        self.alignment = None if settings.align == "none" else WindowAlignment(window, settings.alignment, device)
+        self.bounds = (0, 0)
+
+    @classmethod
+    def empty(cls, model: PatchVO, per_frame: int, settings: StepSettings, device: torch.device) -> PatchWindow:
+        """Window without frames.
+
+        Args:
+            model: the network.
+            per_frame: patches of a frame.
+            settings: of the measurements.
+            device: of all tensors.
+        """
+        c = model.config
+        return cls(model, Window.empty(per_frame, c.patch_size, c.hidden_channels, device), settings, device)
+
+    def __len__(self) -> int:
+        return len(self.window)
+
+    def of_copy(self, window: Window, last: bool) -> PatchWindow:
+        """The same for a copy of the window, with caches of its own.
+
+        Args:
+            window: with the same frames and edges.
+            last: no step will be taken, only measurements aligned that leave the window (:meth:`finalise`).
+        """
+        shared = {id(self.model): self.model, id(self.window): window}
+        return deepcopy(self, shared | ({id(self.correlation): self.correlation} if last else {}))
+
+    def insert(self, position: int, keyframe: Keyframe, maps: Tensor, pose_cw: Tensor, patches: Tensor) -> None:
+        """Add a keyframe without edges; the positions of those after it increase by one.
+
+        Args:
+            position: of the new keyframe.
+            keyframe: with its image; its map slot is one that no frame has.
+            maps: ``(1, 1, C, h, w)`` matching features of the frame.
+            pose_cw: ``(7,)`` world to camera.
+            patches: ``(M, 3, p, p)``.
+        """
+        assert keyframe.image is not None
+        self.bounds = maps.shape[-1], maps.shape[-2]
+        self.correlation.keep_maps(keyframe.map_slot, maps)
+        if self.alignment is not None:
+            self.alignment.keep_image(keyframe.map_slot, keyframe.image)
+        self.window.insert(position, keyframe, pose_cw, patches)
+
+    def add(self, view: View, position: int, identifier: int, pose_cw: Tensor, depth: Tensor) -> Keyframe:
+        """Add a view as a keyframe without edges.
+
+        Args:
+            view: the frame.
+            position: of the new keyframe.
+            identifier: of the new keyframe.
+            pose_cw: ``(7,)`` world to camera.
+            depth: ``(1, M)`` inverse depths of its patches.
+
+        Returns:
+            The keyframe.
+        """
+        keyframe = keyframe_of(view, identifier, self.window.free_map_slot())
+        patches = patch_coordinates(view.seen.centres, depth, self.model.config.patch_size)[0]
+        self.insert(position, keyframe, view.seen.maps, pose_cw, patches)
+        return keyframe
+
+    def connect(self, position: int, lifetime: int) -> None:
+        """Add edges between a frame and those around it, both ways, and to itself if the network has such.
+
+        Args:
+            position: of the frame, which has no edges yet.
+            lifetime: number of frames on either side of it that take part, beside guests.
+        """
+        self._forget(self.window.connect_frame(position, lifetime, self.model.config.self_edges))
+
+    def connect_edges(self, kk: Tensor, jj: Tensor) -> None:
+        """Add edges.
+
+        Args:
+            kk, jj: ``(e,)`` patch and target frame of each new edge.
+        """
+        self._forget(self.window.connect(kk, jj))
+
+    def try_insert(
+        self, view: View, position: int, identifier: int, pose_cw: Tensor, depth: Tensor, policy: InsertPolicy
+    ) -> Attempt:
+        """Add a frame, measure it, and keep it if its measurements support its pose.
+
+        Args:
+            view: the frame.
+            position: of the new keyframe; frames after it are solved again.
+            identifier: of the new keyframe.
+            pose_cw: ``(7,)`` pose to begin with.
+            depth: ``(1, M)`` inverse depths to begin with.
+            policy: number of updates, and the support that is needed.
+
+        Returns:
+            If it was kept; if it was not, everything is as before, bit for bit on the CPU.
+        """
+        before = self.snapshot()
+        self.add(view, position, identifier, pose_cw, depth)
+        self.connect(position, policy.lifetime)
+        evidence = Evidence(0.0, 0.0)
+        for one in policy.rounds:
+            self.update(policy.optimised, one.updates)
+            found = [evidence_of(self.window, k) for k in range(position, position + 1 + policy.later)]
+            evidence = found[0]
+            if all(each.supports(policy.confidence, one.inliers) for each in found):
+                return Attempt(True, evidence)
+        if not policy.checked:
+            return Attempt(True, evidence)
+        self.window.remove(position)
+        self.restore(before)
+        return Attempt(False, evidence)
+
+    def update(self, optimised: int, count: int = 1) -> None:
+        """Take steps on the window of an initialised segment.
+
+        Args:
+            optimised: number of newest frames whose poses are solved for.
+            count: of the steps.
+        """
+        fixed = self.window.fixed(optimised)
+        for _ in range(count):
+            self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)), align=True)
+
+    def snapshot(self) -> Snapshot:
+        """Record everything that steps and new frames change, for :meth:`restore`."""
+        always = self.settings.align == "always"
+        alignment = None if self.alignment is None else self.alignment.snapshot(results=always)
+        return Snapshot(self.window.snapshot(), self.correlation.origins(), alignment)
+
+    def restore(self, before: Snapshot) -> None:
+        """Undo what has changed since a snapshot; the window has the same frames and edges again.
+
+        Args:
+            before: the snapshot.
+        """
+        self.window.restore(before.window)
+        if not torch.equal(self.correlation.origins(), before.origins):
+            self.correlation.restore(before.origins)
+        if self.alignment is not None and before.alignment is not None:
+            self.alignment.restore(before.alignment)
+
+    def _forget(self, edge_slots: Tensor) -> None:
+        """Invalidate the cached results of new edges."""
+        self.correlation.forget(edge_slots)
+        if self.alignment is not None and self.settings.align == "always":
+            self.alignment.forget(edge_slots)
+
+    def finalise(self, edges: Tensor) -> None:
+        """Align edges that leave the window, if that is wanted.
+
+        Args:
+            edges: ``(e,)`` positions among the edges of the window.
+        """
+        if self.alignment is not None and self.settings.align == "final":
+            self.alignment.finalise(edges)
+
+    def state(self) -> UpdateState:
+        """State of the window.
+
+        Returns:
+            State with a batch dimension of 1.
+        """
+        w = self.window
+        return UpdateState(
+            w.edges, w.poses_cw[None], w.patches[None], w.intrinsics[None], w.context[None], w.hidden[None],
+            visible=w.visible,
+        )  # fmt: skip
+
+    def revise(self) -> Revision:
+        """Run the network on the edges of the window, which does not change.
+
+        Returns:
+            Output of the network.
+        """
+        return revise(self.model, self.state(), self.correlation)
+
+    def store(self, revision: Revision) -> None:
+        """Store the measurements of a revision as those of the window; poses and depths do not change.
+
+        Args:
+            revision: of :meth:`revise`.
+        """
+        window = self.window
+        window.targets, window.weights = revision.targets[0], revision.weights[0]
+        window.confidence = revision.weights[0]
+
+    def step(self, options: StepOptions, align: bool = False) -> None:
+        """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
+
+        Args:
+            options: of the step; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that of the
+                settings; measured depths join its factors.
+            align: use the sub-pixel alignment, if it takes part in every step. Its large weights would keep the first
+                solution of a window from leaving a wrong minimum.
+        """
+        refine = self.alignment if align and self.settings.align == "always" else None
+        factors = *options.factors, *depth_factors(self.window.measured), *depth_factors(self.window.prior)
+        options = replace(options, bounds=self.bounds, kernel=self.settings.kernel, factors=factors)
+        after = step(self.model, self.state(), self.correlation, options, refine)
+        assert after.targets is not None and after.weights is not None and after.confidence is not None
+        window = self.window
+        window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]
+        window.targets, window.weights = after.targets[0], after.weights[0]
+        window.confidence = after.confidence[0]

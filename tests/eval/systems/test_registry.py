@@ -71,7 +71,7 @@ def test_settings_are_arguments_and_part_of_the_name(tmp_path):
     for name in ("monoslam+fewest=7", "keyframe+corners=300", "direct+patience=3"):
         assert isinstance(find_system(name).build(0, "cpu"), Odometry)
     assert find_system("klt-pnp+seed=5").build(0, "cpu").seed == 5
-    with pytest.raises(TypeError, match="colour"):
+    with pytest.raises(DvoError, match="colour: unknown setting"):
         find_system("klt-pnp+colour=red").build(0, "cpu")
     with pytest.raises(DvoError, match="setting"):
         find_system("klt-pnp+corners=[1")

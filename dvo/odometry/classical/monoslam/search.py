@@ -108,7 +108,8 @@ def templates(appearance: Appearance, warps: np.ndarray, rows: np.ndarray) -> tu
     at = np.clip(centre[:, :, None, None] + offsets[:, None], 0, 2 * STORE)
     at[..., 1] += side * np.arange(len(rows) * LEVELS).reshape(-1, LEVELS, 1, 1)
     atlas, flat = appearance.patch[rows].reshape(-1, side), at.reshape(-1, width, 2).astype(np.float32)
-    warped = cv2.remap(atlas, flat, np.empty(0, np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    at_x, at_y = (np.ascontiguousarray(flat[..., axis]) for axis in (0, 1))
+    warped = cv2.remap(atlas, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return warped.reshape(len(rows), LEVELS, width, width), usable
 
 

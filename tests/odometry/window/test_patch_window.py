@@ -1,0 +1,105 @@
+"""A frame is tried in a window: it is kept where its measurements support its pose, and leaves no trace elsewhere."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from dvo.odometry.frames.front_end import View, observe
+from dvo.odometry.patch.initial_pose import first_depth
+from dvo.odometry.window.evidence import Evidence
+from dvo.odometry.window.patch_window import PatchWindow, Round
+from tests.support.tiny_tracker import SMALL, frames, tracker
+
+COUNT = 9
+
+
+@pytest.fixture(params=["final", "always", "none"])
+@torch.inference_mode()
+def tried(request):
+    """A tracker between two frames, and a view that it has not seen."""
+    odometry = tracker(replace(SMALL, align=request.param))
+    *seen, new = frames(COUNT)
+    for frame in seen:
+        odometry.track(frame)
+    record = odometry.graph.log.add(new.timestamp)
+    return odometry, View([record], observe(odometry.model, new.image, new.camera, odometry.select, odometry.device))
+
+
+@torch.inference_mode()
+def content(window):
+    """All tensors of a window and of its snapshot, by name."""
+    data = window.window
+    found = {field.name: getattr(data, field.name) for field in fields(data) if field.name not in ("frames", "_edges")}
+    shot = window.snapshot()
+    found |= {"origins": shot.origins, "identifiers": [frame.identifier for frame in data.frames]}
+    if shot.alignment is not None:
+        found["images"] = shot.alignment.images
+        found |= {f"result {k}": part for k, part in enumerate(shot.alignment.results or ())}
+    return {name: value.clone() if isinstance(value, torch.Tensor) else value for name, value in found.items()}
+
+
+@torch.inference_mode()
+def attempt(odometry, view, position, inliers, **changes):
+    policy = replace(odometry.config.policies["continuous"], rounds=(Round(2, 0.0), Round(1, 0.0)), **changes)
+    policy = replace(policy, rounds=tuple(replace(one, inliers=inliers) for one in policy.rounds))
+    depth = first_depth(odometry.window, odometry.config, True)
+    return odometry.patch_window.try_insert(view, position, 77, odometry.window.poses_cw[-1], depth, policy)
+
+
+def same(one, other):
+    return one.keys() == other.keys() and all(
+        torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
+        for name, value in one.items()
+    )
+
+
+@pytest.mark.parametrize("back", [0, 1])
+def test_what_is_not_supported_leaves_no_trace(tried, back):
+    odometry, view = tried
+    before, position = content(odometry.patch_window), len(odometry.window) - back
+    found = attempt(odometry, view, position, inliers=2.0)
+    assert not found.accepted and 0 <= found.evidence.inliers <= 1
+    assert same(content(odometry.patch_window), before)
+
+
+@pytest.mark.parametrize("back", [0, 1])
+def test_what_is_supported_is_part_of_the_window(tried, back):
+    odometry, view = tried
+    window, position = odometry.window, len(odometry.window) - back
+    others = [frame.identifier for frame in window.frames]
+    found = attempt(odometry, view, position, inliers=0.0, later=back)
+    assert found.accepted
+    assert [frame.identifier for frame in window.frames] == [*others[:position], 77, *others[position:]]
+    assert bool(((window.ii == position) & (window.jj != position)).any()) and bool((window.jj == position).any())
+    assert bool(torch.isfinite(window.poses_cw).all())
+
+
+def test_rounds_end_with_the_first_that_supports_it(tried, monkeypatch):
+    odometry, view = tried
+    counts = []
+    real = PatchWindow.update
+    monkeypatch.setattr(
+        PatchWindow, "update", lambda self, many, count=1: counts.append(count) or real(self, many, count)
+    )
+    assert attempt(odometry, view, len(odometry.window), inliers=0.0).accepted and counts == [2]
+    counts.clear()
+    view.records[0].timestamp += 0.1
+    assert not attempt(odometry, view, len(odometry.window), inliers=2.0).accepted and counts == [2, 1]
+    counts.clear()
+    assert attempt(odometry, view, len(odometry.window), inliers=2.0, checked=False).accepted and counts == [2, 1]
+
+
+def test_evidence_supports_a_pose_from_both_thresholds_on():
+    assert Evidence(0.2, 0.1).supports(0.2, 0.1)
+    assert not Evidence(0.2, 0.1).supports(0.21, 0.1) and not Evidence(0.2, 0.1).supports(0.2, 0.11)
+    assert not Evidence(float("nan"), 1.0).supports(0.0, 0.0)
+
+
+def test_policies_follow_the_settings():
+    config = replace(SMALL, updates=2, search_updates=5, min_inliers=0.1, search_inliers=0.2, join_inliers=0.3)
+    policies = config.policies
+    assert policies["continuous"].rounds == (Round(2, 0.1), Round(5, 0.2))
+    assert policies["retry"].rounds == policies["late"].rounds == (Round(5, 0.3),)
+    assert (policies["retry"].later, policies["late"].later) == (0, 1) and not policies["located"].checked
+    assert all((one.lifetime, one.optimised) == (4, 4) for one in policies.values())

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -38,9 +38,8 @@ from dvo.odometry.loops import correction as loop_correction
 from dvo.odometry.loops.check import median_inverse_depth
 from dvo.odometry.loops.finder import Loop, LoopFinder
 from dvo.odometry.loops.relocalisation import Located, locate
-from dvo.odometry.loops.work import Correcting, Searching, is_due
-from dvo.odometry.maintenance.adjuster import Adjuster, Adjusting
-from dvo.odometry.maintenance.background import Background, Steps, all_steps
+from dvo.odometry.maintenance.adjuster import Adjuster
+from dvo.odometry.maintenance.maintenance import Job, MapMaintenance, Moved
 
 PATIENCE = 4
 """Searches after a loop within which a second one has to confirm it."""
@@ -56,7 +55,7 @@ class LoopCloser:
         graph: of the tracker; corrected in place.
         finder: of loops.
         enabled: search for loops; otherwise nothing is kept or found.
-        real_time: take results as soon as they are there, instead of waiting for them at a fixed frame.
+        maintenance: of the map: the job in progress, and when its result is taken.
         adjuster: of global adjustments; None for no adjustments.
 
     Attributes:
@@ -65,26 +64,18 @@ class LoopCloser:
         wait: kept keyframes until the next search.
         pending: loop that has not been confirmed yet.
         searches: since then.
-        work: search, correction or adjustment in progress.
     """
 
     graph: KeyframeGraph
     finder: LoopFinder
     enabled: bool = True
-    real_time: bool = False
+    maintenance: MapMaintenance = field(default_factory=MapMaintenance)
     adjuster: Adjuster | None = None
     loops: list[Loop] = field(default_factory=list)
     corrections: int = 0
     wait: int = 0
     pending: Loop | None = None
     searches: int = 0
-    work: Searching | Correcting | Adjusting | None = None
-    _background: Background = field(default_factory=Background)
-
-    @property
-    def occupies_core(self) -> bool:
-        """A thread computes for long beside tracking; the same frames find the same, but in real time."""
-        return isinstance(self.work, Adjusting) or (self.real_time and self.work is not None)
 
     def see(self, identifier: int, image: np.ndarray, maps: Tensor) -> None:
         """Describe a new keyframe of the window; see :meth:`dvo.odometry.loops.finder.LoopFinder.see`."""
@@ -100,7 +91,7 @@ class LoopCloser:
         """
         if not self.enabled or not self.finder.kept:
             return None
-        if self.real_time and self.work is not None and not self.work.task.done:
+        if self.maintenance.waits:
             return None
         self.drain()
         return locate(self.finder, view, identifier)
@@ -125,14 +116,14 @@ class LoopCloser:
             True if poses were corrected.
         """
         if not self.enabled:
-            return self.drain() if at_once else self._collect(False)
+            return self.drain() if at_once else self.maintenance.advance(self)
         corrected, at_once = False, at_once or not self.finder.options.delay
         seen = self.finder.kept[-1] if self.finder.kept else -1
         for frame in self.graph.archive.kept_after(seen):
             if self.graph.segment_of(frame.identifier) in segments:
                 self._visit(frame)
                 corrected |= at_once and self.drain()
-        return self.drain() | corrected if at_once else self._collect(False)
+        return self.drain() | corrected if at_once else self.maintenance.advance(self)
 
     def adjust(self, segments: Collection[int], wait: bool) -> list[AdjustmentRecord]:
         """Adjust the worlds of the recording: now, with the bounds of the final adjustment, or beside tracking.
@@ -152,10 +143,11 @@ class LoopCloser:
         worlds, before = sorted({self.graph.world_of(segment) for segment in own}), len(self.adjuster.records)
         if not wait:
             self.adjuster.want(worlds)
-            self._adjust_next()
+            if self.maintenance.job is None:
+                self.maintenance.job = self.adjuster.next_job(self.maintenance, -1)
             return []
         for world in worlds:
-            self.work = self.adjuster.begin(self._background, world, "request", 0, None)
+            self.maintenance.job = self.adjuster.job(self.maintenance, world, "request", 0, None)
             self.drain()
         return self.adjuster.records[before:]
 
@@ -165,10 +157,7 @@ class LoopCloser:
         Returns:
             True if poses were corrected.
         """
-        corrected = False
-        while self.work is not None:
-            corrected |= self._collect(True)
-        return corrected
+        return self.maintenance.drain(self)
 
     def complete(self, segments: Collection[int], searches: int = 100) -> bool:
         """Search once more, where no loop has been found so far; for the end of a sequence.
@@ -246,52 +235,37 @@ class LoopCloser:
     def _visit(self, frame: ArchivedKeyframe) -> None:
         """Take a kept keyframe into the list, and begin to search for a loop if it is time to."""
         self.wait -= self.finder.keep(frame.identifier)
-        self._search_next()
+        if self.maintenance.job is None:
+            self.maintenance.job = self._search()
 
-    def _search_next(self) -> None:
-        """Begin the next search if it is time to, and there is no other work."""
+    def _search(self) -> Job[Loop | None] | None:
+        """Search for a loop if it is time to."""
         kept, options = self.finder.kept, self.finder.options
         own = len(kept) > 2 * options.neighbours and kept[-1 - 2 * options.neighbours] >= self.graph.recording.keyframe
-        if self.wait > 0 or not own or self.work is not None:
-            return
+        if self.wait > 0 or not own:
+            return None
         search = self.finder.prepare(kept[-1 - options.neighbours], self.pending)
-        steps = self.finder.verify(search)
-        self.work = Searching(self._background.start(partial(all_steps, steps)) if self.real_time else Steps(steps))
         self.wait = options.every
+        return self.maintenance.in_steps("search", self.finder.verify(search), self._searched)
 
-    def _collect(self, at_once: bool) -> bool:
-        """Take the result of the work in progress if its time has come; True if poses were corrected."""
-        work = self.work
-        if work is None:
-            return False
-        try:
-            if not (at_once or is_due(work, self.finder.options.steps, self.real_time)):
-                return False
-            work.task.result()
-        except Exception:  # but an interruption of the wait (KeyboardInterrupt) leaves the work to the next call
-            self.work = None
-            raise
-        self.work = None
-        if isinstance(work, Searching):
-            self._found(work.task.result())
-            self._adjust_next()
-            if not at_once:
-                self._search_next()  # keyframes may have been kept while the search took its time
-            return False
-        if isinstance(work, Adjusting):
-            assert self.adjuster is not None
-            unit = self.adjuster.take(work)
-            self.rescale(unit)
-            self._adjust_next()
-            return bool(unit)
-        self._apply(work.identifiers, work.task.result())
-        self._adjust_next(self.graph.world_of(self.graph.segment_of(self.loops[-1].new)))
-        return True
+    def next_job(self, ended: Job[Any], at_once: bool) -> Job[Any] | None:
+        """Next job: a global adjustment, of a world that was corrected or is wanted, or a search after another one.
 
-    def _adjust_next(self, corrected: int | None = None) -> None:
-        """Begin the next global adjustment unless there is other work: of a world that was corrected, or is wanted."""
-        if self.adjuster is not None and self.work is None:
-            self.work = self.adjuster.begin_next(self._background, corrected)
+        Args:
+            ended: the job before it.
+            at_once: jobs are waited for.
+        """
+        graph = self.graph
+        corrected = graph.world_of(graph.segment_of(self.loops[-1].new)) if ended.kind == "correction" else -1
+        job = None if self.adjuster is None else self.adjuster.next_job(self.maintenance, corrected)
+        if job is None and ended.kind == "search" and not at_once:
+            return self._search()  # keyframes may have been kept while the search took its time
+        return job
+
+    def _searched(self, loop: Loop | None) -> Moved:
+        """Take the outcome of a search, which moves nothing by itself."""
+        self._found(loop)
+        return {}
 
     def _found(self, loop: Loop | None) -> None:
         """Take the outcome of a search."""
@@ -344,24 +318,23 @@ class LoopCloser:
         if not loop.joins and self.is_within(loop, _SMALL):
             return
         correction = loop_correction.prepare(self.graph, self.finder.kept, self.loops, loop)
-        task = self._background.start(correction.solve)
-        self.work = Correcting(task, self.finder.options.delay, correction.identifiers)
+        apply, delay = partial(self._apply, correction.identifiers), self.finder.options.delay
+        self.maintenance.job = self.maintenance.beside("correction", correction.solve, apply, delay)
 
-    def _apply(self, identifiers: np.ndarray, found: Tensor) -> None:
-        """Correct the poses, and express the loops in the new units of the keyframes."""
+    def _apply(self, identifiers: np.ndarray, found: Tensor) -> Moved:
+        """Correct the poses."""
         # At the end of a sequence keyframes of these worlds are archived that have not been looked at yet.
         later = self.graph.archive.kept_after(self.finder.kept[-1])
         kept = [*self.finder.kept, *(frame.identifier for frame in later)]
-        unit = loop_correction.apply(self.graph, kept, self.loops[-1], identifiers, found)
-        self.rescale(unit)
         self.corrections += 1
+        return loop_correction.apply(self.graph, kept, self.loops[-1], identifiers, found)
 
-    def rescale(self, unit: Mapping[int, float]) -> None:
+    def moved(self, units: Moved) -> None:
         """Express the loops in new units of keyframes.
 
         Args:
-            unit: scale of the similarity of each keyframe (:func:`dvo.map.correction.apply_similarities`); those that
+            units: scale of the similarity of each keyframe (:func:`dvo.map.correction.apply_similarities`); those that
                 are not named keep theirs.
         """
-        self.loops[:] = [loop.in_units(unit) for loop in self.loops]
-        self.pending = None if self.pending is None else self.pending.in_units(unit)
+        self.loops[:] = [loop.in_units(units) for loop in self.loops]
+        self.pending = None if self.pending is None else self.pending.in_units(units)

@@ -1,35 +1,17 @@
-"""Begin and end of global adjustments of a tracker: when they are done, and what is told about them."""
+"""Global adjustments of a tracker: when they are done, and what is told about them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.graph_adjustment import Adjusted, AdjustmentLimits, AdjustmentRecord, Cause, apply, prepare
 from dvo.odometry.global_ba.rolling_shutter import Shutter
-from dvo.odometry.maintenance.background import Background, Task
-
-
-@dataclass
-class Adjusting:
-    """Global adjustment in progress.
-
-    Attributes:
-        task: gives the solution.
-        left: frames until it is taken.
-        world: number of the world.
-        cause: of the adjustment.
-        begun: time of the frame that it was begun with, seconds.
-    """
-
-    task: Task[Adjusted]
-    left: int
-    world: int
-    cause: Cause
-    begun: float
+from dvo.odometry.maintenance.maintenance import Job, MapMaintenance, Moved
 
 
 @dataclass
@@ -58,50 +40,53 @@ class Adjuster:
     wanted: list[int] = field(default_factory=list)
     ended: bool = False
 
-    def begin(
-        self, background: Background, world: int, cause: Cause, delay: int, limits: AdjustmentLimits | None
-    ) -> Adjusting:
+    def job(
+        self, maintenance: MapMaintenance, world: int, cause: Cause, delay: int, limits: AdjustmentLimits | None
+    ) -> Job[Adjusted]:
         """Begin the adjustment of a world, from a snapshot.
 
         Args:
-            background: thread of the work.
+            maintenance: of the map.
             world: number of the world.
             cause: of the adjustment.
             delay: frames until the solution is taken.
             limits: bounds of the work; None for those of the final adjustment.
         """
         work = prepare(self.graph, world, self.shutter(), self.options, limits)
-        return Adjusting(background.start(work.solve), delay, world, cause, self._time())
+        apply = partial(self.take, world=world, cause=cause, begun=self._time())
+        return maintenance.beside("adjustment", work.solve, apply, delay)
 
-    def begin_next(self, background: Background, corrected: int | None) -> Adjusting | None:
+    def next_job(self, maintenance: MapMaintenance, corrected: int) -> Job[Adjusted] | None:
         """Begin the next adjustment beside tracking, if there is one.
 
         Args:
-            background: thread of the work.
-            corrected: world that a loop has just corrected, if one has.
+            maintenance: of the map.
+            corrected: world that a loop has just corrected; -1 if none has.
         """
         if self.ended:
             return None
-        if corrected is not None and self.after_loop:
-            return self.begin(background, corrected, "loop", self.limits.delay, self.limits)
+        if corrected >= 0 and self.after_loop:
+            return self.job(maintenance, corrected, "loop", self.limits.delay, self.limits)
         if self.wanted:
-            return self.begin(background, self.wanted.pop(0), "request", self.limits.delay, self.limits)
+            return self.job(maintenance, self.wanted.pop(0), "request", self.limits.delay, self.limits)
         return None
 
-    def take(self, work: Adjusting) -> dict[int, float]:
-        """Apply a solution that is there, if it lowers the cost.
+    def take(self, found: Adjusted, world: int, cause: Cause, begun: float) -> Moved:
+        """Apply a solution, if it lowers the cost.
 
         Args:
-            work: whose result is there.
+            found: the solution.
+            world: number of the world.
+            cause: of the adjustment.
+            begun: time of the frame that it was begun with, seconds.
 
         Returns:
             New unit of each keyframe that has moved, in old ones
             (:func:`dvo.odometry.global_ba.graph_adjustment.apply`).
         """
-        found = work.task.result()
         if len(found.identifiers):
-            self.records.append(found.record(work.begun, self._time(), work.cause))
-        return apply(self.graph, work.world, found) if found.better else {}
+            self.records.append(found.record(begun, self._time(), cause))
+        return apply(self.graph, world, found) if found.better else {}
 
     def want(self, worlds: Iterable[int]) -> None:
         """Take up worlds that wait for their adjustment.

@@ -12,6 +12,7 @@ from dvo.odometry.loops.finder import LoopFinder
 from dvo.odometry.loops.joint_window import GroupMatcher
 from dvo.odometry.loops.place_descriptors import shipped_descriptor
 from dvo.odometry.maintenance.adjuster import Adjuster
+from dvo.odometry.maintenance.maintenance import MapMaintenance
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.state import TrackerState
 
@@ -32,4 +33,5 @@ def loop_closer(
     places = PlaceIndex(1 if described is None else described.dimensions)
     finder = LoopFinder(graph, GroupMatcher(model, config.measuring, device), places, described, config.loop)
     adjuster = Adjuster(graph, lambda: state.shutter, config.adjustment, config.adjust_after_loop)
-    return LoopCloser(graph, finder, config.loops, config.real_time, adjuster)
+    maintenance = MapMaintenance(config.real_time, config.loop.steps)
+    return LoopCloser(graph, finder, config.loops, maintenance, adjuster)

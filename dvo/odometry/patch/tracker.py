@@ -140,7 +140,7 @@ class PatchOdometry:
         """
         if self.state.finished:
             raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
-        with core_left(self.loops.occupies_core):
+        with core_left(self.loops.maintenance.occupies_core):
             return self._track(checked_frame(frame))
 
     def _track(self, frame: Frame) -> Estimate:

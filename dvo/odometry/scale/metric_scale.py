@@ -79,7 +79,7 @@ def settle_scale(
                 if not options.measures:
                     units = rescale(graph, world, known[world].factor)
                     if loops is not None:
-                        loops.rescale(units)
+                        loops.moved(units)
                 graph.metric[world] = options.source
     if not known:
         return {}

@@ -17,7 +17,7 @@ from dvo.metrics import evaluate
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentLimits, apply, prepare
 from dvo.odometry.global_ba.rolling_shutter import Shutter
-from dvo.odometry.maintenance.adjuster import Adjuster, Adjusting
+from dvo.odometry.maintenance.adjuster import Adjuster
 from dvo.odometry.maintenance.background import Background
 from tests.support.archived_walk import M, archived_walk
 
@@ -66,7 +66,7 @@ def test_the_cost_never_increases(wrong, iterations, frames):
     before = cost(graph)
     limits = AdjustmentLimits(iterations=iterations)
     adjuster = Adjuster(graph, Shutter, AdjustmentOptions())
-    adjuster.take(Adjusting(Background().start(prepared(graph, limits).solve), 0, 0, "loop", 0.0))
+    adjuster.take(Background().start(prepared(graph, limits).solve).result(), 0, "loop", 0.0)
     assert cost(graph) <= before * (1 + 1e-6)
     (record,) = adjuster.records
     assert record.cost_before == before and record.accepted == (record.cost < before)
@@ -77,7 +77,7 @@ def test_a_solution_that_is_no_better_changes_nothing():
     before, found = state(graph), prepared(graph).solve()
     adjuster = Adjuster(graph, Shutter, AdjustmentOptions())
     worse = replace(found, cost=found.cost_before)
-    assert adjuster.take(Adjusting(Background().start(lambda: worse), 0, 0, "request", 1.5)) == {}
+    assert adjuster.take(worse, 0, "request", 1.5) == {}
     for mine, other in zip(before, state(graph), strict=True):
         assert np.array_equal(mine, other)
     (entry,) = adjuster.information()["adjustments"]
@@ -170,7 +170,7 @@ def test_a_short_or_unknown_world_is_left_alone():
     for world in (0, 5):
         task = Background().start(prepare(graph, world, GLOBAL, AdjustmentOptions()).solve)
         assert not task.result().better
-        assert adjuster.take(Adjusting(task, 0, world, "request", 0.0)) == {}
+        assert adjuster.take(task.result(), world, "request", 0.0) == {}
     assert adjuster.information() == {}
     assert replace(adjuster, after_loop=True).information() == {"adjustments": []}
 

@@ -17,7 +17,6 @@ from dvo.odometry.loops import joint_window as loop_window
 from dvo.odometry.loops.check import Limits, median_inverse_depth
 from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.loops.options import LoopOptions
-from dvo.odometry.loops.work import Correcting, Searching
 from dvo.odometry.maintenance.background import Steps, all_steps
 from dvo.synth.sequence import make_sequence
 from tests.support.loop_walk import OPTIONS, SHORT, THERE, there_and_back, track, until
@@ -31,6 +30,11 @@ def film():
 @pytest.fixture(scope="module")
 def closed(film):
     return track(film[0])
+
+
+def kind(loops):
+    """Kind of the job in progress; None without one."""
+    return None if loops.maintenance.job is None else loops.maintenance.job.kind
 
 
 def test_loops_are_found_where_the_way_is_repeated(film, closed):
@@ -169,16 +173,16 @@ def test_at_the_end_keyframes_that_are_far_apart_are_all_searched(closed, monkey
 @pytest.fixture
 def correcting(film):
     """Tracker with a correction in progress."""
-    return until(film, lambda loops: isinstance(loops.work, Correcting))[0]
+    return until(film, lambda loops: kind(loops) == "correction")[0]
 
 
 @pytest.mark.slow
 def test_saving_leaves_work_in_progress_alone(film, closed, tmp_path):
     """Maps are those before the result of a search, or a correction, is there."""
     states = {
-        "searching": lambda loops: isinstance(loops.work, Searching) and loops.pending is not None,
-        "correcting": lambda loops: isinstance(loops.work, Correcting),
-        "closed": lambda loops: loops.corrections > 0 and loops.work is None,
+        "searching": lambda loops: kind(loops) == "search" and loops.pending is not None,
+        "correcting": lambda loops: kind(loops) == "correction",
+        "closed": lambda loops: loops.corrections > 0 and loops.maintenance.job is None,
     }
     odometry, saved = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT), {}
     for frame in film[0]:
@@ -192,7 +196,7 @@ def test_saving_leaves_work_in_progress_alone(film, closed, tmp_path):
     assert result.info["loops"] == closed[2].info["loops"]
     for name, loops in saved.items():
         found = dvo.load_map(tmp_path / f"{name}.dvo").loops
-        assert found.work is None and found.finder.kept[-1] > found.graph.archive.keyframes[0].identifier
+        assert found.maintenance.job is None and found.finder.kept[-1] > found.graph.archive.keyframes[0].identifier
         assert all(torch.equal(mine.measurement, other) for mine, other in zip(found.loops, loops, strict=True))
     odometry.save(tmp_path / "done.dvo")
     assert dvo.load_map(tmp_path / "done.dvo").finish().info["loops"] == result.info["loops"]
@@ -204,7 +208,7 @@ def test_a_correction_at_the_end_moves_keyframes_that_were_not_looked_at(correct
     while len(graph.window):
         graph.archive_oldest()
     last, later = loops.finder.kept[-1], [frame.identifier for frame in graph.archive.kept_after(loops.finder.kept[-1])]
-    scale = float(loops.work.task.result()[list(loops.work.identifiers).index(last), 7])
+    scale = float(loops.maintenance.job.task.result()[list(loops.maintenance.job.apply.args[0]).index(last), 7])
     steps = [se3.relative(*graph.poses_cw(np.array([last, k]))) for k in later]
     loops.wait = 1000  # no further search
     assert loops.advance([0], at_once=True) and loops.corrections == 1
@@ -249,7 +253,7 @@ def test_a_loop_of_a_keyframe_whose_patches_were_released_counts_for_nothing(cor
 
 
 def test_an_interruption_while_a_frame_waits_leaves_the_work(correcting, monkeypatch):
-    loops, work = correcting.loops, correcting.loops.work
+    loops, work = correcting.loops, correcting.loops.maintenance.job
 
     def pressed():
         raise KeyboardInterrupt
@@ -257,7 +261,7 @@ def test_an_interruption_while_a_frame_waits_leaves_the_work(correcting, monkeyp
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(work.task, "result", pressed)
         loops.advance([0], at_once=True)
-    assert loops.work is work and not loops.corrections
+    assert loops.maintenance.job is work and not loops.corrections
     assert loops.advance([0], at_once=True) and loops.corrections == 1
 
 
@@ -265,7 +269,7 @@ def test_an_interruption_while_a_frame_waits_leaves_the_work(correcting, monkeyp
 def test_a_search_at_once_finds_the_same_places(film, closed):
     """Without a delay, searches and corrections are done within ``track``."""
     odometry, _, result = track(film[0], replace(OPTIONS, delay=0))
-    assert odometry.loops.work is None and odometry.loops.corrections
+    assert odometry.loops.maintenance.job is None and odometry.loops.corrections
     assert evaluate(result.trajectory, film[1]).ate_percent < 0.5
 
 
@@ -280,10 +284,10 @@ def test_in_real_time_a_frame_does_not_wait_for_a_search(film, monkeypatch):
 
     monkeypatch.setattr(odometry.loops.finder, "verify", slow)
     estimates = [odometry.track(frame) for frame in film[0][:64]]
-    assert isinstance(odometry.loops.work, Searching) and not odometry.loops.work.task.done
+    assert kind(odometry.loops) == "search" and not odometry.loops.maintenance.job.task.done
     assert sum(estimate.pose_wc is not None for estimate in estimates) > 45
     release.set()
-    assert odometry.finish().info["loops"] is not None and odometry.loops.work is None
+    assert odometry.finish().info["loops"] is not None and odometry.loops.maintenance.job is None
 
 
 def test_a_search_that_fails_ends_the_frame_that_takes_its_result(film, monkeypatch):

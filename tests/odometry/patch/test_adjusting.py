@@ -9,15 +9,19 @@ import pytest
 import dvo
 from dvo.metrics import evaluate
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentLimits
-from dvo.odometry.loops.work import Correcting, Searching
-from dvo.odometry.maintenance.adjuster import Adjusting
 from dvo.odometry.maintenance.background import Background
+from dvo.odometry.maintenance.maintenance import Job
 from tests.support.loop_walk import OPTIONS, SHORT, there_and_back, until
 
 
 @pytest.fixture(scope="module")
 def film():
     return there_and_back()
+
+
+def kind(loops):
+    """Kind of the job in progress; None without one."""
+    return None if loops.maintenance.job is None else loops.maintenance.job.kind
 
 
 def adjusting(film, state):
@@ -32,12 +36,12 @@ def test_a_world_is_adjusted_after_a_loop(film, tmp_path):
     """Saving in the meantime changes nothing, and tells the adjustments that were made."""
     trajectories = []
     for saves in (True, False):
-        odometry, count = adjusting(film, lambda loops: isinstance(loops.work, Correcting))
+        odometry, count = adjusting(film, lambda loops: kind(loops) == "correction")
         begun, errors = 0, []
         for number in range(count, count + 16):
             before, made = odometry.current().trajectory, list(odometry.loops.adjuster.records)
             odometry.track(film[0][number])
-            if isinstance(odometry.loops.work, Adjusting) and not begun:
+            if kind(odometry.loops) == "adjustment" and not begun:
                 begun = number
             elif begun and number == begun + 3 and saves:
                 odometry.save(tmp_path / "adjusting.dvo")
@@ -59,7 +63,7 @@ def test_a_world_is_adjusted_after_a_loop(film, tmp_path):
 
 def test_an_adjustment_on_request(film):
     """It waits, and lowers cost and error; in real time it is done beside tracking, and no frame waits for it."""
-    loaded, count = adjusting(film, lambda loops: loops.corrections > 0 and loops.work is None)
+    loaded, count = adjusting(film, lambda loops: loops.corrections > 0 and loops.maintenance.job is None)
     release = threading.Event()
     before = evaluate(loaded.current().trajectory, film[1]).ate_percent
     (record,) = loaded.adjust()
@@ -69,17 +73,17 @@ def test_an_adjustment_on_request(film):
     assert after < before
     assert loaded.track(film[0][count]).status is dvo.Status.TRACKING
     loaded.config, loaded.loops.real_time = replace(loaded.config, real_time=True), True
-    loaded.loops.work = Searching(Background().start(lambda: release.wait(60) and None))
+    loaded.loops.maintenance.job = Job("search", Background().start(lambda: release.wait(60) and None), lambda _: {})
     assert loaded.adjust() == () and loaded.loops.adjuster.wanted == [0]
     loaded.track(film[0][count + 1])
-    assert isinstance(loaded.loops.work, Searching)
+    assert kind(loaded.loops) == "search"
     release.set()
-    assert loaded.loops.work.task.result() is None
+    assert loaded.loops.maintenance.job.task.result() is None
     loaded.track(film[0][count + 2])
-    assert isinstance(loaded.loops.work, Adjusting) and not loaded.loops.adjuster.wanted
-    assert loaded.loops.work.task.result() is not None
+    assert kind(loaded.loops) == "adjustment" and not loaded.loops.adjuster.wanted
+    assert loaded.loops.maintenance.job.task.result() is not None
     loaded.track(film[0][count + 3])
-    assert len(loaded.loops.adjuster.records) == 2 and loaded.loops.work is None
+    assert len(loaded.loops.adjuster.records) == 2 and loaded.loops.maintenance.job is None
     assert [entry["cause"] for entry in loaded.current().info["adjustments"]] == ["request"] * 2
 
 

@@ -1,0 +1,157 @@
+"""Maintenance of a map while tracking goes on: one worker, one job at a time, applied at a stated frame.
+
+A job (search for a loop, correction by a pose graph, global adjustment) reads a snapshot, or takes a step with each
+frame. Its result is applied between two frames: at a frame that is fixed when the job begins, so that the same frames
+give the same bytes, or in real time as soon as it is there. What has moved is told as one message, which everything
+follows that must.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+from dvo.odometry.maintenance.background import Background, Steps, Task, all_steps
+
+T = TypeVar("T")
+Kind = Literal["search", "correction", "adjustment"]
+Moved = Mapping[int, float]
+"""New unit of each keyframe that a job has moved, in old ones: the scale of its similarity."""
+
+
+@dataclass
+class Job(Generic[T]):
+    """Work on a map.
+
+    Attributes:
+        kind: of the work.
+        task: gives its result: beside tracking, or in steps, some of which each frame takes.
+        apply: called once with the result, between two frames.
+        left: frames until the result is taken; a job in steps ends with the last of them.
+    """
+
+    kind: Kind
+    task: Task[T] | Steps[T]
+    apply: Callable[[T], Moved]
+    left: int = 0
+
+
+class Owner(Protocol):
+    """What a map maintenance reports to."""
+
+    def moved(self, units: Moved) -> None:
+        """Follow keyframes that have moved.
+
+        Args:
+            units: see :data:`Moved`.
+        """
+        ...
+
+    def next_job(self, ended: Job[Any], at_once: bool) -> Job[Any] | None:
+        """Choose the next job.
+
+        Args:
+            ended: that has just been applied.
+            at_once: jobs are waited for; those that take their time with the frames are not begun.
+        """
+        ...
+
+
+@dataclass
+class MapMaintenance:
+    """Jobs of a map, one after the other.
+
+    Attributes:
+        real_time: take results as soon as they are there, instead of waiting for them at a fixed frame.
+        steps: that a frame takes of a job in steps.
+        job: in progress; None for none.
+    """
+
+    real_time: bool = False
+    steps: int = 1
+    job: Job[Any] | None = None
+    _background: Background = field(default_factory=Background)
+
+    @property
+    def occupies_core(self) -> bool:
+        """A thread computes for long beside tracking; the same frames find the same, but in real time."""
+        return self.job is not None and (self.real_time or self.job.kind == "adjustment")
+
+    @property
+    def waits(self) -> bool:
+        """In real time: a job is in progress whose result is not there."""
+        return self.real_time and self.job is not None and not self.job.task.done
+
+    def beside(self, kind: Kind, work: Callable[[], T], apply: Callable[[T], Moved], left: int) -> Job[T]:
+        """Job in the thread, which begins at once.
+
+        Args:
+            kind: of the work.
+            work: called in the thread; what it reads must not change meanwhile.
+            apply, left: see :class:`Job`.
+        """
+        return Job(kind, self._background.start(work), apply, left)
+
+    def in_steps(self, kind: Kind, steps: Generator[None, None, T], apply: Callable[[T], Moved]) -> Job[T]:
+        """Job in steps, some with each frame; in real time in the thread.
+
+        Args:
+            kind: of the work.
+            steps: see :class:`dvo.odometry.maintenance.background.Steps`.
+            apply: see :class:`Job`.
+        """
+        return Job(kind, self._background.start(partial(all_steps, steps)) if self.real_time else Steps(steps), apply)
+
+    def advance(self, owner: Owner, at_once: bool = False) -> bool:
+        """Take the result of the job in progress if its time has come, and begin the next one; once a frame.
+
+        Args:
+            owner: of the map.
+            at_once: wait for the result.
+
+        Returns:
+            True if keyframes have moved.
+        """
+        job = self.job
+        if job is None:
+            return False
+        try:
+            if not (at_once or self._is_due(job)):
+                return False
+            result = job.task.result()
+        except Exception:  # but an interruption of the wait (KeyboardInterrupt) leaves the work to the next call
+            self.job = None
+            raise
+        self.job = None
+        moved = job.apply(result)
+        if moved:
+            owner.moved(moved)
+        if self.job is None:
+            self.job = owner.next_job(job, at_once)
+        return bool(moved)
+
+    def drain(self, owner: Owner) -> bool:
+        """Wait for the job in progress, and what follows from it.
+
+        Args:
+            owner: of the map.
+
+        Returns:
+            True if keyframes have moved.
+        """
+        moved = False
+        while self.job is not None:
+            moved |= self.advance(owner, at_once=True)
+        return moved
+
+    def _is_due(self, job: Job[Any]) -> bool:
+        """Find out if the result of a job is taken with this frame; one in steps takes its next ones."""
+        if isinstance(job.task, Steps):
+            task = job.task
+            return any(task.step() for _ in range(self.steps))
+        if job.kind == "search":
+            return job.task.done
+        job.left -= 1
+        return job.task.done if self.real_time else job.left <= 0

@@ -17,7 +17,8 @@ from dvo.data.images.image_header import image_size
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices
 from dvo.map.archive import ArchivedKeyframe
-from dvo.map.keyframe_graph import NEAR, KeyframeGraph
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import NEAR
 from dvo.map.measurements import ArchivedEdges
 from dvo.nets.patch.config import ModelConfig
 

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from dvo.geometry import se3, sim3
 from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 
 
-def apply_similarities(graph: KeyframeGraph, identifiers: np.ndarray, similarities: Tensor) -> None:
+def apply_similarities(graph: Map, identifiers: np.ndarray, similarities: Tensor) -> None:
     """Set poses and scales of archived keyframes; the dropped keyframes and the frames relative to them follow.
 
     A similarity ``S`` maps points of the world to the frame of the camera, in the unit that the keyframe had so far.
@@ -34,7 +35,7 @@ def apply_similarities(graph: KeyframeGraph, identifiers: np.ndarray, similariti
     _rescale_relative(graph, scales)
 
 
-def _rescale_relative(graph: KeyframeGraph, scales: dict[int, float]) -> None:
+def _rescale_relative(graph: Map, scales: dict[int, float]) -> None:
     """Divide the lengths of dropped keyframes and frames that are relative to keyframes with a new scale."""
     for frame in list(graph.archive):  # by increasing identifier: the keyframe that it is relative to comes first
         if frame.anchor is None or frame.anchor not in scales:
@@ -48,7 +49,7 @@ def _rescale_relative(graph: KeyframeGraph, scales: dict[int, float]) -> None:
     graph.log.rescale(scales)
 
 
-def rescale(graph: KeyframeGraph, segment: int, factor: float) -> dict[int, float]:
+def rescale(graph: Map, segment: int, factor: float) -> dict[int, float]:
     """Multiply all lengths of the world of a segment, from its origin.
 
     Args:

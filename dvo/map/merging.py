@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.measurements import ArchivedEdges
 
 
-def append_graph(graph: KeyframeGraph, other: KeyframeGraph) -> tuple[int, int]:
+def append_graph(graph: Map, other: Map) -> tuple[int, int]:
     """Append the content of a graph; its segments keep their worlds.
 
     The bound of the archive becomes the sum of both, so that nothing is released.

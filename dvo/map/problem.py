@@ -24,7 +24,7 @@ def archive_problem(
         members: the keyframes, by increasing identifier.
         poses_cw: poses of identifiers.
         m: patches of a keyframe.
-        dropped, first, last: see :meth:`dvo.map.keyframe_graph.KeyframeGraph.problem`.
+        dropped, first, last: see :meth:`dvo.map.map.Map.problem`.
     """
     edges = archive.edges(first, last)
     linked = set(np.unique(np.concatenate([edges.source, edges.target])).tolist()) if first > 0 else set()

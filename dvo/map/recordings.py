@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from dvo.map.archive import ArchivedKeyframe
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.recording import Recording
 
 
-def begin_recording(graph: KeyframeGraph) -> Recording:
+def begin_recording(graph: Map) -> Recording:
     """Begin a recording in a graph whose window is empty, with the segment that has been begun last.
 
     Args:
@@ -47,7 +47,7 @@ def increase(times: np.ndarray, first: Sequence[int]) -> bool:
     return bool(rising.all())
 
 
-def increasing_times(graph: KeyframeGraph, frames: Sequence[ArchivedKeyframe]) -> Tensor:
+def increasing_times(graph: Map, frames: Sequence[ArchivedKeyframe]) -> Tensor:
     """Times of keyframes on one clock, on which recordings follow each other a second apart.
 
     Args:
@@ -65,7 +65,7 @@ def increasing_times(graph: KeyframeGraph, frames: Sequence[ArchivedKeyframe]) -
     return torch.from_numpy(times)
 
 
-def count_earlier(graph: KeyframeGraph, identifiers: np.ndarray) -> int:
+def count_earlier(graph: Map, identifiers: np.ndarray) -> int:
     """Count the keyframes of earlier recordings.
 
     Args:

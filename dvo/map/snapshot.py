@@ -1,4 +1,4 @@
-"""Snapshot of the archived part of a keyframe graph, for work beside tracking.
+"""Snapshot of a map, for work beside tracking.
 
 Archived keyframes and measurements are never changed in place, only replaced. A snapshot refers to them, which takes
 next to no time; the copy that can be corrected is made where the work is done.
@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import torch
-
 from dvo.map.archive import ArchiveConfig, ArchivedKeyframe
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.measurements import PackedEdges
 from dvo.map.recording import Recording
 
@@ -20,13 +18,13 @@ _UNBOUNDED = 2**62  # bytes: a copy of what is within the bound of an archive
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Archived keyframes and measurements of a graph at one time; see :class:`KeyframeGraph`.
+    """Archived keyframes and measurements of a map at one time; see :class:`dvo.map.map.Map`.
 
     Attributes:
         per_frame: patches of a keyframe.
         keyframes: in the order in which they were archived.
         parts: measurements, oldest first.
-        segment, starts, worlds, loops, recordings: as those of the graph.
+        segment, starts, worlds, loops, recordings: as those of the map.
     """
 
     per_frame: int
@@ -39,20 +37,20 @@ class Snapshot:
     recordings: tuple[Recording, ...]
 
     @classmethod
-    def of(cls, graph: KeyframeGraph) -> Snapshot:
-        """Snapshot of a graph, by references.
+    def of(cls, source: Map) -> Snapshot:
+        """Snapshot of a map, by references.
 
         Args:
-            graph: with any window, which is left out.
+            source: the map.
         """
         return cls(
-            graph.window.per_frame, tuple(graph.archive.keyframes), tuple(graph.archive.parts), graph.segment,
-            tuple(graph.starts), tuple(graph.worlds.items()), graph.loops, tuple(graph.recordings),
+            source.per_frame, tuple(source.archive.keyframes), tuple(source.archive.parts), source.segment,
+            tuple(source.starts), tuple(source.worlds.items()), source.loops, tuple(source.recordings),
         )  # fmt: skip
 
-    def graph(self) -> KeyframeGraph:
-        """Copy with an empty window and without features, images and a log of frames, to be corrected at will."""
-        copy = KeyframeGraph(self.per_frame, 1, 1, torch.device("cpu"), ArchiveConfig(_UNBOUNDED, False, False))
+    def map(self) -> Map:
+        """Copy without features, images and a log of frames, to be corrected at will."""
+        copy = Map(self.per_frame, ArchiveConfig(_UNBOUNDED, False, False))
         for keyframe in self.keyframes:
             copy.archive.add(replace(keyframe, matching=None, context=None, jpeg=None))
         for part in self.parts:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from dvo.data.trajectory import Trajectory
-from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import KeyframeLog
+from dvo.map.map import Map
 from dvo.map.recording import Recording
 from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
@@ -85,7 +85,7 @@ def breaks_of(log: KeyframeLog, first: int = 0) -> tuple[Break, ...]:
     return find_breaks(times, owner, {record.timestamp: record.reason for record in frames})
 
 
-def result_of(graph: KeyframeGraph, info: dict[str, Any], poses: Mapping[int, np.ndarray] | None = None) -> Result:
+def result_of(graph: Map, info: dict[str, Any], poses: Mapping[int, np.ndarray] | None = None) -> Result:
     """Result of a tracker, for its last recording.
 
     Args:

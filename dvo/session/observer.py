@@ -11,7 +11,8 @@ from torch import Tensor
 
 from dvo.data.frame import Frame
 from dvo.geometry.poses import invert_poses, quaternion_to_matrix
-from dvo.map.keyframe_graph import NEAR, KeyframeGraph
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import NEAR
 from dvo.map.window import Window
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.session.session import Run

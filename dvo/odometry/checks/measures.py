@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from dvo.geometry.projection import reproject
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
 from dvo.odometry.checks.check_pairs import CheckPairs, epipolar_distances, median_displacement
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
@@ -26,7 +26,7 @@ JUMP = 6.0
 
 
 def measure_quality(
-    graph: KeyframeGraph,
+    graph: Map,
     result: Result,
     segments: Collection[int],
     checks: CheckPairs,
@@ -76,7 +76,7 @@ def measure_quality(
     return replace(quality, verdict=verdict, reason=reason, remedy=remedy)
 
 
-def _inliers(graph: KeyframeGraph, segment: int, shutter: Shutter) -> tuple[np.ndarray, np.ndarray, float] | None:
+def _inliers(graph: Map, segment: int, shutter: Shutter) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Numbers of measurements, confident ones and those that agree; residuals; spread. None without a measurement."""
     p = graph.problem(segment=segment)
     across = p.ii != p.jj
@@ -100,7 +100,7 @@ def _inliers(graph: KeyframeGraph, segment: int, shutter: Shutter) -> tuple[np.n
     return counts, residual[confident].numpy(), float(spread)
 
 
-def _distances(graph: KeyframeGraph, checks: CheckPairs) -> list[tuple[np.ndarray, float]]:
+def _distances(graph: Map, checks: CheckPairs) -> list[tuple[np.ndarray, float]]:
     """Distances of the corners of each pair whose frames have poses in one world, and their displacement, pixels."""
     log, found = graph.log, []
     for pair in checks.pairs:

@@ -25,7 +25,7 @@ from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings
 from dvo.geometry import se3
 from dvo.map.correction import rescale
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.measured_depths import measured_depths
 from dvo.map.recordings import count_earlier, increasing_times
 from dvo.odometry.depth.depth_factor import MOST, far_scale, measured_share, to_measured
@@ -104,7 +104,7 @@ class _Change:
 
 
 def adjust_segment(
-    graph: KeyframeGraph,
+    graph: Map,
     segment: int,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
     shutter: Shutter | None = None,

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, solve_part
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.global_ba.self_calibration import Minimum, profile_minimum
@@ -61,7 +61,7 @@ class FocalProfile:
 
 
 def find_focal(
-    graph: KeyframeGraph,
+    graph: Map,
     segment: int,
     shutter: Shutter,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)

@@ -24,6 +24,7 @@ from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3, sim3
 from dvo.map.correction import apply_similarities, move_window, window_carrier
 from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
 from dvo.map.snapshot import Snapshot
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment
@@ -128,7 +129,7 @@ class Adjustment:
     def solve(self) -> Adjusted:
         """Solution. The graph that the snapshot was taken of is neither read nor changed."""
         started = time.perf_counter()
-        graph = self.snapshot.graph()
+        graph = self.snapshot.map()
         members = graph.members(self.world)
         identifiers = np.array([frame.identifier for frame in members], dtype=np.int64)
         since = self._since(graph, identifiers)
@@ -150,7 +151,7 @@ class Adjustment:
         costs = len(part.kk), cost_before, cost
         return Adjusted(rows, sim3.normalise(similarities), depths, *costs, time.perf_counter() - started)
 
-    def _since(self, graph: KeyframeGraph, identifiers: np.ndarray) -> int:
+    def _since(self, graph: Map, identifiers: np.ndarray) -> int:
         """Identifier of the first keyframe within the bounds; 0 if all are."""
         first = 0 if self.frames is None else max(0, len(identifiers) - self.frames)
         if self.edges is not None and len(identifiers):
@@ -162,7 +163,7 @@ class Adjustment:
             first = max(first, int((later > self.edges).sum()))
         return int(identifiers[min(first, len(identifiers) - 1)]) if first else 0
 
-    def _cost(self, graph: KeyframeGraph, since: int) -> tuple[PatchProblem, float]:
+    def _cost(self, graph: Map, since: int) -> tuple[PatchProblem, float]:
         """Measurements that are solved for, and their cost under the poses and depths of a graph."""
         part = graph.problem(True, self.world, since)
         if not len(part.kk):
@@ -185,7 +186,7 @@ def _nothing(started: float) -> Adjusted:
 
 
 def prepare(
-    graph: KeyframeGraph,
+    graph: Map,
     world: int,
     shutter: Shutter,
     options: AdjustmentOptions,
@@ -238,7 +239,7 @@ def apply(graph: KeyframeGraph, world: int, adjusted: Adjusted) -> dict[int, flo
     return dict(zip(moving.tolist(), found[:, 7].tolist(), strict=True))
 
 
-def _set_exactly(graph: KeyframeGraph, adjusted: Adjusted) -> None:
+def _set_exactly(graph: Map, adjusted: Adjusted) -> None:
     """Give keyframes the solved poses and depths; those with a unit of its own have moved all depths by one factor."""
     s = adjusted.similarities
     poses_cw = torch.cat([s[:, :3] / s[:, 7:], s[:, 3:7]], 1).numpy()

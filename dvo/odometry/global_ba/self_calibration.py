@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.recordings import count_earlier, increasing_times
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment, solve_part
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
@@ -78,7 +78,7 @@ def profile_minimum(
 
 
 def find_readout(
-    graph: KeyframeGraph,
+    graph: Map,
     segment: int,
     rows: float,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
@@ -125,7 +125,7 @@ def find_readout(
 
 
 def adjust_segments(
-    graph: KeyframeGraph,
+    graph: Map,
     segments: Sequence[int],
     shutter: Shutter,
     estimate: bool,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3
-from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.map.places import PlaceIndex
 from dvo.odometry.loops.place_descriptors import PlaceDescriptor
 
@@ -43,7 +43,7 @@ class Candidate:
 
 
 def by_likeness(
-    graph: KeyframeGraph,
+    graph: Map,
     places: PlaceIndex,
     descriptor: PlaceDescriptor | None,
     new: int,
@@ -68,7 +68,7 @@ def by_likeness(
 
 
 def by_proximity(
-    graph: KeyframeGraph, new: int, similarity: Tensor, earlier: np.ndarray, seconds: float, count: int = NEAREST
+    graph: Map, new: int, similarity: Tensor, earlier: np.ndarray, seconds: float, count: int = NEAREST
 ) -> Iterator[Candidate]:
     """Candidates that have the patches of a keyframe in view, as far as the poses tell: the best of different visits.
 
@@ -98,7 +98,7 @@ def by_proximity(
         yield Candidate(int(earlier[row]), new, "proximity", pose_cw)
 
 
-def overlap(graph: KeyframeGraph, new: int, pose_cw: Tensor, scale: float, others: np.ndarray) -> np.ndarray:
+def overlap(graph: Map, new: int, pose_cw: Tensor, scale: float, others: np.ndarray) -> np.ndarray:
     """Share ``(N,)`` of the patches of a keyframe that lie in the view of others at a similar depth.
 
     Args:
@@ -121,7 +121,7 @@ def rays_of(centres: Tensor, intrinsics: Tensor) -> Tensor:
     return torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1)
 
 
-def share_in_view(graph: KeyframeGraph, points: Tensor, pose_cw: Tensor, others: np.ndarray) -> np.ndarray:
+def share_in_view(graph: Map, points: Tensor, pose_cw: Tensor, others: np.ndarray) -> np.ndarray:
     """Share ``(N,)`` of the points that a camera sees that lie in the view of keyframes at a similar depth.
 
     Args:

@@ -17,6 +17,7 @@ from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
 from dvo.geometry import se3, sim3
 from dvo.map.correction import apply_similarities, move_window, similarity_between, window_carrier
 from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.map import Map
 from dvo.odometry.loops.check import median_inverse_depth
 from dvo.odometry.loops.finder import Loop
 
@@ -54,19 +55,19 @@ class Correction:
         return sim3.normalise(result.poses_cw)
 
 
-def worlds_of_loop(graph: KeyframeGraph, loop: Loop) -> tuple[int, int]:
+def worlds_of_loop(graph: Map, loop: Loop) -> tuple[int, int]:
     """Worlds of the earlier and the later visit."""
     old, new = (graph.world_of(graph.segment_of(k)) for k in (loop.old, loop.new))
     return old, new
 
 
-def members(graph: KeyframeGraph, kept: Sequence[int], loop: Loop) -> np.ndarray:
+def members(graph: Map, kept: Sequence[int], loop: Loop) -> np.ndarray:
     """Identifiers ``(N,)`` of the kept keyframes in the worlds of a loop, increasing."""
     worlds = worlds_of_loop(graph, loop)
     return np.array([k for k in kept if graph.world_of(graph.segment_of(k)) in worlds], dtype=np.int64)
 
 
-def prepare(graph: KeyframeGraph, kept: Sequence[int], loops: Sequence[Loop], loop: Loop) -> Correction:
+def prepare(graph: Map, kept: Sequence[int], loops: Sequence[Loop], loop: Loop) -> Correction:
     """Pose graph of the worlds of a loop.
 
     Errors are weighted relative to the depth of the scene. Keyframes whose patches were released, which do not tell it,
@@ -129,13 +130,13 @@ def apply(
     return dict(zip(now.tolist(), found[:, 7].tolist(), strict=True))
 
 
-def held_keyframes(graph: KeyframeGraph, identifiers: np.ndarray) -> np.ndarray:
+def held_keyframes(graph: Map, identifiers: np.ndarray) -> np.ndarray:
     """Mask ``(N,)`` of the keyframes of the map, in the world that stays; none without a map."""
     worlds = np.array([graph.world_of(graph.segment_of(int(k))) for k in identifiers])
     return (identifiers < graph.recording.keyframe) & (worlds == worlds.min())
 
 
-def _depths(graph: KeyframeGraph, identifiers: np.ndarray, segments: np.ndarray) -> np.ndarray:
+def _depths(graph: Map, identifiers: np.ndarray, segments: np.ndarray) -> np.ndarray:
     """Median depth ``(N,)`` at keyframes, that of the nearest one of the segment for those without patches.
 
     A segment without any patches has the depth of the nearest keyframe of another one, and 1 if no patches are left.
@@ -149,7 +150,7 @@ def _depths(graph: KeyframeGraph, identifiers: np.ndarray, segments: np.ndarray)
     return depth
 
 
-def _carried(graph: KeyframeGraph, identifiers: np.ndarray, found: Tensor, now: np.ndarray) -> Tensor:
+def _carried(graph: Map, identifiers: np.ndarray, found: Tensor, now: np.ndarray) -> Tensor:
     """Similarities ``(M, 8)`` of all keyframes; one that was not solved for moves with the last one of its segment."""
     position = {int(k): row for row, k in enumerate(identifiers)}
     last = {graph.segment_of(int(k)): int(k) for k in identifiers}
@@ -163,7 +164,7 @@ def _carried(graph: KeyframeGraph, identifiers: np.ndarray, found: Tensor, now: 
     return torch.stack(rows)
 
 
-def _start(graph: KeyframeGraph, identifiers: np.ndarray, poses_cw: Tensor, loop: Loop) -> Tensor:
+def _start(graph: Map, identifiers: np.ndarray, poses_cw: Tensor, loop: Loop) -> Tensor:
     """Similarities ``(N, 8)`` world to camera to start from; a joining segment is moved into the older world.
 
     In a map the later of the two worlds is moved, whichever keyframe is the older one.

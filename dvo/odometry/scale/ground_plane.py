@@ -16,7 +16,7 @@ import numpy as np
 
 from dvo.geometry.poses import invert_poses, quaternion_to_matrix
 from dvo.map.archive import ArchivedKeyframe
-from dvo.map.keyframe_graph import NEAR
+from dvo.map.map import NEAR
 
 _NEIGHBOURS = 8  # keyframes before and after whose points take part
 _STEEP = 0.07  # least slope of the view of a point, 4 degrees below the axis of the camera

@@ -41,6 +41,10 @@ CLIPS: dict[str, dict[str, object]] = {
     "snow": {"family": "street", "kind": "forward", "surroundings": "snow"},
     "border": {"surroundings": "border"},
     "glass": {"surroundings": "glass"},
+    "screens": {"surroundings": "screen"},
+    "night": {"family": "street", "kind": "forward", "surroundings": "night"},
+    "coded": {"h264": 38},
+    "floating": {"stabilised": 0.01},
 }
 """Rendering options of each clip that differ from :data:`COMMON`; see :func:`dvo.synth.sequence_spec`."""
 SHOWN = (20, 32)  # frames of a picture

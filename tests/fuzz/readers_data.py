@@ -13,7 +13,7 @@ from tests.fuzz.target import Target, chance, check_frames, check_trajectory, re
 
 WIDTH, HEIGHT, COUNT = 64, 48, 4
 K = "50 51 31.5 23.5"
-MODULES = ("cv2", "yaml", "dvo.data.source", *(f"dvo.data.{name}" for name in (
+MODULES = ("cv2", "yaml", "dvo.data.open", *(f"dvo.data.readers.{name}" for name in (
     "euroc", "folder", "icl_nuim", "kitti", "sequence", "tartanair", "tum", "video")))  # fmt: skip
 
 

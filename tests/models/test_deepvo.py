@@ -23,6 +23,7 @@ def test_the_page_lists_exactly_the_files_that_name_the_network():
         for room in ("dvo", "train", "configs/train")
         for path in (ROOT / room).rglob("*")
         if path.suffix in (".py", ".yaml")
+        and path.name != "moved.py"
         and ("deepvo" in str(path.relative_to(ROOT)) or "deepvo" in path.read_text(encoding="utf-8").lower())
     }
     assert listed == found

@@ -72,7 +72,7 @@ def test_an_adjustment_on_request(film):
     after = evaluate(loaded.current().trajectory, film[1]).ate_percent
     assert after < before
     assert loaded.track(film[0][count]).status is dvo.Status.TRACKING
-    loaded.config, loaded.loops.real_time = replace(loaded.config, real_time=True), True
+    loaded.config, loaded.loops.maintenance.real_time = replace(loaded.config, real_time=True), True
     loaded.loops.maintenance.job = Job("search", Background().start(lambda: release.wait(60) and None), lambda _: {})
     assert loaded.adjust() == () and loaded.loops.adjuster.wanted == [0]
     loaded.track(film[0][count + 1])

@@ -76,7 +76,7 @@ def test_every_pose_has_a_covariance_and_nothing_else_has(tracked):
 def information(step, factors=()):
     """Dense information matrix of the poses after the reference and all depths, float64, and the rows of the poses."""
     window, gauge = step.window, window_gauge(step.window.problem())
-    options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, settings=step.settings)
+    options = BAOptions(fixed=gauge.reference + 1, bounds=step.bounds, kernel=step.settings.kernel)
     tensors = window.poses_cw, window.patches, window.intrinsics, window.targets, window.confidence
     edges = window.ii, window.jj, window.kk
     given = PatchProblem(*(x[None].double() for x in tensors), *edges, factors=factors)
@@ -184,7 +184,7 @@ def test_scale_and_world_do_not_matter(tracked):
     np.testing.assert_allclose(found.covariance, units @ plain.covariance @ units, rtol=2e-2, atol=tolerance**2)
     assert found.confidence == pytest.approx(plain.confidence, abs=1e-2)
     world = se3.exp(torch.tensor([3.0, -2, 1, 0.5, 1.0, -0.7])).expand_as(poses)
-    found = newest_uncertainty(copied(step, se3.compose(poses, world)), TrackerConfig())
+    found = newest_uncertainty(copied(step, se3.compose(poses, world)), TrackerConfig().variance)
     np.testing.assert_allclose(found.covariance, plain.covariance, rtol=2e-2, atol=tolerance**2)
     wide = newest_uncertainty(step, TrackerConfig(sigma=0.122, covariance_scale=8.0).variance)
     factor = 4 * 8 / TrackerConfig().covariance_scale

@@ -1,4 +1,4 @@
-"""Picture of docs/architecture.md: the rooms of dvo, by their imports: python docs/figures/rooms.py [--out FILE].
+"""Picture of docs/architecture.md: the rooms of dvo, by their imports: python docs/rooms/make.py [--out FILE].
 
 A room stands above all that it imports; its number is that of its lines. An arrow is an import that does not follow
 from others: who imports `nets` may import `geometry` too. `core` is left out, which everybody imports.

@@ -42,7 +42,9 @@ def starts(clear):
     return [track(clear[CUT + DARK :], seed) for seed in (0, 1, 2)]
 
 
-@pytest.mark.parametrize("kind", ["black", "white", "noise"])
+@pytest.mark.parametrize(
+    "kind", ["black", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("white", "noise"))]
+)
 def test_no_pose_without_a_view_and_a_segment_of_its_own_after_it(film, clear, starts, kind):
     shape, dark = clear[0].image.shape, DARK
     images = {

@@ -273,6 +273,7 @@ def test_a_search_at_once_finds_the_same_places(film, closed):
     assert evaluate(result.trajectory, film[1]).ate_percent < 0.5
 
 
+@pytest.mark.slow
 def test_in_real_time_a_frame_does_not_wait_for_a_search(film, monkeypatch):
     """A search that never ends until the end of the sequence holds up no frame."""
     odometry = dvo.load("small", device="cpu", loop=OPTIONS, **SHORT, real_time=True)

@@ -89,7 +89,8 @@ def test_while_it_sees_the_map_the_window_has_keyframes_of_it_that_stay(runs):
     assert sorted(odometry.graph.log.poses) == sorted(f.identifier for f in odometry.graph.archive if f.anchor is None)
 
 
-@pytest.mark.parametrize("scene", [103, pytest.param(105, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", [103, 105])
 def test_other_scenes_are_found_back_as_well(scene):
     frames, _ = interrupted(scene, BACK)
     _, estimates, result = track(frames)
@@ -106,6 +107,7 @@ def test_another_scene_begins_a_world_of_its_own(scene, other):
     assert not any(loop["joins_segments"] for loop in result.info["loops"])
 
 
+@pytest.mark.slow
 def test_without_loops_nothing_is_located():
     frames, _ = interrupted(63, BACK[:16])
     _, estimates, result = track(frames, loops=False)
@@ -113,6 +115,7 @@ def test_without_loops_nothing_is_located():
     assert all(segment.joined_to is None for segment in result.segments)
 
 
+@pytest.mark.slow
 def test_frames_of_a_first_window_whose_edges_have_left_it_are_kept():
     """Little motion for longer than edges stay in the window: nothing speaks against the oldest frames."""
     frames = list(walk(102))

@@ -32,6 +32,7 @@ def adjusting(film, state):
     return odometry, count
 
 
+@pytest.mark.slow
 def test_a_world_is_adjusted_after_a_loop(film, tmp_path):
     """Saving in the meantime changes nothing, and tells the adjustments that were made."""
     trajectories = []

@@ -98,6 +98,7 @@ def test_the_setting_has_a_name_and_belongs_to_the_preset():
         TrackerConfig(initial_pose="middle")
 
 
+@pytest.mark.slow
 def test_a_fast_rotation_begins_closer_to_its_pose(monkeypatch):
     """A hand-held walk at 5 frames per second, with the shipped weights: rotation of the first poses."""
     frames = list(make_sequence(6, frames=9, kind="handheld", fps=5.0))

@@ -98,6 +98,7 @@ def test_the_frame_after_the_dark_gets_a_pose_with_the_next_one(film, dark, monk
     assert {*edges.target[edges.source == own]} & {*edges.source[edges.target == own]}
 
 
+@pytest.mark.slow
 def test_the_newest_views_are_tried_again_up_to_one_that_fails(dark, foreign, monkeypatch):
     refuse(monkeypatch, *(frame.timestamp for frame in dark[BACK : BACK + 3]))
     assert lost_frames(dark, track(dark, join_inliers=0.2)[1]) == list(range(CUT, BACK + 1))
@@ -105,7 +106,7 @@ def test_the_newest_views_are_tried_again_up_to_one_that_fails(dark, foreign, mo
     assert lost_frames(other, track(other, join_inliers=0.2)[1]) == list(range(CUT, BACK + 2))
 
 
-@pytest.mark.parametrize("align", ["final", "always"])
+@pytest.mark.parametrize("align", [pytest.param("final", marks=pytest.mark.slow), "always"])
 def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch, tmp_path, align):
     """Results and files are those of a tracker that does not try again, byte for byte."""
     frames = with_images(dark, [foreign], BACK)

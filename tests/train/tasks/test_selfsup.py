@@ -97,6 +97,7 @@ def test_a_teacher_stays_or_follows(runs, decay, monkeypatch):
     assert torch.equal(flat_weights(teachers[0]), one.teacher)
 
 
+@pytest.mark.slow
 def test_resumed_training_equals_uninterrupted_training(tmp_path, runs):
     pytest.importorskip("kornia")
     options = {

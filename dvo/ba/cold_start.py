@@ -4,7 +4,7 @@ From identity poses and constant depth, rotation and sideways translation explai
 undamped first step takes a huge difference of the two, and the depths then converge to the wrong side of it (the
 bas-relief ambiguity). Damping relative to the diagonal of the reduced system slows such directions down until the
 depths have begun to separate them. With exact targets, 8 frames and 10 updates of 2 steps, about half of rendered
-clips ended within 2 % of the rotation without this, and nine tenths with it (``tests/train/test_objective.py``).
+clips ended within 2 % of the rotation without this, and nine tenths with it (``tests/train/tasks/test_objective.py``).
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ def code_digest(system: System) -> str:
 def reader_digest() -> str:
     """Hash of the code that turns files into frames."""
     found: dict[str, Path] = {}
-    _follow("dvo.data.source", found)
+    _follow("dvo.data.open", found)
     _follow_registered(READERS, found)
     return _digest(sorted(found.values()))
 

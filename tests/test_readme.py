@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dvo.cli import build_parser
 from dvo.models.weights import list_weights
@@ -22,7 +23,7 @@ def blocks(language: str) -> list[str]:
 
 def test_python_block_runs(image_folder, monkeypatch):
     """On twenty small images of noise: the program must end, not track."""
-    block, _ = blocks("python")
+    block = blocks("python")[0]
     assert len([line for line in block.splitlines() if line.strip()]) <= 10
     monkeypatch.chdir(image_folder.parent.parent)
     said = io.StringIO()
@@ -34,7 +35,7 @@ def test_python_block_runs(image_folder, monkeypatch):
 
 def test_live_python_block_runs():
     """On images of noise in place of a camera: both loops must end, and tell of each frame that was not dropped."""
-    _, block = blocks("python")
+    block = blocks("python")[1]
     assert len(block.splitlines()) <= 14
     images = np.random.default_rng(0).integers(0, 255, (6, 480, 640, 3), dtype=np.uint8)
     passes = []
@@ -43,6 +44,20 @@ def test_live_python_block_runs():
         exec(compile(block, str(README), "exec"), {"grab": lambda: passes.append(len(said.getvalue())) or iter(images)})
     first, second = said.getvalue()[: passes[1]].splitlines(), said.getvalue()[passes[1] :].splitlines()
     assert len(first) == 6 and 2 <= len(second) <= 6
+
+
+def test_bundle_adjustment_block_runs():
+    """Gradients arrive at the targets; every Python block has a test here."""
+    first, live, block = blocks("python")
+    assert len(block.splitlines()) <= 7
+    names: dict[str, torch.Tensor] = {}
+    exec(compile(block, str(README), "exec"), names)
+    assert names["targets"].grad.abs().sum() > 0 and torch.isfinite(names["targets"].grad).all()
+
+
+def test_it_is_short():
+    text = README.read_text(encoding="utf-8")
+    assert len(text.split()) <= 1500
 
 
 def test_the_weights_that_it_speaks_of_are_shipped():

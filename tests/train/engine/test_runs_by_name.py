@@ -150,7 +150,7 @@ def test_a_folder_of_recordings_needs_no_brackets(fit, given, capsys):
 @pytest.mark.skipif(not (data_root(required=False) / "tartanair_v2_10").is_dir(), reason="set DVO_DATA")
 def test_fine_tuning_as_the_readme_says(fit, capsys):
     """Its command trains, and the card tells on what; one step on small images instead of many."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
     block = next(block for block in text.split("```bash\n")[1:] if "--name tuned" in block).split("```")[0]
     lines = block.replace("\\\n", " ").strip().splitlines()
     training, exporting = (line.removeprefix("python -m train ").split() for line in lines)

@@ -17,7 +17,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 
 _SEARCHED = 800  # pixels of the longer side of the image in which a checkerboard is searched
-_LEAST = 8  # corners of a ChArUco board in a view
+_MIN_CORNERS = 8  # corners of a ChArUco board in a view
 _OTHERS = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL")  # contain the smaller ones
 
 
@@ -229,7 +229,7 @@ class CharucoBoard:
         best: tuple[np.ndarray, np.ndarray] | None = None
         for detector in self._detectors:
             corners, numbers = detector.detectBoard(grey)[:2]
-            if numbers is None or len(numbers) < _LEAST or (best is not None and len(numbers) <= len(best[0])):
+            if numbers is None or len(numbers) < _MIN_CORNERS or (best is not None and len(numbers) <= len(best[0])):
                 continue
             points = self.points[np.asarray(numbers).ravel()]
             if np.linalg.matrix_rank(points[:, :2] - points[0, :2], tol=1e-6) == 2:

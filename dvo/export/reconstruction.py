@@ -18,7 +18,7 @@ from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices
 from dvo.map.archive import ArchivedKeyframe
 from dvo.map.keyframe_graph import KeyframeGraph
-from dvo.map.map import NEAR
+from dvo.map.map import MIN_NEARNESS
 from dvo.map.measurements import ArchivedEdges
 from dvo.nets.patch.config import ModelConfig
 
@@ -224,7 +224,7 @@ def _patches(frames: list[ArchivedKeyframe], T_cw: np.ndarray, intrinsics: np.nd
 def _usable(inverse_depth: np.ndarray) -> np.ndarray:
     """``(M,)`` bool, patches of a keyframe with a depth, and not so far that it is uncertain."""
     known = np.isfinite(inverse_depth) & (inverse_depth > 0)
-    return known & (inverse_depth > NEAR * np.median(inverse_depth[known])) if known.any() else known
+    return known & (inverse_depth > MIN_NEARNESS * np.median(inverse_depth[known])) if known.any() else known
 
 
 def _observations(

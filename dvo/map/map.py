@@ -18,7 +18,7 @@ from dvo.map.measurements import ArchivedEdges
 from dvo.map.problem import archive_problem
 from dvo.map.recording import Recording
 
-NEAR = 0.05
+MIN_NEARNESS = 0.05
 """Points whose inverse depth is below this fraction of their keyframe's median are left out of the map, because their
 depth is uncertain."""
 
@@ -146,7 +146,7 @@ class Map:
             rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
             pose = torch.from_numpy(keyframe.pose_cw).to(depth.dtype)
             world = se3.act(se3.inverse(pose), rays / depth[:, None])
-            near = (depth > NEAR * depth.median()).numpy()
+            near = (depth > MIN_NEARNESS * depth.median()).numpy()
             points.append(world.numpy()[near])
             colors.append(keyframe.colors[near])
         return np.concatenate(points), np.concatenate(colors)

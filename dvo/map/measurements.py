@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 _PAIR = 10  # bytes of a pair of keyframes: two int32, and the uint16 number of its edges
-_MOST = 2**16 - 1  # edges of a pair
+_MAX_EDGES = 2**16 - 1  # edges of a pair
 _LARGEST = 0xF7  # weight below infinity
 
 
@@ -156,7 +156,7 @@ def pack_edges(edges: ArchivedEdges) -> PackedEdges:
     ends = np.stack([edges.source, edges.target], 1)
     changes = np.flatnonzero((ends[1:] != ends[:-1]).any(1)) + 1
     # A pair begins anew after as many edges as its counter holds.
-    starts = np.union1d(changes, np.arange(0, count, _MOST))
+    starts = np.union1d(changes, np.arange(0, count, _MAX_EDGES))
     counts = np.diff(np.append(starts, count)).astype(np.uint16)
     patch = edges.patch.astype(np.uint8) if edges.patch.max(initial=0) < 256 else edges.patch.astype(np.int16)
     bits = np.ascontiguousarray(edges.position, "<f4").view("<u4").astype(np.uint64) + 0x80  # rounds to nearest

@@ -12,7 +12,7 @@ from torch import Tensor
 from dvo.data.frame import Frame
 from dvo.geometry.poses import invert_poses, quaternion_to_matrix
 from dvo.map.keyframe_graph import KeyframeGraph
-from dvo.map.map import NEAR
+from dvo.map.map import MIN_NEARNESS
 from dvo.map.window import Window
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.session.session import Run
@@ -171,7 +171,7 @@ def _points(window: Window, centres: Tensor, poses_wc: np.ndarray) -> tuple[np.n
     focal = window.intrinsics[frames]
     inverse_depth = centres[:, 2].double().cpu().numpy()
     rays = ((centres[:, :2] - focal[:, 2:]) / focal[:, :2]).double().cpu().numpy()
-    near = inverse_depth > NEAR * max(float(np.median(inverse_depth)), 1e-9)
+    near = inverse_depth > MIN_NEARNESS * max(float(np.median(inverse_depth)), 1e-9)
     local = np.column_stack([rays, np.ones(len(rays))])[near] / inverse_depth[near, None]
     owner = frames.cpu().numpy()[near]
     rotations = quaternion_to_matrix(poses_wc[:, 3:])

@@ -28,13 +28,13 @@ from dvo.odometry.quality import FILM, Quality, leaves_doubt
 
 FRAMES = 150
 """Frames that are tracked again."""
-FEWEST = 10
+MIN_COMMON_FRAMES = 10
 """Common frames with poses that a comparison needs."""
-PIXELS = 640 * 480
+MAX_PIXELS = 640 * 480
 """Size of the images that are kept for it, about, at most."""
-DIFFERENT = 3.0
+MAX_DIFFERENCE = 3.0
 """Largest RMS difference of the two after a similarity, percent of the path."""
-WORSE = 1.25
+MAX_RESIDUAL_RATIO = 1.25
 """Residual of a good second run over that of the first above which their difference says nothing about the first."""
 
 
@@ -93,8 +93,8 @@ def compare_again(
     forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])
     difference = _difference(forward, result.trajectory)
     mine, other = result.quality, again.quality
-    worse = other is not None and other.verdict == "good" and other.residual > WORSE * mine.residual
-    if worse or not difference > DIFFERENT:  # NaN: nothing is known
+    worse = other is not None and other.verdict == "good" and other.residual > MAX_RESIDUAL_RATIO * mine.residual
+    if worse or not difference > MAX_DIFFERENCE:  # NaN: nothing is known
         return replace(result.quality, second=difference)
     reason = f"a second run, backward with another seed, differs by {difference:.0f}% of the path"
     return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
@@ -102,7 +102,7 @@ def compare_again(
 
 def _kept(frame: Frame) -> Frame:
     """Image of a frame and its mask, of few pixels, since many are kept; without a readout time (see above)."""
-    image, camera, mask = masked_image(frame, PIXELS)
+    image, camera, mask = masked_image(frame, MAX_PIXELS)
     return Frame(frame.index, frame.timestamp, image, replace(camera, readout=0.0), mask=mask)
 
 
@@ -111,7 +111,7 @@ def _difference(one: Trajectory, other: Trajectory) -> float:
     _, i, j = np.intersect1d(one.timestamps, other.timestamps, return_indices=True)
     source, target = one.positions[i], other.positions[j]
     length = float(np.linalg.norm(np.diff(target, axis=0), axis=1).sum()) if len(j) else 0.0
-    if len(j) < FEWEST or length == 0:
+    if len(j) < MIN_COMMON_FRAMES or length == 0:
         return float("nan")
     moved = sim3.act(align(source, target), torch.from_numpy(source)).numpy()
     return 100 * float(np.sqrt(((moved - target) ** 2).sum(1).mean())) / length

@@ -92,7 +92,7 @@ def test_the_beginning_alone_is_tracked_again(monkeypatch):
 
 
 def test_large_images_are_kept_small(monkeypatch):
-    monkeypatch.setattr(second_run, "PIXELS", 40 * 30)
+    monkeypatch.setattr(second_run, "MAX_PIXELS", 40 * 30)
     other = Walk()
     assert compare_again(Walk().finish(), other, frames(12)).verdict == "good"
     ((height, width, *camera),) = other.sizes

@@ -22,7 +22,7 @@ SECONDS_PER_ROUND, SECONDS_PER_TILE, SECONDS_PER_NUMBER, SECONDS_PER_PRODUCT = 2
 
 AT_ONCE = 512
 """Rows below a tile up to which all its products are one product: twice the arithmetic, but few calls."""
-MOST = 2**17
+MAX_BLOCKS = 2**17
 """Blocks of the products of a batch, at most, if there is more than one tile in it."""
 LARGE = 256
 """Numbers of a tile from which adding one after the other is faster than gathering and scattering them all."""
@@ -121,7 +121,7 @@ def plan_tiles(size: int, rows: Tensor, columns: Tensor, width: int, limit: floa
     device = rows.device
     steps = []
     for group in chosen:
-        most = max(1, MOST // max(1, len(group[0][1]) * width) ** 2)
+        most = max(1, MAX_BLOCKS // max(1, len(group[0][1]) * width) ** 2)
         steps += [_round(group[k : k + most], stored, device) for k in range(0, len(group), most)]
     rank = torch.tensor([place[tile] for tile in range(count)], device=device)
     flip = rank[a] < rank[b]

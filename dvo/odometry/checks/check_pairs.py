@@ -16,13 +16,13 @@ from dvo.geometry import se3
 
 CORNERS = 120
 """Largest number of corners of a pair."""
-FEWEST = 16
+MIN_CORNERS = 16
 """Corners below which a pair says nothing."""
-MOST = 256
+MAX_PAIRS = 256
 """Pairs that are kept; those of a longer sequence are further apart."""
 GAPS = (4, 32)
 """Frames from the first image to the second: at the beginning, and at most."""
-MOVED = (2.0, 6.0, 20.0)
+DISPLACEMENTS = (2.0, 6.0, 20.0)
 """Median displacements of the corners of a pair, pixels: below the first they tell nothing and the second image is a
 later one; the gap grows below the second, and shrinks above the third."""
 RETURN = 0.4
@@ -75,15 +75,15 @@ class CheckPairs:
             first, before = self._first
             points = followed(before, grey, mask)
             moved = median_displacement(points)
-            if len(points) >= FEWEST and moved < MOVED[0] and number < first + GAPS[1]:
+            if len(points) >= MIN_CORNERS and moved < DISPLACEMENTS[0] and number < first + GAPS[1]:
                 self._next = number + self._gap
                 return
-            if len(points) >= FEWEST and moved >= MOVED[0]:
+            if len(points) >= MIN_CORNERS and moved >= DISPLACEMENTS[0]:
                 self.pairs.append(CheckPair(first, number, points, np.asarray(intrinsics, np.float64)))
                 pause = self._pause
-            shorter, longer = len(points) < FEWEST or moved > MOVED[2], moved < MOVED[1]
+            shorter, longer = len(points) < MIN_CORNERS or moved > DISPLACEMENTS[2], moved < DISPLACEMENTS[1]
             self._gap = max(self._gap // 2, 1) if shorter else min(2 * self._gap, GAPS[1]) if longer else self._gap
-        if len(self.pairs) > MOST:
+        if len(self.pairs) > MAX_PAIRS:
             self.pairs, self._pause = self.pairs[::2], 2 * self._pause + self._gap
         self._first, self._next = (None, number + pause) if pause else ((number, grey), number + self._gap)
 

@@ -15,10 +15,10 @@ from torch import Tensor
 from dvo.map.archive import ArchivedKeyframe
 from dvo.map.window import Window
 
-MOST = 0.5
+MEASURED_SHARE = 0.5
 """Share of the patches with a measured depth above which these decide the relief, so that it needs no other start."""
 
-_NEAR = 0.02  # logarithm of a scale that iterations reach without help: beyond it the kernel takes the influence away
+_SCALE_REACH = 0.02  # logarithm of a scale that iterations reach: beyond it the kernel takes the influence away
 
 
 def measured_share(measured: Tensor | None) -> float:
@@ -75,7 +75,7 @@ def to_measured(poses_cw: Tensor, depths: Tensor, measured: Tensor | None) -> tu
     centres = depths.reshape(len(measured), -1)[:, 0].double().cpu().numpy()
     factors = metres_of_unit(centres, measured.double().cpu().numpy())
     scale = float(np.median(factors)) if len(factors) else 1.0
-    if abs(math.log(scale)) <= _NEAR:
+    if abs(math.log(scale)) <= _SCALE_REACH:
         return poses_cw, depths
     return torch.cat([poses_cw[:, :3] * scale, poses_cw[:, 3:]], 1), depths / scale
 
@@ -91,4 +91,4 @@ def far_scale(frames: list[ArchivedKeyframe]) -> float:
     """
     factors = [metres_of_unit(f.inverse_depth, f.measured) for f in frames if f.measured is not None]
     scale = float(np.median(np.concatenate(factors))) if sum(map(len, factors)) else 1.0
-    return scale if abs(math.log(scale)) > _NEAR else 1.0
+    return scale if abs(math.log(scale)) > _SCALE_REACH else 1.0

@@ -14,7 +14,7 @@ from dvo.odometry.protocol import DepthMap, SparseMap
 
 NEIGHBOURS = (-2, -1, 1, 2)
 """Keyframes, relative to each, with which its depths are compared."""
-_LEAST = 0.25  # of the mean inverse depth of a map, below which a point is too far away for a map
+_MIN_SHARE = 0.25  # of the mean inverse depth of a map, below which a point is too far away for a map
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def reliable_pixels(
     n = len(inverse_depth)
     possible = torch.tensor([sum(0 <= k + step < n for step in NEIGHBOURS) for k in range(n)], device=views.device)
     enough = views >= possible.clamp(max=least_views)[:, None, None]
-    near = inverse_depth > _LEAST * inverse_depth.mean((1, 2), keepdim=True)
+    near = inverse_depth > _MIN_SHARE * inverse_depth.mean((1, 2), keepdim=True)
     return enough & near & (confidence >= least_confidence)
 
 

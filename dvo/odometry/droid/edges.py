@@ -13,7 +13,7 @@ from dvo.ba.layer.dense import dense_patches
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 
-FAR = 1e3
+FAR_DISTANCE = 1e3
 """Distance of frames that hardly see each other, feature pixels."""
 _SHARE = 0.75  # of the pixels that must be in front of the other frame
 _STEP = 2  # every second pixel of a row and of a column is enough for a mean
@@ -38,8 +38,8 @@ def flow_distances(
         pairs: ordered pairs of frames; None for all of them.
 
     Returns:
-        ``(N, N)`` feature pixels, or ``(P,)`` for pairs; the mean of both directions, :data:`FAR` for frames of which
-        one sees less than three quarters of the other's points in front of it.
+        ``(N, N)`` feature pixels, or ``(P,)`` for pairs; the mean of both directions, :data:`FAR_DISTANCE` for frames
+        of which one sees less than three quarters of the other's points in front of it.
     """
     n = len(poses_cw)
     wanted = [(i, j) for i in range(n) for j in range(n)] if pairs is None else pairs
@@ -58,13 +58,13 @@ def flow_distances(
         first = torch.arange(len(both), device=ii.device)
         second = first + len(both)
         there = reproject(poses, patches, camera, first, second, ii)
-        length = (there.coords - start).norm(dim=-1)[0].clamp(max=FAR)
+        length = (there.coords - start).norm(dim=-1)[0].clamp(max=FAR_DISTANCE)
         valid = there.valid[0]
         count = valid.flatten(1).sum(1)
         total += share * torch.where(valid, length, 0.0).flatten(1).sum(1) / count.clamp(min=1)
         seen &= count >= _SHARE * valid[0].numel()
-    found = torch.where(seen, total, FAR).view(2, -1)
-    distance = found.mean(0).clamp(max=FAR).double().cpu().numpy()
+    found = torch.where(seen, total, FAR_DISTANCE).view(2, -1)
+    distance = found.mean(0).clamp(max=FAR_DISTANCE).double().cpu().numpy()
     return distance.reshape(n, n) if pairs is None else distance
 
 

@@ -30,7 +30,7 @@ from dvo.odometry.two_frame.two_view import parallax_of
 _OPTIONS = replace(OPTIONS, solver=replace(OPTIONS.solver, max_iterations=20))
 _EVERY = 3  # of the rows and columns of a map, one counts
 _REFINEMENT = RefinementOptions(iterations=20, parallax=0.0)
-_LONGEST = 2.0  # step between two keyframes, median depths
+_MAX_STEP = 2.0  # step between two keyframes, median depths
 _OTHER = 0.02  # rotation between two motions from which on they are different solutions, radians
 # Directions of the translation that motions are sought from: the axes, and those between them.
 _DIRECTIONS = (
@@ -204,7 +204,7 @@ def _other_motion(edge: FrameEdge) -> tuple[Tensor, bool]:
         pose_ab = refine_motion(flow, [start], intrinsics, _REFINEMENT, weights=weights)
         parallax = parallax_of(flow.numpy(), pose_ab.numpy(), intrinsics.numpy())
         side = 1.0 if (parallax.motion * parallax.direction).sum() >= 0 else -1.0
-        pose_ab = torch.cat([pose_ab[:3] * side * parallax.step(_LONGEST), pose_ab[3:]])
+        pose_ab = torch.cat([pose_ab[:3] * side * parallax.step(_MAX_STEP), pose_ab[3:]])
 
         def at(problem: PatchProblem, options: GlobalBAOptions) -> PatchProblem:
             poses = torch.stack([problem.poses_cw[0], se3.inverse(pose_ab)])

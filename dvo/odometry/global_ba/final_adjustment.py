@@ -28,7 +28,7 @@ from dvo.map.correction import rescale
 from dvo.map.map import Map
 from dvo.map.measured_depths import measured_depths
 from dvo.map.recordings import count_earlier, increasing_times
-from dvo.odometry.depth.depth_factor import MOST, far_scale, measured_share, to_measured
+from dvo.odometry.depth.depth_factor import MEASURED_SHARE, far_scale, measured_share, to_measured
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
 _RANGES = {
@@ -166,7 +166,7 @@ def adjust_segment(
         poses, found = now[rows], depths
         if first:
             poses, found, _ = solve_part(part, poses, found, fixed, replace(options, kernels=first))
-        if start == 1 and not map_size and measured_share(measured_depths(part)) < MOST:
+        if start == 1 and not map_size and measured_share(measured_depths(part)) < MEASURED_SHARE:
             poses, found = _leave_minimum(part, poses, found, fixed, options)
         for _ in range(options.shutter_rounds if rolling is not None else 0):
             assert rolling is not None

@@ -24,14 +24,14 @@ from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, solve_par
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.global_ba.self_calibration import Minimum, profile_minimum
 
-FEWEST = 20
+MIN_KEYFRAMES = 20
 """Frames of a segment below which nothing is concluded."""
 FARTHEST = 1.2
 """Largest distance of the values that are tried from the first one, in logarithms."""
 ASIDE = 0.08
 """Largest distance of a principal point that is tried from that of the graph, focal lengths."""
 
-FLAT = 0.005
+MIN_CONTRAST = 0.005
 """Contrast of the coarse minimum below which no finer one is looked for."""
 
 _STEPS = 0.08, 0.02  # distance of the values that are tried, in logarithms: coarse, then fine
@@ -78,11 +78,11 @@ def find_focal(
         principal_point: False leaves it where it is.
 
     Returns:
-        The profile; that of the coarse steps alone where it is flat (:data:`FLAT`). An infinite deviation if the cost
-        still falls at the end of the range, or for fewer than :data:`FEWEST` frames.
+        The profile; that of the coarse steps alone where it is flat (:data:`MIN_CONTRAST`). An infinite deviation if
+        the cost still falls at the end of the range, or for fewer than :data:`MIN_KEYFRAMES` frames.
     """
     frames = graph.members(segment)
-    if len(frames) < FEWEST:
+    if len(frames) < MIN_KEYFRAMES:
         return FocalProfile(_UNKNOWN, 0.0)
     part = graph.problem(True, segment)
     solve = _Solver(
@@ -99,7 +99,7 @@ def find_focal(
         return min(sides) / here - 1 if (here := solve(value)) > 0 else 0.0
 
     flat = contrast_at(coarse.value)
-    if flat < FLAT:
+    if flat < MIN_CONTRAST:
         return FocalProfile(coarse, flat)
     fine = profile_minimum(solve, coarse.value, _STEPS[1], -FARTHEST, FARTHEST, freedom)
     found = FocalProfile(replace(fine, gain=coarse.gain), contrast_at(fine.value))

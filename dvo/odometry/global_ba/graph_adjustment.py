@@ -32,7 +32,7 @@ from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global
 
 Cause = Literal["loop", "request"]
 
-_FEWEST = 3  # keyframes below which nothing is adjusted
+_MIN_KEYFRAMES = 3  # keyframes below which nothing is adjusted
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Adjustment:
         identifiers = np.array([frame.identifier for frame in members], dtype=np.int64)
         since = self._since(graph, identifiers)
         before = {frame.identifier: frame for frame in members if frame.identifier >= since}
-        if len(before) < _FEWEST:
+        if len(before) < _MIN_KEYFRAMES:
             return _nothing(started)
         part, cost_before = self._cost(graph, since)
         adjust_segment(graph, self.world, self.options, self.shutter, since)

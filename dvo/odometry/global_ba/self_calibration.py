@@ -21,10 +21,10 @@ from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_se
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
 _FRAMES = 150  # of a segment that are looked at, those with most motion
-_FEWEST = 20  # frames below which nothing is concluded
+_MIN_FRAMES = 20  # frames below which nothing is concluded
 _GAIN = 0.02  # relative decrease of the cost below which a readout time is not believed
 _STEP = 0.2  # distance of the values that are tried, frame intervals
-_LONGEST = 1.2  # end of the range, frame intervals: a minimum near one interval needs a neighbour on both sides
+_MAX_READOUT = 1.2  # end of the range, frame intervals: a minimum near one interval needs a neighbour on both sides
 _ITERATIONS = 4
 
 
@@ -98,7 +98,7 @@ def find_readout(
     frames = graph.members(segment)
     identifiers = np.array([frame.identifier for frame in frames])
     earlier = count_earlier(graph, identifiers)  # keyframes of a map, whose camera may be another one
-    if len(frames) - earlier < _FEWEST:
+    if len(frames) - earlier < _MIN_FRAMES:
         return Minimum(0.0, np.inf, 0.0)
     times = increasing_times(graph, frames)
     now = graph.poses_cw(identifiers)
@@ -121,7 +121,7 @@ def find_readout(
         return found
 
     interval = float((times[1:] - times[:-1])[earlier:].median())
-    return profile_minimum(cost, 0.0, _STEP * interval, 0.0, _LONGEST * interval, depths.numel())
+    return profile_minimum(cost, 0.0, _STEP * interval, 0.0, _MAX_READOUT * interval, depths.numel())
 
 
 def adjust_segments(

@@ -18,7 +18,7 @@ LIKENESS = 0.3
 """Smallest similarity of the descriptors of a candidate by retrieval, in [-1, 1]."""
 RETRIEVED = 8
 """Candidates by retrieval, at most."""
-APART = 6
+MIN_DISTANCE = 6
 """Identifiers of two such candidates differ by more than this."""
 OVERLAP = 0.3
 """Smallest share of the patches in view of a candidate by proximity."""
@@ -61,7 +61,7 @@ def by_likeness(
     row = places.descriptor(new)
     if row is None or descriptor is None:
         return
-    found = places.query(descriptor.views(row), RETRIEVED, before=int(earlier[-1]) + 1, apart=APART)
+    found = places.query(descriptor.views(row), RETRIEVED, before=int(earlier[-1]) + 1, apart=MIN_DISTANCE)
     for old, score in zip(found.identifiers.tolist(), found.scores.tolist(), strict=True):
         if score >= LIKENESS and graph.segment_of(old) >= 0:
             yield Candidate(old, new, "retrieval", graph.poses_cw(np.array([old]))[0])

@@ -41,10 +41,10 @@ from dvo.odometry.loops.relocalisation import Located, locate
 from dvo.odometry.maintenance.adjuster import Adjuster
 from dvo.odometry.maintenance.maintenance import Job, MapMaintenance, Moved
 
-PATIENCE = 4
+CONFIRM_WITHIN = 4
 """Searches after a loop within which a second one has to confirm it."""
 # A loop whose correction is smaller (in the same units) leaves the poses to the final adjustment.
-_SMALL = (0.01, 0.003, 0.01)
+_SMALL_CORRECTION = (0.01, 0.003, 0.01)
 
 
 @dataclass
@@ -273,7 +273,7 @@ class LoopCloser:
         soon = 2 - (options.every - self.wait)  # keyframes from the beginning of the search on
         if loop is None:
             if pending is not None:
-                self.wait, self.pending = (soon, pending) if self.searches < PATIENCE else (options.every, None)
+                self.wait, self.pending = (soon, pending) if self.searches < CONFIRM_WITHIN else (options.every, None)
             return
         if self._needs_confirmation(loop):
             if pending is None or not self.finder.agree(pending, loop):
@@ -286,7 +286,7 @@ class LoopCloser:
 
     def _needs_confirmation(self, loop: Loop) -> bool:
         """Return True unless the loop changes next to nothing, so that the present poses confirm it."""
-        return loop.joins or not self.is_within(loop, _SMALL)
+        return loop.joins or not self.is_within(loop, _SMALL_CORRECTION)
 
     def is_within(self, loop: Loop, limits: tuple[float, float, float]) -> bool:
         """Find out if a loop agrees with the poses.
@@ -315,7 +315,7 @@ class LoopCloser:
         Args:
             loop: the last of :attr:`loops`.
         """
-        if not loop.joins and self.is_within(loop, _SMALL):
+        if not loop.joins and self.is_within(loop, _SMALL_CORRECTION):
             return
         correction = loop_correction.prepare(self.graph, self.finder.kept, self.loops, loop)
         apply, delay = partial(self._apply, correction.identifiers), self.finder.options.delay

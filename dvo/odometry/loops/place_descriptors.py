@@ -28,7 +28,7 @@ from dvo.core.errors import DvoError
 SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "places" / "small.safetensors"
 GRID = (3, 4)
 """Rows and columns of cells."""
-LEAST = 1e-6
+MIN_LENGTH = 1e-6
 """Length below which a vector counts as zero."""
 
 
@@ -163,9 +163,9 @@ def describe_cells(cells: np.ndarray, fitted: GridDescriptor) -> np.ndarray:
         )  # fmt: skip
     projected = (cells - fitted.mean) @ fitted.projection
     lengths = np.linalg.norm(projected, axis=-1, keepdims=True)
-    vector = (projected / np.sqrt(np.maximum(lengths, LEAST))).ravel()
+    vector = (projected / np.sqrt(np.maximum(lengths, MIN_LENGTH))).ravel()
     length = float(np.linalg.norm(vector))
-    return (vector / length if length > LEAST else np.zeros_like(vector)).astype(np.float32)
+    return (vector / length if length > MIN_LENGTH else np.zeros_like(vector)).astype(np.float32)
 
 
 def fit_grid(cells: np.ndarray, channels: int = 32) -> GridDescriptor:

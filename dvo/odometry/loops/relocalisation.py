@@ -26,20 +26,20 @@ from dvo.map.measured_depths import SIGMA
 from dvo.map.window import Keyframe, Window
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.frames.front_end import View
-from dvo.odometry.loops.candidates import APART, LIKENESS, RETRIEVED, rays_of, share_in_view
+from dvo.odometry.loops.candidates import LIKENESS, MIN_DISTANCE, RETRIEVED, rays_of, share_in_view
 from dvo.odometry.loops.finder import Loop, LoopFinder
 from dvo.odometry.loops.guess import MATCHED, guess_pose
 from dvo.odometry.loops.joint_window import Group, Match
 from dvo.odometry.maintenance.background import all_steps
 from dvo.odometry.window.patch_window import PatchWindow
 
-NEAR = 12
+GROUP_REACH = 12
 """Kept keyframes before and after a candidate among which its group is chosen."""
-GROUP = 4
+GROUP_SIZE = 4
 """Keyframes that a frame is matched with at once."""
 MIN_OVERLAP = 0.5
 """Share of the patches of a candidate that another keyframe of its group has in view."""
-REFRESH = 2
+REFRESH_EVERY = 2
 """Frames from one choice of the guests of a window to the next."""
 MIN_GUESSED = 0.2
 """Share of the patches of a group that agree on a pose from points, below which the network does not look at it. Other
@@ -183,7 +183,7 @@ def _overlapping(graph: KeyframeGraph, finder: LoopFinder) -> list[int]:
     centres = window.patches[-m:, :, middle, middle].double().cpu()
     rays = rays_of(centres[:, :2], window.frames[-1].intrinsics.double().cpu())
     points = rays / centres[:, 2:].clamp(min=1e-6)
-    return _spread(graph, points, pose_cw, np.array(others, dtype=np.int64), [], GROUP)
+    return _spread(graph, points, pose_cw, np.array(others, dtype=np.int64), [], GROUP_SIZE)
 
 
 def _as_keyframe(view: View, identifier: int) -> ArchivedKeyframe:
@@ -203,7 +203,7 @@ def _groups(finder: LoopFinder, view: View) -> Iterator[tuple[int, Group]]:
     if finder.descriptor is None or not finder.kept:
         return
     row = finder.descriptor(seen.image, seen.maps)
-    found = finder.places.query(finder.descriptor.views(row), RETRIEVED, apart=APART)
+    found = finder.places.query(finder.descriptor.views(row), RETRIEVED, apart=MIN_DISTANCE)
     alike = [int(k) for k, score in zip(found.identifiers, found.scores, strict=True) if score >= LIKENESS]
     for old in dict.fromkeys([*alike, finder.kept[-1]]):
         group = _group(finder, old)
@@ -216,7 +216,7 @@ def _group(finder: LoopFinder, old: int) -> Group | None:
     """Keyframe and those of its segment that see the same from farthest away; None if it cannot be matched."""
     graph, at = finder.graph, bisect_left(finder.kept, old)
     segment = graph.segment_of(old)
-    near = [k for k in finder.kept[max(0, at - NEAR) : at + NEAR + 1] if graph.segment_of(k) == segment]
+    near = [k for k in finder.kept[max(0, at - GROUP_REACH) : at + GROUP_REACH + 1] if graph.segment_of(k) == segment]
     near = [k for k in near if finder.matcher.can_match(graph.archive[k]) and len(graph.archive[k].inverse_depth)]
     if segment < 0 or old not in near:
         return None
@@ -226,7 +226,7 @@ def _group(finder: LoopFinder, old: int) -> Group | None:
     frame, pose_cw = graph.archive[old], graph.poses_cw(np.array([old]))[0]
     rays = rays_of(torch.from_numpy(frame.centres).double(), torch.from_numpy(frame.intrinsics).double())
     points = rays / torch.from_numpy(frame.inverse_depth).double().clamp(min=1e-6)[:, None]
-    chosen = _spread(graph, points, pose_cw, others, [old], GROUP)
+    chosen = _spread(graph, points, pose_cw, others, [old], GROUP_SIZE)
     return tuple(graph.archive[k] for k in sorted(chosen)) if len(chosen) > 1 else None
 
 

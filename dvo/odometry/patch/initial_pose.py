@@ -28,8 +28,8 @@ AGREEMENT = 2.0
 _DEPTH_FRAMES = 3  # number of newest frames whose median depth initialises a new frame
 _WIDTHS = (8.0, 4.0, 2.0)  # of the kernels, feature pixels: wide ones first, since the pose may be far off
 _ITERATIONS = 4  # with each of them
-_LEAST = 8  # matches that must agree with a pose; six unknowns leave two of them to contradict it
-_SHARE = 1 / 3  # and their share of all
+_MIN_MATCHES = 8  # matches that must agree with a pose; six unknowns leave two of them to contradict it
+_MIN_SHARE = 1 / 3  # and their share of all
 _ACCURACY = 1.0  # of a match, feature pixels; a prediction that is as close is as good
 
 
@@ -121,7 +121,7 @@ def pose_from_nearest(window: Window, seen: Observation, predicted: Tensor) -> T
     starts = {PRESENT: _at(poses[1]), "nearest": _at(poses[0])}
     best = preferred(multistart(problem, starts, options, abandon=float("inf"))).problem
     agree = int((_distance(best) < AGREEMENT).sum())
-    return best.poses_cw[1].to(predicted) if agree >= max(_LEAST, _SHARE * m) else predicted
+    return best.poses_cw[1].to(predicted) if agree >= max(_MIN_MATCHES, _MIN_SHARE * m) else predicted
 
 
 def _at(pose_cw: Tensor) -> Start:

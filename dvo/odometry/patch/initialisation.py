@@ -7,7 +7,7 @@ from dvo.ba.multistart import AS_THEY_ARE, COLD_STARTS, PRESENT, RESTARTS, Solut
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.window import Window
 from dvo.models.step import Revision, StepOptions
-from dvo.odometry.depth.depth_factor import MOST, match_window, measured_share
+from dvo.odometry.depth.depth_factor import MEASURED_SHARE, match_window, measured_share
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty.uncertainty import has_second_solution
 from dvo.odometry.window.evidence import NO_MATCH, last_unrelated, measured
@@ -16,14 +16,14 @@ from dvo.odometry.window.patch_window import PatchWindow
 
 RESTART_AGES = frozenset({4, 8, 16, 32})
 """Numbers of frames after the initialisation at which its solution is compared with others."""
-AGAIN = 8
+RETRY_EVERY = 8
 """Frames from one comparison to the next as long as another solution is nearly as good."""
-MOVED = 0.2
+MOVED_SHARE = 0.2
 """Share of the patches that have to move: the others may be far away, or fixed to the camera."""
-SLOW = (0.3, 0.6)
+SLOW_START = (0.3, 0.6)
 """Shares of the motion and of the parallax that a slow start needs."""
 SLOW_AFTER = (4, 10)
-"""Frames without a start between which what is needed goes down to :data:`SLOW`."""
+"""Frames without a start between which what is needed goes down to :data:`SLOW_START`."""
 NOT_INITIALISED = "not initialised: too little motion"
 """Cause of the loss of the frames of a segment that was never initialised."""
 
@@ -37,14 +37,14 @@ def needed(waited: int) -> tuple[float, float]:
         waited: frames with content since the segment has begun.
 
     Returns:
-        From 1 to :data:`SLOW`.
+        From 1 to :data:`SLOW_START`.
     """
     slow = min(max((waited - SLOW_AFTER[0]) / (SLOW_AFTER[1] - SLOW_AFTER[0]), 0.0), 1.0)
-    return 1 - slow * (1 - SLOW[0]), 1 - slow * (1 - SLOW[1])
+    return 1 - slow * (1 - SLOW_START[0]), 1 - slow * (1 - SLOW_START[1])
 
 
 def flow_revision(revision: Revision, window: Window) -> float:
-    """Revision of the flow from the last keyframe to the newest frame, at equal poses, that :data:`MOVED` exceed.
+    """Revision of the flow from the last keyframe to the newest frame, at equal poses, that :data:`MOVED_SHARE` exceed.
 
     The median would stay at zero for ever where most of the picture is far, or fixed to the camera.
 
@@ -57,7 +57,7 @@ def flow_revision(revision: Revision, window: Window) -> float:
     """
     n = len(window)
     edges = measured(window, revision.weights[0], (window.ii == n - 2) & (window.jj == n - 1))
-    return float(revision.delta[0][edges].norm(dim=-1).quantile(1 - MOVED)) if bool(edges.any()) else 0.0
+    return float(revision.delta[0][edges].norm(dim=-1).quantile(1 - MOVED_SHARE)) if bool(edges.any()) else 0.0
 
 
 def newest_confidence(revision: Revision, window: Window) -> float:
@@ -107,7 +107,7 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int) ->
         True if the parallax is sufficient for tracking.
     """
     window = patch_window.window
-    measured = measured_share(window.measured) >= MOST
+    measured = measured_share(window.measured) >= MEASURED_SHARE
     for age in range(config.initial_updates):
         patch_window.step(StepOptions(fixed=1, damping=damping_at(age)))
         if age == config.initial_updates // 2 and not measured:
@@ -116,9 +116,9 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int) ->
     n = len(window)
     if measured:
         return True
-    seen = parallax(window, 0, n - 1, MOVED)
+    seen = parallax(window, 0, n - 1, MOVED_SHARE)
     if n > config.initial_frames:
-        seen = max(seen, parallax(window, n // 2, n - 1, MOVED))
+        seen = max(seen, parallax(window, n // 2, n - 1, MOVED_SHARE))
     return seen >= needed(waited)[1] * config.initial_parallax
 
 
@@ -189,9 +189,9 @@ def restart_due(age: int, ambiguous: bool) -> bool:
         ambiguous: another solution was nearly as good the last time.
 
     Returns:
-        True at :data:`RESTART_AGES`, and each :data:`AGAIN` frames as long as the window is ambiguous.
+        True at :data:`RESTART_AGES`, and each :data:`RETRY_EVERY` frames as long as the window is ambiguous.
     """
-    return age in RESTART_AGES or (ambiguous and age % AGAIN == 0)
+    return age in RESTART_AGES or (ambiguous and age % RETRY_EVERY == 0)
 
 
 def leave_minimum(patch_window: PatchWindow, config: TrackerConfig) -> bool:
@@ -206,7 +206,7 @@ def leave_minimum(patch_window: PatchWindow, config: TrackerConfig) -> bool:
         (:mod:`dvo.odometry.uncertainty.second_solution`).
     """
     window = patch_window.window
-    if measured_share(window.measured) >= MOST:
+    if measured_share(window.measured) >= MEASURED_SHARE:
         return False
     found = multistart(window.problem(), RESTARTS)
     best = preferred(found)

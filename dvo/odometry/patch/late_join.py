@@ -22,7 +22,7 @@ from dvo.odometry.patch.initial_pose import first_depth, initial_pose
 from dvo.odometry.patch.state import TrackerState
 from dvo.odometry.window.patch_window import PatchWindow
 
-VIEWS = 2
+MAX_VIEWS = 2
 """Number of waiting views that are tried again, the newest ones."""
 
 
@@ -42,7 +42,7 @@ def join_waiting(
         joined: record of the newest keyframe. If it has a reason, the one of a break before it, the earliest frame
             that is joined takes that over.
     """
-    waiting, state.waiting = state.waiting[-VIEWS:], []
+    waiting, state.waiting = state.waiting[-MAX_VIEWS:], []
     newest = graph.window.frames[-1].identifier
     for back, view in enumerate(reversed(waiting), 1):
         if not _join(graph, patch_window, config, view, newest - back):

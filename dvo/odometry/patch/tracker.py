@@ -26,7 +26,7 @@ from dvo.map.keyframe_log import FrameRecord
 from dvo.map.window import Window
 from dvo.models.patch_vo import PatchVO
 from dvo.nets.patch.masks import visible_features
-from dvo.odometry.depth.depth_factor import MOST, measured_share
+from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.depth.patch_depth import measure_depth
 from dvo.odometry.exclusive import exclusive
 from dvo.odometry.frames.frame_sequence import FrameSequence
@@ -34,7 +34,7 @@ from dvo.odometry.frames.front_end import View, observe
 from dvo.odometry.frames.working_image import masked_image
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
 from dvo.odometry.global_ba.rolling_shutter import Shutter
-from dvo.odometry.loops.relocalisation import REFRESH, hold_to_map, invite
+from dvo.odometry.loops.relocalisation import REFRESH_EVERY, hold_to_map, invite
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
@@ -281,7 +281,7 @@ class PatchOdometry:
         if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
             state.ambiguous = leave_minimum(self.patch_window, config)
         join_waiting(self.graph, self.patch_window, state, config, record)
-        if self.graph.located is not None and state.tracked % REFRESH == 0:
+        if self.graph.located is not None and state.tracked % REFRESH_EVERY == 0:
             hold_to_map(self.graph, self.patch_window, self.loops.finder)
         self._reduce()  # may correct the window
         return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
@@ -327,7 +327,7 @@ class PatchOdometry:
             state.initialised = enough and newest_evidence(window).supports(config.lost_confidence, config.min_inliers)
             state.adjustable += [self.graph.segment] * state.initialised
             if state.initialised and config.restart:
-                state.ambiguous = measured_share(window.measured) < MOST  # until it is tried
+                state.ambiguous = measured_share(window.measured) < MEASURED_SHARE  # until it is tried
         self._reduce()
         pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)

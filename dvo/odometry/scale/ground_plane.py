@@ -16,11 +16,11 @@ import numpy as np
 
 from dvo.geometry.poses import invert_poses, quaternion_to_matrix
 from dvo.map.archive import ArchivedKeyframe
-from dvo.map.map import NEAR
+from dvo.map.map import MIN_NEARNESS
 
 _NEIGHBOURS = 8  # keyframes before and after whose points take part
 _STEEP = 0.07  # least slope of the view of a point, 4 degrees below the axis of the camera
-_FEWEST = 12  # points of a plane
+_MIN_POINTS = 12  # points of a plane
 _SHARE = 0.25  # of the points below the camera that a plane needs
 _BELOW = 0.1  # share of these points that may lie below it
 _NEAR_PLANE = 0.08  # distance of a point from its plane, of the height: a smooth road is measured to about a tenth
@@ -96,7 +96,7 @@ def plane_below(points: np.ndarray, tilt: float, rng: np.random.Generator) -> fl
         Distance of the camera from the plane; None if there is no ground plane.
     """
     below = points[points[:, 1] > 0]
-    if len(below) < _FEWEST:
+    if len(below) < _MIN_POINTS:
         return None
     triples = below[np.array([rng.choice(len(below), 3, replace=False) for _ in range(_SAMPLES)])]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
@@ -112,7 +112,7 @@ def plane_below(points: np.ndarray, tilt: float, rng: np.random.Generator) -> fl
     best = int(inside.sum(1).argmax())
     chosen = inside[best]
     for _ in range(3):
-        if chosen.sum() < max(_FEWEST, _SHARE * len(below)):
+        if chosen.sum() < max(_MIN_POINTS, _SHARE * len(below)):
             return None
         normal, height = _fit(below[chosen])
         distance = below @ normal - height
@@ -136,5 +136,5 @@ def _points(frame: ArchivedKeyframe) -> np.ndarray:
     fx, fy, cx, cy = frame.intrinsics.astype(np.float64)
     x, y = frame.centres.astype(np.float64).T
     rays = np.column_stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)])
-    used = (depth > NEAR * np.median(depth)) & (rays[:, 1] > _STEEP)
+    used = (depth > MIN_NEARNESS * np.median(depth)) & (rays[:, 1] > _STEEP)
     return rays[used] / depth[used, None]

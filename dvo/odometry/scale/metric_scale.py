@@ -24,7 +24,7 @@ from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.scale.ground_plane import ground_height
 
-_FEWEST = 20  # measured depths that a world needs
+_MIN_DEPTHS = 20  # measured depths that a world needs
 _SYSTEMATIC = (
     0.01  # relative error of the scale that all measured depths of a recording share, see docs/metric_scale.md
 )
@@ -143,7 +143,7 @@ def scale_of_depths(frames: Sequence[ArchivedKeyframe]) -> ObservedScale:
     ]
     logs = [values for values in logs if len(values)]
     count = sum(map(len, logs))
-    if count < _FEWEST:
+    if count < _MIN_DEPTHS:
         return ObservedScale(math.nan, observations=count, problem=f"too few measured depths: {count}")
     medians = np.array([np.median(values) for values in logs])
     spread = 1.4826 * float(np.median(np.abs(medians - np.median(medians))))

@@ -18,7 +18,7 @@ _TEXTURE = 8.0  # eigenvalue at which a pixel counts half, squared grey levels p
 _DIFFERENCE = 0.5  # squared pixels; weight of the difference beside the eigenvalue
 _LOCAL = 4.0  # standard deviation of the mean that is taken off, pixels: changes of exposure make no difference
 _BEYOND = 50.0  # grey levels by which a pixel differs from one beyond the edge
-_LEAST = 1e-3
+_MIN_WEIGHT = 1e-3
 
 
 def flow_weights(image_a: np.ndarray, image_b: np.ndarray, flow: np.ndarray) -> np.ndarray:
@@ -50,4 +50,4 @@ def flow_weights(image_a: np.ndarray, image_b: np.ndarray, flow: np.ndarray) -> 
     difference = cv2.blur((a - moved) ** 2, (_SPAN, _SPAN))
     weights = texture / (texture + _TEXTURE + _DIFFERENCE * difference)
     weights = cv2.resize(weights.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA).astype(np.float64)
-    return np.where(finite, np.clip(weights, _LEAST, 1), _LEAST)
+    return np.where(finite, np.clip(weights, _MIN_WEIGHT, 1), _MIN_WEIGHT)

@@ -18,7 +18,7 @@ AGREEMENT = 1.0
 """A flow agrees with a motion within this distance from its epipolar line, and with the flow the other way within this
 distance from its start; feature pixels, to which a tenth of the length of the flow is added."""
 
-_LEAST = 0.1  # smallest z of a turned ray; beyond it the plane z = 1 tells nothing
+_MIN_Z = 0.1  # smallest z of a turned ray; beyond it the plane z = 1 tells nothing
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def parallax_of(flow: np.ndarray, pose_ab: np.ndarray, intrinsics: np.ndarray) -
     matrix = pose_matrices(np.asarray(pose_ab, dtype=np.float64)[None])[0]
     t = matrix[:3, 3] / max(float(np.linalg.norm(matrix[:3, 3])), 1e-12)
     turned = end @ matrix[:3, :3].T
-    counts = np.isfinite(turned).all(-1) & (turned[:, 2] > _LEAST)
+    counts = np.isfinite(turned).all(-1) & (turned[:, 2] > _MIN_Z)
     there = turned[counts, :2] / turned[counts, 2:]
     length = np.hypot(dx, dy).reshape(-1)[counts]
     return Parallax(there - start[counts], there * t[2] - t[:2], length, (fx + fy) / 2)

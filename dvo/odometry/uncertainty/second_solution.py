@@ -21,7 +21,7 @@ from dvo.odometry.uncertainty.gauge import Gauge, relative_error
 INDEPENDENT = 10.0
 """Number of independent residuals that the probability of a solution is computed for. A window has a thousand, but
 those of a patch, and of neighbouring ones, share their errors (docs/uncertainty.md)."""
-LEAST = 0.05
+MIN_PROBABILITY = 0.05
 """Probability below which a solution is left out."""
 DISTANCE = 4.0
 """Normalised squared distance, for each degree of freedom, below which two solutions are one: a window that determines
@@ -72,7 +72,7 @@ def second_solutions(
             scene in the image by less than its :data:`~dvo.odometry.uncertainty.displacement.TOLERANCE` are one too.
 
     Returns:
-        The others, best first; those of a probability below :data:`LEAST` are left out.
+        The others, best first; those of a probability below :data:`MIN_PROBABILITY` are left out.
     """
     now, information = solved[0], np.linalg.pinv(covariance, hermitian=True) / len(covariance)
 
@@ -87,7 +87,7 @@ def second_solutions(
             different.append((_likelihood(other.cost, now.cost), error, other))
     total = 1 + sum(weight for weight, _, _ in different)
     found = [SecondSolution(weight / total, error, other) for weight, error, other in different]
-    return [other for other in found if other.probability >= LEAST]
+    return [other for other in found if other.probability >= MIN_PROBABILITY]
 
 
 def _likelihood(cost: float, now: float) -> float:

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from dvo.geometry import se3
 from dvo.odometry.checks.check_pairs import (
-    FEWEST,
+    DISPLACEMENTS,
     GAPS,
-    MOST,
-    MOVED,
+    MAX_PAIRS,
+    MIN_CORNERS,
     CheckPair,
     CheckPairs,
     epipolar_distances,
@@ -46,7 +46,7 @@ def pairs_of(images, mask=None):
 def test_corners_move_as_the_picture_does(wall):
     a, b = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in film(wall, 2, 7))
     points = followed(a, b)
-    assert len(points) > 3 * FEWEST
+    assert len(points) > 3 * MIN_CORNERS
     np.testing.assert_allclose(np.median(points[:, 2:] - points[:, :2], axis=0), [-7, 0], atol=0.05)
     half = np.zeros(a.shape, bool)
     half[:, 80:] = True
@@ -59,7 +59,7 @@ def test_the_gap_follows_the_motion(wall):
     assert max(p.second - p.first for p in fast[3:]) <= 2 < min(p.second - p.first for p in slow)
     assert len(fast) > len(slow) > 3 and not still
     for pair in slow:
-        assert np.median(np.linalg.norm(pair.points[:, 2:] - pair.points[:, :2], axis=1)) >= MOVED[0]
+        assert np.median(np.linalg.norm(pair.points[:, 2:] - pair.points[:, :2], axis=1)) >= DISPLACEMENTS[0]
         assert pair.second - pair.first <= GAPS[1]
 
 
@@ -70,9 +70,9 @@ def test_what_cannot_be_followed_gives_no_pair():
 
 
 def test_a_long_sequence_keeps_a_bounded_number(wall, monkeypatch):
-    monkeypatch.setattr("dvo.odometry.checks.check_pairs.MOST", 8)
+    monkeypatch.setattr("dvo.odometry.checks.check_pairs.MAX_PAIRS", 8)
     pairs = pairs_of(film(wall, 250, 3))
-    assert MOST > 8 >= len(pairs) >= 4 and pairs[0].first < 20 and pairs[-1].second > 180
+    assert MAX_PAIRS > 8 >= len(pairs) >= 4 and pairs[0].first < 20 and pairs[-1].second > 180
 
 
 @given(st.lists(st.floats(-0.15, 0.15), min_size=12, max_size=12), st.integers(0, 10_000))

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from dvo.geometry import se3
-from dvo.odometry.droid.edges import FAR, flow_distances, neighbours_of, proximity_edges
+from dvo.odometry.droid.edges import FAR_DISTANCE, flow_distances, neighbours_of, proximity_edges
 
 
 def scene(count=4):
@@ -29,7 +29,7 @@ def test_rotation_counts_with_the_rest_of_the_share():
 def test_frames_that_look_away_are_far():
     poses, depth, intrinsics = scene(2)
     poses[1] = se3.exp(torch.tensor([0.0, 0, 0, 0, 3.0, 0]))
-    assert flow_distances(poses, depth, intrinsics, 0.3, [(0, 1)])[0] == FAR
+    assert flow_distances(poses, depth, intrinsics, 0.3, [(0, 1)])[0] == FAR_DISTANCE
 
 
 def test_distances_are_symmetric_and_use_the_camera_of_each_frame():

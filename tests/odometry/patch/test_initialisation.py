@@ -7,7 +7,7 @@ import torch
 from dvo.ba.kernels import Kernel
 from dvo.ba.multistart import multistart, reversed_relief
 from dvo.geometry import se3
-from dvo.odometry.depth.depth_factor import MOST, measured_share
+from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.initialisation import RESTART_AGES, leave_minimum, restart_due
@@ -63,7 +63,7 @@ def test_frames_at_which_a_second_solution_is_looked_for():
 def test_nothing_is_tried_where_depths_are_measured():
     window, true = _reversed_window(unit=1.0)
     poses = window.poses_cw
-    assert measured_share(window.measured) >= MOST and _error(poses, true) > 0.01
+    assert measured_share(window.measured) >= MEASURED_SHARE and _error(poses, true) > 0.01
     assert not leave_minimum(_step(window), CONFIG) and window.poses_cw is poses
 
 

@@ -117,6 +117,17 @@ def test_the_system_is_evaluated_beside_the_others(recording, tmp_path):
     assert "standing-still" in rows and "null" in rows
 
 
+def test_the_odometry_without_weights_tracks_on_the_command_line(recording, tmp_path):
+    """By its name, with a setting of its own; the reader is that of the package too."""
+    command(
+        "-m", "dvo", "run", recording, "--system", "standing-still", "--set", "height=1.5", "--out", tmp_path / "out"
+    )
+    poses = np.loadtxt(out / "trajectory.txt")
+    assert len(poses) == 6 and (poses[:, 2] == -1.5).all()
+    told = command("-c", "import dvo; print(dvo.load('standing-still', height=2.0).name)")
+    assert told.strip() == "standing-still"
+
+
 def test_the_scene_family_is_rendered(tmp_path):
     command("-m", "dvo", "synth", "preview", "shed", "--rows", "1", "--size", "48x32", "--out", tmp_path / "shed.png")
     assert (tmp_path / "shed.png").stat().st_size > 1000

@@ -122,7 +122,7 @@ def test_the_odometry_without_weights_tracks_on_the_command_line(recording, tmp_
     command(
         "-m", "dvo", "run", recording, "--system", "standing-still", "--set", "height=1.5", "--out", tmp_path / "out"
     )
-    poses = np.loadtxt(out / "trajectory.txt")
+    poses = np.loadtxt(tmp_path / "out" / "trajectory.txt")
     assert len(poses) == 6 and (poses[:, 2] == -1.5).all()
     told = command("-c", "import dvo; print(dvo.load('standing-still', height=2.0).name)")
     assert told.strip() == "standing-still"

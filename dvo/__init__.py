@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from dvo.metrics import Metrics, evaluate
     from dvo.models.weights import load_model
     from dvo.nets.patch.config import ModelConfig
-    from dvo.odometry.calibrate.calibrate import calibrate
-    from dvo.odometry.calibrate.camera_estimate import SelfCalibration
+    from dvo.odometry.calibration.calibrate import calibrate
+    from dvo.odometry.calibration.camera_estimate import SelfCalibration
     from dvo.odometry.load import load
     from dvo.odometry.load_map import load_map
     from dvo.odometry.patch.config import TrackerConfig
@@ -63,7 +63,7 @@ _LAZY = {
     "ModelConfig": ("dvo.nets.patch.config", "ModelConfig"),
     "Odometry": ("dvo.odometry.protocol", "Odometry"),
     "Result": ("dvo.odometry.protocol", "Result"),
-    "SelfCalibration": ("dvo.odometry.calibrate.camera_estimate", "SelfCalibration"),
+    "SelfCalibration": ("dvo.odometry.calibration.camera_estimate", "SelfCalibration"),
     "Segment": ("dvo.odometry.protocol", "Segment"),
     "SparseMap": ("dvo.odometry.protocol", "SparseMap"),
     "Status": ("dvo.odometry.protocol", "Status"),
@@ -71,7 +71,7 @@ _LAZY = {
     "Trajectory": ("dvo.data.trajectory", "Trajectory"),
     "base_trajectory": ("dvo.data.extrinsics", "base_trajectory"),
     "bundle_adjust": ("dvo.ba.layer.layer", "bundle_adjust"),
-    "calibrate": ("dvo.odometry.calibrate.calibrate", "calibrate"),
+    "calibrate": ("dvo.odometry.calibration.calibrate", "calibrate"),
     "evaluate": ("dvo.metrics", "evaluate"),
     "export_map": ("dvo.export.formats", "export_map"),
     "export_trajectory": ("dvo.export.formats", "export_trajectory"),

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 from rich.progress import Progress
 
-from dvo.commands.console import StderrConsole, device_of, say, seed_everything
-from dvo.commands.run import load_odometry, track
+from dvo.commands.console import StderrConsole, say, seed_everything
+from dvo.commands.run import device_for, load_odometry, track
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.session.results import results_folder
@@ -74,7 +74,7 @@ def demo(arguments: argparse.Namespace) -> int:
     Raises:
         DvoError: weights that cannot be loaded, or a folder that cannot be written.
     """
-    device = device_of(arguments.device)
+    device = device_for(arguments)
     seed_everything(arguments.seed)
     facts = {
         "source": f"rendered: {FAMILY}, seed {SCENE}",

@@ -26,6 +26,7 @@ MOVED = {
     "dvo.graph.places": "dvo.map.places",
     "dvo.graph.serialisation": "dvo.map.io.serialisation",
     "dvo.nets.config": "dvo.nets.patch.config",
+    "dvo.odometry.calibrate": "dvo.odometry.calibration.calibrate",
     "dvo.odometry.config": "dvo.odometry.patch.config",
     "dvo.odometry.deepvo": "dvo.odometry.two_frame.deepvo",
     "dvo.odometry.evidence": "dvo.odometry.window.evidence",

@@ -40,7 +40,7 @@ FLOORS: dict[str, tuple[str, ...]] = {
     "odometry": (
         "quality", "protocol", "exclusive", "registry", "segments", "frames", "window", "uncertainty", "depth",
         "global_ba", "maintenance", "loops", "scale", "checks", "patch", "two_frame", "droid", "classical", "load",
-        "load_map", "merging", "calibrate",
+        "load_map", "merging", "calibration",
     ),
 }  # fmt: skip
 TOP = {"cli", "commands", "demo", "moved", "__main__", "__init__"}  # these know everything, nobody below knows them

@@ -17,7 +17,8 @@ import pytest
 import torch
 
 import dvo
-from dvo.cli import main
+from dvo.cli import build_parser, main
+from dvo.commands.run import load_odometry
 from dvo.data.trajectory import read_tum
 from dvo.odometry.quality import Quality
 from dvo.synth.sequence import make_sequence
@@ -70,6 +71,14 @@ def test_an_odometry_without_weights(tmp_path, capsys):
     assert main([*line, "--out", str(tmp_path / "other"), "--system", "klt-pnp", "--map", "room.dvo"]) == 2
     assert main([*line, "--system", "klt-pnp", "--weights", "tiny"]) == 2
     assert "not allowed with" in capsys.readouterr().err
+    assert main([*line, "--system", "klt-pnp", "--device", "meta"]) == 2
+    assert "--device: an odometry without weights computes on the CPU" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("given", "loops"), [([], True), (["--no-loops"], False)])
+def test_no_loops_wins_without_weights_too(given, loops):
+    arguments = build_parser().parse_args(["run", "clip", "--system", "keyframe", "--set", "loops=true", *given])
+    assert load_odometry(arguments, torch.device("cpu")).config.loops is loops
 
 
 def test_run_writes_the_results_folder(given, image_folder, tmp_path, capsys):

@@ -11,7 +11,7 @@ import dvo
 from dvo.cli import main
 from dvo.commands import camera
 from dvo.data.calibration.focal_guess import guess_from_angle
-from dvo.odometry.calibrate.camera_estimate import SelfCalibration
+from dvo.odometry.calibration.camera_estimate import SelfCalibration
 
 
 @pytest.fixture(autouse=True)

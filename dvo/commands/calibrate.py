@@ -21,7 +21,7 @@ from dvo.data.files.output import replaced
 from dvo.data.images.reduction import MAX_PIXELS
 from dvo.data.source import Source
 from dvo.data.streams.capture import is_stream
-from dvo.odometry.calibrate.calibrate import calibrate as self_calibrate
+from dvo.odometry.calibration.calibrate import calibrate as self_calibrate
 from dvo.session import results
 
 FISHEYE = "calib.yaml"

@@ -13,8 +13,8 @@ import torch
 
 from dvo.commands.console import TrackingProgress, say, seed_everything, warn
 from dvo.data.source import Source
-from dvo.odometry.calibrate.calibrate import calibrate
-from dvo.odometry.calibrate.camera_estimate import SelfCalibration, is_foreign
+from dvo.odometry.calibration.calibrate import calibrate
+from dvo.odometry.calibration.camera_estimate import SelfCalibration, is_foreign
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Odometry
 

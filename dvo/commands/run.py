@@ -32,7 +32,7 @@ from dvo.data.frame import Frame
 from dvo.data.streams.capture import shown
 from dvo.data.trajectory import Trajectory
 from dvo.export.formats import check_formats, export_run, remove_exports
-from dvo.odometry.calibrate.camera_estimate import is_foreign
+from dvo.odometry.calibration.camera_estimate import is_foreign
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         DvoError: invalid source, weights, device, settings or export, or a folder that cannot be written.
     """
     check_formats(arguments.export)
-    device = device_of(arguments.device)
+    device = device_for(arguments)
     source = dvo.open(
         arguments.source,
         calib=arguments.calib,
@@ -149,6 +149,25 @@ def _map_file(text: str, odometry: Odometry) -> Path:
     return Path(text)
 
 
+def device_for(arguments: argparse.Namespace) -> torch.device:
+    """Device of ``--device``; an odometry without weights computes on the CPU.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        The device.
+
+    Raises:
+        DvoError: the device is not available, or the odometry cannot use it.
+    """
+    if arguments.system is None:
+        return device_of(arguments.device)
+    if arguments.device not in ("auto", "cpu"):
+        raise DvoError("an odometry without weights computes on the CPU", field="--device", remedy="leave it out")
+    return torch.device("cpu")
+
+
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
     """Load the odometry of ``--weights`` with the settings of ``--preset``, ``--config``, ``--set`` and ``--no-loops``.
 
@@ -168,7 +187,7 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     settings |= parse_settings(arguments.set)
     if arguments.preset is not None:
         settings["preset"] = arguments.preset
-    if arguments.no_loops and arguments.system is None:
+    if arguments.no_loops and (arguments.system is None or "loops" in settings):
         settings["loops"] = False
     settings |= scale_settings(arguments)
     reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})

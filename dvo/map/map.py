@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from copy import copy
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -16,11 +17,25 @@ from dvo.map.archive import Archive, ArchiveConfig, ArchivedKeyframe
 from dvo.map.keyframe_log import KeyframeLog
 from dvo.map.measurements import ArchivedEdges
 from dvo.map.problem import archive_problem
-from dvo.map.recording import Recording
 
 MIN_NEARNESS = 0.05
 """Points whose inverse depth is below this fraction of their keyframe's median are left out of the map, because their
 depth is uncertain."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Beginning of a recording.
+
+    Attributes:
+        frame: position of its first frame in the log.
+        keyframe: identifier of its first keyframe; those from it on belong to it, or to later recordings.
+        segment: number of its first segment.
+    """
+
+    frame: int = 0
+    keyframe: int = 0
+    segment: int = 0
 
 
 class Map:

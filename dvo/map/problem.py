@@ -14,7 +14,7 @@ from dvo.map.measured_depths import depth_factors
 
 
 def archive_problem(
-    archive: Archive, members: Sequence[ArchivedKeyframe], poses_cw: Callable[[np.ndarray], Tensor], m: int,
+    archive: Archive, members: Sequence[ArchivedKeyframe], poses_cw: Callable[[np.ndarray], Tensor], per_frame: int,
     dropped: bool = True, first: int = 0, last: int | None = None,
 ) -> PatchProblem:  # fmt: skip
     """Bundle adjustment problem of keyframes and the edges between them.
@@ -23,7 +23,7 @@ def archive_problem(
         archive: of the edges.
         members: the keyframes, by increasing identifier.
         poses_cw: poses of identifiers.
-        m: patches of a keyframe.
+        per_frame: patches of a keyframe.
         dropped, first, last: see :meth:`dvo.map.map.Map.problem`.
     """
     edges = archive.edges(first, last)
@@ -41,14 +41,14 @@ def archive_problem(
     patches = [np.column_stack([frame.centres, frame.inverse_depth]) for frame in frames]
     return PatchProblem(
         poses_cw=poses_cw(identifiers),
-        patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(len(frames) * m, 3, 1, 1),
+        patches=torch.from_numpy(np.array(patches, dtype=np.float64)).reshape(len(frames) * per_frame, 3, 1, 1),
         intrinsics=torch.from_numpy(np.array([f.intrinsics for f in frames], dtype=np.float64).reshape(-1, 4)),
         targets=torch.from_numpy(edges.position.astype(np.float64)),
         weights=torch.from_numpy(edges.weight.astype(np.float64)),
         ii=torch.from_numpy(ii),
         jj=torch.from_numpy(jj),
-        kk=torch.from_numpy(ii * m + edges.patch),
-        factors=depth_factors(_measured(frames, m)),
+        kk=torch.from_numpy(ii * per_frame + edges.patch),
+        factors=depth_factors(_measured(frames, per_frame)),
         identifiers=torch.from_numpy(identifiers),
     )
 

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from dvo.map.archive import ArchivedKeyframe
-from dvo.map.map import Map
-from dvo.map.recording import Recording
+from dvo.map.map import Map, Recording
 
 
 def begin_recording(graph: Map) -> Recording:

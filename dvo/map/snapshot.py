@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from dvo.map.archive import ArchiveConfig, ArchivedKeyframe
-from dvo.map.map import Map
+from dvo.map.map import Map, Recording
 from dvo.map.measurements import PackedEdges
-from dvo.map.recording import Recording
 
 _UNBOUNDED = 2**62  # bytes: a copy of what is within the bound of an archive
 

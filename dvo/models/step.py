@@ -2,8 +2,7 @@
 
 Training unrolls this step on a clip (:meth:`dvo.models.patch_vo.PatchVO.unroll`), the tracker applies it once or more
 per frame (:class:`dvo.odometry.patch.tracker.PatchOdometry`). A step maps a state to a state. All differences between
-the two
-loops are arguments: the edges and the poses and depths to start from (in the state), the implementation of the
+the two loops are arguments: the edges and the poses and depths to start from (in the state), the implementation of the
 correlation (the lookup), which poses are fixed and how strongly bundle adjustment is damped (the options).
 """
 

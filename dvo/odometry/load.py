@@ -32,7 +32,8 @@ def load(
 
     Args:
         weights: name of weights that ship with dvo, or a file; or name of a system without weights
-            (:data:`dvo.odometry.registry.SYSTEMS`): ``keyframe``, ``klt-pnp``, ``direct``, ``monoslam``.
+            (:data:`dvo.odometry.registry.SYSTEMS`): ``keyframe``, ``klt-pnp``, ``direct``, ``monoslam``. Weights that
+            ship with dvo win over a system of their name.
         device: of all computation; a system without weights computes on the CPU.
         seed: of all random numbers of the odometry. The same seed on the same machine gives the same trajectory, bit
             for bit on the CPU with a fixed number of threads.
@@ -55,7 +56,7 @@ def load(
         >>> result = odometry.finish()
     """
     settle_threads()
-    if isinstance(weights, str) and weights in SYSTEMS:
+    if isinstance(weights, str) and weights in SYSTEMS and not (FOLDER / f"{weights}.safetensors").is_file():
         check_seed(seed)
         return build_system(weights, seed, overrides if config is None else {"config": config, **overrides})
     return build_odometry(load_weights(weights, device), device=device, seed=seed, config=config, **overrides)

@@ -46,12 +46,11 @@ class Estimate:
             this pose and those after it are in that world and scale, earlier ones of the segment were not.
         covariance: ``(6, 6)`` float64 of the error ``xi`` of ``pose_wc`` relative to the pose of the reference, which
             is held fixed, as is the scale of the segment (:mod:`dvo.odometry.uncertainty.uncertainty`). ``xi = [tau,
-            phi]`` is a
-            right tangent, in the coordinates of this camera: ``T_wc_true = T_wc Exp(xi)``, ``tau`` in units of the
-            segment, ``phi`` in radians. (The left tangent of ``T_cw`` is ``-xi``, with the same covariance; that of
-            ``T_wc`` has the covariance ``A C A^T`` with ``A = se3.adjoint(pose_wc)``.) Where the measurements fit two
-            motions about as well, it contains both (:mod:`dvo.odometry.uncertainty.second_solution`). None without a
-            pose, where the measurements do not determine it, and from odometries that have none.
+            phi]`` is a right tangent, in the coordinates of this camera: ``T_wc_true = T_wc Exp(xi)``, ``tau`` in units
+            of the segment, ``phi`` in radians. (The left tangent of ``T_cw`` is ``-xi``, with the same covariance; that
+            of ``T_wc`` has the covariance ``A C A^T`` with ``A = se3.adjoint(pose_wc)``.) Where the measurements fit
+            two motions about as well, it contains both (:mod:`dvo.odometry.uncertainty.second_solution`). None without
+            a pose, where the measurements do not determine it, and from odometries that have none.
         reference: timestamp of the reference, seconds: the oldest keyframe of the window that a measurement still
             reaches; None without one.
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.map.keyframe_log import KeyframeLog
-from dvo.map.map import Map
-from dvo.map.recording import Recording
+from dvo.map.map import Map, Recording
 from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 
 

@@ -290,7 +290,7 @@ def make_clip(
         )
         images = expose(images, camera, rng, flow, times)
     pixels = (images * 255).round_().to(torch.uint8)
-    if conditions.h264:
+    if spec.sensor and conditions.h264:
         coded = compressed_video(pixels.permute(0, 2, 3, 1).cpu().numpy(), conditions.h264)
         pixels = torch.from_numpy(coded).permute(0, 3, 1, 2).contiguous().to(pixels.device)
     depth = rendering.depth if moving is None or moving.all() else rendering.depth[~moving]

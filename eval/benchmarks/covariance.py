@@ -5,12 +5,11 @@
 ``python -m eval.benchmarks.covariance --scale depth [--split calibration --clips 4]``
 
 After every frame the newest pose relative to the reference of its covariance
-(:mod:`dvo.odometry.uncertainty.uncertainty`) is
-compared with the truth, whose scale is fitted to what the covariance holds fixed: the RMS distance of the keyframes in
-between from the reference. Printed are, by sequence, by suite and for all, the normalised error squared
-``xi^T C^-1 xi`` for each of the six degrees of freedom (its expectation is 1), the same of the rotation and of the
-position alone, and the displacement that the error causes in the image; and for bins of the confidence the share of
-poses whose displacement is below the tolerance that it is the probability of.
+(:mod:`dvo.odometry.uncertainty.uncertainty`) is compared with the truth, whose scale is fitted to what the covariance
+holds fixed: the RMS distance of the keyframes in between from the reference. Printed are, by sequence, by suite and for
+all, the normalised error squared ``xi^T C^-1 xi`` for each of the six degrees of freedom (its expectation is 1), the
+same of the rotation and of the position alone, and the displacement that the error causes in the image; and for bins of
+the confidence the share of poses whose displacement is below the tolerance that it is the probability of.
 
 The split ``validation`` is that of the suites. ``calibration`` has the same options and other scenes;
 ``TrackerConfig.covariance_scale`` is fitted on it: the present one times the geometric mean, over the sequences, of

@@ -11,8 +11,8 @@ import argparse
 import math
 
 from dvo.core.threads import settle_threads
-from dvo.odometry.calibrate.calibrate import CalibrationOptions, calibrate
-from dvo.odometry.calibrate.camera_estimate import SelfCalibration
+from dvo.odometry.calibration.calibrate import CalibrationOptions, calibrate
+from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from dvo.synth.sequence import SyntheticSequence, make_sequence
 
 FAMILIES = ("hall", "gallery", "courtyard")

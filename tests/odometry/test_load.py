@@ -81,6 +81,14 @@ def test_presets_and_single_settings_of_every_odometry(architecture):
         build_odometry(weights, max_gap=0.5)
 
 
+def test_shipped_weights_win_over_a_system_of_their_name():
+    SYSTEMS.register("small", "spare_package:Spare")
+    try:
+        assert isinstance(dvo.load("small"), PatchOdometry)
+    finally:
+        SYSTEMS.unregister("small")
+
+
 def test_odometries_without_weights_are_loaded_by_name():
     sequence = make_sequence(4, frames=16, family="room", kind="sideways", height=120, width=160, fps=15.0)
     for name in ("keyframe", "klt-pnp", "direct", "monoslam"):

@@ -4,7 +4,7 @@ import numpy as np
 
 from dvo.data.trajectory import Trajectory
 from dvo.map.keyframe_log import KeyframeLog
-from dvo.map.recording import Recording
+from dvo.map.map import Recording
 from dvo.odometry.protocol import Break, Result, SparseMap
 from dvo.odometry.segments import breaks_of, result_of_log, segments_of
 

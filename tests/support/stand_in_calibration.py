@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from unittest.mock import create_autospec
 
-from dvo.odometry.calibrate import calibrate
+from dvo.odometry.calibration import calibrate
 from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.tracker import PatchOdometry

@@ -1,8 +1,7 @@
 """Dense bundle adjustment: every pixel of a feature map is a patch of size one with an inverse depth of its own.
 
 The layer is that of :func:`dvo.ba.layer.layer.bundle_adjust`. Edges join whole frames here, hence the layout of the
-sums is
-known without sorting: a group for each pair of frames, all of them full. (Teed and Deng, "DROID-SLAM", 2021.)
+sums is known without sorting: a group for each pair of frames, all of them full. (Teed and Deng, "DROID-SLAM", 2021.)
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ from dvo.map.io.measured_arrays import has_measured, measured_arrays, read_measu
 from dvo.map.io.old_window import archive_old_window
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord, KeyframeLog
+from dvo.map.map import Recording
 from dvo.map.measurements import ArchivedEdges
-from dvo.map.recording import Recording
 from dvo.map.recordings import increase
 
 Arrays = dict[str, np.ndarray]

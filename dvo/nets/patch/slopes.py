@@ -3,8 +3,8 @@
 The inverse depth of a plane is linear in the image. Where it is ``d (1 + s o)`` at an offset ``o`` from the centre of
 a patch, the pixel there moves by ``du/dlog(d) s o`` more than at the depth of the centre, and the affine warp of the
 window (:func:`dvo.nets.alignment.alignment.patch_warps`) has this part. After the alignment, the differences of the
-grey levels
-that are left tell the slopes: one step of Gauss-Newton, with position, gain and offset of the grey levels eliminated.
+grey levels that are left tell the slopes: one step of Gauss-Newton, with position, gain and offset of the grey levels
+eliminated.
 """
 
 from __future__ import annotations

@@ -238,17 +238,22 @@ class KltPnp:
         step[:3, 3] *= length if length > 0 else self._speed or 0.0
         return step @ last
 
+    def _known_pose(self, index: int) -> np.ndarray:
+        """World-to-camera pose ``(4, 4)`` of a frame that has one."""
+        pose = self._log.pose(index)
+        assert pose is not None
+        return pose
+
     def _update_points(self, index: int) -> None:
         """Add the newest view to every point, triangulate what has become possible, drop what contradicts."""
         c, tracks = self.config, self._tracks
-        T = self._log.pose(index)
-        assert T is not None
+        T = self._known_pose(index)
         old = np.flatnonzero(tracks.has_point)
         self._observe(old, tracks.uv[old], T)
         new = np.flatnonzero(~tracks.has_point & (tracks.anchor != index))
         if len(new):
             first, which = np.unique(tracks.anchor[new], return_inverse=True)
-            anchors = [pose for a in first if (pose := self._log.pose(a)) is not None]
+            anchors = [self._known_pose(a) for a in first]
             R = np.array([a[:3, :3] for a in anchors])[which]
             centres = np.array([_centre(a) for a in anchors])[which]
             one = np.einsum("nji,nj->ni", R, two_view.rays(tracks.anchor_uv[new], self._intrinsics))

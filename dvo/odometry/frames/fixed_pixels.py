@@ -24,7 +24,7 @@ LARGE = 3.0
 """Displacement above which a sample counts no more, pixels: one jump is no evidence."""
 CORNERS = 80
 """Corners that the motion of the picture is taken from, found in the image at half its size."""
-MIN_FRAMES = 8
+MIN_CORNERS = 8
 """Corners that have to agree on it."""
 CHANGED = 0.2
 """Share of the pixels with texture that have to change from one sample to the next."""
@@ -118,12 +118,12 @@ def picture_motion(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, n
     there, found, _ = cv2.calcOpticalFlowPyrLK(one, other, corners, np.zeros_like(corners), winSize=(11, 11))
     pairs = np.concatenate([corners, there], 2)[found > 0].reshape(-1, 4)
     moved = pairs[np.abs(pairs[:, 2:] - pairs[:, :2]).max(1) > DISPLACEMENT / 2]
-    if len(moved) < MIN_FRAMES:
+    if len(moved) < MIN_CORNERS:
         return None
     cv2.setRNGSeed(0)
     before, after = (np.ascontiguousarray(side) for side in np.hsplit(moved, 2))
     affine, agree = cv2.estimateAffine2D(before, after, ransacReprojThreshold=1.0)
-    if affine is None or int(agree.sum()) < MIN_FRAMES:
+    if affine is None or int(agree.sum()) < MIN_CORNERS:
         return None
     y, x = np.mgrid[0:height, 0:width].astype(np.float32) / 2
     to_right, down = (2 * (row[0] * x + row[1] * y + row[2]) for row in affine.astype(np.float32))

@@ -235,7 +235,7 @@ class PatchOdometry:
         loops (:mod:`dvo.odometry.global_ba.graph_adjustment`); the window moves along. A solution that does not lower
         the robust cost is not taken. Work in progress for loops is waited for. With the setting ``real_time`` nothing
         is waited for: the adjustments are done beside tracking, within bounds, and applied when they are there. Poses
-            and depths may change, and the scale.
+        and depths may change, and the scale.
 
         Returns:
             One record for each world, with the cost before and after; none for a world with fewer than three archived

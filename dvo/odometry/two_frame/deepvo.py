@@ -58,11 +58,10 @@ class DeepVOOdometry:
     A frame has a pose if its image has content (:func:`dvo.odometry.window.evidence.missing_content`) and shows the
     scene of the image before it (:func:`dvo.odometry.window.evidence.matched_share`, since the network has no
     measurements of its own); the first one of a segment is its world. A frame that does not is lost. For want of
-    measurements no step is taken
-    across lost frames or a gap in time: the next segment begins, with a world and a scale of its own and an empty
-    recurrent state. After a cut its first frame is the lost one, which the result gives a pose once the frame after it
-    shows the same scene; after images of noise there is none. An image that repeats the one before it has the same
-    pose, and the network does not see it. The intrinsics are not used.
+    measurements no step is taken across lost frames or a gap in time: the next segment begins, with a world and a scale
+    of its own and an empty recurrent state. After a cut its first frame is the lost one, which the result gives a pose
+    once the frame after it shows the same scene; after images of noise there is none. An image that repeats the one
+    before it has the same pose, and the network does not see it. The intrinsics are not used.
 
     Args:
         model: the network; moved to ``device`` and used in evaluation mode.

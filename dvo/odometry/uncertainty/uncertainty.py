@@ -8,8 +8,7 @@ a right image): these determine the scale, and their priors are measurements lik
 inverse depths are marginalised.
 
 Measurements have the variance ``sigma^2 / confidence`` (:attr:`dvo.odometry.patch.config.TrackerConfig.sigma`). Their
-errors
-are not independent: a patch that is off is off in all frames. :attr:`TrackerConfig.covariance_scale`, the mean
+errors are not independent: a patch that is off is off in all frames. :attr:`TrackerConfig.covariance_scale`, the mean
 normalised error squared on rendered sequences, accounts for it (docs/uncertainty.md).
 
 While a window may have a second solution, covariance and confidence are those of the mixture of the two

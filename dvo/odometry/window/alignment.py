@@ -25,13 +25,17 @@ class AlignmentSnapshot:
     """State of an alignment, for :meth:`WindowAlignment.restore`.
 
     Attributes:
-        images: ``(N, H, W)`` grey images by map slot. Their number, and what is in the slots that no frame has, takes
-            part in the rounding of a sampled grey level (:func:`dvo.nets.alignment.alignment.sample_images`).
+        count: number of images. It, and what is in the slots that no frame has, takes part in the rounding of a sampled
+            grey level (:func:`dvo.nets.alignment.alignment.sample_images`).
+        slot: map slot of the next frame.
+        image: ``(H, W)`` what is in it; None if there is no such slot yet.
         results: of the edges of the window: ``(E, 2)`` measurements that were aligned, infinite for none, ``(E, 2)``
             their alignments, ``(E,)`` bool for those that were accepted; None if they are not kept.
     """
 
-    images: Tensor
+    count: int
+    slot: int
+    image: Tensor | None
     results: tuple[Tensor, Tensor, Tensor] | None
 
 
@@ -44,11 +48,14 @@ class WindowAlignment:
         window: provides the edges.
         options: of the alignment.
         device: of the images.
+
+    Attributes:
+        images: ``(N, H, W)`` grey images by map slot.
     """
 
     def __init__(self, window: Window, options: AlignmentOptions, device: torch.device) -> None:
         self.window, self.options = window, options
-        self._images = torch.zeros(0, 0, 0, device=device)
+        self.images = torch.zeros(0, 0, 0, device=device)
         # By edge slot: measurement of the network that was aligned (infinite for none), its alignment, and whether the
         # alignment was accepted.
         self._measured = torch.zeros(0, 2, device=device)
@@ -62,14 +69,12 @@ class WindowAlignment:
             map_slot: slot of the frame; its content is overwritten.
             image: ``(H, W, 3)`` uint8 RGB.
         """
-        grey = torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).to(self._images)
-        missing = map_slot + 1 - len(self._images)
+        grey = torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).to(self.images)
+        missing = map_slot + 1 - len(self.images)
         if missing > 0:
             empty = grey.new_zeros(missing, *grey.shape)
-            self._images = torch.cat([self._images, empty]) if len(self._images) else empty
-        else:
-            self._images = self._images.clone()  # a snapshot may hold it
-        self._images[map_slot] = grey
+            self.images = torch.cat([self.images, empty]) if len(self.images) else empty
+        self.images[map_slot] = grey
 
     def forget(self, edge_slots: Tensor) -> None:
         """Invalidate the slots of new edges.
@@ -88,22 +93,25 @@ class WindowAlignment:
         self._accepted[edge_slots] = False
 
     def snapshot(self, results: bool) -> AlignmentSnapshot:
-        """Record the images and, if they are wanted, the results of the edges of the window.
+        """Record what one more frame changes and, if they are wanted, the results of the edges of the window.
 
         Args:
             results: are wanted.
         """
         slots = self.window.edge_slots
         kept = (self._measured[slots], self._aligned[slots], self._accepted[slots]) if results else None
-        return AlignmentSnapshot(self._images, kept)
+        count, slot = len(self.images), self.window.free_map_slot()
+        return AlignmentSnapshot(count, slot, self.images[slot].clone() if slot < count else None, kept)
 
     def restore(self, before: AlignmentSnapshot) -> None:
         """Restore the images and, if they were recorded, the results of the edges of the window.
 
         Args:
-            before: a snapshot of a window with the same frames and edges.
+            before: a snapshot of a window with the same frames and edges, to which one frame was added since.
         """
-        self._images = before.images
+        self.images = self.images[: before.count]
+        if before.image is not None:
+            self.images[before.slot] = before.image
         if before.results is not None:
             slots = self.window.edge_slots
             self.forget(slots)
@@ -175,7 +183,7 @@ class WindowAlignment:
         seen = reproject(*at, window.ii[edges], window.jj[edges], kk, jacobians=True)
         assert seen.jac_d is not None
         found = slope_equations(
-            self._images, map_slots[window.ii[edges]], map_slots[window.jj[edges]],
+            self.images, map_slots[window.ii[edges]], map_slots[window.jj[edges]],
             window.patches[kk, :2, centre, centre] * stride, window.targets[edges] * stride,
             patch_warps(seen.coords[0], self.tilts(edges)),
             seen.jac_d[0, ..., 0] * window.patches[kk, 2, centre, centre, None], self.options,
@@ -219,10 +227,10 @@ class WindowAlignment:
         centres = window.patches[window.kk[edges], :2, centre, centre] * stride
         map_slots = window.map_slots
         found = align_patches(
-            self._images, map_slots[window.ii[edges]], map_slots[window.jj[edges]], centres, measured * stride,
+            self.images, map_slots[window.ii[edges]], map_slots[window.jj[edges]], centres, measured * stride,
             patch_warps(coords, self.tilts(edges)), options,
         )  # fmt: skip
-        size = self._images.shape[2], self._images.shape[1]
+        size = self.images.shape[2], self.images.shape[1]
         return found.positions / stride, accept(found, measured * stride, size, stride, options)
 
     def tilts(self, edges: Tensor) -> Tensor | None:

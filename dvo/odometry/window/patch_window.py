@@ -93,7 +93,8 @@ class Snapshot:
     Attributes:
         window: poses, patches and edge states.
         origins: of the correlations; a value that is interpolated in a cached window depends on them in its last bit.
-        alignment: images by map slot and, of an alignment in every step, its results; None without one.
+        alignment: the image that one more frame replaces and, of an alignment in every step, its results; None
+            without one.
     """
 
     window: WindowSnapshot
@@ -115,8 +116,8 @@ class PatchWindow:
 
     Example:
         >>> window = PatchWindow.empty(model, 24, StepSettings(), device)
-        >>> position = window.append(keyframe, image, maps, pose_cw, patches)
-        >>> window.connect(position, lifetime=7)
+        >>> keyframe = window.add(view, len(window), identifier, pose_cw, depth)
+        >>> window.connect(len(window) - 1, lifetime=7)
         >>> window.update(optimised=8)
     """
 
@@ -248,7 +249,7 @@ class PatchWindow:
             self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)), align=True)
 
     def snapshot(self) -> Snapshot:
-        """Record everything that steps and new frames change, for :meth:`restore`."""
+        """Record everything that steps and one new frame change, for :meth:`restore`."""
         always = self.settings.align == "always"
         alignment = None if self.alignment is None else self.alignment.snapshot(results=always)
         return Snapshot(self.window.snapshot(), self.correlation.origins(), alignment)

@@ -24,22 +24,42 @@ def compressed_video(images: np.ndarray, crf: int) -> np.ndarray:
         ``(N, H, W, 3)`` uint8 RGB, the same on each call.
 
     Raises:
-        DvoError: ``imageio-ffmpeg``, which brings the encoder, is not installed.
+        DvoError: ``imageio-ffmpeg``, which brings the encoder, is not installed, or its encoder does not work.
     """
+    _, rows, columns, _ = images.shape
+    even = np.pad(images, ((0, 0), (0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")
+    _, height, width, _ = even.shape
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+    command = [_program(), "-v", "error", "-threads", "1"]
+    encode = [*command, *raw, "-r", "30", "-i", "-", "-c:v", "libx264", "-preset", "veryfast", "-threads", "1",
+              "-crf", str(crf), "-g", str(LENGTH), "-bf", "0", "-pix_fmt", "yuv420p", "-f", "h264", "-"]  # fmt: skip
+    code = _output(encode, even.tobytes())
+    decode = [*command, "-f", "h264", "-i", "-", *raw, "-"]
+    pixels = _output(decode, code)
+    return np.frombuffer(pixels, np.uint8).reshape(even.shape)[:, :rows, :columns].copy()
+
+
+def _program() -> str:
+    """Path of ffmpeg."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         raise DvoError(
             "H.264 needs imageio-ffmpeg, which is not installed", field="h264", remedy="pip install 'dvo[synth]'"
         )
     import imageio_ffmpeg
 
-    _, rows, columns, _ = images.shape
-    even = np.pad(images, ((0, 0), (0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")
-    _, height, width, _ = even.shape
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-threads", "1"]
-    encode = [*command, *raw, "-r", "30", "-i", "-", "-c:v", "libx264", "-preset", "veryfast", "-threads", "1",
-              "-crf", str(crf), "-g", str(LENGTH), "-bf", "0", "-pix_fmt", "yuv420p", "-f", "h264", "-"]  # fmt: skip
-    code = subprocess.run(encode, input=even.tobytes(), capture_output=True, check=True).stdout
-    decode = [*command, "-f", "h264", "-i", "-", *raw, "-"]
-    pixels = subprocess.run(decode, input=code, capture_output=True, check=True).stdout
-    return np.frombuffer(pixels, np.uint8).reshape(even.shape)[:, :rows, :columns].copy()
+    try:
+        return imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[0]
+        remedy = "pip install --force-reinstall imageio-ffmpeg"
+        raise DvoError(f"no ffmpeg ({reason})", field="h264", remedy=remedy) from error
+
+
+def _output(command: list[str], data: bytes) -> bytes:
+    """What a run of ffmpeg on some data writes."""
+    try:
+        return subprocess.run(command, input=data, capture_output=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError) as error:
+        lines = getattr(error, "stderr", b"").decode(errors="replace").strip().splitlines() or [str(error)]
+        remedy = "use an ffmpeg with libx264: unset IMAGEIO_FFMPEG_EXE, or name another one in it"
+        raise DvoError(f"{command[0]} failed ({lines[-1]})", field="h264", remedy=remedy) from error

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from dvo.data.calibration.focal_guess import guess_from_angle
-from dvo.odometry.calibrate.camera_estimate import SELF_CALIBRATED, SelfCalibration
+from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration
 from eval.benchmarks.self_calibration import clip, errors, row
 
 GUESS = guess_from_angle(320, 240)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 import dvo
 from dvo.core.errors import DvoError
 from dvo.geometry import se3
+from dvo.map.map import Recording
 from dvo.map.measurements import ArchivedEdges
-from dvo.map.recording import Recording
 from dvo.metrics import evaluate
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentLimits, apply, prepare

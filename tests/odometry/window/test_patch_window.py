@@ -34,7 +34,7 @@ def content(window):
     shot = window.snapshot()
     found |= {"origins": shot.origins, "identifiers": [frame.identifier for frame in data.frames]}
     if shot.alignment is not None:
-        found["images"] = shot.alignment.images
+        found["images"] = window.alignment.images
         found |= {f"result {k}": part for k, part in enumerate(shot.alignment.results or ())}
     return {name: value.clone() if isinstance(value, torch.Tensor) else value for name, value in found.items()}
 

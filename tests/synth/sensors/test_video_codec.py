@@ -1,6 +1,7 @@
 """H.264 compression of renderings."""
 
 import importlib.util
+import sys
 
 import numpy as np
 import pytest
@@ -39,6 +40,13 @@ def test_a_sequence_is_read_in_any_order():
     plain = make_sequence(3, frames=LENGTH + 3, **SIZE)
     difference = np.abs(plain.frame(4).image.astype(float) - sequence.frame(4).image)
     assert 1 < difference.mean() < 30
+
+
+@pytest.mark.parametrize("program", [sys.executable, "no such program"])
+def test_an_encoder_that_does_not_work(monkeypatch, program):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", program)
+    with pytest.raises(DvoError, match="h264: .* failed .*libx264"):
+        compressed_video(noise(), 30)
 
 
 def test_without_the_encoder(monkeypatch):

@@ -10,8 +10,8 @@ import dvo
 from dvo.core.errors import DvoError
 from dvo.data import read_calibration
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
-from dvo.odometry.calibrate.calibrate import CalibrationOptions, calibrate
-from dvo.odometry.calibrate.camera_estimate import SelfCalibration
+from dvo.odometry.calibration.calibrate import CalibrationOptions, calibrate
+from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from dvo.odometry.global_ba.focal_length import FocalProfile
 from dvo.odometry.global_ba.self_calibration import Minimum
 from dvo.odometry.protocol import Estimate, Status

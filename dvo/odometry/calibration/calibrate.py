@@ -23,7 +23,7 @@ from dvo.core.settings import check_settings
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
-from dvo.odometry.calibrate.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
+from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
 from dvo.odometry.global_ba.focal_length import FocalProfile, find_focal
 from dvo.odometry.load import load
 from dvo.odometry.protocol import Estimate, Status

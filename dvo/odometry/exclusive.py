@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-METHODS = ("track", "finish", "complete", "current", "reset", "save", "adjust")
+METHODS = ("track", "finish", "current", "reset", "save", "adjust")
 """Methods of an odometry that read or change its state."""
 
 

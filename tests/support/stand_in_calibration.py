@@ -22,6 +22,8 @@ def replace_tracking(monkeypatch, track, profile):
     odometry = create_autospec(PatchOdometry, instance=True)
     odometry.track.side_effect = track
     odometry.state = SimpleNamespace(adjustable=[0], info={}, shutter=Shutter(0.0, 36.0))
-    odometry.graph, odometry.config = SimpleNamespace(members=lambda segment: range(60)), TrackerConfig()
+    odometry.config = TrackerConfig()
     monkeypatch.setattr(calibrate, "load", lambda *_, **__: odometry)
+    monkeypatch.setattr(calibrate, "closed_graph", lambda _: SimpleNamespace(members=lambda segment: range(60)))
+    monkeypatch.setattr(calibrate, "adjust_segments", lambda *_: {"readout": 0.0})
     monkeypatch.setattr(calibrate, "find_focal", lambda *_: profile())

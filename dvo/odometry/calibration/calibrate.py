@@ -17,6 +17,7 @@ from itertools import islice, tee
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings
@@ -25,12 +26,12 @@ from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
 from dvo.odometry.global_ba.focal_length import FocalProfile, find_focal
+from dvo.odometry.global_ba.self_calibration import adjust_segments
 from dvo.odometry.load import load
+from dvo.odometry.patch.saving import closed_graph
 from dvo.odometry.protocol import Estimate, Status
 
 if TYPE_CHECKING:
-    import torch
-
     from dvo.odometry.patch.tracker import PatchOdometry
 
 _FARTHEST_ASIDE = 0.1  # principal points further from the middle, in longer sides of the image, are not believed
@@ -53,7 +54,7 @@ class CalibrationOptions:
     """Options of :func:`calibrate`.
 
     Attributes:
-        frames: tracked frames that the focal length is estimated from. If they cannot tell it, twice as many are tried.
+        frames: tracked frames that the focal length is estimated from. If they cannot tell it, as many more are added.
         rounds: times that they are tracked, at most.
         spare: frames that all rounds together track beyond as many as the clip has; of a clip whose length is not
             known any number.
@@ -138,14 +139,14 @@ def calibrate(
     walk: list[tuple[float, float]] = []
     length = _length(frames)
     left = math.inf if length is None else length + options.spare
+    tracking: _Tracking | None = None
     for number in range(options.rounds):
-        odometry = _loaded(weights, device, seed)
-        clip = islice(_readable(frames if kept is None else copy(kept)), limit)
-        ratio = first.camera.width / width
-        seen, fed = _track(odometry, clip, focal * ratio, (aside[0] * ratio, aside[1] * ratio), wanted,
-                           options.interval, left, on_frame)  # fmt: skip
-        left -= fed
-        profile, count = _profile(odometry)
+        if tracking is None:
+            clip = islice(_readable(frames if kept is None else copy(kept)), limit)
+            x, y = (value * first.camera.width / width for value in aside)
+            tracking = _Tracking(_loaded(weights, device, seed), clip, focal * first.camera.width / width, (x, y))
+        left -= tracking.go_on(wanted, options.interval, left, on_frame)
+        profile, count = _profile(tracking.odometry)
         asked = [*walk, (math.log(focal), profile.minimum.value)]
         slope = _slope(asked)
         step = profile.minimum.value / slope
@@ -153,11 +154,13 @@ def calibrate(
         reason = _doubt(profile, deviation, focal * math.exp(step), guess, options)
         is_last = number + 1 == options.rounds or left < min(wanted, math.inf if length is None else length) / 2
         if reason:
-            if seen < wanted or wanted > options.frames or is_last:
+            if tracking.tracked < wanted or wanted > options.frames or is_last:
                 break
+            if walk:  # back to the guess; tracked with it, the clip goes on from where it is
+                tracking = None
             focal, aside, wanted, walk = guess.focal, (0.0, 0.0), 2 * wanted, []
             continue
-        walk = asked
+        tracking, walk = None, asked
         before, (aside, unsure) = aside, _principal_point(profile, aside, focal, max(width, height), options)
         focal *= math.exp(step)
         if abs(step) > options.settled:  # the last round may end without having settled
@@ -206,31 +209,35 @@ def _slope(walk: list[tuple[float, float]]) -> float:
     return min(max((walk[-2][1] - step) / (at - walk[-2][0]), 0.4), 1.0)
 
 
-def _track(
-    odometry: PatchOdometry,
-    frames: Iterable[Frame],
-    focal: float,
-    aside: tuple[float, float],
-    wanted: int,
-    interval: float,
-    most: float,
-    on_frame: Callable[[Frame, Estimate | None], None] | None,
-) -> tuple[int, int]:
-    """Track frames with a focal length until as many as wanted have a pose; numbers of these, and of all."""
-    tracked, fed, last = 0, 0, -math.inf
-    for frame in frames:
-        if frame.timestamp < last + interval:
-            continue
-        last, height, width = frame.timestamp, frame.camera.height, frame.camera.width
-        camera = replace(pinhole(focal, aside, width, height), readout=frame.camera.readout).camera(width, height)
-        estimate = odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera, mask=frame.mask))
-        if on_frame is not None:
-            on_frame(frame, estimate)
-        tracked, fed = tracked + (estimate.status is Status.TRACKING), fed + 1
-        if tracked >= wanted or fed >= most:
-            break
-    odometry.complete()
-    return tracked, fed
+class _Tracking:
+    """Tracking of the beginning of a clip with a focal length."""
+
+    def __init__(
+        self, odometry: PatchOdometry, frames: Iterable[Frame], focal: float, aside: tuple[float, float]
+    ) -> None:
+        self.odometry, self.frames, self.focal, self.aside = odometry, iter(frames), focal, aside
+        self.tracked, self.last = 0, -math.inf
+
+    def go_on(
+        self,
+        wanted: int,
+        interval: float,
+        most: float,
+        on_frame: Callable[[Frame, Estimate | None], None] | None,
+    ) -> int:
+        """Track until as many frames as wanted have a pose, or no more are allowed; the number of those tracked now."""
+        fed = 0
+        while self.tracked < wanted and fed < most and (frame := next(self.frames, None)) is not None:
+            if frame.timestamp < self.last + interval:
+                continue
+            self.last, height, width = frame.timestamp, frame.camera.height, frame.camera.width
+            pixels = replace(pinhole(self.focal, self.aside, width, height), readout=frame.camera.readout)
+            camera = pixels.camera(width, height)
+            estimate = self.odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera, mask=frame.mask))
+            if on_frame is not None:
+                on_frame(frame, estimate)
+            self.tracked, fed = self.tracked + (estimate.status is Status.TRACKING), fed + 1
+        return fed
 
 
 def _loaded(weights: str, device: torch.device | str, seed: int) -> PatchOdometry:
@@ -245,14 +252,15 @@ def _loaded(weights: str, device: torch.device | str, seed: int) -> PatchOdometr
     return odometry
 
 
+@torch.inference_mode()
 def _profile(odometry: PatchOdometry) -> tuple[FocalProfile, int]:
-    """Profile of the longest segment, and its number of frames."""
-    graph, state = odometry.graph, odometry.state
-    segments = state.adjustable or [0]
-    longest = max(segments, key=lambda segment: len(graph.members(segment)))
-    readout = state.info.get("readout", 0.0)
-    shutter = replace(state.shutter, readout=readout if isinstance(readout, float) else 0.0)
-    return find_focal(graph, longest, shutter, odometry.config.adjustment), len(graph.members(longest))
+    """Profile of the longest segment so far, and its number of frames."""
+    state, config = odometry.state, odometry.config
+    graph = closed_graph(odometry)
+    info = adjust_segments(graph, state.adjustable, state.shutter, config.estimate_readout, config.adjustment)
+    longest = max(state.adjustable or [0], key=lambda segment: len(graph.members(segment)))
+    shutter = replace(state.shutter, readout=float(info["readout"]))
+    return find_focal(graph, longest, shutter, config.adjustment), len(graph.members(longest))
 
 
 def _principal_point(

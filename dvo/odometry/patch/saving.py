@@ -78,15 +78,26 @@ def save_map(file: str | Path, odometry: SavedTracker) -> None:
 
 def _closed(odometry: SavedTracker) -> tuple[KeyframeGraph, LoopCloser, dict[str, Any]]:
     """Copies of graph and loops with the segment closed, and the scale for run.json."""
-    state, config, graph = odometry.state, odometry.config, odometry.graph.copy()
+    state, config, graph = odometry.state, odometry.config, closed_graph(odometry)
     finder = odometry.loops.finder
     places = PlaceIndex.from_arrays(finder.places.to_arrays())
     finder = replace(finder, graph=graph, kept=list(finder.kept), places=places)
     loops = replace(odometry.loops, graph=graph, finder=finder, loops=list(odometry.loops.loops))
     with torch.inference_mode():
-        graph.finalise = odometry.patch_window.of_copy(graph.window, state.initialised).finalise
-        graph.begin_segment(state.keyframes, state.initialised, NOT_INITIALISED)
         for frame in graph.archive.kept_after(finder.kept[-1] if finder.kept else -1):
             if graph.segment_of(frame.identifier) in state.adjustable:
                 finder.keep(frame.identifier)
         return graph, loops, settle_scale(graph, state.adjustable, config.scale, loops)
+
+
+@torch.inference_mode()
+def closed_graph(odometry: SavedTracker) -> KeyframeGraph:
+    """Copy of the graph of a tracker with everything archived, at the poses of the moment; tracking may go on.
+
+    Args:
+        odometry: between two frames of a sequence.
+    """
+    state, graph = odometry.state, odometry.graph.copy()
+    graph.finalise = odometry.patch_window.of_copy(graph.window, state.initialised).finalise
+    graph.begin_segment(state.keyframes, state.initialised, NOT_INITIALISED)
+    return graph

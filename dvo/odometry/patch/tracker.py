@@ -181,18 +181,6 @@ class PatchOdometry:
             keyframe, up to scale. Of a map without a frame of a new recording, the result of the map.
         """
         state = self.state
-        if self.complete():
-            state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
-        return replace(self._result({}), quality=state.quality)
-
-    @torch.inference_mode()
-    def complete(self) -> bool:
-        """Archive and adjust everything, for those who want the graph alone: no result, no verdict.
-
-        Returns:
-            False if it was done before, or for a map without a frame of a new recording.
-        """
-        state = self.state
         begun, state.finished = not state.finished and state.map is None, True
         if begun:
             if len(state.waiting) >= self.config.initial_frames:
@@ -200,7 +188,8 @@ class PatchOdometry:
             self._close_segment()
             self.loops.complete(state.adjustable)
             state.info |= finish_segments(self.graph, state, self.config, self.loops)
-        return begun
+            state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
+        return replace(self._result({}), quality=state.quality)
 
     @torch.inference_mode()
     def current(self) -> Result:

@@ -137,6 +137,29 @@ def test_all_rounds_together_track_a_bounded_number_of_frames(leaning, spare, ro
     assert found.deviation < 20 if settled else found.deviation > abs(found.focal - 200)
 
 
+@pytest.mark.parametrize("told_at", [20, 40, None])
+def test_a_clip_that_does_not_tell_goes_on(clip, monkeypatch, told_at):
+    """The next frames are added to those that are tracked already, as long as the focal length stays the guess."""
+    tracked = []
+
+    def track(frame):
+        tracked.append((frame.index, round(frame.camera.fx)))
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    def profile():
+        told = told_at is not None and len(tracked) >= told_at
+        return FocalProfile(Minimum(math.log(200 / tracked[-1][1]), 0.01, 0.5), 0.5 if told else 0.001, FLAT)
+
+    replace_tracking(monkeypatch, track, profile)
+    frames = [replace(clip[0], index=k, timestamp=k / 30) for k in range(100)]
+    guess = FocalGuess(160.0, 40.0, "prior", 192, 144)
+    found = calibrate(frames, guess, options=CalibrationOptions(frames=20))
+    first = {20: 20, 40: 40, None: 40}[told_at]
+    assert tracked[:first] == [(k, 160) for k in range(first)]
+    assert found.found == (told_at is not None) and (len(tracked) == first) == (told_at is None)
+    assert all(index == k and focal == 200 for k, (index, focal) in enumerate(tracked[first:]))
+
+
 def test_what_is_hardly_possible_is_judged_after_the_last_step(leaning):
     """Half of the way lies in the range of the guess, the whole of it does not."""
     narrow = FocalGuess(160.0, 160 * 0.05, "exif", 192, 144)  # 131 to 195 px

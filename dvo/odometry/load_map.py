@@ -16,7 +16,7 @@ from dvo.map.io.serialisation import GraphTable, read_graph
 from dvo.map.places import LARGEST, PlaceIndex
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import LoadedWeights, load_weights, tensor_digest
-from dvo.odometry.frames.frame_sequence import RequiredSize
+from dvo.odometry.frames.gate import RequiredSize
 from dvo.odometry.load import source_of
 from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.loops.finder import Loop
@@ -106,7 +106,7 @@ def load_map(
     state.keyframes, state.adjustable, state.map = odometry.graph.starts[-1][0], list(table.initialised), table
     highest = max((frame.identifier for frame in odometry.graph.archive), default=-1)
     source.require(state.keyframes > highest, "begins the next segment before the last keyframe", "segments")
-    state.sequence.required = None if size is None else RequiredSize(size, odometry.config.pixels)
+    odometry.gate.sequence.required = None if size is None else RequiredSize(size, odometry.config.pixels)
     return odometry
 
 

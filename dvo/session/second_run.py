@@ -22,7 +22,7 @@ from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import sim3
 from dvo.geometry.alignment import align
-from dvo.odometry.frames.working_image import masked_image
+from dvo.odometry.frames.working_image import working_image
 from dvo.odometry.protocol import Odometry, Result
 from dvo.odometry.quality import FILM, Quality, leaves_doubt
 
@@ -102,7 +102,7 @@ def compare_again(
 
 def _kept(frame: Frame) -> Frame:
     """Image of a frame and its mask, of few pixels, since many are kept; without a readout time (see above)."""
-    image, camera, mask = masked_image(frame, MAX_PIXELS)
+    image, camera, mask = working_image(frame, MAX_PIXELS)
     return Frame(frame.index, frame.timestamp, image, replace(camera, readout=0.0), mask=mask)
 
 

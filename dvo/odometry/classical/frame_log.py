@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ class FrameLog:
     def __init__(self) -> None:
         self.keyframes = KeyframeLog()
         self.turns: list[np.ndarray | None] = []
+        self._repeats: list[int] = []  # frames with the image of the one before them
+        self._last = Estimate(0.0, None, Status.INITIALISING)  # of the newest frame
 
     def begin(self, timestamp: float) -> int:
         """Append a frame without a pose.
@@ -37,6 +40,25 @@ class FrameLog:
         self.keyframes.add(timestamp)
         self.turns.append(None)
         return len(self.turns) - 1
+
+    def repeat(self, timestamp: float) -> Estimate:
+        """Append a frame with the image of the one before it, which has its pose and state.
+
+        Returns:
+            Its estimate.
+        """
+        index = self.begin(timestamp)
+        self.turns[index] = np.eye(3)
+        self._repeats.append(index)
+        self.keyframes.frames[index].follow(self.keyframes.frames[index - 1])
+        self._last = replace(self._last, timestamp=timestamp)
+        return self._last
+
+    def lose(self, index: int, reason: str) -> Estimate:
+        """Keep a frame without a pose, unless it is given one later; its estimate, with a reason if there is one."""
+        self.mark_lost(index)
+        self._last = replace(self.estimate(Status.LOST), reason=reason)
+        return self._last
 
     def set_pose(self, index: int, T_cw: np.ndarray) -> None:
         """Give a frame a pose ``(4, 4)`` that is final unless set again: the frame is its own keyframe."""
@@ -69,7 +91,8 @@ class FrameLog:
         """Estimate of the newest frame; a lost one has no pose."""
         T = None if status is Status.LOST else self.keyframes.pose(-1)
         pose = None if T is None else poses_from_matrices(np.linalg.inv(T))
-        return Estimate(self.keyframes.frames[-1].timestamp, pose, status, confidence)
+        self._last = Estimate(self.keyframes.frames[-1].timestamp, pose, status, confidence)
+        return self._last
 
     def poses(self) -> list[np.ndarray | None]:
         """``T_cw (4, 4)`` of every frame, None where there is none."""
@@ -80,6 +103,8 @@ class FrameLog:
         frames = self.keyframes.frames
         lost = {index for index, record in enumerate(frames) if record.lost}
         poses = back_fill(self.poses(), self.turns, lost)
+        for index in self._repeats:
+            poses[index] = poses[index - 1]
         rows = [index for index, pose in enumerate(poses) if pose is not None]
         matrices = np.array([np.linalg.inv(poses[index]) for index in rows]).reshape(-1, 4, 4)  # type: ignore[arg-type]
         trajectory = Trajectory(np.array([frames[index].timestamp for index in rows]), poses_from_matrices(matrices))
@@ -92,7 +117,8 @@ def back_fill(
     """Fill missing poses from their neighbours by measured rotations; the camera is taken to stand meanwhile.
 
     Args:
-        T_cw: ``(4, 4)`` world to camera, None where there is none. Without any, the first frame is the world.
+        T_cw: ``(4, 4)`` world to camera, None where there is none. Without any, the first frame that is not lost is the
+            world.
         turns: ``(3, 3)`` rotation from the frame before to each frame, None where it is not known.
         lost: positions that stay empty.
 
@@ -100,8 +126,9 @@ def back_fill(
         The poses; still None where no chain of turns leads to a known one.
     """
     poses = list(T_cw)
-    if poses and all(T is None for T in poses):
-        poses[0] = np.eye(4)
+    seen = [index for index in range(len(poses)) if index not in lost]
+    if seen and all(T is None for T in poses):
+        poses[seen[0]] = np.eye(4)
     # First backwards: what precedes the start of a map belongs to that map.
     for order, towards in ((range(len(poses) - 2, -1, -1), 1), (range(1, len(poses)), -1)):
         for i in order:

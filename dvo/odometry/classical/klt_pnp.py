@@ -18,6 +18,7 @@ from dvo.data.frame import Frame
 from dvo.odometry.classical import two_view
 from dvo.odometry.classical.frame_log import FrameLog, map_of
 from dvo.odometry.classical.klt import Tracks, detect, follow
+from dvo.odometry.frames.gate import Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
 
@@ -64,6 +65,7 @@ class KltPnp:
     def __init__(self, config: KltPnpConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = changed(config or KltPnpConfig(), settings)
         self.seed = seed
+        self._gate = Gate(pixels=None)
         self._log = FrameLog()
         self._tracks = Tracks()
         self._grey: np.ndarray | None = None  # the last image in which the tracks were seen
@@ -79,18 +81,22 @@ class KltPnp:
         self._map: list[tuple[np.ndarray, np.ndarray]] = []
 
     def track(self, frame: Frame) -> Estimate:
-        index = self._log.begin(frame.timestamp)
+        admitted = self._gate.admit(frame)
+        if admitted.repeated and not admitted.problem:
+            return self._log.repeat(frame.timestamp)
+        index, frame = self._log.begin(frame.timestamp), admitted.frame
         self._intrinsics, self._size = frame.camera.intrinsics, (frame.camera.width, frame.camera.height)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        if self._grey is None and admitted.problem:
+            return self._log.lose(index, admitted.problem)
         if self._grey is None:
             self._begin(frame, grey, index)
             return self._log.estimate(Status.INITIALISING)
-        if not self._follow(grey, index):
-            self._log.mark_lost(index)
+        if admitted.problem or not self._follow(grey, index):
             self._blind += 1
             if self._blind >= self.config.patience or not self._started:
                 self._begin(frame, grey, index)
-            return self._log.estimate(Status.LOST)
+            return self._log.lose(index, admitted.problem)
         self._grey, self._blind = grey, 0
         if not self._started:
             self._try_start(frame, grey, index)
@@ -101,7 +107,8 @@ class KltPnp:
         return self._log.estimate(Status.TRACKING, confidence)
 
     def finish(self) -> Result:
-        self._retire(np.ones(len(self._tracks), bool))
+        if self._gate.finish():
+            self._retire(np.ones(len(self._tracks), bool))
         info = {
             "working_size": list(self._size),
             "working_intrinsics": self._intrinsics.tolist(),

@@ -14,10 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.core.errors import DvoError
 from dvo.core.settings import check_seed
 from dvo.data.frame import Frame
-from dvo.data.frame_checks import checked_frame
 from dvo.geometry import se3
 from dvo.map.keyframe_log import KeyframeLog
 from dvo.models.droid import DroidVO
@@ -27,12 +25,11 @@ from dvo.odometry.droid.depth_maps import depth_maps, fused
 from dvo.odometry.droid.frame import place_frame, predicted_pose
 from dvo.odometry.droid.mapper import DenseMapper, View
 from dvo.odometry.exclusive import exclusive
-from dvo.odometry.frames.frame_sequence import FrameSequence
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.content import NO_MATCH
+from dvo.odometry.frames.gate import Gate
 from dvo.odometry.patch.config import with_changes
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of_log
-from dvo.odometry.window.evidence import NO_MATCH, missing_content
 
 _WITH_FEATURES = 32  # frames without a pose whose features are kept until the initialisation
 _NOT_INITIALISED = "not initialised"  # reason of a loss: the segment ended before its keyframes agreed with each other
@@ -126,13 +123,12 @@ class DroidOdometry:
         """Begin a new sequence as a new odometry with the same seed would."""
         self.log = KeyframeLog()
         self.mapper = DenseMapper(self.model, self.config, self.log)
-        self._sequence = FrameSequence(self.config.max_gap)
-        self._last: tuple[np.ndarray, Estimate] | None = None  # working image of the last frame, and its estimate
+        self._gate = Gate(self.config.pixels, self.config.max_gap)
+        self._last: Estimate | None = None  # of the last frame
         self._recent: list[tuple[float, Tensor]] = []  # times and poses of the last two frames
         self._waiting: list[_Waiting] = []
         self._segment, self._failures = 0, 0
-        self._interrupted = ""  # cause of the interruption since the last frame with a pose
-        self._finished = False
+        self._interruption: str | None = None  # cause of that since the last frame with a pose
         self._info: dict[str, Any] = {}
 
     @torch.inference_mode()
@@ -150,27 +146,21 @@ class DroidOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        if self._finished:
-            raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
-        frame = checked_frame(frame)
-        image, camera = working_image(frame, self.config.pixels)
-        self._sequence.check(frame)
-        if self._last is not None and np.array_equal(image, self._last[0]):
-            estimate = self._repeat(frame.timestamp, self._last[1])
-        else:
-            gap = self._sequence.tick(frame.timestamp)
-            record = self.log.add(frame.timestamp)
-            record.segment = self._segment
-            problem = missing_content(image)
-            if problem:
-                estimate = self._lose(frame.timestamp, problem)
-            else:
-                if gap is not None and not gap.frozen and self._recent and not self._interrupted:
-                    self._interrupted = record.reason = str(gap)
-                self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.intrinsics.tolist()}
-                estimate = self._place(self._view(frame.timestamp, image, camera.intrinsics))
-        self._last = image, estimate
-        return estimate
+        admitted = self._gate.admit(frame)
+        if admitted.repeated and self._last is not None:
+            self._last = self._repeat(frame.timestamp, self._last)
+            return self._last
+        record = self.log.add(frame.timestamp)
+        record.segment = self._segment
+        if admitted.problem:
+            self._last = self._lose(frame.timestamp, admitted.problem)
+            return self._last
+        gap, image, camera = admitted.gap, admitted.image, admitted.camera.intrinsics
+        if gap is not None and not gap.frozen and self._recent and self._interruption is None:
+            self._interruption = record.reason = str(gap)
+        self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.tolist()}
+        self._last = self._place(self._view(frame.timestamp, image, camera))
+        return self._last
 
     @torch.inference_mode()
     def finish(self) -> Result:
@@ -180,9 +170,8 @@ class DroidOdometry:
             Trajectories ``T_wc`` of all segments, each in the world of its first frame, up to scale; depth maps of the
             keyframes; the map of the longest segment, fused from the reliable depths.
         """
-        if not self._finished:
+        if self._gate.finish():
             self._close()
-        self._finished = True
         return self.current()
 
     @torch.inference_mode()
@@ -212,7 +201,6 @@ class DroidOdometry:
 
     def _repeat(self, timestamp: float, last: Estimate) -> Estimate:
         """Note a frame with the image of the one before it."""
-        self._sequence.repeat(timestamp)
         before = len(self.log.frames) - 1
         record = self.log.add(timestamp)
         record.follow(self.log.frames[before])
@@ -224,14 +212,14 @@ class DroidOdometry:
     def _lose(self, time: float, reason: str) -> Estimate:
         record = self.log.frames[-1]
         record.lost, record.reason = True, reason
-        self._interrupted = self._interrupted or reason
+        self._interruption = self._interruption or reason
         return Estimate(time, None, Status.LOST, 0.0, self._segment, reason)
 
     def _place(self, view: View) -> Estimate:
         """Estimate the pose of a frame with content."""
         if self.mapper.ready:
             return self._follow(view)
-        if self._interrupted and len(self.mapper.window):
+        if self._interruption is not None and len(self.mapper.window):
             self._close()
         return self._warm_up(view)
 
@@ -239,7 +227,7 @@ class DroidOdometry:
         """Collect keyframes until there are enough for the initialisation."""
         mapper, number = self.mapper, len(self.log.frames) - 1
         record = self.log.frames[number]
-        record.segment, self._interrupted = self._segment, ""
+        record.segment, self._interruption = self._segment, None
         if not len(mapper.window):
             record.anchor = mapper.add(view, se3.identity(device=self.device))
             return self._initialising(view.timestamp)
@@ -251,7 +239,7 @@ class DroidOdometry:
             self._failures += 1
             if self._failures < self.config.patience:
                 estimate = self._lose(view.timestamp, NO_MATCH)
-                self._interrupted = ""
+                self._interruption = None
                 return estimate
             self._close()
             return self._warm_up(view)
@@ -288,7 +276,7 @@ class DroidOdometry:
     def _follow(self, view: View) -> Estimate:
         """Place a frame against the newest keyframes; it may become the next one."""
         config, mapper = self.config, self.mapper
-        before = self._recent[-2] if len(self._recent) > 1 and not self._interrupted else None
+        before = self._recent[-2] if len(self._recent) > 1 and self._interruption is None else None
         start = predicted_pose(before, self._recent[-1], view.timestamp, config.motion_damping)
         anchors = mapper.window.keyframes[:-3:-1]
         assert view.matching is not None
@@ -296,9 +284,9 @@ class DroidOdometry:
             self.model, anchors, view.matching, view.intrinsics, start, config.frame_updates, kernel=config.kernel
         )
         found = placed.found
-        if not mapper.supports(found, joining=bool(self._interrupted)):
+        if not mapper.supports(found, joining=self._interruption is not None):
             return self._fail(view)
-        self._failures, self._interrupted = 0, ""
+        self._failures, self._interruption = 0, None
         pose, number = placed.pose_cw, len(self.log.frames) - 1
         if found.flow > config.filter_flow:
             self.log.frames[number].anchor = mapper.add(view, pose)
@@ -336,7 +324,7 @@ class DroidOdometry:
         used = mapper.ready
         mapper.close(self._segment)
         self._segment += used
-        self._recent, self._waiting, self._failures, self._interrupted = [], [], 0, ""
+        self._recent, self._waiting, self._failures, self._interruption = [], [], 0, None
 
     def _give_up(self) -> None:
         """Lose the frames of keyframes that do not agree with each other."""

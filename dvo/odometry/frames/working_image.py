@@ -29,55 +29,33 @@ def working_size(width: int, height: int, pixels: int) -> tuple[int, int]:
     return tuple(max(_MULTIPLE * 4, _MULTIPLE * round(side * scale / _MULTIPLE)) for side in (width, height))  # type: ignore[return-value]
 
 
-def masked_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera, np.ndarray | None]:
-    """Resize a frame and its mask, for an odometry that uses masks.
+def working_image(frame: Frame, pixels: int | None) -> tuple[np.ndarray, Camera, np.ndarray | None]:
+    """Resize a frame by area resampling, and its mask by the nearest pixels.
 
     Args:
         frame: checked, without lens distortion.
-        pixels: see :func:`working_size`.
+        pixels: see :func:`working_size`; None for the image as it is.
 
     Returns:
-        Image and camera of :func:`working_image`; ``(h, w)`` bool mask by the nearest pixels, None without one.
+        ``(h, w, 3)`` uint8 RGB image, its camera, and its ``(h, w)`` bool mask, None without one.
 
     Raises:
-        DvoError: the frame's camera has distortion.
+        DvoError: the frame's camera has distortion, which the odometries do not model.
     """
-    image, camera = _resized(frame, pixels)
-    if frame.mask is None:
-        return image, camera, None
-    mask = cv2.resize(frame.mask.astype(np.uint8), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-    return image, camera, mask > 0
-
-
-def working_image(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
-    """Resize a frame by area resampling.
-
-    Args:
-        frame: without lens distortion.
-        pixels: see :func:`working_size`.
-
-    Returns:
-        ``(H, W, 3)`` uint8 RGB image and its camera.
-
-    Raises:
-        DvoError: the frame's camera has distortion, which the tracker does not model; the frame has a mask, which the
-            odometry would not see.
-    """
-    if frame.mask is not None:
-        raise DvoError("this odometry does not use masks", field="mask", remedy="use weights of patch_vo, or no mask")
-    return _resized(frame, pixels)
-
-
-def _resized(frame: Frame, pixels: int) -> tuple[np.ndarray, Camera]:
-    """Working image and its camera, whatever the mask."""
     if needs_undistortion(frame.camera):
         raise DvoError(
             f"frames with {frame.camera.model} distortion cannot be tracked",
             field="camera",
             remedy="undistort them first: dvo.geometry.undistort.Undistorter, or dvo.open, which does this",
         )
-    width, height = working_size(frame.camera.width, frame.camera.height, pixels)
-    if (width, height) == (frame.camera.width, frame.camera.height):
-        return np.array(frame.image, order="C"), frame.camera  # a copy: a caller may use its buffer for the next frame
+    given = frame.camera.width, frame.camera.height
+    width, height = given if pixels is None else working_size(*given, pixels)
+    if (width, height) == given:
+        # Copies: a caller may use its buffers for the next frame.
+        mask = None if frame.mask is None else np.array(frame.mask, order="C")
+        return np.array(frame.image, order="C"), frame.camera, mask
     image = cv2.resize(frame.image, (width, height), interpolation=cv2.INTER_AREA)
-    return image, frame.camera.resized(width, height)
+    camera = frame.camera.resized(width, height)
+    if frame.mask is None:
+        return image, camera, None
+    return image, camera, cv2.resize(frame.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0

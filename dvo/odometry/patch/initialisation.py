@@ -8,9 +8,10 @@ from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.window import Window
 from dvo.models.step import Revision, StepOptions
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, match_window, measured_share
+from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty.uncertainty import has_second_solution
-from dvo.odometry.window.evidence import NO_MATCH, last_unrelated, measured
+from dvo.odometry.window.evidence import last_unrelated, measured
 from dvo.odometry.window.motion import parallax
 from dvo.odometry.window.patch_window import PatchWindow
 

@@ -21,6 +21,7 @@ from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.places import PlaceIndex
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import tensor_digest
+from dvo.odometry.frames.gate import Gate
 from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import run_information
@@ -40,6 +41,7 @@ class SavedTracker(Protocol):
     config: TrackerConfig
     model: PatchVO
     graph: KeyframeGraph
+    gate: Gate
     state: TrackerState
     patch_window: PatchWindow
     loops: LoopCloser
@@ -56,7 +58,7 @@ def save_map(file: str | Path, odometry: SavedTracker) -> None:
         DvoError: the file cannot be written.
     """
     state, graph, loops, info = odometry.state, odometry.graph, odometry.loops, None
-    if not state.finished and state.map is None:
+    if not odometry.gate.finished and state.map is None:
         graph, loops, info = _closed(odometry)
     found = run_information(graph, state, odometry.config, loops, odometry.seed) | (info or {})
     table = state.map or MapTable(

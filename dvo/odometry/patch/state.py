@@ -3,18 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum, auto
 
-import numpy as np
 import torch
 
 from dvo.odometry.checks.check_pairs import CheckPairs
 from dvo.odometry.frames.fixed_pixels import FixedPixels
-from dvo.odometry.frames.frame_sequence import FrameSequence
 from dvo.odometry.frames.front_end import View
 from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.patch.map_tables import MapTable
 from dvo.odometry.protocol import Estimate
 from dvo.odometry.quality import Quality
+
+
+class Phase(Enum):
+    """What a tracker does with the next frame that has content."""
+
+    INITIALISING = auto()  # adds it to a window without poses
+    TRACKING = auto()  # inserts it into the window
+    INTERRUPTED = auto()  # joins it with the window across lost frames or a gap, or a new segment begins
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """What separates the next frame from the window.
+
+    Attributes:
+        reason: in words.
+        is_gap: time has passed, and no frame was lost before it.
+    """
+
+    reason: str
+    is_gap: bool = False
 
 
 @dataclass
@@ -23,18 +43,15 @@ class TrackerState:
 
     Attributes:
         generator: of the patch centres.
-        sequence: order, size and intervals of the frames.
         keyframes: number of identifiers of keyframes given so far.
         tracked: frames of the segment since its initialisation.
         waited: frames of the segment before it.
-        initialised: the segment is.
+        phase: of the segment.
+        interruption: while the phase is ``INTERRUPTED``, what the next frame has to be joined across.
         ambiguous: its window may have a second solution (:mod:`dvo.odometry.uncertainty.second_solution`).
-        finished: no frame is taken any more.
         adjustable: segments that were initialised.
         waiting: frames with content since tracking was lost.
-        joining: cause of the interruption that the next frame has to be joined across; empty for none.
-        skipped: the interruption is a gap in time.
-        last: last working image and its estimate; None before the first frame.
+        last: estimate of the last frame; None before the first one.
         world: that of the last pose of the segment (:meth:`KeyframeGraph.world_of`); -1 before its first one.
         shutter: timing of the rows of the last frame.
         info: metadata for run.json.
@@ -47,18 +64,15 @@ class TrackerState:
     """
 
     generator: torch.Generator
-    sequence: FrameSequence
     keyframes: int = 0
     tracked: int = 0
     waited: int = 0
-    initialised: bool = False
+    phase: Phase = Phase.INITIALISING
+    interruption: Interruption | None = None
     ambiguous: bool = False
-    finished: bool = False
     adjustable: list[int] = field(default_factory=list)
     waiting: list[View] = field(default_factory=list)
-    joining: str = ""
-    skipped: bool = False
-    last: tuple[np.ndarray, Estimate] | None = None
+    last: Estimate | None = None
     world: int = -1
     shutter: Shutter = Shutter(0.0, 1.0)
     info: dict[str, object] = field(default_factory=dict)
@@ -69,10 +83,48 @@ class TrackerState:
     started: float | None = None
     quality: Quality | None = None
 
+    @property
+    def initialised(self) -> bool:
+        """True if the segment has poses."""
+        return self.phase is not Phase.INITIALISING
+
     def begin_segment(self) -> None:
         """Forget the segment that has been closed."""
-        self.initialised, self.joining, self.skipped, self.tracked, self.world = False, "", False, 0, -1
+        self.phase, self.interruption, self.tracked, self.world = Phase.INITIALISING, None, 0, -1
         self.ambiguous, self.waited = False, 0
+
+    def initialise(self, segment: int) -> None:
+        """Begin to track a segment.
+
+        Args:
+            segment: its number.
+        """
+        self.phase = Phase.TRACKING
+        self.adjustable.append(segment)
+
+    def interrupt(self, reason: str, *, is_gap: bool = False) -> str:
+        """Note that the next frame does not follow the window; what has interrupted it first counts.
+
+        Args:
+            reason: in words.
+            is_gap: time has passed without a frame.
+
+        Returns:
+            The reason that counts.
+        """
+        if self.phase is Phase.TRACKING:
+            self.phase, self.interruption = Phase.INTERRUPTED, Interruption(reason, is_gap)
+        return reason if self.interruption is None else self.interruption.reason
+
+    def resume(self) -> str:
+        """Note that a frame was joined with the window.
+
+        Returns:
+            Reason of a break before it: that of a gap in time, where no lost frame tells of it.
+        """
+        gap = "" if self.interruption is None or not self.interruption.is_gap else self.interruption.reason
+        self.phase, self.interruption = Phase.TRACKING, None
+        return gap
 
     def enter(self, segment: int, world: int) -> bool:
         """Record the world of a pose.

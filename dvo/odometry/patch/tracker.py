@@ -18,7 +18,6 @@ from torch import Tensor
 from dvo.core.errors import DvoError
 from dvo.core.threads import core_left
 from dvo.data.frame import Frame
-from dvo.data.frame_checks import checked_frame
 from dvo.geometry import se3
 from dvo.map.archive import ArchiveConfig
 from dvo.map.keyframe_graph import KeyframeGraph
@@ -29,9 +28,9 @@ from dvo.nets.patch.masks import visible_features
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.depth.patch_depth import measure_depth
 from dvo.odometry.exclusive import exclusive
-from dvo.odometry.frames.frame_sequence import FrameSequence
+from dvo.odometry.frames.content import NO_MATCH, missing_content
 from dvo.odometry.frames.front_end import View, observe
-from dvo.odometry.frames.working_image import masked_image
+from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
 from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.loops.relocalisation import REFRESH_EVERY, hold_to_map, invite
@@ -49,11 +48,11 @@ from dvo.odometry.patch.late_join import join_waiting
 from dvo.odometry.patch.loops import loop_closer
 from dvo.odometry.patch.new_recording import begin_in_map
 from dvo.odometry.patch.saving import save_map
-from dvo.odometry.patch.state import TrackerState
+from dvo.odometry.patch.state import Phase, TrackerState
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
 from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
-from dvo.odometry.window.evidence import NO_MATCH, missing_content, newest_evidence
+from dvo.odometry.window.evidence import newest_evidence
 from dvo.odometry.window.motion import flow_magnitude
 from dvo.odometry.window.patch_window import PatchWindow
 
@@ -73,6 +72,7 @@ class PatchOdometry:
         weights: name or file of the network, by which :func:`dvo.load_map` finds it again.
 
     Attributes:
+        gate: that every frame has to pass.
         graph: window, archive and log of frames.
         state: all else that a frame changes.
         patch_window: the window with the network that measures it; what it caches is computed from the other two.
@@ -105,7 +105,8 @@ class PatchOdometry:
         """Begin a new sequence as a new tracker with the same seed would; a map that it was loaded with is left."""
         config, c = self.config, self.model.config
         select = self.model.selection(config.selection)
-        self.state = TrackerState(torch.Generator().manual_seed(self.seed), FrameSequence(config.max_gap))
+        self.gate = Gate(config.pixels, config.max_gap, masks=True)
+        self.state = TrackerState(torch.Generator().manual_seed(self.seed))
         self.select = partial(select, patches=config.patches, generator=self.state.generator)
         sizes = config.patches, c.patch_size, c.hidden_channels
         self.graph = KeyframeGraph(*sizes, self.device, self.archive, lambda edges: self.patch_window.finalise(edges))
@@ -138,39 +139,29 @@ class PatchOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        if self.state.finished:
-            raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
         with core_left(self.loops.maintenance.occupies_core):
-            return self._track(checked_frame(frame))
+            admitted, state = self.gate.admit(frame), self.state
+            state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
+            if state.map is not None:
+                begin_in_map(self.graph, self.loops.finder, state)
+            record = self.graph.log.add(frame.timestamp)
+            if admitted.repeated:
+                return self._repeat(record)
+            state.last = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
+            return state.last
 
-    def _track(self, frame: Frame) -> Estimate:
-        """Process a frame."""
-        state = self.state
-        image, camera, mask = masked_image(frame, self.config.pixels)
-        state.shutter = Shutter(camera.readout, camera.height / self.model.config.STRIDE)
-        state.sequence.check(frame)
-        if state.map is not None:
-            begin_in_map(self.graph, self.loops.finder, state)
-        record = self.graph.log.add(frame.timestamp)
-        if state.last is not None and np.array_equal(image, state.last[0]):
-            state.sequence.repeat(frame.timestamp)
-            return self._repeat(record)
-        gap = state.sequence.tick(frame.timestamp)
-        if problem := missing_content(image, mask):
-            estimate = self._lose(record, problem)
-        else:
-            if gap and state.initialised and not state.joining:
-                state.joining, state.skipped = str(gap), not gap.frozen
-            mask = self._without_fixed(image, mask)
-            seen = observe(self.model, image, camera, self.select, self.device, mask=mask)
-            seen = measure_depth(self.model, seen, frame, self.config.scale, self.config.measuring)
-            state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
-            state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
-            estimate = self._take(View([record], seen))
-            if len(state.waiting) >= self.config.patience:
-                estimate = self._begin_segment()
-        state.last = image, estimate
-        return estimate
+    def _measure(self, record: FrameRecord, admitted: Admitted) -> Estimate:
+        """Process a frame with content."""
+        state, image = self.state, admitted.image
+        if admitted.gap:
+            state.interrupt(str(admitted.gap), is_gap=not admitted.gap.frozen)
+        mask = self._without_fixed(image, admitted.mask)
+        seen = observe(self.model, image, admitted.camera, self.select, self.device, mask=mask)
+        seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)
+        state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
+        state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
+        estimate = self._take(View([record], seen))
+        return self._begin_segment() if len(state.waiting) >= self.config.patience else estimate
 
     @torch.inference_mode()
     def finish(self) -> Result:
@@ -181,8 +172,7 @@ class PatchOdometry:
             keyframe, up to scale. Of a map without a frame of a new recording, the result of the map.
         """
         state = self.state
-        begun, state.finished = not state.finished and state.map is None, True
-        if begun:
+        if self.gate.finish() and state.map is None:
             if len(state.waiting) >= self.config.initial_frames:
                 self._begin_segment()
             self._close_segment()
@@ -241,7 +231,7 @@ class PatchOdometry:
             ...         for record in odometry.adjust():
             ...             print(record.keyframes, record.cost_before, record.cost)
         """
-        if self.state.finished:
+        if self.gate.finished:
             raise DvoError("the sequence is finished and adjusted", field="adjust()", remedy="adjust before finish()")
         if self.state.map is not None:  # which stays as it is
             return ()
@@ -258,14 +248,13 @@ class PatchOdometry:
         if not state.initialised:
             return self._initialise(view)
         identifier, (pose, depth) = self._name(view), self._begin(view)
-        policy = config.policies["retry" if state.joining else "continuous"]
+        policy = config.policies["retry" if state.phase is Phase.INTERRUPTED else "continuous"]
         if not self.patch_window.try_insert(view, len(window), identifier, pose, depth, policy).accepted:
             if estimate := self._relocalise(view):
                 return estimate
             state.waiting.append(view)
             return self._lose(record, NO_MATCH)
-        record.place(identifier, self.graph.segment, state.joining if state.skipped else "")
-        state.joining, state.skipped = "", False
+        record.place(identifier, self.graph.segment, state.resume())
         state.tracked += 1
         if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
             state.ambiguous = leave_minimum(self.patch_window, config)
@@ -281,14 +270,14 @@ class PatchOdometry:
         found = self.loops.locate(view, state.keyframes)
         if found is None:
             return None
-        reason = state.joining or record.reason
+        reason = record.reason if state.interruption is None else state.interruption.reason
         self._close_segment()
-        state.waiting, state.initialised = [], True
+        state.waiting = []
+        state.initialise(graph.segment)
         graph.join(graph.segment, graph.segment_of(found.loop.old))
         invite(self.patch_window, found.guests)
         graph.located = found.loop.old
         self.loops.relocalised(found.loop)
-        state.adjustable.append(graph.segment)
         identifier, policy = self._name(view), self.config.policies["located"]
         pose, depth = found.pose_cw.to(self.device, torch.float32), found.depths[None].to(self.device)
         self.patch_window.try_insert(view, len(self.window), identifier, pose, depth, policy)
@@ -301,7 +290,7 @@ class PatchOdometry:
         identifier, (pose, depth) = self._name(view), self._begin(view)
         self.patch_window.add(view, len(window), identifier, pose, depth)
         self.patch_window.connect(len(window) - 1, config.lifetime)
-        state.joining, state.waited = "", state.waited + 1
+        state.waited += 1
         if len(window) > 1:
             revision = self.patch_window.revise()
             if not first_motion(revision, window, config, state.waited):
@@ -313,10 +302,10 @@ class PatchOdometry:
         record.place(identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
             enough = initialise_related(self.graph, self.patch_window, config, state.waited)
-            state.initialised = enough and newest_evidence(window).supports(config.lost_confidence, config.min_inliers)
-            state.adjustable += [self.graph.segment] * state.initialised
-            if state.initialised and config.restart:
-                state.ambiguous = measured_share(window.measured) < MEASURED_SHARE  # until it is tried
+            if enough and newest_evidence(window).supports(config.lost_confidence, config.min_inliers):
+                state.initialise(self.graph.segment)
+                if config.restart:
+                    state.ambiguous = measured_share(window.measured) < MEASURED_SHARE  # until it is tried
         self._reduce()
         pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
         return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)
@@ -341,27 +330,25 @@ class PatchOdometry:
         record.follow(past)
         if state.waiting and state.waiting[-1].records[-1] is past:
             state.waiting[-1].records.append(record)
-        state.last = state.last[0], replace(state.last[1], timestamp=record.timestamp, recovered=False)
-        return state.last[1]
+        state.last = replace(state.last, timestamp=record.timestamp, recovered=False)
+        return state.last
 
     def _lose(self, record: FrameRecord, reason: str) -> Estimate:
         """Mark a frame as lost; the next frame of an initialised segment has to be joined across it."""
         record.anchor, record.lost = None, True
-        if self.state.initialised and not self.state.joining:
-            self.state.joining = reason
-        record.reason = self.state.joining or reason
+        record.reason = self.state.interrupt(reason)
         return self._estimate(record, None, Status.LOST)
 
     def _begin_segment(self) -> Estimate:
         """Close the segment, and begin the next one with the frames that could not be joined with it."""
-        waiting, self.state.waiting, reason = self.state.waiting, [], self.state.joining
+        waiting, self.state.waiting, interruption = self.state.waiting, [], self.state.interruption
         self._close_segment()
         for view in waiting:
             estimate = self._take(view)
             for repeat in view.records[1:]:
                 repeat.follow(view.records[0])
         if not waiting[0].records[0].lost:
-            waiting[0].records[0].reason = reason
+            waiting[0].records[0].reason = "" if interruption is None else interruption.reason
         return estimate
 
     def _close_segment(self) -> None:

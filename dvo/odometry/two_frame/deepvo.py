@@ -9,20 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings
 from dvo.data.frame import Frame
-from dvo.data.frame_checks import checked_frame
 from dvo.geometry import se3
 from dvo.models.deepvo import DeepVO, RecurrentState, step_pose
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.exclusive import exclusive
-from dvo.odometry.frames.frame_sequence import FrameSequence
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.content import NO_MATCH, matched_share
+from dvo.odometry.frames.gate import Gate
 from dvo.odometry.patch.config import with_changes
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
-from dvo.odometry.window.evidence import NO_MATCH, matched_share, missing_content
 
 _RANGES = {"pixels": (0, 2**28), "max_gap": (1, math.inf), "min_matches": (0, 1)}
 
@@ -94,7 +91,7 @@ class DeepVOOdometry:
 
     def reset(self) -> None:
         """Begin a new sequence as a new odometry with the same seed would."""
-        self._sequence = FrameSequence(self.config.max_gap)
+        self._gate = Gate(self.config.pixels, self.config.max_gap)
         self._estimates: list[Estimate] = []
         self._reasons: dict[float, str] = {}
         self._segment = -1  # number of the newest segment; -1 before the first one
@@ -102,8 +99,6 @@ class DeepVOOdometry:
         self._before: np.ndarray | None = None  # image that the next step begins with; None: a segment begins
         self._alone: int | None = None  # position of the frame with that image while no other shows its scene
         self._state: RecurrentState | None = None
-        self._last: np.ndarray | None = None  # last image
-        self._finished = False
 
     @torch.inference_mode()
     def track(self, frame: Frame) -> Estimate:
@@ -122,25 +117,17 @@ class DeepVOOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        if self._finished:
-            raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
-        frame = checked_frame(frame)
-        image, _ = working_image(frame, self.config.pixels)
-        self._sequence.check(frame)
-        if self._last is not None and np.array_equal(image, self._last):
-            self._sequence.repeat(frame.timestamp)
+        admitted = self._gate.admit(frame)
+        if admitted.repeated:
             last = self._estimates[-1]
             return self._record(frame.timestamp, last.confidence, last.reason)
-        self._last = image
-        gap = self._sequence.tick(frame.timestamp)
-        problem = missing_content(image)
-        if problem:
+        if admitted.problem:
             self._before = self._state = self._alone = None
-            return self._record(frame.timestamp, 0.0, problem)
-        reason = ""
+            return self._record(frame.timestamp, 0.0, admitted.problem)
+        gap, reason = admitted.gap, ""
         if gap and not gap.frozen and self._before is not None:
             self._before, self._alone, reason = None, None, str(gap)
-        return self._record(frame.timestamp, self._advance(image), reason)
+        return self._record(frame.timestamp, self._advance(admitted.image), reason)
 
     def finish(self) -> Result:
         """End the sequence. Frames are refused afterwards; a second call gives the same result.
@@ -148,7 +135,7 @@ class DeepVOOdometry:
         Returns:
             Trajectories ``T_wc`` of all segments, each in the world of its first frame; no map.
         """
-        self._finished = True
+        self._gate.finish()
         return self.current()
 
     def current(self) -> Result:

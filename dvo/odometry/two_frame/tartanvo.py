@@ -16,23 +16,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings
 from dvo.data.frame import Frame
-from dvo.data.frame_checks import checked_frame
 from dvo.geometry import se3
 from dvo.models.tartanvo import TartanVO
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.exclusive import exclusive
-from dvo.odometry.frames.frame_sequence import FrameSequence
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.content import NO_MATCH, matched_share
+from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.patch.config import with_changes
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import own_copy, result_of_estimates, withdraw
 from dvo.odometry.two_frame.epipolar_refinement import refine_motion
 from dvo.odometry.two_frame.flow_reliability import flow_weights
 from dvo.odometry.two_frame.two_view import parallax_of, returning_share
-from dvo.odometry.window.evidence import NO_MATCH, matched_share, missing_content
 
 UNRELATED = "new scene"
 """Reason of a break before a frame that does not show what was seen before an interruption."""
@@ -183,17 +180,15 @@ class TartanOdometry:
 
     def reset(self) -> None:
         """Begin a new sequence as a new odometry with the same seed would."""
-        self._sequence = FrameSequence(self.config.max_gap)
+        self._gate = Gate(self.config.pixels, self.config.max_gap)
         self._view: _View | None = None
-        self._last: tuple[np.ndarray, Estimate] | None = None  # working image of the last frame, and its estimate
         self._estimates: list[Estimate] = []
         self._reasons: dict[float, str] = {}  # of losses and breaks, by timestamp
         self._segment = 0
-        self._interrupted = ""  # cause of the interruption since the last frame with a pose
+        self._interruption: str | None = None  # cause of that since the last frame with a pose
         self._shown: np.ndarray | None = None  # image of the last frame, if it had content
         self._alone: int | None = None  # position of that frame if it began a segment, or waits to be placed
         self._pending: tuple[float, np.ndarray, np.ndarray] | None = None  # that frame, if it has no pose for it
-        self._finished = False
         self._info: dict[str, Any] = {}
 
     @torch.inference_mode()
@@ -212,36 +207,11 @@ class TartanOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        if self._finished:
-            raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
-        frame = checked_frame(frame)
-        image, camera = working_image(frame, self.config.pixels)
-        self._sequence.check(frame)
-        if self._last is not None and np.array_equal(image, self._last[0]):
-            self._sequence.repeat(frame.timestamp)
-            estimate = replace(self._last[1], timestamp=frame.timestamp)
-        else:
-            gap = self._sequence.tick(frame.timestamp)
-            if gap is not None:  # the flow decides if the view is that before it
-                self._shown = self._alone = self._pending = None
-            problem = missing_content(image) or self._stranger(frame.timestamp, image, camera.intrinsics)
-            if problem:
-                self._interrupted = self._interrupted or problem
-                if problem != NO_MATCH:
-                    self._shown = self._alone = self._pending = None
-                estimate = Estimate(frame.timestamp, None, Status.LOST, 0.0, self._segment, problem)
-            else:
-                if gap is not None and self._view is not None and not self._interrupted:
-                    self._interrupted = str(gap)
-                    if not gap.frozen:
-                        self._reasons[frame.timestamp] = str(gap)
-                self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.intrinsics.tolist()}
-                if self._pending is not None:  # its scene is confirmed
-                    self._admit(*self._pending)
-                estimate = self._place(frame.timestamp, image, camera.intrinsics)
+        admitted = self._gate.admit(frame)
+        repeated = admitted.repeated
+        estimate = replace(self._estimates[-1], timestamp=frame.timestamp) if repeated else self._measure(admitted)
         if estimate.status is Status.LOST:
             self._reasons[frame.timestamp] = estimate.reason
-        self._last = image, estimate
         self._estimates.append(estimate)
         return own_copy(estimate)
 
@@ -251,7 +221,7 @@ class TartanOdometry:
         Returns:
             Trajectories ``T_wc`` of all segments, each in the world of its first frame, up to scale; no map.
         """
-        self._finished = True
+        self._gate.finish()
         return self.current()
 
     def current(self) -> Result:
@@ -262,6 +232,26 @@ class TartanOdometry:
         """
         info = {**self._info, "seed": self.seed, "config": asdict(self.config)}
         return result_of_estimates(self._estimates, self._reasons, info)
+
+    def _measure(self, admitted: Admitted) -> Estimate:
+        """Estimate of a frame with an image of its own."""
+        time, image, gap, camera = admitted.timestamp, admitted.image, admitted.gap, admitted.camera.intrinsics
+        if gap is not None:  # the flow decides if the view is that before it
+            self._shown = self._alone = self._pending = None
+        problem = admitted.problem or self._stranger(time, image, camera)
+        if problem:
+            self._interruption = self._interruption or problem
+            if problem != NO_MATCH:
+                self._shown = self._alone = self._pending = None
+            return Estimate(time, None, Status.LOST, 0.0, self._segment, problem)
+        if gap is not None and self._view is not None and self._interruption is None:
+            self._interruption = str(gap)
+            if not gap.frozen:
+                self._reasons[time] = str(gap)
+        self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.tolist()}
+        if self._pending is not None:  # its scene is confirmed
+            self._admit(*self._pending)
+        return self._place(time, image, camera)
 
     def _stranger(self, timestamp: float, image: np.ndarray, intrinsics: np.ndarray) -> str:
         """Find out if a frame with content does not show the scene of the frame before it, and remember it."""
@@ -290,7 +280,7 @@ class TartanOdometry:
         """Estimate the pose of a frame with content."""
         pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].to(self.device)
         features = self.model.encode(pixels)
-        view, interrupted, self._interrupted = self._view, self._interrupted, ""
+        view, interruption, self._interruption = self._view, self._interruption, None
         start = se3.identity(dtype=torch.float64)
         self._alone = len(self._estimates)
         if view is None:
@@ -298,7 +288,7 @@ class TartanOdometry:
         camera = torch.as_tensor(intrinsics, dtype=torch.float32, device=self.device)[None]
         motion = self.model.between(view.features, features, camera)
         flow = motion.flows.flow[0].cpu().numpy()
-        if interrupted:
+        if interruption is not None:
             back = self.model.matching.match(features, view.features).flow[0].cpu().numpy()
             if returning_share(flow, back) < self.config.join_share:
                 self._segment += 1

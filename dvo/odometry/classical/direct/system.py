@@ -22,7 +22,7 @@ from dvo.odometry.classical.direct.image import Level, pyramid
 from dvo.odometry.classical.direct.start import TwoViewStart, spread
 from dvo.odometry.classical.direct.stereo import StereoConfig, search_lines
 from dvo.odometry.classical.frame_log import FrameLog, map_of
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.gate import Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
 
@@ -96,6 +96,7 @@ class DirectOdometry:
     def __init__(self, config: DirectConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = changed(config or DirectConfig(), settings)
         self._seed = seed
+        self._gate = Gate(self.config.pixels)
         self._log = FrameLog()
         self._intrinsics, self._size = np.ones(4), (0, 0)
         self._key: Keyframe | None = None
@@ -109,22 +110,26 @@ class DirectOdometry:
         self._counts = {"maps_started": 0, "keyframes": 0}
 
     def track(self, frame: Frame) -> Estimate:
-        index = self._log.begin(frame.timestamp)
-        image, camera = working_image(frame, self.config.pixels)
+        admitted = self._gate.admit(frame)
+        if admitted.repeated and not admitted.problem:
+            return self._log.repeat(frame.timestamp)
+        index, image, camera = self._log.begin(frame.timestamp), admitted.image, admitted.camera
         self._intrinsics, self._size = camera.intrinsics, (camera.width, camera.height)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         levels = pyramid(grey.astype(np.float32), camera.intrinsics, len(self.config.iterations))
+        if self._key is None and admitted.problem:
+            self._start, self._pending = None, []
+            return self._log.lose(index, admitted.problem)
         if self._key is None:
             return self._initialise(grey, levels, image, index)
-        found = self._align(self._key, levels)
+        found = None if admitted.problem else self._align(self._key, levels)
         if found is None:
-            self._log.mark_lost(index)
             self._blind += 1
             if self._blind >= self.config.patience:
                 self._retire(self._key)
                 self._key, self._start, self._blind = None, None, 0
                 self._initialise(grey, levels, image, index)
-            return self._log.estimate(Status.LOST)
+            return self._log.lose(index, admitted.problem)
         self._moved(index, self._key, found)
         self._measure(self._key, levels[0], found)
         shift = np.linalg.norm(found.T[:3, 3]) * self._typical(self._key)
@@ -133,6 +138,7 @@ class DirectOdometry:
         return self._log.estimate(Status.TRACKING, found.agreement)
 
     def finish(self) -> Result:
+        self._gate.finish()
         if self._key is not None:
             self._retire(self._key)
             self._key = None

@@ -27,6 +27,7 @@ from dvo.odometry.classical.keyframe.map import Keyframe, Map
 from dvo.odometry.classical.keyframe.pose import centre, refine_pose
 from dvo.odometry.classical.keyframe.relocalise import relocalise, search
 from dvo.odometry.classical.klt import detect, follow
+from dvo.odometry.frames.gate import Gate
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 
 
@@ -39,6 +40,7 @@ class KeyframeOdometry:
         self.config = changed(config or KeyframeConfig(), settings)
         self._seed = seed
         self._loops = LoopCloser(self.config, seed) if self.config.loops else None
+        self._gate = Gate(pixels=None)
         self._log = FrameLog()
         self._intrinsics, self._size = np.ones(4), (0, 0)
         self._map, self._old = Map(), Map()  # the map in use or being started; the one before it
@@ -57,28 +59,33 @@ class KeyframeOdometry:
         self._counts = {"maps_started": 0, "planar_starts": 0, "keyframes": 0, "culled": 0, "relocalised": 0}
 
     def track(self, frame: Frame) -> Estimate:
-        index = self._log.begin(frame.timestamp)
+        admitted = self._gate.admit(frame)
+        if admitted.repeated and not admitted.problem:
+            return self._log.repeat(frame.timestamp)
+        index, frame = self._log.begin(frame.timestamp), admitted.frame
         self._intrinsics, self._size = frame.camera.intrinsics, (frame.camera.width, frame.camera.height)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        if self._grey is None and admitted.problem:
+            return self._log.lose(index, admitted.problem)
         if self._grey is None:
             self._begin(frame, grey, index)
             return self._log.estimate(Status.INITIALISING)
-        followed = self._follow(grey, index)
+        followed = not admitted.problem and self._follow(grey, index)
         if not self._started:
-            return self._initialise(frame, grey, index, followed)
+            return self._initialise(frame, grey, index, followed, admitted.problem)
         confidence = self._pose(index) if followed else None
         if confidence is None and not self._recover(self._map, grey, index):
-            self._log.mark_lost(index)
             self._blind += 1
             if self._blind >= self.config.patience:
                 self._give_up(frame, grey, index)
-            return self._log.estimate(Status.LOST)
+            return self._log.lose(index, admitted.problem)
         self._grey, self._blind = grey, 0
         if self._wants_keyframe(index):
             self._insert(frame, grey, index)
         return self._log.estimate(Status.TRACKING, confidence or 0.3)
 
     def finish(self) -> Result:
+        self._gate.finish()
         points, colors = zip(*self._retired, self._old.points(), self._map.points(), strict=True)
         info = {
             "working_size": list(self._size),
@@ -270,14 +277,13 @@ class KeyframeOdometry:
         self._old = self._map
         self._begin(frame, grey, index)
 
-    def _initialise(self, frame: Frame, grey: np.ndarray, index: int, followed: bool) -> Estimate:
+    def _initialise(self, frame: Frame, grey: np.ndarray, index: int, followed: bool, problem: str) -> Estimate:
         if self._old.keyframes and self._recover(self._old, grey, index):
             self._grey, self._blind = grey, 0
             return self._log.estimate(Status.TRACKING, 0.3)
         if not followed:
-            self._log.mark_lost(index)
             self._begin(frame, grey, index)
-            return self._log.estimate(Status.LOST)
+            return self._log.lose(index, problem)
         self._grey = grey
         assert self._first is not None
         if self._try_start(self._first, index, grey):

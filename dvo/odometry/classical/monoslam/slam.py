@@ -11,7 +11,7 @@ those in view. Accelerations are in that unit.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import cv2
@@ -35,7 +35,7 @@ from dvo.odometry.classical.monoslam.search import (
     self_likeness,
     templates,
 )
-from dvo.odometry.frames.working_image import working_image
+from dvo.odometry.frames.gate import Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
 
@@ -94,6 +94,7 @@ class MonoSlam:
     def __init__(self, config: MonoSlamConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = changed(config or MonoSlamConfig(), settings)
         self._rng = np.random.default_rng([seed, 7501])
+        self._gate = Gate(self.config.pixels)
         self._times: list[float] = []
         self._poses: list[np.ndarray | None] = []
         self._filter: Filter | None = None
@@ -105,11 +106,15 @@ class MonoSlam:
         self._map: list[tuple[np.ndarray, np.ndarray]] = []
 
     def track(self, frame: Frame) -> Estimate:
-        image, camera = working_image(frame, self.config.pixels)
+        admitted = self._gate.admit(frame)  # a repeated image is measured: the camera stands
+        image, camera = admitted.image, admitted.camera
         pyramid = image_pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self._size = (camera.width, camera.height)
         dt = frame.timestamp - self._times[-1] if self._times else 0.0
         self._times.append(frame.timestamp)
+        if self._filter is None and admitted.problem:
+            self._poses.append(None)
+            return Estimate(frame.timestamp, None, Status.LOST, reason=admitted.problem)
         if self._filter is None:
             self._filter = self._begin(camera.intrinsics)
             self._refill(pyramid, image)
@@ -120,7 +125,7 @@ class MonoSlam:
         looked, matched = self._measure(state, pyramid)
         sound = state.is_sound()
         if matched < c.fewest or matched < 0.25 * looked or not sound:
-            return self._lost(frame, pyramid, image, sound)
+            return replace(self._lost(frame, pyramid, image, sound), reason=admitted.problem)
         self._blind_since = None
         self._tend(state, pyramid, image)
         self._poses.append(self._pose())
@@ -130,7 +135,8 @@ class MonoSlam:
         )
 
     def finish(self) -> Result:
-        self._retire(None)
+        if self._gate.finish():
+            self._retire(None)
         rows = [index for index, pose in enumerate(self._poses) if pose is not None]
         poses = np.array([self._poses[index] for index in rows]).reshape(-1, 7)
         return Result(

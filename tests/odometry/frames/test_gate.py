@@ -1,4 +1,4 @@
-"""Order, size and intervals of frames."""
+"""Admission of frames; order, size and intervals of a sequence."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
-from dvo.odometry.frames.frame_sequence import FrameSequence
+from dvo.odometry.frames.gate import FrameSequence, Gate
 
 
 def ticks(times, max_gap=4.5):
@@ -67,3 +67,27 @@ def test_order_and_size():
     with pytest.raises(DvoError, match="is 80x48, the frames before are 64x48"):
         sequence.check(frame(2.0, width=80))
     sequence.check(frame(2.0))
+
+
+def test_a_gate_keeps_images_of_its_own():
+    """A caller may use its buffers for the next frame."""
+    camera, image, mask = (
+        Camera(50.0, 50.0, 31.5, 23.5, 64, 48),
+        np.zeros((48, 64, 3), np.uint8),
+        np.ones((48, 64), bool),
+    )
+    image[:, ::16] = 200
+    gate = Gate(pixels=None, masks=True)
+    first = gate.admit(Frame(0, 0.0, image, camera, mask=mask))
+    before = first.image.copy()
+    image[:], mask[:] = np.roll(image, 5, 1), False
+    assert np.array_equal(first.image, before) and first.mask.all()
+    assert not gate.admit(Frame(1, 0.1, image, camera)).repeated
+
+
+@pytest.mark.parametrize(("pixels", "size"), [(None, (65, 49)), (0, (64, 48)), (32 * 24, (32, 32))])
+def test_a_gate_gives_the_working_image(pixels, size):
+    camera, image = Camera(50.0, 50.0, 32.0, 24.0, 65, 49), np.zeros((49, 65, 3), np.uint8)
+    admitted = Gate(pixels).admit(Frame(0, 0.0, image, camera))
+    assert admitted.image.shape == (size[1], size[0], 3) and (admitted.camera.width, admitted.camera.height) == size
+    assert admitted.problem == "black image" and admitted.mask is None and admitted.gap is None

@@ -1,4 +1,9 @@
-"""Order, size and intervals of the frames of a sequence."""
+"""Gate of an odometry: what each frame has to pass, and what is known of it before anything is measured.
+
+Every odometry of this package asks the same of its frames, in the same order: the sequence is not finished, the frame
+is valid, has no lens distortion, follows the frame before it in time and has its size; then, whether its image repeats
+that of the frame before it, whether there is a gap in time, and whether the image shows anything.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +12,14 @@ from collections import deque
 from dataclasses import dataclass
 from statistics import median
 
+import numpy as np
+
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
-from dvo.odometry.frames.working_image import working_size
+from dvo.data.frame_checks import checked_frame
+from dvo.geometry.camera import Camera
+from dvo.odometry.frames.content import missing_content
+from dvo.odometry.frames.working_image import working_image, working_size
 
 RECENT = 30
 """Number of intervals that the usual one is the median of."""
@@ -141,3 +151,100 @@ class FrameSequence:
         if self._last is not None:
             self._intervals.append(time - self._last)
         self._last = time
+
+
+@dataclass(frozen=True)
+class Admitted:
+    """Frame that has passed a gate.
+
+    Attributes:
+        frame: checked; depth, right image and inertial samples are not read yet.
+        image: ``(h, w, 3)`` uint8 RGB working image.
+        camera: of the working image.
+        mask: ``(h, w)`` bool, pixels that count; None for all.
+        repeated: the image is that of the frame before it.
+        gap: time without a new image before it; None if there is none, or for a repeated image.
+        problem: what the image shows nothing for, such as ``"black image"``; empty for an image with content.
+    """
+
+    frame: Frame
+    image: np.ndarray
+    camera: Camera
+    mask: np.ndarray | None
+    repeated: bool
+    gap: Gap | None
+    problem: str
+
+    @property
+    def timestamp(self) -> float:
+        """Time of the frame, seconds."""
+        return self.frame.timestamp
+
+
+class Gate:
+    """Admission of the frames of one sequence, for any odometry.
+
+    Args:
+        pixels: of the working image, see :func:`dvo.odometry.frames.working_image.working_size`; None for the image as
+            it is given.
+        max_gap: time between two images above which they are separated by a gap, in medians of the recent intervals.
+        masks: whether the odometry uses masks; otherwise a frame with one is refused.
+
+    Attributes:
+        sequence: order, size and intervals of the frames.
+        finished: no frame is admitted any more.
+
+    Example:
+        >>> from dvo.geometry.camera import Camera
+        >>> gate = Gate(pixels=None)
+        >>> image = np.zeros((48, 64, 3), np.uint8)
+        >>> gate.admit(Frame(0, 0.0, image, Camera(50.0, 50.0, 31.5, 23.5, 64, 48))).problem
+        'black image'
+        >>> gate.admit(Frame(1, 0.1, image, Camera(50.0, 50.0, 31.5, 23.5, 64, 48))).repeated
+        True
+    """
+
+    def __init__(self, pixels: int | None, max_gap: float = math.inf, *, masks: bool = False) -> None:
+        self.pixels, self.masks = pixels, masks
+        self.sequence = FrameSequence(max_gap)
+        self.finished = False
+        self._last: tuple[np.ndarray, str] | None = None  # image of the last frame, and its problem
+
+    def admit(self, frame: Frame) -> Admitted:
+        """Check the next frame, and bring it to the working size.
+
+        Args:
+            frame: as given by the caller.
+
+        Returns:
+            The frame; of a repeated image with the problem that it had before.
+
+        Raises:
+            DvoError: a call after :meth:`finish`, a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a
+                camera with lens distortion, a mask that the odometry does not use, a timestamp that does not increase,
+                or an image of another size than the first.
+        """
+        if self.finished:
+            raise DvoError("the sequence is finished", field="track()", remedy="build an odometry for each sequence")
+        frame = checked_frame(frame)
+        if frame.mask is not None and not self.masks:
+            raise DvoError(
+                "this odometry does not use masks", field="mask", remedy="use weights of patch_vo, or no mask"
+            )
+        image, camera, mask = working_image(frame, self.pixels)
+        self.sequence.check(frame)
+        if self._last is not None and np.array_equal(image, self._last[0]):
+            self.sequence.repeat(frame.timestamp)
+            return Admitted(frame, image, camera, mask, repeated=True, gap=None, problem=self._last[1])
+        gap, problem = self.sequence.tick(frame.timestamp), missing_content(image, mask)
+        self._last = image, problem
+        return Admitted(frame, image, camera, mask, repeated=False, gap=gap, problem=problem)
+
+    def finish(self) -> bool:
+        """Admit no frame from now on.
+
+        Returns:
+            True on the first call.
+        """
+        begun, self.finished = not self.finished, True
+        return begun

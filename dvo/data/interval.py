@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any, TypeVar
 
+import numpy as np
+
 from dvo.core.errors import DvoError
 
 Item = TypeVar("Item", bound=tuple[Any, ...])
@@ -101,41 +103,22 @@ class Interval:
             raise DvoError(f"no frame {self}; read were {end}", file=file, field="start", remedy=remedy)
 
 
-def limit(recording: Any, interval: Interval) -> None:
-    """Limit a newly opened recording to an interval.
+def expected_frames(interval: Interval, count: int | None, times: np.ndarray | None, file: object) -> int | None:
+    """Number of frames of a recording in an interval; None if it is not known before they are read.
 
     Args:
-        recording: a :class:`dvo.data.recording.Recording` with the attribute ``interval``, which it heeds.
-        interval: to read; a recording whose times are known is checked at once.
-
-    Raises:
-        DvoError: the recording cannot be limited, or has no frame in the interval.
-    """
-    if not interval:
-        return
-    if not hasattr(recording, "interval"):
-        message = f"the reader {recording.kind} reads whole recordings"
-        raise DvoError(message, file=recording.path, field="start", remedy="leave out start and end")
-    recording.interval = interval
-    expected_frames(recording)
-
-
-def expected_frames(recording: Any) -> int | None:
-    """Number of frames of a recording in its interval; None if it is not known before they are read.
-
-    Args:
-        recording: a :class:`dvo.data.recording.Recording`.
+        interval: that is read.
+        count: of all frames; None if it is not known.
+        times: ``(count,)`` seconds, of all frames; None if they are not known.
+        file: of the recording, for messages.
 
     Raises:
         DvoError: none is in the interval.
     """
-    interval: Interval = getattr(recording, "interval", Interval())
-    count: int | None = recording.frame_count
     if not interval:
         return count
-    times = getattr(recording, "timestamps", None)
     if times is not None:
-        return sum(1 for _ in interval.select(enumerate(times.tolist()), lambda item: item[1], 1, recording.path))
+        return sum(1 for _ in interval.select(enumerate(times.tolist()), lambda item: item[1], 1, file))
     if count is None or isinstance(interval.start, float) or isinstance(interval.end, float):
         return None
     return max(0, min(count, count if interval.end is None else int(interval.end)) - int(interval.start or 0))

@@ -11,7 +11,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.images.images import decode, list_images
 from dvo.data.images.reduction import Reduction
-from dvo.data.recording import ImageRecording
+from dvo.data.recording import Recording
 from dvo.geometry.undistort import Undistorter
 
 _HALF = 128  # grey level from which a pixel of a JPEG file is white: its black is not exactly 0
@@ -112,14 +112,14 @@ class Masks:
 
 
 def open_masks(
-    path: Path, recording: Any, size: tuple[int, int], invert: bool, reduction: Reduction | None = None
+    path: Path, recording: Recording, size: tuple[int, int], invert: bool, reduction: Reduction | None = None
 ) -> Masks:
     """Masks of a recording.
 
     Args:
         path: an image, or a folder with one for each image of the recording: of the same stem, or else as many as
             there are images, in natural order.
-        recording: a :class:`dvo.data.recording.Recording`.
+        recording: of the images.
         size: width and height of its images.
         invert: white pixels are ignored, black ones used.
         reduction: of the images; None for none.
@@ -131,7 +131,7 @@ def open_masks(
         files = [path]
     else:
         found = list_images(path)
-        images = recording.images if isinstance(recording, ImageRecording) else []
+        images = recording.images or []
         by_stem = {file.stem: file for file in found}
         count = recording.frame_count
         if images and all(image.stem in by_stem for image in images):

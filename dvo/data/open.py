@@ -12,15 +12,15 @@ from dvo.data.calibration.focal_guess import guess_focal
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
-from dvo.data.images.reduction import MAX_PIXELS, reduce_images
-from dvo.data.interval import Bound, Interval, limit
+from dvo.data.images.reduction import MAX_PIXELS, reduction_to
+from dvo.data.interval import Bound, Interval, expected_frames
 from dvo.data.mask import open_masks
 from dvo.data.opening import check_invert, check_stride, first_frame, locate, no_calibration
 from dvo.data.readers.groundtruth import read_groundtruth
 from dvo.data.readers.registry import find_reader
 from dvo.data.readers.rosbag import split_topic
-from dvo.data.recording import ImageRecording, Request
-from dvo.data.source import Source
+from dvo.data.recording import Request, Selection
+from dvo.data.source import Reading, Source
 from dvo.data.streams.capture import is_stream
 from dvo.data.streams.live_source import open_stream
 
@@ -76,7 +76,7 @@ def open_source(
         mask_invert: white is ignored and black used.
         max_pixels: images with more are reduced by area right after they are decoded, by the smallest whole factor that
             suffices (:mod:`dvo.data.images.reduction`); calibration and masks remain those of the recorded images. None
-            for never; streams and bags of ROS are never reduced.
+            for never; streams are never reduced.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -119,32 +119,34 @@ def open_source(
     with lookups(path):
         recording = find_reader(path, reader).open(path, request)
     first = first_frame(recording)
-    limit(recording, interval)
+    expected_frames(interval, recording.frame_count, recording.timestamps, path)  # one without frames is an error
     calibration = recording.calibration if request.calibration is None else request.calibration
     height, width = first.image.shape[:2]
     guessed = None
     if calibration is None:
         if not guess:
             raise no_calibration(path)
-        guessed = guess_focal(recording.images[0] if isinstance(recording, ImageRecording) else path, width, height)
+        guessed = guess_focal(recording.images[0] if recording.images else path, width, height)
         calibration = guessed.calibration
-    turned = getattr(recording, "turned", 0)
     doubts = calibration.doubts(width, height)
-    if turned and calibration.readout:  # rows of the images are columns of the sensor, or come in reverse order
+    if recording.turned and calibration.readout:  # rows of images are columns of the sensor, or in reverse order
         calibration = replace(calibration, readout=0.0)
-        what = "images are" if isinstance(recording, ImageRecording) else "video is"
-        doubts.append(f"the {what} turned by {turned} degrees: the readout of the calibration was not used")
+        what = "images are" if recording.images else "video is"
+        doubts.append(f"the {what} turned by {recording.turned} degrees: the readout of the calibration was not used")
     camera = calibration.camera(width, height)
-    reduction = reduce_images(recording, width, height, max_pixels)
+    reduction = reduction_to(max_pixels, width, height)
     size, masks = (width, height), None
     if mask is not None:
         masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
     truth = recording.groundtruth
     if groundtruth is not None:
-        truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), getattr(recording, "timestamps", None))
+        truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), recording.timestamps)
     try:
-        found = Source(recording, camera, truth, stride, undistort, doubts)
-        found.calibration, found.guess, found.masks = calibration, guessed, masks
-        return found
+        selection = Selection(interval, stride, reduction)
+        reading = Reading(
+            camera, selection, calibration=calibration, guess=guessed, masks=masks, groundtruth=truth,
+            undistort=undistort, doubts=tuple(doubts),
+        )  # fmt: skip
+        return Source(recording, reading)
     except DvoError as error:  # the lens model does not know its file
         raise DvoError(error.message, file=calibration.file, field=error.field, remedy=error.remedy) from None

@@ -69,7 +69,7 @@ def first_frame(recording: Recording) -> RawFrame:
     """First frame that decodes.
 
     Args:
-        recording: as opened.
+        recording: as opened, from its first frame on.
 
     Raises:
         DvoError: there is none.

@@ -41,13 +41,31 @@ class Request:
 
 
 @dataclass(frozen=True)
+class Selection:
+    """What is read of a recording.
+
+    Attributes:
+        interval: frames before it are not decoded, if the recording allows it, and those after it not read.
+        stride: every how many-th frame of the interval is wanted.
+        reduction: of the images, right after they are decoded; None for none.
+    """
+
+    interval: Interval = Interval()
+    stride: int = 1
+    reduction: Reduction | None = None
+
+
+EVERYTHING = Selection()
+
+
+@dataclass(frozen=True)
 class RawFrame:
     """An image as recorded.
 
     Attributes:
         index: position in the recording from 0, unreadable images counted.
         timestamp: seconds.
-        image: ``(H, W, 3)`` uint8 RGB; reduced, if the recording was told so.
+        image: ``(H, W, 3)`` uint8 RGB; reduced, if the selection says so.
         origin: file name or frame number, for messages.
         depth: loads the depth image of this frame: ``(H, W)`` float32 metres with nan for unknown, or None.
         right: loads the right image of this frame: ``(H, W, 3)`` uint8 RGB, or None.
@@ -100,6 +118,9 @@ class Recording(Protocol):
         kind: name of the reader.
         path: file or folder that the user named.
         frame_count: number of frames; None if it is not known before they are read.
+        timestamps: ``(frame_count,)`` seconds; None if they are not known before they are read.
+        images: files of the images, one a frame; None for a recording of another kind.
+        turned: degrees clockwise by which frames are turned to stand upright.
         calibration: of the images as recorded; None if the data set has none.
         groundtruth: camera-to-world poses; None if the data set has none.
         warnings: guesses and oddities that the user should know, a sentence each.
@@ -116,20 +137,32 @@ class Recording(Protocol):
     warnings: list[str]
 
     @property
+    def timestamps(self) -> np.ndarray | None: ...
+
+    @property
+    def images(self) -> list[Path] | None: ...
+
+    @property
+    def turned(self) -> int: ...
+
+    @property
     def stereo(self) -> Callable[[], StereoRig | None] | None: ...
 
     @property
     def inertial(self) -> Callable[[], InertialSamples] | None: ...
 
-    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
-        """Frames from the first to the last.
+    def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
+        """Frames in order.
 
         Args:
             log: receives what could not be read.
-            stride: every how many-th frame is wanted.
+            selection: of them.
 
         Yields:
-            Every ``stride``-th frame that can be read, times strictly increasing.
+            The selected frames that can be read, times strictly increasing.
+
+        Raises:
+            DvoError: no frame is in the interval.
         """
         ...
 
@@ -176,17 +209,12 @@ class ImageRecording:
         sensors: files of other sensors.
 
     Attributes:
-        interval: that is read, see :func:`dvo.data.interval.limit`.
-        reduction: of the images, see :func:`dvo.data.images.reduction.reduce_images`.
         orientation: of EXIF, by which all images are turned; 1 (as stored) if they do not agree, or if the data set has
             depth or right images.
 
     Raises:
         DvoError: no images, or times that are not finite.
     """
-
-    interval = Interval()
-    reduction: Reduction | None = None
 
     def __init__(
         self,
@@ -218,8 +246,8 @@ class ImageRecording:
                 f"{int((~later).sum())} images are not later than the one before and were dropped, "
                 f"the first is {first} (give right times with --times)"
             )
-        self.images = [image for image, keep in zip(images, later, strict=True) if keep]
-        self.timestamps = np.asarray(timestamps, dtype=np.float64)[later]
+        self.images: list[Path] = [image for image, keep in zip(images, later, strict=True) if keep]
+        self.timestamps: np.ndarray = np.asarray(timestamps, dtype=np.float64)[later]
         self.frame_count: int | None = len(self.images)
         has_others = self.sensors.depth is not None or self.sensors.right is not None
         self.orientation = 1 if has_others else common_orientation(self.images, self.warnings)
@@ -239,28 +267,29 @@ class ImageRecording:
         """Degrees clockwise by which images are turned to stand upright, as their EXIF data ask for."""
         return turn(self.orientation)
 
-    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+    def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """See :class:`Recording`."""
-        numbered = enumerate(self.timestamps.tolist())
-        for index, _ in self.interval.select(numbered, lambda item: item[1], stride, self.path):
-            frame = self.frame(index, log)
+        numbered, interval = enumerate(self.timestamps.tolist()), selection.interval
+        for index, _ in interval.select(numbered, lambda item: item[1], selection.stride, self.path):
+            frame = self.frame(index, log, selection.reduction)
             if frame is None:
                 log.unreadable.append(self.images[index].name)
             else:
                 yield frame
 
-    def frame(self, index: int, log: Log) -> RawFrame | None:
+    def frame(self, index: int, log: Log, reduction: Reduction | None = None) -> RawFrame | None:
         """One frame, in any order.
 
         Args:
             index: position in ``images``.
             log: receives depth and right images that cannot be read.
+            reduction: of the image; None for none.
 
         Returns:
             The frame, or None if its image is corrupt.
         """
         file = self.images[index]
-        image = read_image(file, self.reduction, self.orientation)
+        image = read_image(file, reduction, self.orientation)
         if image is None:
             return None
         depth = partial(self._depth, file, log) if self.sensors.depth else None

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -12,10 +14,9 @@ from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.focal_guess import FocalGuess
 from dvo.data.frame import Frame, InertialSamples, StereoView
-from dvo.data.images.reduction import Reduction
 from dvo.data.interval import expected_frames
 from dvo.data.mask import Masks
-from dvo.data.recording import ImageRecording, Log, RawFrame, Recording
+from dvo.data.recording import EVERYTHING, ImageRecording, Log, RawFrame, Recording, Selection
 from dvo.data.sensors.depth import registered_depth, resized_depth
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
@@ -23,13 +24,65 @@ from dvo.geometry.field_of_view import notice_of_cut
 from dvo.geometry.undistort import Undistorter, needs_undistortion
 
 
+class Stage(Protocol):
+    """Step between a recording and the frames of a source, such as the files of another sensor; a frozen object."""
+
+    def __call__(self, frames: Iterator[RawFrame], log: Log, selection: Selection) -> Iterator[RawFrame]:
+        """Change frames.
+
+        Args:
+            frames: of the recording, or of the stage before.
+            log: receives what could not be read.
+            selection: of the recording that is read.
+
+        Yields:
+            The same frames, with more in them.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How frames are made of a recording: what is read, the stages that follow, and cameras and masks.
+
+    Attributes:
+        recorded_camera: of the images as recorded.
+        selection: of the recording.
+        stages: that follow, in order.
+        calibration: of the recorded images, as read; None for a stream.
+        guess: of the focal length; None for a calibration.
+        masks: of the recorded images; None for none.
+        depth_calibration: of depth images that are not registered to the images; None for others.
+        groundtruth: camera-to-world poses; None for none.
+        undistort: resample images, depth, masks and right images to pinhole cameras.
+        doubts: guesses at opening, in sentences for the user.
+        rig: reads the calibration of the right camera; None for that of the recording.
+    """
+
+    recorded_camera: Camera
+    selection: Selection = EVERYTHING
+    stages: tuple[Stage, ...] = ()
+    calibration: Calibration | None = None
+    guess: FocalGuess | None = None
+    masks: Masks | None = None
+    depth_calibration: Calibration | None = None
+    groundtruth: Trajectory | None = None
+    undistort: bool = True
+    doubts: tuple[str, ...] = ()
+    rig: Callable[[], StereoRig | None] | None = None
+
+
 class Source:
     """Frames of one recording, to be iterated any number of times. Made by :func:`dvo.data.open.open_source`.
 
     Depth, right images and inertial samples, where the recording has them, are read when a frame's field is first read.
 
+    Args:
+        recording: as its reader found it.
+        reading: how frames are made of it.
+
     Attributes:
-        recording: as its reader found it, before cameras and undistortion.
+        recording, reading: the same.
         name: of the sequence.
         kind: name of the reader, see :data:`dvo.data.readers.registry.READERS`.
         path: file or folder that was opened.
@@ -39,44 +92,41 @@ class Source:
         calibration: of the recorded images, as read; None for a stream.
         masks: of the recorded images; None for none.
         guess: of the focal length, for a source without a calibration that was opened with one; None otherwise.
-        depth_calibration: of depth images that are not registered to the images; None for others.
         turned: degrees clockwise by which frames are turned to stand upright, as a video or EXIF data ask for.
         stride: every how many-th frame is read.
         frame_count: frames to expect, the stride taken into account; None if a video does not say. A video's header may
             promise more than can be read.
         groundtruth: camera-to-world poses of the camera that is read, or None. World frame and scale are the dataset's.
+
+    Raises:
+        DvoError: no frame in the interval.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        recorded_camera: Camera,
-        groundtruth: Trajectory | None,
-        stride: int,
-        undistort: bool,
-        doubts: list[str],
-    ) -> None:
-        self.recording = recording
+    def __init__(self, recording: Recording, reading: Reading) -> None:
+        self.recording, self.reading = recording, reading
         self._log = Log()
-        self.name, self.kind, self.path = recording.name, recording.kind, recording.path
-        self.recorded_camera, self.groundtruth, self.stride = recorded_camera, groundtruth, stride
-        self._undistort = undistort
-        self.reduction: Reduction | None = getattr(recording, "reduction", None)
-        read = recorded_camera if self.reduction is None else self.reduction.camera(recorded_camera)
-        self._undistorter = Undistorter(read) if undistort and needs_undistortion(read) else None
+        self.name, self.kind, self.path, self.turned = recording.name, recording.kind, recording.path, recording.turned
+        self.recorded_camera, self.groundtruth = reading.recorded_camera, reading.groundtruth
+        self.calibration, self.guess, self.masks = reading.calibration, reading.guess, reading.masks
+        self.stride, self.reduction = reading.selection.stride, reading.selection.reduction
+        read = self.recorded_camera if self.reduction is None else self.reduction.camera(self.recorded_camera)
+        self._undistorter = Undistorter(read) if reading.undistort and needs_undistortion(read) else None
         self._right_undistorter: Undistorter | None = None  # the size of right images is not known before the first
         self.camera = self._undistorter.camera if self._undistorter else read
         self._cut = notice_of_cut(read, self.camera) if self._undistorter else []
-        count = expected_frames(recording)
-        self.frame_count: int | None = None if count is None else -(-count // stride)
-        self._doubts = doubts
-        self.calibration: Calibration | None = None
-        self.guess: FocalGuess | None = None
-        self.masks: Masks | None = None
-        self.depth_calibration: Calibration | None = None
-        self.turned: int = getattr(recording, "turned", 0)
+        interval = reading.selection.interval
+        count = expected_frames(interval, recording.frame_count, recording.timestamps, recording.path)
+        self.frame_count: int | None = None if count is None else -(-count // self.stride)
 
-    def recalibrated(self, calibration: Calibration) -> Source:
+    def changed(self, **changes: Any) -> Self:
+        """The same recording, read in another way.
+
+        Args:
+            changes: of the attributes of :class:`Reading`.
+        """
+        return type(self)(self.recording, replace(self.reading, **changes))
+
+    def recalibrated(self, calibration: Calibration) -> Self:
         """The same recording with another calibration.
 
         Args:
@@ -86,10 +136,7 @@ class Source:
             DvoError: intrinsics that do not fit the images.
         """
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        found = Source(self.recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
-        found.calibration, found.masks = calibration, self.masks
-        found.depth_calibration = self.depth_calibration
-        return found
+        return self.changed(recorded_camera=camera, calibration=calibration, guess=None)
 
     def __len__(self) -> int:
         """``frame_count``.
@@ -104,7 +151,7 @@ class Source:
     @property
     def warnings(self) -> list[str]:
         """Guesses at opening and faults of the last pass so far, in sentences for the user."""
-        return [*self.recording.warnings, *self._doubts, *self._cut, *self._log.messages()]
+        return [*self.recording.warnings, *self.reading.doubts, *self._cut, *self._log.messages()]
 
     @property
     def skipped(self) -> int:
@@ -114,8 +161,7 @@ class Source:
     @property
     def timestamps(self) -> np.ndarray | None:
         """Seconds, one for every image of the recording whatever the stride; None for a video."""
-        recording = self.recording
-        return recording.timestamps if isinstance(recording, ImageRecording) else None
+        return self.recording.timestamps
 
     def frames_at(self, indices: Sequence[int]) -> list[tuple[Frame, Path]]:
         """Read single frames of a recording that is made of image files.
@@ -132,12 +178,12 @@ class Source:
         recording = self.recording
         if not isinstance(recording, ImageRecording):
             raise DvoError("a video is read in order only", file=self.path, remedy="extract its frames into a folder")
-        frames = []
+        frames: list[tuple[Frame, Path]] = []
         for index in indices:
-            raw = recording.frame(index, self._log)
+            raw = recording.frame(index, self._log, self.reduction)
             if raw is None:
                 raise DvoError("cannot be decoded", file=recording.images[index], remedy="remove or replace the image")
-            frames.append((self._frame(raw, None), recording.images[index]))
+            frames.extend((self._frame(whole, None), recording.images[index]) for whole in self._staged(iter([raw])))
         return frames
 
     def __iter__(self) -> Iterator[Frame]:
@@ -148,7 +194,7 @@ class Source:
         """
         self._log = log = Log()
         previous = float("inf")
-        for raw in self.recording.frames(log, self.stride):
+        for raw in self._staged(self.recording.frames(log, self.reading.selection)):
             height, width = raw.image.shape[:2]
             if (width, height) != (self.camera.width, self.camera.height):
                 raise DvoError(
@@ -159,6 +205,12 @@ class Source:
                 )
             yield self._frame(raw, previous)
             previous = raw.timestamp
+
+    def _staged(self, frames: Iterator[RawFrame]) -> Iterator[RawFrame]:
+        """Frames after all stages."""
+        for stage in self.reading.stages:
+            frames = stage(frames, self._log, self.reading.selection)
+        return frames
 
     def _frame(self, raw: RawFrame, previous: float | None) -> Frame:
         """Frame of a recorded image; ``previous``: time after which its inertial samples begin, None for none."""
@@ -175,14 +227,15 @@ class Source:
         depth = load()
         if depth is None:
             return None
-        if self.depth_calibration is not None:
-            return registered_depth(depth, self.depth_calibration, self.camera)
+        if self.reading.depth_calibration is not None:
+            return registered_depth(depth, self.reading.depth_calibration, self.camera)
         depth = resized_depth(depth, (self.camera.width, self.camera.height), origin)
         return self._undistorter.depth(depth) if self._undistorter else depth
 
     @cached_property
     def _rig(self) -> StereoRig | None:
-        return self.recording.stereo() if self.recording.stereo else None
+        read = self.reading.rig or self.recording.stereo
+        return None if read is None else read()
 
     def _right(self, load: Callable[[], np.ndarray | None]) -> StereoView | None:
         rig = self._rig
@@ -192,7 +245,7 @@ class Source:
         camera = rig.calibration.camera(image.shape[1], image.shape[0])
         if self.reduction is not None and image.shape[1::-1] == self.reduction.recorded:
             image, camera = self.reduction(image), self.reduction.camera(camera)
-        if self._undistort and needs_undistortion(camera):
+        if self.reading.undistort and needs_undistortion(camera):
             if self._right_undistorter is None or self._right_undistorter.source != camera:
                 self._right_undistorter = Undistorter(camera)
             image, camera = self._right_undistorter(image), self._right_undistorter.camera

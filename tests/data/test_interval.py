@@ -64,7 +64,7 @@ def test_a_folder_keeps_times_and_numbers_and_decodes_no_other_image(make, monke
     frame = ImageRecording.frame
     source = open_source(path, calib=CALIB, times="../times.txt", start=1.0, end="9f", stride=3)
     monkeypatch.setattr(
-        ImageRecording, "frame", lambda self, index, log: (read.append(index), frame(self, index, log))[1]
+        ImageRecording, "frame", lambda self, index, *others: (read.append(index), frame(self, index, *others))[1]
     )
     frames = list(source)
     assert [(f.index, f.timestamp) for f in frames] == [(2, 101.0), (5, 102.5), (8, 104.0)]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import StereoRig
 from dvo.data.files.files import listed_files
 from dvo.data.files.stamps import times_from_names
 from dvo.data.images.images import list_images
-from dvo.data.recording import ImageRecording, Log, RawFrame
+from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Selection
 from dvo.data.sensors.sensors import Finder, NearestInTime, SameNumbers
 
 
@@ -45,35 +45,62 @@ class _InOrder:
         return self.files.get(image)
 
 
-class CompanionRecording:
-    """Video with files of another sensor in the order of its frames; everything else is that of another recording.
+@dataclass(frozen=True)
+class CompanionFiles:
+    """Stage that adds the images of another sensor to frames; they are read when they are first wanted.
 
-    Args:
-        recording: of the images.
-        add: frame with what the file holds, from a frame, its file and the log of the pass.
-        files: of each frame.
-        stereo: reads the calibration of the right camera, if the files are right images.
+    Attributes:
+        field: of the frame that they are for, ``depth`` or ``right``.
+        file: of a frame, from its position in the recording; None for none.
+        read: image of a file; None if it cannot be decoded.
     """
 
-    def __init__(
-        self,
-        recording: Any,
-        add: Callable[[RawFrame, Path, Log], RawFrame],
-        files: list[Path],
-        stereo: Callable[[], StereoRig | None] | None = None,
-    ) -> None:
-        self._recording, self._add, self._files = recording, add, files
-        self.stereo = recording.stereo if stereo is None else stereo
+    field: Literal["depth", "right"]
+    file: Callable[[int], Path | None]
+    read: Callable[[Path], np.ndarray | None]
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # of a copy that is not filled yet
-            raise AttributeError(name)
-        return getattr(self._recording, name)
+    def __call__(self, frames: Iterator[RawFrame], log: Log, selection: Selection) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.source.Stage`."""
+        for raw in frames:
+            load = partial(self._load, raw.index, log)
+            yield replace(raw, depth=load) if self.field == "depth" else replace(raw, right=load)
 
-    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
-        """See :class:`dvo.data.recording.Recording`."""
-        for raw in self._recording.frames(log, stride):
-            yield self._add(raw, self._files[raw.index], log) if raw.index < len(self._files) else raw
+    def _load(self, index: int, log: Log) -> np.ndarray | None:
+        file = self.file(index)
+        image = None if file is None else self.read(file)
+        if file is not None and image is None:
+            log.without.append(file.name)
+        return image
+
+
+def files_of_frames(path: Path | None, recording: Recording, kind: CompanionKind) -> Callable[[int], Path | None]:
+    """Rule by which files belong to the frames of a recording.
+
+    Args:
+        path: existing folder, or for images a list of ``time file`` rows; None is refused.
+        recording: images (:func:`companions_of_images`), or another one, whose frames have files of a folder in order.
+        kind: of the files.
+
+    Returns:
+        Function from the position of a frame to its file.
+
+    Raises:
+        DvoError: no files, or files that belong to no frame.
+    """
+    if isinstance(recording, ImageRecording) and path is not None:
+        return of_positions(companions_of_images(path, recording, kind), recording)
+    files = companions_of_frames(path, recording.frame_count, kind)
+    return lambda index: files[index] if index < len(files) else None
+
+
+def of_positions(finder: Finder, recording: ImageRecording) -> Callable[[int], Path | None]:
+    """Rule for the positions of images.
+
+    Args:
+        finder: rule for their files.
+        recording: of the images.
+    """
+    return lambda index: finder(recording.images[index])
 
 
 def companions_of_images(path: Path, recording: ImageRecording, kind: CompanionKind) -> Finder:

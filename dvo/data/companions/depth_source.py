@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration
 from dvo.data.calibration.read import read_calibration
-from dvo.data.companions.companions import CompanionKind, CompanionRecording, companions_of_frames, companions_of_images
+from dvo.data.companions.companions import CompanionFiles, CompanionKind, files_of_frames, of_positions
 from dvo.data.opening import locate
 from dvo.data.readers.tum import DEPTH_SCALE
-from dvo.data.recording import ImageRecording, Log, RawFrame
+from dvo.data.recording import ImageRecording
 from dvo.data.sensors.depth import read_depth
 from dvo.data.source import Source
 
@@ -58,37 +55,20 @@ def with_depth(
     """
     if scale is not None and not 0 < scale < float("inf"):
         raise DvoError(f"is {scale}", field="--depth-scale", remedy="give the units of a metre, such as 1000")
-    found, recording = copy.copy(source), source.recording
+    changes: dict[str, Any] = {}
     if calib is not None:
         if not isinstance(calib, Calibration):
             calib = read_calibration(locate(calib, source.path, "depth-calib"))
-        found.depth_calibration = calib
-    path = None if depth is None else locate(depth, source.path, "depth")
-    if not isinstance(recording, ImageRecording):
-        files = companions_of_frames(path, recording.frame_count, _KIND)
-        found.recording = CompanionRecording(recording, partial(_with_file, scale=scale or MILLIMETRES), files)
-        return found
-    own = recording.sensors
-    if path is None and own.depth is None:
-        remedy = "give --depth PATH: a folder of 16-bit PNG files, or a list such as depth.txt"
-        raise DvoError("the source has no depth of its own", file=source.path, field=_KIND.option, remedy=remedy)
-    sensors = replace(own, depth_scale=scale or own.depth_scale)
-    if path is not None:
-        finder = companions_of_images(path, recording, _KIND)
-        sensors = replace(own, depth=finder, depth_scale=scale or (DEPTH_SCALE if path.is_file() else MILLIMETRES))
-    changed = copy.copy(recording)
-    changed.sensors = sensors
-    found.recording = changed
-    return found
-
-
-def _with_file(raw: RawFrame, file: Path, log: Log, scale: float) -> RawFrame:
-    """Frame of a video with the depth of a file."""
-    return replace(raw, depth=partial(_depth, file, log, scale))
-
-
-def _depth(file: Path, log: Log, scale: float) -> np.ndarray | None:
-    depth = read_depth(file, scale)
-    if depth is None:
-        log.without.append(file.name)
-    return depth
+        changes["depth_calibration"] = calib
+    path, recording = None if depth is None else locate(depth, source.path, "depth"), source.recording
+    own = recording.sensors.depth if isinstance(recording, ImageRecording) else None
+    if isinstance(recording, ImageRecording) and path is None:
+        if own is None:
+            remedy = "give --depth PATH: a folder of 16-bit PNG files, or a list such as depth.txt"
+            raise DvoError("the source has no depth of its own", file=source.path, field=_KIND.option, remedy=remedy)
+        file, usual = of_positions(own, recording), recording.sensors.depth_scale
+    else:
+        file = files_of_frames(path, recording, _KIND)
+        usual = DEPTH_SCALE if path is not None and path.is_file() else MILLIMETRES
+    stage = CompanionFiles("depth", file, partial(read_depth, scale=scale or usual))
+    return source.changed(stages=(*source.reading.stages, stage), **changes)

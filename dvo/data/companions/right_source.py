@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
-
-import numpy as np
+from typing import TypeGuard, TypeVar
 
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig, rectified
 from dvo.data.calibration.stereo import right_camera
-from dvo.data.companions.companions import CompanionKind, CompanionRecording, companions_of_frames, companions_of_images
+from dvo.data.companions.companions import (
+    CompanionFiles,
+    CompanionKind,
+    companions_of_images,
+    files_of_frames,
+    of_positions,
+)
 from dvo.data.images.images import read_image
-from dvo.data.interval import Interval
 from dvo.data.opening import locate
 from dvo.data.readers.registry import find_reader
 from dvo.data.readers.sequence import RIGHT_OF
-from dvo.data.recording import ImageRecording, Log, RawFrame, Request
+from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request, Selection
 from dvo.data.sensors.sensors import Finder
 from dvo.data.source import Source
 
@@ -63,55 +65,60 @@ def with_right(source: Source, right: Path | str | None = None, baseline: float 
         message = "a stereo pair needs the focal length, which was guessed"
         raise DvoError(message, file=source.path, field=_KIND.option, remedy="give a calibration with --calib")
     path = None if right is None else locate(right, source.path, "right")
-    recording, found = source.recording, copy.copy(source)
-    found.__dict__.pop("_rig", None)  # of the source, if it has been read
-    if isinstance(recording, ImageRecording):
-        own = recording.sensors
-        finder = own.right if path is None else companions_of_images(path, recording, _KIND)
-        finder = finder or _beside(source, recording)
-        sensors = replace(own, right=finder, stereo=_rig(source, baseline))
-        found.recording = copy.copy(recording)
-        found.recording.sensors = sensors
-        return found
-    rig = _rig(source, baseline)
-    if path is not None and path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
-        found.recording = PairedRecording(recording, find_reader(path, None).open(path, Request()), rig)
-    else:
-        files = companions_of_frames(path, recording.frame_count, _KIND)
-        found.recording = CompanionRecording(recording, _with_file, files, rig)
-    return found
+    recording, stages = source.recording, source.reading.stages
+    orientation = recording.orientation if isinstance(recording, ImageRecording) else 1
+    read = partial(read_image, reduction=None, orientation=orientation)
+    if not isinstance(recording, ImageRecording) and is_video(path):
+        stages = (*stages, CompanionVideo.of(recording, path))
+    elif isinstance(recording, ImageRecording) and path is None and recording.sensors.right is None:
+        stages = (*stages, CompanionFiles("right", of_positions(_beside(source, recording), recording), read))
+    elif path is not None or not isinstance(recording, ImageRecording):
+        stages = (*stages, CompanionFiles("right", files_of_frames(path, recording, _KIND), read))
+    return source.changed(stages=stages, rig=_rig(source, baseline))
 
 
-class PairedRecording:
-    """Video whose right images are the frames of another one with the same numbers.
+def is_video(path: Path | None) -> TypeGuard[Path]:
+    """True for a file with the name of a video.
 
     Args:
-        recording: of the left images.
-        right: of the right images.
-        stereo: see :class:`dvo.data.recording.Recording`.
+        path: None for none.
+    """
+    return path is not None and path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
-    Raises:
-        DvoError: they have different numbers of frames.
+
+@dataclass(frozen=True)
+class CompanionVideo:
+    """Stage that adds the frames of another video with the same numbers as right images.
+
+    Attributes:
+        recording: of the right images.
     """
 
-    def __init__(self, recording: Any, right: Any, stereo: Callable[[], StereoRig]) -> None:
-        counts = recording.frame_count, right.frame_count
+    recording: Recording
+
+    @classmethod
+    def of(cls, left: Recording, path: Path) -> CompanionVideo:
+        """Open the video of the right images.
+
+        Args:
+            left: recording of the left images.
+            path: of the video.
+
+        Raises:
+            DvoError: they have different numbers of frames.
+        """
+        right = find_reader(path, None).open(path, Request())
+        counts = left.frame_count, right.frame_count
         if None not in counts and counts[0] != counts[1]:
             message = f"{counts[1]} frames, the left video has {counts[0]}"
-            raise DvoError(message, file=right.path, field=_KIND.option, remedy="give videos with the same frames")
-        self._recording, self._right, self.stereo = recording, right, stereo
+            raise DvoError(message, file=path, field=_KIND.option, remedy="give videos with the same frames")
+        return cls(right)
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):  # of a copy that is not filled yet
-            raise AttributeError(name)
-        return getattr(self._recording, name)
-
-    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
-        """See :class:`dvo.data.recording.Recording`."""
-        self._right.interval = getattr(self._recording, "interval", Interval())
-        others = self._right.frames(Log(), stride)
+    def __call__(self, frames: Iterator[RawFrame], log: Log, selection: Selection) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.source.Stage`."""
+        others = self.recording.frames(Log(), replace(selection, reduction=None))
         other: RawFrame | None = next(others, None)
-        for raw in self._recording.frames(log, stride):
+        for raw in frames:
             while other is not None and other.index < raw.index:
                 other = next(others, None)
             if other is not None and other.index == raw.index:
@@ -153,18 +160,6 @@ def _rig(source: Source, baseline: float | None) -> Callable[[], StereoRig]:
     fx, fy, cx, cy = camera.intrinsics.tolist()
     calibration = Calibration(fx, fy, cx, cy, camera.model, camera.coefficients, camera.width, camera.height)
     return rectified(calibration, baseline)
-
-
-def _with_file(raw: RawFrame, file: Path, log: Log) -> RawFrame:
-    """Frame of a video with the right image of a file."""
-    return replace(raw, right=partial(_read, file, log))
-
-
-def _read(file: Path, log: Log) -> np.ndarray | None:
-    image = read_image(file)
-    if image is None:
-        log.without.append(file.name)
-    return image
 
 
 def _same(found: T) -> T:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -70,16 +69,15 @@ class Reduction:
         return camera.resized(*self.size)
 
 
-def reduce_images(recording: Any, width: int, height: int, max_pixels: int | None) -> Reduction | None:
-    """Let a recording reduce its images by the smallest factor that leaves at most ``max_pixels``.
+def reduction_to(max_pixels: int | None, width: int, height: int) -> Reduction | None:
+    """Reduction by the smallest factor that leaves at most a number of pixels.
 
     Args:
-        recording: a :class:`dvo.data.recording.Recording`; one without the attribute ``reduction`` is left as it is.
-        width, height: of its images, pixels.
         max_pixels: pixels of an image; None for any number.
+        width, height: of the recorded images, pixels.
 
     Returns:
-        What it will do; None for nothing.
+        None if they are small enough.
 
     Raises:
         DvoError: ``max_pixels`` is not positive.
@@ -89,7 +87,4 @@ def reduce_images(recording: Any, width: int, height: int, max_pixels: int | Non
     if not max_pixels > 0:  # NaN fails too
         raise DvoError(f"{max_pixels} pixels", field="max_pixels", remedy="give a positive number, or None")
     factor = math.ceil(math.sqrt(width * height / max_pixels))
-    if factor < 2 or not hasattr(recording, "reduction"):
-        return None
-    recording.reduction = Reduction((width, height), factor)
-    return recording.reduction
+    return None if factor < 2 else Reduction((width, height), factor)

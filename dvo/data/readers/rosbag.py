@@ -20,9 +20,8 @@ from dvo.data.calibration.values import from_values
 from dvo.data.files.files import MAX_NUMBER, is_file, lookups
 from dvo.data.files.stamps import checked_rate, read_times
 from dvo.data.frame import InertialSamples
-from dvo.data.interval import Interval
 from dvo.data.readers.ros_images import decode_message
-from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
 SUFFIXES = (".bag", ".mcap", ".db3")
@@ -112,7 +111,9 @@ class BagRecording:
     """
 
     kind = "rosbag"
-    interval = Interval()
+    timestamps: np.ndarray | None = None
+    images: list[Path] | None = None
+    turned = 0
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
 
@@ -163,7 +164,7 @@ class BagRecording:
             self.warnings.append(f"{name} was not used: {error.message}")
             return None
 
-    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+    def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; messages passed over by the stride are not decoded."""
         previous, late = -np.inf, False
         with _opened(self.path) as reader:
@@ -173,7 +174,9 @@ class BagRecording:
                 index, connection, recorded, data = item
                 return self._time(index, reader.deserialize(data, connection.msgtype), recorded)
 
-            for index, connection, recorded, data in self.interval.select(numbered, time, stride, self.path):
+            for index, connection, recorded, data in selection.interval.select(
+                numbered, time, selection.stride, self.path
+            ):
                 message = reader.deserialize(data, connection.msgtype)
                 timestamp = self._time(index, message, recorded)
                 if not timestamp > previous:
@@ -187,6 +190,7 @@ class BagRecording:
                     log.unreadable.append(f"image {index}")
                     continue
                 previous = timestamp
+                image = image if selection.reduction is None else selection.reduction(image)
                 yield RawFrame(index, timestamp, image, origin)
 
     def _time(self, index: int, message: Any, recorded: int) -> float:

@@ -18,9 +18,7 @@ from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.frame import InertialSamples
 from dvo.data.images.image_header import MAX_PIXELS
 from dvo.data.images.images import SUFFIXES, to_rgb8
-from dvo.data.images.reduction import Reduction
-from dvo.data.interval import Interval
-from dvo.data.recording import Log, RawFrame, Reader, Recording, Request
+from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -112,8 +110,6 @@ class VideoRecording:
         request: options of the user.
 
     Attributes:
-        interval: that is read, see :func:`dvo.data.interval.limit`; frames before it are decoded, but not converted.
-        reduction: of the images, see :func:`dvo.data.images.reduction.reduce_images`.
         turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
             rows of the sensor in the order in which it reads them.
 
@@ -122,8 +118,8 @@ class VideoRecording:
     """
 
     kind = "video"
-    interval = Interval()
-    reduction: Reduction | None = None
+    timestamps: np.ndarray | None = None
+    images: list[Path] | None = None
     calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
@@ -162,8 +158,8 @@ class VideoRecording:
             return read_times(file, last + 1)
         return times
 
-    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
-        """See :class:`dvo.data.recording.Recording`; only every ``stride``-th frame is converted."""
+    def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
+        """See :class:`dvo.data.recording.Recording`; frames that are not wanted are decoded, but not converted."""
         read, last, previous, dropped = 0, 0.0, -np.inf, 0
 
         def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
@@ -174,8 +170,8 @@ class VideoRecording:
                 yield index, milliseconds
 
         with _capture(self.path) as capture:
-            for index, milliseconds in self.interval.select(
-                grabbed(capture), lambda item: self._time(*item), stride, self.path
+            for index, milliseconds in selection.interval.select(
+                grabbed(capture), lambda item: self._time(*item), selection.stride, self.path
             ):
                 timestamp = self._time(index, milliseconds)
                 if timestamp is None or not previous < timestamp < np.inf:  # NaN fails too
@@ -188,12 +184,12 @@ class VideoRecording:
                     log.unreadable.append(f"frame {index}")
                     continue
                 previous = timestamp
-                image = image if self.reduction is None else self.reduction(image)
+                image = image if selection.reduction is None else selection.reduction(image)
                 yield RawFrame(index, timestamp, to_rgb8(image), f"{self.path} frame {index}")
         missing = (self.frame_count or 0) - read - len(log.unreadable)
         if self._use_container and missing > 0:  # of a variable rate the announced number may be rate times duration
             missing = min(missing, round((self.frame_count or 0) - 1 - last / 1000 * self._fps))
-        if missing > 0 and self.interval.end is None:
+        if missing > 0 and selection.interval.end is None:
             # healthy files may be off by a frame or so: estimated counts, edit lists
             verdict = ": it is cut short or damaged" if missing > max(1, (self.frame_count or 0) // 200) else ""
             log.notes.append(f"the video announces {self.frame_count} frames, {read} could be read{verdict}")

@@ -8,10 +8,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig
@@ -20,11 +22,11 @@ from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import checked_rate
 from dvo.data.frame import InertialSamples
 from dvo.data.images.images import decode_bytes, to_rgb8
-from dvo.data.interval import Bound, Interval, limit
+from dvo.data.interval import Bound, Interval
 from dvo.data.mask import open_masks
 from dvo.data.opening import check_invert, check_stride
-from dvo.data.recording import Log, RawFrame
-from dvo.data.source import Source
+from dvo.data.recording import EVERYTHING, Log, RawFrame, Selection
+from dvo.data.source import Reading, Source
 from dvo.data.streams.capture import STANDARD_INPUT, Capture, StreamClock, is_stream, shown
 from dvo.data.streams.image_pipe import pipe_reader, split_images
 from dvo.data.streams.live import LiveFrames, StreamCounts
@@ -63,8 +65,10 @@ class LiveRecording(Generic[T]):
     """
 
     kind = "stream"
-    interval = Interval()
     frame_count: int | None = None
+    timestamps: np.ndarray | None = None
+    images: list[Path] | None = None
+    turned = 0
     calibration: Calibration | None = None
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
@@ -105,15 +109,16 @@ class LiveRecording(Generic[T]):
         after = "" if then is None else f", and then: {then.message}"
         return DvoError(f"the first {what}{after}", file=self.live.name, remedy="check the stream")
 
-    def frames(self, log: Log, stride: int = 1) -> Iterator[RawFrame]:
+    def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; the stride counts frames that were not dropped."""
         numbered = enumerate(self.live)
-        for _, item in self.interval.select(numbered, lambda item: item[1].timestamp, stride, self.live.name):
+        interval, reduction = selection.interval, selection.reduction
+        for _, item in interval.select(numbered, lambda item: item[1].timestamp, selection.stride, self.live.name):
             raw = self.decode(item)
             if raw is None:
                 log.unreadable.append(f"image {item.index}")
             else:
-                yield raw
+                yield raw if reduction is None else replace(raw, image=reduction(raw.image))
         dropped = self.live.counts.dropped
         self.live.stop()  # at the end of an interval the stream goes on
         self.live.counts.dropped = dropped  # what waits lies behind the interval
@@ -146,13 +151,6 @@ class LiveSource(Source):
     def times(self) -> str:
         """Origin of the times."""
         return self.recording.times
-
-    def recalibrated(self, calibration: Calibration) -> LiveSource:
-        """The same stream with another calibration; see :meth:`dvo.data.source.Source.recalibrated`."""
-        camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
-        found = LiveSource(self.recording, camera, self.groundtruth, self.stride, self._undistort, self._doubts)
-        found.masks = self.masks
-        return found
 
     def stop(self) -> None:
         """End the iteration as soon as possible. May be called from any thread, and in a signal handler."""
@@ -231,15 +229,13 @@ def open_stream(
     else:
         recording, timeout = _of_pipe(source, fps, queue, stopped), None
     try:
-        limit(recording, interval)
         first = recording.first(timeout)
         height, width = first.image.shape[:2]
         doubts = calib.doubts(width, height) if calib else [_assumption(width, height)]
         camera = (calib or guess_from_angle(width, height).calibration).camera(width, height)
-        found = LiveSource(recording, camera, None, stride, undistort, doubts)
-        if mask is not None:
-            found.masks = open_masks(Path(mask), recording, (width, height), mask_invert)
-        return found
+        masks = None if mask is None else open_masks(Path(mask), recording, (width, height), mask_invert)
+        selection = Selection(interval, stride)
+        return LiveSource(recording, Reading(camera, selection, undistort=undistort, masks=masks, doubts=tuple(doubts)))
     except BaseException:
         recording.live.close()
         raise

@@ -39,7 +39,7 @@ def test_paths_beside_the_source(make):
     depth_image(make, "seq/d/1.png", 1, 1000)
     make.calib("seq/depth.txt")
     found = with_depth(source, "../d", calib="../depth.txt")
-    assert depths(found) == [1, None, None] and found.depth_calibration is not None
+    assert depths(found) == [1, None, None] and found.reading.depth_calibration is not None
     for given in ({"depth": "d"}, {"calib": "depth.txt"}):
         with pytest.raises(DvoError, match="no such file") as caught:
             with_depth(source, **given)

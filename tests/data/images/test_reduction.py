@@ -10,7 +10,7 @@ from dvo.core.errors import DvoError
 from dvo.data import Calibration, open_source
 from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
-from dvo.data.images.reduction import MAX_PIXELS, Reduction
+from dvo.data.images.reduction import MAX_PIXELS, Reduction, reduction_to
 from dvo.geometry.camera import Camera
 from dvo.odometry.global_ba.focal_length import FocalProfile
 from dvo.odometry.global_ba.self_calibration import Minimum
@@ -50,15 +50,9 @@ def folder(make, suffix="png", width=WIDTH, height=HEIGHT, name="images"):
     ],
 )
 def test_the_smallest_factor(size, limit, factor):
-    from dvo.data.images.reduction import reduce_images
-
-    class Recording:
-        reduction = None
-
-    found = reduce_images(Recording, *size, limit)
-    assert (1 if found is None else found.factor) == factor and Recording.reduction is found
-    assert reduce_images(Recording, *size, None) is None
-    assert reduce_images(object(), *size, 1) is None  # a reader that cannot
+    found = reduction_to(limit, *size)
+    assert (1 if found is None else found.factor) == factor
+    assert reduction_to(None, *size) is None
 
 
 @pytest.mark.parametrize(("suffix", "tolerance"), [("png", 0.51), ("jpg", 1)])

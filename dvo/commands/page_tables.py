@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.metrics.table import shown
 from dvo.session.frame_table import FrameRow
 from dvo.viz.run_page import colour_of
 
@@ -52,13 +53,10 @@ def figures(facts: dict[str, Any], rows: Sequence[FrameRow]) -> list[tuple[str, 
     quality = facts.get("quality") or {}
     found = [("verdict", str(quality["verdict"]))] if quality.get("verdict") else []
     found.append(("tracked frames", f"{frames.get('tracked', '?')} of {frames.get('read', '?')}"))
-    if metrics.get("ate_rmse") is not None:
-        group = "SE(3)" if metrics.get("alignment") == "se3" else "Sim(3)"
-        found.append((f"ATE after {group}", f"{metrics['ate_rmse']:.3g} m"))
-        if metrics.get("ate_percent") is not None:
-            found.append(("ATE / path length", f"{metrics['ate_percent']:.2f} %"))
-    if metrics.get("rpe_rot_deg") is not None:
-        found.append(("RPE rotation", f"{metrics['rpe_rot_deg']:.3g}°"))
+    group = "SE(3)" if metrics.get("alignment") == "se3" else "Sim(3)"
+    for metric, text in shown(metrics):
+        noun = metric.title.split()[0]
+        found.append((f"{noun} after {group}" if noun == "ATE" else noun, f"{text} {metric.unit}"))
     found.append(("segments", str(len(facts.get("segments") or []))))
     found.append(("breaks", str(len(facts.get("breaks") or []))))
     if "loops" in info:

@@ -10,6 +10,7 @@ from typing import Any
 from dvo.commands.console import say
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics, evaluate
+from dvo.metrics.table import shown
 from dvo.odometry.protocol import Break
 from dvo.session import results
 from dvo.session.session import Run
@@ -199,7 +200,10 @@ def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = (
     if metrics is not None and metrics.reason:
         say(f"no error against ground truth: {metrics.reason}")
     elif metrics is not None:
-        relative = f"RPE {metrics.rpe_trans:.3g} m and {metrics.rpe_rot_deg:.3g} deg a frame"
+        relative = " and ".join(
+            f"{text} {metric.unit}" for metric, text in shown(metrics, ("rpe_trans", "rpe_rot_deg"))
+        )
+        relative = f"RPE {relative} a frame"
         group = "SE(3)" if metrics.alignment == "se3" else "Sim(3)"
         wrong = "" if scores.scale is None else f", scale wrong by {100 * abs(1 / scores.scale - 1):.2f} %"
         longest = " of the longest segment" if several else ""

@@ -20,6 +20,7 @@ from dvo.metrics import align_trajectory, associate, relative_rotation_errors
 from dvo.metrics.segment_metrics import World, match_worlds, scored_worlds
 from dvo.odometry.protocol import Segment
 from dvo.viz.plot import INK, PAPER, plan_axes, with_gaps
+from eval.scoring.metric_table import METRICS
 from eval.scoring.summary import quartiles
 from eval.suites.suite import Suite
 
@@ -87,7 +88,7 @@ def plot_sequence(
     shown = _thin(groundtruth.positions)
     plan.plot(*shown[:, [first, second]].T, color=TRUTH_COLOR, lw=4.5, label="ground truth", solid_capstyle="round")
     plan.plot(*groundtruth.positions[0, [first, second]], "o", color=INK, ms=6, zorder=5)
-    by_rotation = judged_by == "rpe_rot_deg"
+    by_rotation = METRICS[judged_by].unit == "°"
     typical = []
     for name, style in styles(list(estimates)).items():
         look: dict[str, Any] = {"color": style.color, "lw": style.width, "ls": style.line}

@@ -21,14 +21,11 @@ from eval.reporting.loops import NOTE, TITLES, loop_lines, loop_table
 from eval.reporting.plots import plot_axis, plot_sequence, plot_speed, styles
 from eval.reporting.tables import MADE_UP_NOTE, SEGMENTS_NOTE, axis_table, markdown, one_line, speed_note, write_csv
 from eval.reporting.verdict import verdicts
+from eval.scoring.metric_table import BLACKOUT, FIGURES, METRICS, OVERALL, RESOURCES
 from eval.scoring.score import Row
 from eval.scoring.summary import (
-    FIGURES,
     NOTHING,
     NULL,
-    RECOVERY,
-    RESOURCES,
-    UNITS,
     VOID,
     Axis,
     Cell,
@@ -49,23 +46,6 @@ from eval.suites.suite import Sequence, Suite
 RESULTS, TABLE, AXES, PAGE, FIGURE_FOLDER = "results.csv", "table.md", "axes.md", "report.html", "figures"
 LOOPS = "loops.md"
 TEMPLATES = Path(__file__).resolve().parent / "templates"
-# Title, field, digits, meaning; of the table of systems.
-OVERALL = (
-    ("complete %", "completeness", 0),
-    ("rot. error / rot.", "rotation_error_ratio", 2),
-    ("scale drift", "scale_drift", 2),
-    ("ATE AUC", "auc", 2),
-    ("pose AUC 1°", "pose_auc_1", 2),
-    ("2°", "pose_auc_2", 2),
-    ("5°", "pose_auc_5", 2),
-    ("10°", "pose_auc_10", 2),
-    ("RPE per distance %", "rpe_distance_percent", 1),
-    ("t_rel %", "t_rel", 2),
-    ("r_rel °/100 m", "r_rel", 2),
-    ("ATE m, true scale per frame", "ate_per_frame_scale", 3),
-)
-AREAS = ("auc", "pose_auc_1", "pose_auc_2", "pose_auc_5", "pose_auc_10")  # means over runs; the rest are medians
-BLACKOUT = (("segment ATE %", "segment_ate_percent", 2), *RECOVERY)
 
 
 @dataclass(frozen=True)
@@ -161,7 +141,7 @@ def content(out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str],
         "axis_figures": [axis_figure(axis, manifest, rows, figures) for axis in axes],
         "speed_figures": speed_figures(axes, manifest, rows, figures),
         "speed_note": speed_note(manifest, rows),
-        "overall_titles": [column[0] for column in (*OVERALL, *segment_columns(rows), *RESOURCES)],
+        "overall_titles": [metric.title for metric in (*OVERALL, *segment_columns(rows), *RESOURCES)],
         "overall": [(name, overall(name, rows)) for name in manifest.systems],
         "notes": {"segments": SEGMENTS_NOTE, "made-up poses": MADE_UP_NOTE},
         "loops": {"note": NOTE, "titles": TITLES, "lines": loop_lines(manifest, rows)},
@@ -247,7 +227,7 @@ def speed_figures(axes: list[Axis], manifest: Manifest, rows: list[Row], figures
                     pair = (resource_cell(mine, "fps").median, error_cell(mine, judge).median)
                     points.setdefault(system, []).append(pair)
         if any(math.isfinite(error) and error > 0 for pairs in points.values() for _, error in pairs):
-            unit = UNITS.get(judge, judge)
+            unit = METRICS[judge].title
             svg = plot_speed(points, unit)
             found.append((f"{unit} against frames a second, by system", figures(f"speed_{judge}", svg)))
     return found
@@ -265,20 +245,14 @@ def overall(system: str, rows: list[Row]) -> list[str]:
     """
     mine = [row for row in rows if row.system == system and row.status not in VOID]
     cells = []
-    for _, field, digits in OVERALL:
-        values = [float(getattr(row, field)) for row in mine]
-        if field == "completeness":
-            values = [100 * value for value in values]
-        cells.append(_text(_overall(field, values), digits))
-    for _, field, digits, factor in segment_columns(rows):  # means: most runs have one segment
-        values = [factor * float(getattr(row, field)) for row in mine if row.tracked]
-        cells.append(_text(_mean(values), max(digits, 1)))
-    return cells + [resource_cell(mine, field).middle(digits) for _, field, digits in RESOURCES]
-
-
-def _overall(field: str, values: list[float]) -> float:
-    """Mean of an area, median of everything else; values without a meaning are left out."""
-    return _mean(values) if field in AREAS else summarise(values).median
+    for metric in OVERALL:
+        values = [metric.factor * float(getattr(row, metric.name)) for row in mine]
+        found = _mean(values) if metric.over_runs == "mean" else summarise(values).median
+        cells.append(_text(found, metric.digits))
+    for metric in segment_columns(rows):  # means: most runs have one segment
+        values = [metric.factor * float(getattr(row, metric.name)) for row in mine if row.tracked]
+        cells.append(_text(_mean(values), max(metric.digits, 1)))
+    return cells + [resource_cell(mine, metric.name).middle(metric.digits) for metric in RESOURCES]
 
 
 def _mean(values: list[float]) -> float:
@@ -303,12 +277,11 @@ def sequence_section(
     lines = []
     for name, group in groups.items():
         texts = []
-        for _, field, digits in columns:
-            resource = any(field == other for _, other, _ in RESOURCES)
-            found = resource_cell(group, field) if resource else error_cell(group, field)
-            texts.append((found.text(digits), field == sequence.judged_by and judged[name].best))
+        for metric in columns:
+            found = (resource_cell if metric in RESOURCES else error_cell)(group, metric.name)
+            texts.append((found.text(metric.digits), metric.name == sequence.judged_by and judged[name].best))
         shares = [summarise([100 * row.completeness for row in group]).text(0)]
-        shares += [count_cell(group, field, factor).text(digits) for _, field, digits, factor in extra]
+        shares += [count_cell(group, metric).text(metric.digits) for metric in extra]
         failed = sum(row.failed for row in group)
         states = ", ".join(dict.fromkeys(row.status for row in group if row.failed))
         lines.append((name, f"{failed}/{len(group)}" + (f" {states}" if states else ""), shares, texts))
@@ -325,7 +298,7 @@ def sequence_section(
         "sequence": sequence,
         "frames": max((row.frames for row in mine), default=0),
         "length": max(known, default=math.nan),
-        "columns": ["complete %", *(column[0] for column in (*extra, *columns))],
+        "columns": [METRICS["completeness"].title, *(metric.title for metric in (*extra, *columns))],
         "lines": lines,
         "figure": figure,
         "reason": next((one_line(row.reason) for row in mine if row.status == "no data"), ""),

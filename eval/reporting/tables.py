@@ -10,12 +10,9 @@ from pathlib import Path
 
 from dvo.metrics.segment_metrics import FRAMES_PER_WORLD, SEGMENT_POSES
 from eval.execution.plan import Manifest
+from eval.scoring.metric_table import FIGURES, METRICS, RECOVERY, RESOURCES, SCALE
 from eval.scoring.score import COLUMNS, Row
 from eval.scoring.summary import (
-    FIGURES,
-    RECOVERY,
-    RESOURCES,
-    SCALE,
     axes_of,
     axis_cells,
     count_cell,
@@ -85,9 +82,8 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     extra = segment_columns(rows)
     figures = [*FIGURES, *(SCALE if suite.alignment == "se3" else ())]
     figures += RECOVERY if any(one.judged_by == "recovery_s" for one in suite.sequences) else ()
-    names = ["sequence", "system", "runs failed", *(title for title, _, _ in figures), "complete %"]
-    names += [title for title, _, _, _ in extra]
-    names += [title for title, _, _ in RESOURCES]
+    names = ["sequence", "system", "runs failed", *(metric.title for metric in figures), METRICS["completeness"].title]
+    names += [metric.title for metric in (*extra, *RESOURCES)]
     lines = [protocol(manifest, suite, rows), "", _line(names), _line(["---"] * 2 + ["--:"] * (len(names) - 2))]
     for sequence in suite.sequences:
         groups = {name: [r for r in rows if r.sequence == sequence.name and r.system == name] for name in systems}
@@ -95,12 +91,12 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
         judged = judged_cells(sequence, groups)
         for position, (name, group) in enumerate(groups.items()):
             cells = []
-            for _, field, digits in figures:
-                text = error_cell(group, field).text(digits)
-                cells.append(f"**{text}**" if field == sequence.judged_by and judged[name].best else text)
+            for metric in figures:
+                text = error_cell(group, metric.name).text(metric.digits)
+                cells.append(f"**{text}**" if metric.name == sequence.judged_by and judged[name].best else text)
             cells.append(summarise([100 * row.completeness for row in group]).text(0))
-            cells += [count_cell(group, field, factor).text(digits) for _, field, digits, factor in extra]
-            cells += [resource_cell(group, field).text(digits) for _, field, digits in RESOURCES]
+            cells += [count_cell(group, metric).text(metric.digits) for metric in extra]
+            cells += [resource_cell(group, metric.name).text(metric.digits) for metric in RESOURCES]
             failed = sum(row.failed for row in group)
             title = f"{sequence.name} ({sequence.about})" if sequence.about else sequence.name
             lines.append(_line([title if position == 0 else "", name, f"{failed}/{len(group)}", *cells]))
@@ -129,12 +125,10 @@ def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     }
     worked = "; ".join(f"{name}: {size}" for name, size in sizes.items() if size)
     judges = list(dict.fromkeys(sequence.judged_by for sequence in suite.sequences))
-    turned = [sequence.name for sequence in suite.sequences if sequence.judged_by == "rpe_rot_deg"]
-    said = "by ATE in percent of the path" + (f", {', '.join(turned)} by RPE in degrees" if turned else "")
-    if judges == ["rpe_rot_deg"]:
-        said = "by RPE in degrees"
-    elif judges == ["recovery_s"]:
-        said = "by the seconds until the pose is right again in the world of before the dark"
+    names = {judge: [sequence.name for sequence in suite.sequences if sequence.judged_by == judge] for judge in judges}
+    usual = max(judges, key=lambda judge: len(names[judge]))
+    said = f"by {METRICS[usual].title}"
+    said += "".join(f", {', '.join(names[judge])} by {METRICS[judge].title}" for judge in judges if judge != usual)
     sentences = [
         f"**{suite.label}** (suite `{suite.name}`).",
         f"Alignment {suite.alignment}; every {suite.stride}. image fed;"

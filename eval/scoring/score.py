@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, make_dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -18,99 +18,40 @@ from eval.execution.predict import RECORD, Prediction, read_prediction, read_seg
 from eval.scoring.blackout import dark_spans
 from eval.scoring.errors import Errors, all_errors
 from eval.scoring.loops import LoopErrors, loop_errors
+from eval.scoring.metric_table import METRICS, Scored
 from eval.suites.suite import Sequence as Recording
 from eval.suites.suite import Suite, reference_for
 
-SAME_FRAME = 1e-4  # seconds between the stamps of a frame and of its pose
-AUC_METRES = 1.0  # DPVO's "AUC" of a run is max(0, 1 - ATE / 1 m); a table's is the mean over runs, failed ones 0
+_ABOUT = ("system", str), ("version", str), ("suite", str), ("sequence", str), ("seed", int), ("status", str)
+_COUNTS = ("frames", int), ("tracked", int), ("alignment", str)
+_MEASURED = ("threads", int), ("parallel", int), ("device", str), ("reason", str)
+_FIRST = (
+    "ate_rmse", "rpe_trans", "rpe_rot_deg", "completeness", "fps", "latency_p95_ms", "peak_memory_mb",
+)  # fmt: skip
+_REST = tuple(name for name in METRICS if name not in _FIRST)
 
+Row = make_dataclass(
+    "Row",
+    [
+        *_ABOUT,
+        *_COUNTS,
+        *((name, float) for name in _FIRST),
+        ("stride", int),
+        ("resolution", str),
+        *((name, float) for name in _REST),
+        *_MEASURED,
+    ],  # fmt: skip
+    frozen=True,
+    namespace={
+        "__module__": __name__,
+        "__doc__": """One run in results.csv; fields are the columns, nan where a value has no meaning.
 
-@dataclass(frozen=True)
-class Row:
-    """One run in results.csv; fields are the columns, nan where a value has no meaning.
-
-    Attributes:
-        ate_rmse, ate_percent: metres, percent of the path; after the alignment, as all errors.
-        rpe_trans, rpe_rot_deg: median over all pairs of frames :attr:`Suite.rpe_gap` apart; ``_rmse`` beside.
-        rotation_error_ratio: sum of relative rotation errors over sum of relative rotations; 1 without any turn.
-        scale_drift: scale of the last third over scale of the first, minus 1.
-        t_rel, r_rel, kitti_longest_m: see :class:`eval.scoring.metrics.SegmentErrors`.
-        auc: DPVO's, of this run: ``max(0, 1 - ATE)`` with a metre as threshold, 0 for a failed run.
-        pose_auc_1, ...: see :func:`eval.scoring.metrics.relative_pose_auc`; 0 for a failed run.
-        ate_per_frame_scale: metres, every step given the true length first; not comparable with an ordinary ATE.
-        ate_rot_deg: root mean square angle to the truth after the alignment.
-        rpe_distance_m, rpe_distance_percent, rpe_distance_deg: see :class:`eval.scoring.metrics.PathErrors`.
-        blackouts, segment_ate_percent, recovery_s: see :class:`eval.scoring.blackout.BlackoutErrors`.
-        segments: number of segments of the trajectory, those that share a world counted once.
-        scored: share of the frames fed that have a pose in a segment that counts for the ATE.
-        unseen: number of frames without a view, see :func:`eval.scoring.blackout.without_view`.
-        made_up: share of them that carry a pose; nan without such a frame.
-        scale_error: percent by which the scale of the longest segment is wrong, with the alignment SE(3).
-        ate_sim3_percent: of the path, after a Sim(3) alignment where that of the suite is SE(3).
-        loops, false_loops, revisit_s, loop_recall: see :class:`eval.scoring.loops.LoopErrors`.
-        threads, parallel, device: how the resources were measured; ``parallel`` above 1 means on a shared machine.
-    """
-
-    system: str
-    version: str
-    suite: str
-    sequence: str
-    seed: int
-    status: str
-    frames: int
-    tracked: int
-    alignment: str
-    ate_rmse: float
-    rpe_trans: float
-    rpe_rot_deg: float
-    completeness: float
-    fps: float
-    latency_p95_ms: float
-    peak_memory_mb: float
-    stride: int
-    resolution: str
-    rotation_error_ratio: float
-    scale_drift: float
-    t_rel: float
-    r_rel: float
-    kitti_longest_m: float
-    auc: float
-    pose_auc_1: float
-    pose_auc_2: float
-    pose_auc_5: float
-    pose_auc_10: float
-    ate_per_frame_scale: float
-    ate_percent: float
-    ate_rot_deg: float
-    rpe_distance_m: float
-    rpe_distance_percent: float
-    rpe_distance_deg: float
-    rpe_trans_rmse: float
-    rpe_rot_deg_rmse: float
-    path_length: float
-    blackouts: int
-    segment_ate_percent: float
-    recovery_s: float
-    segments: int
-    scored: float
-    unseen: int
-    made_up: float
-    loops: float
-    false_loops: float
-    revisit_s: float
-    loop_recall: float
-    scale_error: float
-    ate_sim3_percent: float
-    threads: int
-    parallel: int
-    device: str
-    reason: str
-
-    @property
-    def failed(self) -> bool:
-        return self.status != "ok"
-
-
+    Beside those of the run they are the metrics of :mod:`eval.scoring.metric_table`. ``threads``, ``parallel`` and
+    ``device`` tell how the resources were measured; ``parallel`` above 1 means on a shared machine.
+    """,
+        "failed": property(lambda row: row.status != "ok"),
+    },
+)
 COLUMNS = tuple(column.name for column in fields(Row))
 
 
@@ -185,29 +126,29 @@ def score(
     stamps = np.array(prediction.stamps, dtype=np.float64)
     status, reason = prediction.status, prediction.reason
     frames = len(stamps)
-    errors = Errors()
+    errors, reference = Errors(), None
     if groundtruth is not None and frames:
+        reference = reference_for(groundtruth, stamps)
         unseen = np.isin(stamps, prediction.unseen)
         most = most_worlds(frames, len(dark_spans(stamps, unseen)))
-        errors = all_errors(segments, reference_for(groundtruth, stamps), suite, prediction.dark, most)
+        errors = all_errors(segments, reference, suite, prediction.dark, most)
     ran = prediction.status == "ok"
     loops = loop_errors(prediction.info, sequence, prediction.stamps, prediction.unseen) if ran else LoopErrors()
     metrics = errors.metrics
     completeness = prediction.tracked / frames if frames else math.nan
     scored = completeness if math.isnan(errors.scored) else completeness * errors.scored
-
-    def value(name: str) -> float:
-        return math.nan if metrics is None else float(getattr(metrics, name))
-
     if status == "ok" and not completeness >= suite.lost_below:
         status, reason = "lost", f"{prediction.tracked} of {frames} frames have a pose"
     elif status == "ok" and not scored >= suite.lost_below and metrics is not None:
         status, reason = "lost", metrics.reason or "too little of it is scored"
     elif status == "ok" and metrics is not None and metrics.reason:
         reason = metrics.reason
-        judged = getattr(metrics, sequence.judged_by, value("ate_percent"))
+        judged = getattr(metrics, sequence.judged_by, metrics.ate_percent)
         if not math.isfinite(judged):
             status = "failed"
+    run = Scored(
+        prediction, segments, reference, suite, errors, loops, len(worlds_of(segments)), completeness, scored, status
+    )
     return Row(
         system=system,
         version=prediction.version,
@@ -218,73 +159,11 @@ def score(
         frames=frames,
         tracked=prediction.tracked,
         alignment=suite.alignment,
-        ate_rmse=value("ate_rmse"),
-        rpe_trans=value("rpe_trans"),
-        rpe_rot_deg=value("rpe_rot_deg"),
-        completeness=completeness,
-        fps=_number(prediction.fps),
-        latency_p95_ms=_number(prediction.latency_p95_ms),
-        peak_memory_mb=_number(prediction.peak_memory_mb),
         stride=suite.stride,
         resolution=prediction.resolution,
-        rotation_error_ratio=value("rotation_error_ratio"),
-        scale_drift=value("scale_drift"),
-        t_rel=errors.kitti.t_rel,
-        r_rel=errors.kitti.r_rel,
-        kitti_longest_m=errors.kitti.longest_m,
-        auc=_area(status, max(0.0, 1 - value("ate_rmse") / AUC_METRES)),
-        pose_auc_1=_area(status, errors.pose_auc.get(1.0, math.nan)),
-        pose_auc_2=_area(status, errors.pose_auc.get(2.0, math.nan)),
-        pose_auc_5=_area(status, errors.pose_auc.get(5.0, math.nan)),
-        pose_auc_10=_area(status, errors.pose_auc.get(10.0, math.nan)),
-        ate_per_frame_scale=errors.per_frame_scale,
-        ate_percent=value("ate_percent"),
-        ate_rot_deg=errors.rotation,
-        rpe_distance_m=errors.path.distance_m,
-        rpe_distance_percent=errors.path.trans_percent,
-        rpe_distance_deg=errors.path.rot_deg,
-        rpe_trans_rmse=value("rpe_trans_rmse"),
-        rpe_rot_deg_rmse=value("rpe_rot_deg_rmse"),
-        path_length=value("path_length"),
-        blackouts=errors.blackout.blackouts,
-        segment_ate_percent=errors.blackout.segment_ate_percent,
-        recovery_s=errors.blackout.recovery_s,
-        segments=len(worlds_of(segments)),
-        scored=scored,
-        unseen=len(prediction.unseen),
-        made_up=made_up_share(prediction.unseen, segments) if prediction.status == "ok" else math.nan,
-        loops=loops.loops,
-        false_loops=loops.false,
-        revisit_s=loops.revisit_s,
-        loop_recall=loops.recall,
-        scale_error=errors.scale_error,
-        ate_sim3_percent=100 * errors.shape / value("path_length") if value("path_length") > 0 else math.nan,
         threads=prediction.threads,
         parallel=prediction.parallel,
         device=prediction.device,
         reason=reason,
+        **{name: metric.find(run) for name, metric in METRICS.items()},
     )
-
-
-def made_up_share(unseen: Sequence[float], segments: Sequence[Segment]) -> float:
-    """Share of the frames without a view that carry a pose; nan without such a frame.
-
-    Args:
-        unseen: timestamps of the frames without a view, seconds.
-        segments: of the run.
-    """
-    if not unseen:
-        return math.nan
-    stamps = np.concatenate([np.zeros(0), *(segment.trajectory.timestamps for segment in segments)])
-    return sum(bool((np.abs(stamps - stamp) < SAME_FRAME).any()) for stamp in unseen) / len(unseen)
-
-
-def _area(status: str, found: float) -> float:
-    """An area under a recall curve: what a run did not do counts as not recalled; without data there is no curve."""
-    if status in ("no data", "not run", "unavailable"):
-        return math.nan
-    return found if status == "ok" and math.isfinite(found) else 0.0
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)

@@ -13,33 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dvo.metrics.table import Metric
 from eval.execution.plan import Manifest
+from eval.scoring.metric_table import MADE_UP, METRICS, SEGMENTS
+from eval.scoring.metric_table import NEVER_MADE as VOID
 from eval.scoring.score import Row
 from eval.suites.suite import Sequence as Recording
 from eval.suites.suite import Suite
 
-# Column of the table, field of the row, digits.
-FIGURES = (
-    ("ATE %", "ate_percent", 2),
-    ("ATE m", "ate_rmse", 3),
-    ("RPE m", "rpe_trans", 4),
-    ("RPE °", "rpe_rot_deg", 3),
-    ("rot. error / rot.", "rotation_error_ratio", 2),
-    ("scale drift", "scale_drift", 2),
-)
-SCALE = (
-    ("scale error %", "scale_error", 2),
-    ("ATE %, Sim(3)", "ate_sim3_percent", 2),
-)  # shown where the alignment leaves the scale to the systems
-RECOVERY = (("recovery s", "recovery_s", 1),)  # shown where sequences are judged by it
-# Column, field, digits, factor; shown where a run has several segments, or frames without a view.
-SEGMENTS = (("segments", "segments", 0, 1.0), ("scored %", "scored", 0, 100.0))
-MADE_UP = (("made-up poses %", "made_up", 0, 100.0),)
-RESOURCES = (("frames/s", "fps", 1), ("p95 ms", "latency_p95_ms", 0), ("MB", "peak_memory_mb", 0))
-UNITS = {"ate_percent": "ATE %", "rpe_rot_deg": "RPE °", "segment_ate_percent": "segment ATE %", "recovery_s": "s"}
-DIGITS = {field: digits for _, field, digits in (*FIGURES, *SCALE, *RECOVERY)}
 NULL = "null"
-VOID = ("no data", "not run", "unavailable")  # states in which a run was never made
 NOTHING = "–"
 
 
@@ -68,13 +50,13 @@ class Axis:
 
     @property
     def unit(self) -> str:
-        """Unit of the error."""
-        return UNITS.get(self.judged_by, self.judged_by)
+        """Name of the error, with its unit."""
+        return METRICS[self.judged_by].title
 
     @property
     def digits(self) -> int:
         """Digits after the point with which the error is shown."""
-        return DIGITS.get(self.judged_by, 2)
+        return METRICS[self.judged_by].digits
 
 
 @dataclass(frozen=True)
@@ -182,8 +164,8 @@ def resource_cell(rows: Sequence[Row], field: str) -> Cell:
     return summarise([float(getattr(row, field)) for row in rows], failed=sum(row.failed for row in rows))
 
 
-def segment_columns(rows: Iterable[Row]) -> list[tuple[str, str, int, float]]:
-    """Columns on segments and on frames without a view that a table of some runs needs: title, field, digits, factor.
+def segment_columns(rows: Iterable[Row]) -> list[Metric]:
+    """Columns on segments and on frames without a view that a table of some runs needs.
 
     Args:
         rows: of the table.
@@ -194,15 +176,14 @@ def segment_columns(rows: Iterable[Row]) -> list[tuple[str, str, int, float]]:
     return [*(SEGMENTS if several or any(row.blackouts for row in rows) else ()), *(MADE_UP if unseen else ())]
 
 
-def count_cell(rows: Iterable[Row], field: str, factor: float = 1.0) -> Cell:
-    """Summary of a count or a share over the runs that left a trajectory.
+def count_cell(rows: Iterable[Row], metric: Metric) -> Cell:
+    """Summary of a count or a share over the runs that left a trajectory, as it is shown.
 
     Args:
         rows: of some runs.
-        field: column of results.csv.
-        factor: on the values, 100 for percent.
+        metric: the column.
     """
-    return summarise([factor * float(getattr(row, field)) for row in rows if row.tracked])
+    return summarise([metric.factor * float(getattr(row, metric.name)) for row in rows if row.tracked])
 
 
 def best_of(cells: Mapping[str, Cell], digits: int | None = None) -> set[str]:

@@ -17,6 +17,7 @@ from dvo.data.open import open_source
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, associate
+from eval.scoring.metric_table import JUDGES
 from eval.suites.axes import Axes, choose, expand, read_axes
 from eval.suites.rendered import rendered_folder
 
@@ -24,7 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
 SUITES = ROOT / "configs" / "eval"
 RENDERED = ("axes", "memory", "world")  # files of rendered suites; each is also the name of all suites in it
 LONGEST_NAME = 100
-Judge = Literal["ate_percent", "rpe_rot_deg", "recovery_s"]
+Judge: Any = Literal[JUDGES]
+"""Names of the metrics that can decide between systems."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,9 @@ class Sequence:
     Attributes:
         name: in the tables.
         path: folder or file, relative to the data folder; empty if rendered.
-        judged_by: the column that decides between systems: ``ate_percent``, where scale is weak ``rpe_rot_deg``, or
-            ``recovery_s`` where the question is if a place is found again.
+        judged_by: name of the metric that decides between systems (:mod:`eval.scoring.metric_table`):
+            ``ate_percent``, where scale is weak ``rpe_rot_deg``, or ``recovery_s`` where the question is if a place is
+            found again.
         about: a few words.
         calib, times, groundtruth: files relative to the folder, where the layout itself does not say.
         start, end: part of the recording: seconds since its first frame (``"2.5"``), or the number of a frame

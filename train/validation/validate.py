@@ -22,6 +22,7 @@ from dvo.data.open import open_source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics
 from dvo.metrics.segment_metrics import evaluate_segments, most_worlds, worlds_of
+from dvo.metrics.table import ERRORS
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Odometry
 from dvo.session.session import FrameCallback, Run, run
@@ -97,10 +98,9 @@ def main(arguments: list[str]) -> None:
             if source.groundtruth is None:
                 raise DvoError("no ground truth", file=source.path, remedy="name sequences with ground truth")
             m, done = track_sequence(new_odometry(seed), islice(source, options.frames), source.groundtruth)
+            errors = "  ".join(f"{metric.title} {metric.text(metric.find(m)):>7s}" for metric in ERRORS)
             print(
-                f"{name:24s} seed {seed} ATE {m.ate_percent:7.2f} % of {m.path_length:6.2f} m  RPE rot "
-                f"{m.rpe_rot_deg:6.3f} deg  rotation error/motion {m.rotation_error_ratio:5.3f}  scale drift "
-                f"{m.scale_drift:+.2f}  lost {done.result.frames_lost}  segments "
+                f"{name:24s} seed {seed} {errors}  lost {done.result.frames_lost}  segments "
                 f"{len(worlds_of(done.result.segments))}  {done.frames_per_second:5.1f} fps",
                 flush=True,
             )

@@ -45,5 +45,5 @@ def test_judged_by_rotation(plan, rows):
     turned = replace(plan.suites[0], sequences=(sequence,))
     manifest = replace(read_manifest(plan.out), suites=(turned,))
     two: list[Row] = [replace(null, rpe_rot_deg=0.25), replace(good, rpe_rot_deg=0.75)]
-    assert "**0.250**" in markdown(manifest, turned, two) and "by RPE in degrees" in markdown(manifest, turned, two)
+    assert "**0.250**" in markdown(manifest, turned, two) and "by RPE °" in markdown(manifest, turned, two)
     assert "| tiny | RPE ° | 0.750 |" in axis_table(manifest, two)

@@ -13,7 +13,8 @@ from dvo.data.trajectory import read_tum
 from eval.execution.plan import read_manifest
 from eval.execution.predict import predict_here, read_segments
 from eval.scoring import score as score_module
-from eval.scoring.score import COLUMNS, Row, made_up_share, score
+from eval.scoring.metric_table import made_up_share
+from eval.scoring.score import COLUMNS, Row, score
 
 REQUIRED_COLUMNS = [
     *("system", "version", "suite", "sequence", "seed", "status", "frames", "tracked", "alignment"),

@@ -1,7 +1,9 @@
 """A package outside ``dvo``, ``train`` and ``eval`` (``tests/outside``) brings a network, an odometry, a training task,
-an update operator, a factor, a reader, a system, a scene family and a trajectory format. It is announced by entry
-points, as an installed package is, and each part is run by the ordinary commands without editing a file."""
+an update operator, a factor, a reader, a system, a scene family, a trajectory format, a metric, a calibration dialect,
+a place descriptor and a loss term. It is announced by entry points, as an installed package is, and each part is run by
+the ordinary commands without editing a file."""
 
+import csv
 import json
 import os
 import subprocess
@@ -62,10 +64,14 @@ def test_parts_are_announced_without_a_call():
         "from dvo.models.registry import ARCHITECTURES; from dvo.odometry.registry import ODOMETRIES\n"
         "from dvo.data.readers.registry import READERS; from dvo.synth.scenes.families import FAMILIES\n"
         "from train.tasks.registry import TASKS; from eval.systems.registry import SYSTEMS\n"
+        "from eval.scoring.metric_table import METRICS; from dvo.data.calibration.read import DIALECTS\n"
+        "from dvo.odometry.loops.place_descriptors import PLACE_DESCRIPTORS\n"
+        "from train.tasks.patch_vo.objective import LOSS_TERMS\n"
         "print([n in r for n, r in (('distance_vo', ARCHITECTURES), ('distance_vo', ODOMETRIES), ('array', READERS),\n"
-        "    ('shed', FAMILIES), ('distance_vo', TASKS), ('standing-still', SYSTEMS))])"
+        "    ('shed', FAMILIES), ('distance_vo', TASKS), ('standing-still', SYSTEMS), ('end_error', METRICS),\n"
+        "    ('focal', DIALECTS), ('mean_colour', PLACE_DESCRIPTORS), ('nearness', LOSS_TERMS))])"
     ))  # fmt: skip
-    assert listed.strip() == str([True] * 6)
+    assert listed.strip() == str([True] * 10)
 
 
 def test_the_update_operator_is_chosen_by_a_word():
@@ -113,8 +119,59 @@ def test_the_system_is_evaluated_beside_the_others(recording, tmp_path):
     (tmp_path / "walks.yaml").write_text(yaml.safe_dump(suite))
     command("-m", "eval", "run", "--suite", tmp_path / "walks.yaml", "--systems", "standing-still+height=1.5,null",
             "--data", recording.parent, "--seeds", "1", "--out", tmp_path / "runs", "--threads", "1")  # fmt: skip
-    rows = (tmp_path / "runs" / "results.csv").read_text()
-    assert "standing-still" in rows and "null" in rows
+    with open(tmp_path / "runs" / "results.csv", newline="") as file:
+        rows = {row["system"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"standing-still+height=1.5", "null"}
+    # The camera of the truth moves by half a metre; the metric of the package takes the poses as they are.
+    assert float(rows["standing-still+height=1.5"]["end_error"]) == pytest.approx(np.hypot(0.5, 1.5), abs=1e-6)
+    assert "end error m" in (tmp_path / "runs" / "table.md").read_text()
+
+
+def test_a_sequence_is_judged_by_the_metric():
+    found = command("-c", (
+        "from eval.suites.suite import read_suite; from pathlib import Path; import tempfile\n"
+        "file = Path(tempfile.mkdtemp()) / 'a.yaml'\n"
+        "file.write_text('name: a\\nlabel: b\\nsequences: [{name: c, path: d, judged_by: end_error}]\\n')\n"
+        "print(read_suite(file).sequences[0].judged_by)"
+    ))  # fmt: skip
+    assert found.strip() == "end_error"
+
+
+def test_a_calibration_of_the_dialect_is_read(recording, tmp_path):
+    file, out = tmp_path / "camera.txt", tmp_path / "out"
+    file.write_text("FOCAL 60 64 48\n")
+    command("-m", "dvo", "run", recording, "--system", "standing-still", "--calib", file, "--out", out)
+    camera = json.loads((out / "run.json").read_text())["camera"]
+    assert [camera[name] for name in ("fx", "fy", "cx", "cy")] == [60, 60, 31.5, 23.5]
+
+
+def test_places_are_described_by_the_descriptor():
+    told = command("-c", (
+        "import dvo; found = dvo.load('small', loop={'descriptor': 'mean_colour'}).loops.finder\n"
+        "print(found.descriptor.name, found.places.dimensions)"
+    ))  # fmt: skip
+    assert told.strip() == "mean colour 3"
+
+
+def test_the_loss_term_is_in_the_loss_and_in_the_log():
+    told = command("-c", (
+        "import torch; from train.tasks.patch_vo.objective import LossConfig, Terms\n"
+        "from train.tasks.patch_vo.task import PatchVOTask; from train.tasks.task import StepContext\n"
+        "found = {}\n"
+        "for weight in (0.0, 2.0):\n"
+        "    loss = LossConfig(terms={'nearness': weight})\n"
+        "    task = PatchVOTask('tiny', updates=2, warmup_until=0.0, patches=4, loss=loss); torch.manual_seed(0)\n"
+        "    net = task.network(); context = StepContext(net, 0, task.buffers())\n"
+        "    g = torch.Generator().manual_seed(0); poses = torch.zeros(1, 8, 7); poses[..., 6] = 1\n"
+        "    poses[..., 0] = 0.1 * torch.arange(8)\n"
+        "    batch = {'images': torch.randint(0, 255, (1, 8, 3, 48, 64), generator=g, dtype=torch.uint8),\n"
+        "        'depth': torch.ones(1, 8, 48, 64), 'poses_cw': poses,\n"
+        "        'intrinsics': torch.tensor([50.0, 50, 32, 24]).expand(1, 8, 4)}\n"
+        "    step = task.accept_loss(context, task.compute_loss(context, batch))\n"
+        "    found[weight] = float(step.loss), float(step.measures['loss_nearness'])\n"
+        "print(found[2.0][1] > 0, abs(found[2.0][0] - found[0.0][0] - found[2.0][1]) < 1e-4 * found[2.0][0])"
+    ))  # fmt: skip
+    assert told.strip() == "True True"
 
 
 def test_the_odometry_without_weights_tracks_on_the_command_line(recording, tmp_path):

@@ -19,7 +19,7 @@ from dvo.data.opening import check_invert, check_stride, first_frame, locate, no
 from dvo.data.readers.groundtruth import read_groundtruth
 from dvo.data.readers.registry import find_reader
 from dvo.data.readers.rosbag import split_topic
-from dvo.data.recording import Request, Selection
+from dvo.data.recording import Recording, Request, Selection
 from dvo.data.source import Reading, Source
 from dvo.data.streams.capture import is_stream
 from dvo.data.streams.live_source import open_stream
@@ -118,6 +118,9 @@ def open_source(
     )
     with lookups(path):
         recording = find_reader(path, reader).open(path, request)
+    if not isinstance(recording, Recording):
+        remedy = "derive it from dvo.data.recording.Recording"
+        raise DvoError(f"{type(recording).__name__} is no recording", file=path, field="reader", remedy=remedy)
     first = first_frame(recording)
     expected_frames(interval, recording.frame_count, recording.timestamps, path)  # one without frames is an error
     calibration = recording.calibration if request.calibration is None else request.calibration

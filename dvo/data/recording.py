@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -110,8 +110,9 @@ def _few(names: list[str]) -> str:
     return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
 
 
+@runtime_checkable
 class Recording(Protocol):
-    """Images with times, as a reader found them.
+    """Images with times, as a reader found them. A class that derives from it has only to set what it knows.
 
     Attributes:
         name: of the sequence.
@@ -137,19 +138,24 @@ class Recording(Protocol):
     warnings: list[str]
 
     @property
-    def timestamps(self) -> np.ndarray | None: ...
+    def timestamps(self) -> np.ndarray | None:
+        return None
 
     @property
-    def images(self) -> list[Path] | None: ...
+    def images(self) -> list[Path] | None:
+        return None
 
     @property
-    def turned(self) -> int: ...
+    def turned(self) -> int:
+        return 0
 
     @property
-    def stereo(self) -> Callable[[], StereoRig | None] | None: ...
+    def stereo(self) -> Callable[[], StereoRig | None] | None:
+        return None
 
     @property
-    def inertial(self) -> Callable[[], InertialSamples] | None: ...
+    def inertial(self) -> Callable[[], InertialSamples] | None:
+        return None
 
     def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """Frames in order.

@@ -109,6 +109,28 @@ class Calibration:
 
 
 @dataclass(frozen=True)
+class Dialect:
+    """Form of a calibration file.
+
+    Attributes:
+        matches: whether a file is of this form, from its path and its text (empty for a binary file, ``*.bin``).
+        read: the calibration, from path, text, and the number of the camera that the user asks for, None for none.
+
+    Example:
+        A module of an outside package, announced by an entry point of the group ``dvo.calibration_dialects``::
+
+            def read(path: Path, text: str, camera: int | None) -> Calibration:
+                focal, width, height = map(float, text.split()[1:])
+                return Calibration(focal, focal, (width - 1) / 2, (height - 1) / 2, file=path)
+
+            DIALECT = Dialect(lambda path, text: text.startswith("FOCAL "), read)
+    """
+
+    matches: Callable[[Path, str], bool]
+    read: Callable[[Path, str, int | None], Calibration]
+
+
+@dataclass(frozen=True)
 class StereoRig:
     """Right camera of a stereo pair.
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import MAX_BYTES, is_shell_pipe
-from dvo.data.calibration.calibration import Calibration
+from dvo.data.calibration.calibration import Calibration, Dialect
 from dvo.data.files.files import is_file, lookups
 from dvo.geometry.camera import DistortionModel
 
@@ -78,7 +78,17 @@ def is_calibration_file(path: Path) -> bool:
     return is_file(split_camera(path)[0]) or is_shell_pipe(path)
 
 
-def colmap_calibration(path: Path, text: str, identifier: int | None = None) -> Calibration | None:
+def is_colmap(path: Path, text: str) -> bool:
+    """True for a binary file, and for a text whose first row is ``NUMBER MODEL ...``.
+
+    Args:
+        path: of the file.
+        text: its content.
+    """
+    return path.suffix.lower() == ".bin" or _is_list(text)
+
+
+def colmap_calibration(path: Path, text: str, identifier: int | None = None) -> Calibration:
     """Calibration of a camera of a COLMAP model.
 
     Args:
@@ -87,21 +97,13 @@ def colmap_calibration(path: Path, text: str, identifier: int | None = None) -> 
         identifier: number of the camera, CAMERA_ID; None for the only one.
 
     Returns:
-        Calibration with the size of the images, whose focal lengths are not checked; None for a text whose first row is
-        not ``NUMBER MODEL ...``.
+        Calibration with the size of the images, whose focal lengths are not checked.
 
     Raises:
-        DvoError: malformed file, several cameras and no number, no camera of that number, a number for a file of
-            another program, or a model that dvo does not have.
+        DvoError: malformed file, several cameras and no number, no camera of that number, or a model that dvo does not
+            have.
     """
-    if path.suffix.lower() == ".bin":
-        entries = _read_binary(path)
-    elif _is_list(text):
-        entries = _read_text(text, path)
-    elif identifier is None:
-        return None
-    else:
-        raise DvoError("no cameras of COLMAP in it", file=path, field="calibration", remedy=f"leave out :{identifier}")
+    entries = _read_binary(path) if path.suffix.lower() == ".bin" else _read_text(text, path)
     if not entries:
         raise DvoError("no camera in it", file=path, field="calibration", remedy=_REMEDY)
     found = {entry.identifier: entry for entry in entries}
@@ -201,3 +203,6 @@ def _read_binary(path: Path) -> list[_Entry]:
     if at != len(data):
         raise DvoError("bytes after the last camera", file=path, field="calibration", remedy=_REMEDY)
     return entries
+
+
+DIALECT = Dialect(is_colmap, colmap_calibration)

@@ -7,12 +7,21 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
 from dvo.core.yaml_files import is_shell_pipe, read_text
-from dvo.data.calibration.calibration import EXPECTED, Calibration
-from dvo.data.calibration.colmap_cameras import colmap_calibration, split_camera
-from dvo.data.calibration.text import from_text
-from dvo.data.calibration.values import from_values, load_yaml
+from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
+from dvo.data.calibration.colmap_cameras import split_camera
 from dvo.data.files.files import MAX_NUMBER, is_file
+
+_BUILT_IN = {
+    "colmap": "dvo.data.calibration.colmap_cameras:DIALECT",
+    "yaml": "dvo.data.calibration.values:DIALECT",
+    "text": "dvo.data.calibration.text:DIALECT",
+}
+DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUILT_IN))
+"""Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
+first, because ``text`` takes any file."""
+_NUMBERED = "colmap"  # the only dialect of the package whose files number their cameras
 
 
 def read_calibration(path: Path | str) -> Calibration:
@@ -44,10 +53,12 @@ def read_calibration(path: Path | str) -> Calibration:
     if not (is_file(path) or is_shell_pipe(path)):
         raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
     text = "" if path.suffix.lower() == ".bin" else read_text(path, EXPECTED)
-    looks_yaml = path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
-    calibration = colmap_calibration(path, text, camera)
-    if calibration is None:
-        calibration = from_values(load_yaml(text, path), path) if looks_yaml else from_text(text, path)
+    names = [*(name for name in DIALECTS if name not in _BUILT_IN), *_BUILT_IN]
+    dialects: dict[str, Dialect] = {name: DIALECTS.resolve(name) for name in names}
+    name = next(name for name, dialect in dialects.items() if dialect.matches(path, text))
+    if camera is not None and name in _BUILT_IN and name != _NUMBERED:
+        raise DvoError("no cameras of COLMAP in it", file=path, field="calibration", remedy=f"leave out :{camera}")
+    calibration = dialects[name].read(path, text, camera)
     values = [calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.coefficients]
     if not (np.abs(values) <= MAX_NUMBER).all():  # NaN fails too
         raise DvoError("not a finite number", file=path, field="intrinsics", remedy=EXPECTED)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import EXPECTED, Calibration
+from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
 from dvo.data.calibration.kitti import kitti_calibration
 from dvo.data.calibration.named_values import read_named_values
 from dvo.data.calibration.values import from_matrix, from_values, load_yaml
@@ -50,3 +50,6 @@ def from_text(text: str, path: Path) -> Calibration:
     fx, fy, cx, cy, *coefficients = rows[0]
     model: DistortionModel = "radtan" if any(coefficients) else "none"
     return Calibration(fx, fy, cx, cy, model, tuple(coefficients) if model == "radtan" else (), file=path)
+
+
+DIALECT = Dialect(lambda path, text: True, lambda path, text, camera: from_text(text, path))

@@ -10,7 +10,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import parse_yaml
-from dvo.data.calibration.calibration import EXPECTED, Calibration
+from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
 from dvo.geometry.camera import DistortionModel
 
 _MODELS: dict[str, DistortionModel] = {
@@ -184,3 +184,16 @@ def _with_distortion(calibration: Calibration, data: dict[str, Any], path: Path)
         model = "none"
     kept = () if model == "none" else tuple(float(coefficient) for coefficient in coefficients)
     return replace(calibration, model=model, coefficients=kept)
+
+
+def is_yaml(path: Path, text: str) -> bool:
+    """True for a file with the name or the first line of a YAML.
+
+    Args:
+        path: of the file.
+        text: its content.
+    """
+    return path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
+
+
+DIALECT = Dialect(is_yaml, lambda path, text, camera: from_values(load_yaml(text, path), path))

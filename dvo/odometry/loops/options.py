@@ -17,6 +17,8 @@ class LoopOptions:
         every: kept keyframes between two searches.
         neighbours: keyframes before and after each of the two that are matched along.
         steps: of a search that are taken with a frame, each about as long as an update of the network.
+        descriptor: name of the descriptor of images by which places are found again
+            (:data:`dvo.odometry.loops.place_descriptors.PLACE_DESCRIPTORS`).
         delay: frames between the beginning of a correction and the frame that takes its result, so that tracking goes
             on meanwhile; 0 to do it within a frame, and searches as well.
 
@@ -36,6 +38,7 @@ class LoopOptions:
     neighbours: int = 1
     steps: int = 1
     delay: int = 8
+    descriptor: str = "grid"
 
     def __post_init__(self) -> None:
         check_settings(self, self.RANGES)

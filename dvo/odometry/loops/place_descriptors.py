@@ -24,7 +24,13 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
 
+PLACE_DESCRIPTORS = Registry(
+    "place descriptor", "dvo.place_descriptors", {"grid": "dvo.odometry.loops.place_descriptors:shipped_descriptor"}
+)
+"""Names to ``"module:builder"``. A builder takes the number of channels of the network's matching features, and gives a
+:class:`PlaceDescriptor`, or None where it has none for them: then loops are found from the poses alone."""
 SHIPPED = Path(__file__).resolve().parents[2] / "weights" / "places" / "small.safetensors"
 GRID = (3, 4)
 """Rows and columns of cells."""

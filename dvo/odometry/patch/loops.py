@@ -10,7 +10,7 @@ from dvo.models.patch_vo import PatchVO
 from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.loops.finder import LoopFinder
 from dvo.odometry.loops.joint_window import GroupMatcher
-from dvo.odometry.loops.place_descriptors import shipped_descriptor
+from dvo.odometry.loops.place_descriptors import PLACE_DESCRIPTORS, PlaceDescriptor
 from dvo.odometry.maintenance.adjuster import Adjuster
 from dvo.odometry.maintenance.maintenance import MapMaintenance
 from dvo.odometry.patch.config import TrackerConfig
@@ -29,7 +29,8 @@ def loop_closer(
         device: of the computation.
         state: of the tracker.
     """
-    described = shipped_descriptor(model.config.feature_channels)
+    build = PLACE_DESCRIPTORS.resolve(config.loop.descriptor)
+    described: PlaceDescriptor | None = build(model.config.feature_channels)
     places = PlaceIndex(1 if described is None else described.dimensions)
     finder = LoopFinder(graph, GroupMatcher(model, config.measuring, device), places, described, config.loop)
     adjuster = Adjuster(graph, lambda: state.shutter, config.adjustment, config.adjust_after_loop)

@@ -3,7 +3,7 @@ V2V if wanted."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -11,6 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dvo.core.registry import Registry
 from dvo.core.settings import check_settings
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
@@ -20,6 +21,11 @@ from dvo.losses.pose import PoseErrors, pose_errors
 from dvo.map.edges import PatchGraph
 from dvo.models.patch_vo import Mode, UpdateState
 from dvo.nets.patch.patchifier import crop_patches
+
+LOSS_TERMS = Registry("loss term", "dvo.loss_terms")
+"""Further terms of the loss by name, those of other packages; ``LossConfig.terms`` gives them a weight. A term is a
+function of the state after an update and of the truth (:class:`dvo.models.patch_vo.UpdateState`, :class:`Truth`), and
+gives a scalar tensor with a graph."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,7 @@ class LossConfig:
         target: of the error of the flow that bundle adjustment is given, feature pixels; trains the flow head directly
             (similar to DROID-SLAM's residual loss).
         target_limit: cap of one edge's target error; beyond the reach of the correlation there is nothing to learn.
+        terms: of further terms, by their names (:data:`LOSS_TERMS`).
         pose_from: first update whose poses count.
         margin: an edge counts while the true position of its centre is within this many feature pixels of the map.
         weighted: the flow error is weighted by the confidence, held constant, over all edges (V2V); otherwise it is
@@ -60,9 +67,12 @@ class LossConfig:
     balance_every: int = 20
     balance_window: int = 50
     trend_window: int = 4
+    terms: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_settings(self, {"trend_window": (1, 10_000)})
+        for name in self.terms:
+            LOSS_TERMS.target(name)  # an unknown one is an error
 
     @property
     def follows_gradients(self) -> bool:
@@ -140,12 +150,14 @@ class Terms:
     Attributes:
         target, flow: scalars.
         translation, rotation: ``(B,)``, one number a clip.
+        further: scalars, by name.
     """
 
     target: list[Tensor] = field(default_factory=list)
     flow: list[Tensor | None] = field(default_factory=list)
     translation: list[Tensor | None] = field(default_factory=list)
     rotation: list[Tensor | None] = field(default_factory=list)
+    further: dict[str, list[Tensor]] = field(default_factory=dict)
 
     def total(self, config: LossConfig, beta: float = 1.0, rotation: float = 1.0) -> Tensor:
         """Weighted sum of all terms.
@@ -162,13 +174,15 @@ class Terms:
                 total = total + config.flow * beta * flow
             if tau is not None and phi is not None:
                 total = total + config.pose * (tau + rotation * phi).mean()
+        for name, values in self.further.items():
+            total = total + config.terms[name] * torch.stack(values).sum()
         return total
 
     def sums(self, config: LossConfig) -> dict[str, Tensor]:
         """The terms summed over the updates with the weights of the configuration, those of the balance left out:
-        ``target``, ``flow``, ``translation``, ``rotation``."""
+        ``target``, ``flow``, ``translation``, ``rotation``, and further ones by their names."""
 
-        def add(values: list[Tensor] | list[Tensor | None], weight: float) -> Tensor:
+        def add(values: Sequence[Tensor | None], weight: float) -> Tensor:
             found = [v.mean() for v in values if v is not None]
             return weight * torch.stack(found).sum() if found else self.target[0].new_zeros(())
 
@@ -177,6 +191,7 @@ class Terms:
             "flow": add(self.flow, config.flow),
             "translation": add(self.translation, config.pose),
             "rotation": add(self.rotation, config.pose),
+            **{name: add(values, config.terms[name]) for name, values in self.further.items()},
         }
 
 
@@ -197,6 +212,7 @@ def clip_terms(
         ``px<0.25`` ...
     """
     terms = Terms()
+    further = {name: LOSS_TERMS.resolve(name) for name in config.terms}
     there: tuple[Tensor, Tensor] | None = None
     graph: PatchGraph | None = None
     measures: dict[str, Tensor] = {}
@@ -225,6 +241,8 @@ def clip_terms(
             errors = pose_errors(state.poses_cw, truth.poses_cw[:, : state.frames])
         terms.translation.append(None if errors is None else errors.translation)
         terms.rotation.append(None if errors is None else errors.rotation)
+        for name, term in further.items():
+            terms.further.setdefault(name, []).append(term(state, truth))
         measures = {"flow": flow, "target": target, "confidence": state.confidence.mean()}
         # Only the last update is measured further.
         measured = partial(_further_measures, truth, state, mode, errors, error, wanted, near)

@@ -23,9 +23,9 @@ from dvo.odometry.droid import frame as dense_frame
 from dvo.odometry.droid import window as dense_window
 from dvo.odometry.droid.config import DenseConfig
 from dvo.odometry.droid.droid import DroidOdometry
+from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Interim, Odometry, Status
-from dvo.odometry.window.evidence import NO_MATCH
 from dvo.session.results import write_results
 from dvo.session.session import run
 from dvo.synth.clip import make_clip

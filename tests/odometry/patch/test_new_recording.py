@@ -133,7 +133,7 @@ def test_a_map_in_progress_without_loops_is_described(walk, tmp_path):
         odometry.track(frame)
     odometry.save(tmp_path / "a.dvo")
     found = dvo.load_map(tmp_path / "a.dvo", new_recording=True, updates=2, seed=5)
-    assert not len(found.window) and not odometry.state.finished
+    assert not len(found.window) and not odometry.gate.finished
     assert (found.config.updates, found.config.loops, found.seed) == (2, True, 5)
     kept = found.loops.finder.kept
     assert kept[-1] == odometry.window.frames[-1].identifier

@@ -16,10 +16,10 @@ from dvo.models.tartanvo import TartanVO, TwoFrameMotion
 from dvo.models.weights import LoadedWeights, save_weights
 from dvo.nets.two_frame.flow_pyramid import Flows
 from dvo.nets.two_frame.tartanvo import preset
+from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Interim, Odometry, Status
 from dvo.odometry.two_frame.tartanvo import UNRELATED, TartanOdometry, TwoFrameConfig
-from dvo.odometry.window.evidence import NO_MATCH
 from dvo.session.session import run
 
 CAMERA = Camera(70.0, 70.0, 31.5, 23.5, 64, 48)

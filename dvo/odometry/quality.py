@@ -24,6 +24,9 @@ LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
 CHECK_FOCAL, RUN_AGAIN = 0.2, 0.25
 """Lack of agreement, of what makes a result doubtful, above which it is asked for its focal length, and run again."""
+MAX_SHIFT_GAIN = 0.25
+"""Share of the cost of the followed corners that shifts of the images explain, above which the crop of the picture
+floats (:mod:`dvo.odometry.checks.floating_crop`)."""
 MOST_FIXED = 0.2
 """Share of the image that is fixed to the camera: it takes part until it is found, so that the beginning suffers."""
 WRONG_FOCAL = 0.12
@@ -36,6 +39,7 @@ MOST_JUMPS = 2
 MASK = "mask what moves or is fixed to the camera (--mask), or film so that most of the picture stands still"
 CALIBRATE = "check the calibration (dvo calibrate), or run without --calib"
 FILM = "film textured surfaces at a few metres while the camera moves sideways, or use --preset accurate"
+STEADY = "turn electronic stabilisation off, or film with a wide margin that no software crops"
 MOVE = "move the camera sideways while filming; a tripod or a single picture has no trajectory"
 
 
@@ -56,6 +60,7 @@ class Quality:
         deviation: median distance of the followed corners from the epipolar lines of the poses, over the median
             displacement of the corners of their pair; NaN without pairs.
         check: share of these corners within a pixel of the lines; NaN without pairs.
+        crop: share of the cost of these corners that shifts of the images explain; NaN with too few pairs.
         checks: number of pairs of images with followed corners.
         jumps: number of frames between which the camera moved far more than before and after.
         fixed: share of the image that is fixed to the camera, is in no mask that was given, and was left out.
@@ -79,6 +84,7 @@ class Quality:
     residual: float = float("nan")
     deviation: float = float("nan")
     check: float = float("nan")
+    crop: float = float("nan")
     checks: int = 0
     jumps: int = 0
     fixed: float = 0.0
@@ -128,6 +134,8 @@ def judge(quality: Quality, frames: int, cause: str = "") -> tuple[Verdict, str,
     if not quality.tracked:
         few = f"; {frames} {'frame is' if frames == 1 else 'frames are'} too few" if frames < 5 else ""
         return "failed", f"no frame has a pose ({cause or 'nothing was tracked'}{few})", MOVE
+    if quality.crop > MAX_SHIFT_GAIN:
+        return "doubtful", "the picture is shifted from image to image, as in stabilised video", STEADY
     doubts = [lack if math.isfinite(lack) else 0.0 for lack in lacks(quality)]
     if sum(doubts) > 1 and doubts[0] > doubts[1]:
         reason = f"corners that were followed do not agree with the poses ({quality.check:.0%} of them do)"

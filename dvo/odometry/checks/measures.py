@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
 from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
-from dvo.odometry.checks.check_pairs import CheckPairs, epipolar_distances, median_displacement
+from dvo.odometry.checks.check_pairs import CheckPair, CheckPairs, epipolar_distances, median_displacement
+from dvo.odometry.checks.floating_crop import shift_gain
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.protocol import Result
 from dvo.odometry.quality import Quality, judge
@@ -21,6 +24,8 @@ FIELDS = (4, 3)
 """Fields of the image, across and down, in which the spread of the measurements is counted."""
 NEAR_LINE = 1.0
 """Distance of a corner from its epipolar line that agrees, pixels."""
+ROLLING_SHARE = 0.5
+"""Share that counts of what shifts explain under a rolling shutter, whose correction for corners is approximate."""
 JUMP = 6.0
 """Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
 
@@ -72,6 +77,7 @@ def measure_quality(
         deviation = float(np.median(np.concatenate([away / moved for away, moved in pairs])))
         agreed = float((distances < NEAR_LINE).mean())
         quality = replace(quality, checks=len(pairs), deviation=deviation, check=agreed)
+        quality = replace(quality, crop=_shift_gain(graph, checks, shutter, stride))
     verdict, reason, remedy = judge(quality, result.frames_read, cause)
     return replace(quality, verdict=verdict, reason=reason, remedy=remedy)
 
@@ -102,14 +108,63 @@ def _inliers(graph: Map, segment: int, shutter: Shutter) -> tuple[np.ndarray, np
 
 def _distances(graph: Map, checks: CheckPairs) -> list[tuple[np.ndarray, float]]:
     """Distances of the corners of each pair whose frames have poses in one world, and their displacement, pixels."""
-    log, found = graph.log, []
+    return [
+        (epipolar_distances(pair, first, second), median_displacement(pair.points))
+        for pair, first, second in _placed(graph, checks)
+    ]
+
+
+def _placed(graph: Map, checks: CheckPairs) -> Iterator[tuple[CheckPair, np.ndarray, np.ndarray]]:
+    """Pairs whose frames have poses in one world, with these, ``T_cw``."""
+    log = graph.log
     for pair in checks.pairs:
         frames = [log.frames[number] for number in (pair.first, pair.second)]
-        poses = [log.pose(number) for number in (pair.first, pair.second)]
+        first, second = (log.pose(number) for number in (pair.first, pair.second))
         same = graph.world_of(frames[0].segment) == graph.world_of(frames[1].segment)
-        if not any(frame.lost for frame in frames) and same and poses[0] is not None and poses[1] is not None:
-            found.append((epipolar_distances(pair, poses[0], poses[1]), median_displacement(pair.points)))
-    return found
+        if not any(frame.lost for frame in frames) and same and first is not None and second is not None:
+            yield pair, first, second
+
+
+def _shift_gain(graph: Map, checks: CheckPairs, shutter: Shutter, stride: int) -> float:
+    """What shifts of the images explain of the corners, see :func:`dvo.odometry.checks.floating_crop.shift_gain`."""
+    pairs, motions = [], []
+    for pair, *poses in _placed(graph, checks):
+        first, second = (torch.as_tensor(pose, dtype=torch.float64) for pose in poses)
+        motion = se3.relative(first, second)
+        motions.append(se3.matrix(motion).numpy())
+        pairs.append(_as_read_at_once(graph, pair, motion, shutter, stride) if shutter.readout > 0 else pair)
+    return shift_gain(pairs, motions) * (ROLLING_SHARE if shutter.readout > 0 else 1.0)
+
+
+def _as_read_at_once(graph: Map, pair: CheckPair, motion: Tensor, shutter: Shutter, stride: int) -> CheckPair:
+    """Corners of a pair without what a rolling shutter adds: turns, and steps as if the camera moved evenly."""
+    ends = [torch.as_tensor(part, dtype=torch.float64) for part in np.split(pair.points, 2, axis=1)]
+    focal, centre = torch.as_tensor(pair.intrinsics, dtype=torch.float64).split(2)
+
+    def turned(xy: Tensor, turn: Tensor) -> Tensor:
+        rays = so3.rotate(turn, torch.cat([(xy - centre) / focal, torch.ones_like(xy[:, :1])], 1))
+        return rays[:, :2] / rays[:, 2:] * focal + centre
+
+    offsets = [shutter.offsets(xy[:, 1] / stride) for xy in ends]
+    numbers = pair.first, pair.second
+    first, second = (
+        turned(xy, so3.conjugate(_turn(graph, number, away)))
+        for xy, number, away in zip(ends, numbers, offsets, strict=True)
+    )
+    times = [graph.log.frames[number].timestamp for number in numbers]
+    pace = (second - turned(first, motion[3:].expand(len(first), 4))) / (times[1] - times[0])
+    corrected = [xy - pace * away[:, None] for xy, away in zip((first, second), offsets, strict=True)]
+    return replace(pair, points=torch.cat(corrected, 1).numpy())
+
+
+def _turn(graph: Map, number: int, offsets: Tensor) -> Tensor:
+    """Rotations ``(N, 4)`` of a camera from the time of a frame to a little earlier or later ``(N,)``, seconds."""
+    log = graph.log
+    near = [k for k in range(max(number - 2, 0), min(number + 3, len(log.frames))) if log.pose(k) is not None]
+    near = [k for k in near if not log.frames[k].lost and log.frames[k].segment == log.frames[number].segment]
+    times = torch.tensor([log.frames[k].timestamp for k in near], dtype=torch.float64)
+    track = PoseTrack.through(times, torch.as_tensor(np.array([log.pose(k) for k in near]), dtype=torch.float64))
+    return track.motion(torch.full((len(offsets),), near.index(number)), offsets)[:, 3:]
 
 
 def count_jumps(result: Result) -> int:

@@ -66,6 +66,22 @@ def with_crowd(rng: np.random.Generator, frames: Sequence[Frame], _: int) -> Ite
         yield replace(frame, image=image)
 
 
+def with_floating_crop(rng: np.random.Generator, frames: Sequence[Frame], _: int) -> Iterator[Frame]:
+    """The inner part of the picture, floating as that of stabilised video does."""
+    height, width = frames[0].image.shape[:2]
+    margin = int(0.08 * width)
+    rates, phases = 2 * np.pi / rng.uniform(0.5, 3.0, (4, 2)), rng.uniform(0, 2 * np.pi, (4, 2))
+    size = width - 2 * margin, height - 2 * margin
+    reach = rng.uniform(0.01, 0.02) * width
+    for frame in frames:
+        x, y = margin + (reach * np.sin(frame.timestamp * rates + phases).sum(0) / 2**0.5).clip(-margin, margin)
+        image = cv2.warpAffine(frame.image, np.array([[1, 0, -x], [0, 1, -y]]), size, flags=cv2.INTER_LINEAR)
+        camera = replace(
+            frame.camera, cx=frame.camera.cx - margin, cy=frame.camera.cy - margin, width=size[0], height=size[1]
+        )
+        yield replace(frame, image=image, camera=camera)
+
+
 def with_waves(rng: np.random.Generator, frames: Sequence[Frame], _: int) -> Iterator[Frame]:
     """A sea that fills most of the picture: travelling waves in perspective, with glitter."""
     height, width = frames[0].image.shape[:2]

@@ -26,6 +26,7 @@ CHANGES: dict[str, failures.Change] = {
     "overlay": failures.with_overlay,
     "crowd": failures.with_crowd,
     "waves": failures.with_waves,
+    "crop": failures.with_floating_crop,
     "focal": failures.with_wrong_focal,
     "still": failures.before_still_camera,
 }

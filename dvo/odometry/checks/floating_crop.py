@@ -1,0 +1,104 @@
+"""Crop of stabilised video that floats over what the sensor sees, told by the corners of the check pairs.
+
+Electronic stabilisation moves the part of the image that is kept, and with it the principal point. To the tracker a
+shift looks like a turn, which it nearly is; what tells them apart is the second order towards the edges of the image.
+So the motion between the two images of a pair is fitted twice to the corners, with and without a shift of the second
+image, and the shares of the robust cost that the shift takes away are added up. A camera whose principal point stays
+needs none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from dvo.odometry.checks.check_pairs import CheckPair
+
+MIN_CORNERS = 30
+"""Corners of a pair that seven unknowns are fitted to, at least."""
+MIN_PAIRS = 6
+"""Pairs below which nothing is concluded."""
+MAX_PAIRS = 32
+"""Pairs that are looked at, evenly over the sequence."""
+
+_SCALE = 0.5  # of the robust kernel, pixels
+_ITERATIONS = 12
+_STEP = 1e-5  # of the numeric derivatives, radians
+_STRONGEST = 1e8  # damping beyond which no step helps
+
+
+def shift_gain(pairs: Sequence[CheckPair], motions: Sequence[np.ndarray]) -> float:
+    """Share of the cost of the corners of all pairs that shifts of the second images take away.
+
+    Args:
+        pairs: their corners as a global shutter would have seen them.
+        motions: ``(4, 4)`` of each pair, from the first camera to the second, by the poses; where the fits begin.
+
+    Returns:
+        In [0, 1]; NaN for too few pairs.
+    """
+    known = [at for at, pair in enumerate(pairs) if len(pair.points) >= MIN_CORNERS]
+    if len(known) < MIN_PAIRS:
+        return math.nan
+    chosen = [known[at] for at in np.unique(np.linspace(0, len(known) - 1, MAX_PAIRS).astype(int))]
+    plain = shifted = 0.0
+    for at in chosen:
+        without = fitted_cost(pairs[at], motions[at], False)
+        plain, shifted = plain + without, shifted + min(fitted_cost(pairs[at], motions[at], True), without)
+    return 1 - shifted / plain if plain > 0 else math.nan
+
+
+def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:
+    """Robust cost of the Sampson distances of the corners of a pair from the best motion (Levenberg-Marquardt).
+
+    Args:
+        pair: the corners.
+        motion: ``(4, 4)`` to begin with; only the direction of its translation counts.
+        with_shift: the second image may be shifted.
+
+    Returns:
+        Sum of Cauchy costs, pixels squared.
+    """
+    fx, fy, cx, cy = pair.intrinsics
+    scale, points = _SCALE / math.sqrt(fx * fy), pair.points.astype(np.float64)
+    first, second = (
+        np.column_stack([(p[:, 0] - cx) / fx, (p[:, 1] - cy) / fy, np.ones(len(p))])
+        for p in (points[:, :2], points[:, 2:])
+    )
+    length = float(np.linalg.norm(motion[:3, 3]))
+    towards = motion[:3, 3] / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
+    aside = np.linalg.svd(towards[None])[2][1:]
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        turn = np.asarray(cv2.Rodrigues(x[:3])[0]) @ motion[:3, :3]
+        tx, ty, tz = (direction := towards + x[3:5] @ aside) / np.linalg.norm(direction)
+        essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ turn
+        moved = second - np.append(x[5:7], 0.0) if with_shift else second
+        lines, back = first @ essential.T, moved @ essential
+        gradient = (lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
+        return np.asarray((moved * lines).sum(1) / np.sqrt(np.maximum(gradient, 1e-18)))
+
+    def cost_of(distances: np.ndarray) -> float:
+        return float(_SCALE**2 * np.log1p((distances / scale) ** 2).sum())
+
+    x, damping = np.zeros(7 if with_shift else 5), 1e-3
+    now = residuals(x)
+    cost = cost_of(now)
+    for _ in range(_ITERATIONS):
+        jacobian = np.stack([(residuals(x + _STEP * unit) - now) / _STEP for unit in np.eye(len(x))], 1)
+        weighted = jacobian / (1 + (now / scale) ** 2)[:, None]
+        normal, gradient = weighted.T @ jacobian, weighted.T @ now
+        while damping < _STRONGEST:
+            lifted = normal + damping * np.diag(np.diag(normal) + 1e-12)
+            step = x - np.linalg.solve(lifted, gradient)
+            after = residuals(step)
+            if cost_of(after) < cost:
+                x, now, cost, damping = step, after, cost_of(after), damping / 5
+                break
+            damping *= 8
+        else:
+            break
+    return cost

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 wait_passively()
 find_moved()
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _LAZY = {
     "BADamping": ("dvo.ba.options", "BADamping"),

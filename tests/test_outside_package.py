@@ -1,7 +1,7 @@
 """A package outside ``dvo``, ``train`` and ``eval`` (``tests/outside``) brings a network, an odometry, a training task,
 an update operator, a factor, a reader, a system, a scene family, a trajectory format, a metric, a calibration dialect,
-a place descriptor and a loss term. It is announced by entry points, as an installed package is, and each part is run by
-the ordinary commands without editing a file."""
+a place descriptor, a loss term and a sensor of the window. It is announced by entry points, as an installed package is,
+and each part is run by the ordinary commands without editing a file."""
 
 import csv
 import json
@@ -151,6 +151,24 @@ def test_places_are_described_by_the_descriptor():
         "print(found.descriptor.name, found.places.dimensions)"
     ))  # fmt: skip
     assert told.strip() == "mean colour 3"
+
+
+def test_the_sensor_takes_part_in_the_window():
+    """It fixes the scale, its own unknowns come and go with the keyframes, and without it nothing is as before."""
+    told = command("-c", (
+        "import dvo, torch; from dvo.synth.sequence import make_sequence\n"
+        "size = {'frames': 24, 'height': 96, 'width': 128, 'fps': 10.0}\n"
+        "clip = make_sequence(5, family='room', kind='straight', speed=4.0, **size)\n"
+        "odometry = dvo.load('small', pixels=0, patches=24, sensors='tape')\n"
+        "for frame in clip: odometry.track(frame)\n"
+        "frames, poses = odometry.window.frames, odometry.window.poses_cw\n"
+        "from dvo.geometry import se3\n"
+        "steps = se3.inverse(poses)[:, :3].diff(dim=0).norm(dim=1)\n"
+        "wanted = 2 * torch.tensor([f.timestamp for f in frames]).diff()\n"
+        "print(odometry.sensors[0].seen, len(frames) > 3, bool((steps / wanted - 1).abs().max() < 0.05),\n"
+        "    all(abs(float(f.states['tape']) - 2 * f.timestamp) < 0.02 for f in frames))"
+    ))  # fmt: skip
+    assert told.strip() == "24 True True True"
 
 
 def test_the_loss_term_is_in_the_loss_and_in_the_log():

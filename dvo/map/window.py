@@ -42,6 +42,7 @@ class Keyframe:
             patches, 1 / feature-map pixel; 0 where the surface is not known; None: that of no patch is.
         prior: ``(M, 2)`` inverse depths of its patches in the unit of the window, known from elsewhere, and their
             weights in bundle adjustment, 0 for none; None: of no patch.
+        states: ``(D,)`` values of further unknowns of the frame, by name, such as a velocity.
         guest: it is archived already, and takes part because the window was located by it: its pose is held, and of
             what leaves the window only its measurements are archived. Guests are the first keyframes of a window.
     """
@@ -59,11 +60,12 @@ class Keyframe:
     slopes: Tensor | None = None
     prior: Tensor | None = None
     guest: bool = False
+    states: dict[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class WindowSnapshot:
-    """Poses, patches and edge states of a window, for :meth:`Window.restore`; shapes as in :class:`Window`."""
+    """What a step changes in a window, for :meth:`Window.restore`; shapes as in :class:`Window`."""
 
     poses_cw: Tensor
     patches: Tensor
@@ -71,6 +73,7 @@ class WindowSnapshot:
     targets: Tensor
     weights: Tensor
     confidence: Tensor
+    states: tuple[dict[str, Tensor], ...]
 
 
 @dataclass
@@ -364,15 +367,16 @@ class Window:
         self.hidden, self.targets, self.weights, self.confidence = (torch.zeros_like(x) for x in edges)
 
     def snapshot(self) -> WindowSnapshot:
-        """Record poses, patches and edge states.
+        """Record poses, patches, edge states and further unknowns.
 
         Returns:
             The snapshot; it shares memory with the window, which replaces its tensors rather than changing them.
         """
-        return WindowSnapshot(self.poses_cw, self.patches, self.hidden, self.targets, self.weights, self.confidence)
+        edges = self.hidden, self.targets, self.weights, self.confidence
+        return WindowSnapshot(self.poses_cw, self.patches, *edges, tuple(dict(frame.states) for frame in self.frames))
 
     def restore(self, before: WindowSnapshot) -> None:
-        """Restore poses, patches and edge states.
+        """Restore poses, patches, edge states and further unknowns.
 
         Args:
             before: a snapshot of the same frames and edges.
@@ -380,3 +384,5 @@ class Window:
         self.poses_cw, self.patches = before.poses_cw, before.patches
         self.hidden, self.targets, self.weights = before.hidden, before.targets, before.weights
         self.confidence = before.confidence
+        for frame, states in zip(self.frames, before.states, strict=True):
+            frame.states = dict(states)

@@ -8,7 +8,8 @@ correlation (the lookup), which poses are fixed and how strongly bundle adjustme
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 from torch import Tensor
@@ -18,6 +19,7 @@ from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor
 from dvo.ba.solve import solve
+from dvo.ba.state import StateBlock
 from dvo.geometry.projection import reproject
 from dvo.map.edges import PatchGraph
 from dvo.nets.correlation.correlation import CorrelationLookup
@@ -46,6 +48,7 @@ class UpdateState:
             changed it; None before the first step.
         confidence: ``(B, E, 2)`` of the network, in (0, 1); None before the first step.
         visible: ``(N, h, w)`` bool, pixels of the feature maps that measurements may lie in; None: all.
+        states: ``(B, N, D)`` values of the further unknowns of the last step, by name.
     """
 
     graph: PatchGraph
@@ -59,6 +62,7 @@ class UpdateState:
     weights: Tensor | None = None
     confidence: Tensor | None = None
     visible: Tensor | None = None
+    states: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
@@ -88,6 +92,7 @@ class StepOptions:
         bounds: ``(width, height)`` of the feature map, see :func:`dvo.ba.layer.layer.bundle_adjust`.
         check: indices and weights, see :class:`dvo.ba.options.BAOptions`.
         factors: further measurements for bundle adjustment, for example of depth or of an inertial sensor.
+        blocks: further unknowns that the factors concern, by name.
         kernel: robust kernel of the weighted residuals in bundle adjustment.
     """
 
@@ -98,6 +103,7 @@ class StepOptions:
     bounds: tuple[float, float] | None = None
     check: bool | None = False
     factors: tuple[Factor, ...] = ()
+    blocks: Mapping[str, StateBlock] = field(default_factory=dict)
     kernel: Kernel = Kernel()
 
 
@@ -225,7 +231,7 @@ def step(
         return replace(state, coords=revision.coords + revision.delta[:, :, None, None])
     given = state.poses_cw, state.patches, state.intrinsics, measured.targets, measured.weights
     solved = solve(
-        PatchProblem(*given, graph.ii, graph.jj, graph.kk, factors=options.factors),
+        PatchProblem(*given, graph.ii, graph.jj, graph.kk, factors=options.factors, blocks=options.blocks),
         BAOptions(
             fixed=options.fixed,
             iterations=options.iterations,
@@ -236,7 +242,7 @@ def step(
             kernel=options.kernel,
         ),
     )
-    return replace(state, poses_cw=solved.poses_cw, patches=solved.patches)
+    return replace(state, poses_cw=solved.poses_cw, patches=solved.patches, states=solved.blocks)
 
 
 def recent_depth(patches: Tensor, per_frame: int, frames: int) -> Tensor:

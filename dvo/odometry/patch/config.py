@@ -16,6 +16,7 @@ from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
 from dvo.odometry.loops.options import LoopOptions
 from dvo.odometry.window.patch_window import InsertPolicy, Round, StepSettings
+from dvo.odometry.window.sensors import WINDOW_SENSORS
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -124,6 +125,8 @@ class TrackerConfig:
             found, it usually has. Right poses had more than 0.3.
         max_gap: time between frames above which they are separated by a gap, in medians of the recent intervals.
         scale: observation that metres come from, none for a trajectory up to scale; a table of its values will do.
+        sensors: names of others whose measurements take part in every step of an initialised window
+            (:data:`dvo.odometry.window.sensors.WINDOW_SENSORS`), with commas between or as a list.
 
     Raises:
         DvoError: a value of the wrong type or out of range, with the name of the setting.
@@ -172,8 +175,11 @@ class TrackerConfig:
     join_inliers: float = 0.25
     max_gap: float = 4.5
     scale: ScaleOptions = ScaleOptions()  # noqa: RUF009 (frozen)
+    sensors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        names = self.sensors.split(",") if isinstance(self.sensors, str) else self.sensors
+        object.__setattr__(self, "sensors", tuple(name for name in names if name and WINDOW_SENSORS.target(name)))
         object.__setattr__(self, "scale", settings_of(ScaleOptions, self.scale, "scale"))
         object.__setattr__(self, "loop", settings_of(LoopOptions, self.loop, "loop"))
         check_settings(self, _RANGES)

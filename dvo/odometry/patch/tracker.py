@@ -55,6 +55,7 @@ from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
 from dvo.odometry.window.evidence import newest_evidence
 from dvo.odometry.window.motion import flow_magnitude
 from dvo.odometry.window.patch_window import PatchWindow
+from dvo.odometry.window.sensors import WINDOW_SENSORS, WindowSensor
 
 
 @exclusive
@@ -110,7 +111,10 @@ class PatchOdometry:
         self.select = partial(select, patches=config.patches, generator=self.state.generator)
         sizes = config.patches, c.patch_size, c.hidden_channels
         self.graph = KeyframeGraph(*sizes, self.device, self.archive, lambda edges: self.patch_window.finalise(edges))
-        self.patch_window = PatchWindow(self.model, self.window, config.window, self.device)
+        self.sensors: list[WindowSensor] = [
+            WINDOW_SENSORS.resolve(name)(self.model, self.device) for name in config.sensors
+        ]
+        self.patch_window = PatchWindow(self.model, self.window, config.window, self.device, self.sensors)
         self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
 
     @property
@@ -155,6 +159,8 @@ class PatchOdometry:
         state, image = self.state, admitted.image
         if admitted.gap:
             state.interrupt(str(admitted.gap), is_gap=not admitted.gap.frozen)
+        for sensor in self.sensors:
+            sensor.observe(admitted.frame)
         mask = self._without_fixed(image, admitted.mask)
         seen = observe(self.model, image, admitted.camera, self.select, self.device, mask=mask)
         seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)

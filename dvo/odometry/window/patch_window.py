@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -21,6 +22,7 @@ from dvo.odometry.frames.front_end import View, keyframe_of
 from dvo.odometry.window.alignment import AlignmentSnapshot, WindowAlignment
 from dvo.odometry.window.correlation import WindowCorrelation
 from dvo.odometry.window.evidence import Evidence, evidence_of
+from dvo.odometry.window.sensors import WindowSensor
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class PatchWindow:
         window: keyframes and edges; see :meth:`empty`.
         settings: of the measurements.
         device: of the caches.
+        sensors: others whose measurements take part in every step.
 
     Attributes:
         bounds: ``(width, height)`` of the feature map.
@@ -121,8 +124,16 @@ class PatchWindow:
         >>> window.update(optimised=8)
     """
 
-    def __init__(self, model: PatchVO, window: Window, settings: StepSettings, device: torch.device) -> None:
+    def __init__(
+        self,
+        model: PatchVO,
+        window: Window,
+        settings: StepSettings,
+        device: torch.device,
+        sensors: Sequence[WindowSensor] = (),
+    ) -> None:
         self.model, self.window, self.settings, self.device = model, window, settings, device
+        self.sensors = tuple(sensors)
         self.correlation = WindowCorrelation(window, model.config, device)
         self.alignment = None if settings.align == "none" else WindowAlignment(window, settings.alignment, device)
         self.bounds = (0, 0)
@@ -150,7 +161,7 @@ class PatchWindow:
             window: with the same frames and edges.
             last: no step will be taken, only measurements aligned that leave the window (:meth:`finalise`).
         """
-        shared = {id(self.model): self.model, id(self.window): window}
+        shared = {id(self.model): self.model, id(self.window): window, id(self.sensors): self.sensors}
         return deepcopy(self, shared | ({id(self.correlation): self.correlation} if last else {}))
 
     def insert(self, position: int, keyframe: Keyframe, maps: Tensor, pose_cw: Tensor, patches: Tensor) -> None:
@@ -316,16 +327,21 @@ class PatchWindow:
 
         Args:
             options: of the step; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that of the
-                settings; measured depths join its factors.
+                settings; measured depths and the sensors of the window join its factors.
             align: use the sub-pixel alignment, if it takes part in every step. Its large weights would keep the first
                 solution of a window from leaving a wrong minimum.
         """
         refine = self.alignment if align and self.settings.align == "always" else None
         factors = *options.factors, *depth_factors(self.window.measured), *depth_factors(self.window.prior)
-        options = replace(options, bounds=self.bounds, kernel=self.settings.kernel, factors=factors)
+        factors += tuple(factor for sensor in self.sensors for factor in sensor.factors(self.window))
+        blocks = {name: block for sensor in self.sensors for name, block in sensor.blocks(self.window).items()}
+        options = replace(options, bounds=self.bounds, kernel=self.settings.kernel, factors=factors, blocks=blocks)
         after = step(self.model, self.state(), self.correlation, options, refine)
         assert after.targets is not None and after.weights is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]
         window.targets, window.weights = after.targets[0], after.weights[0]
         window.confidence = after.confidence[0]
+        for name, values in after.states.items():
+            for frame, value in zip(window.frames, values[0], strict=True):
+                frame.states[name] = value

@@ -32,6 +32,16 @@ def pytest_runtest_call(item):
 
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+CORE = ("geometry", "ba", "nets", "map", "data", "metrics", "eval/scoring")
+"""Rooms whose tests are the marker ``core``, but for those that are slow."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of the core rooms."""
+    folders = tuple(REPOSITORY / "tests" / room for room in CORE)
+    for item in items:
+        if any(folder in item.path.parents for folder in folders) and item.get_closest_marker("slow") is None:
+            item.add_marker(pytest.mark.core)
 
 # The same examples on every run; no deadline, because machines are shared.
 settings.register_profile("dvo", deadline=None, derandomize=True)

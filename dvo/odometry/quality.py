@@ -25,8 +25,8 @@ LEAST_TRACKED = 0.5
 CHECK_FOCAL, RUN_AGAIN = 0.2, 0.25
 """Lack of agreement, of what makes a result doubtful, above which it is asked for its focal length, and run again."""
 MAX_SHIFT_GAIN = 0.25
-"""Share of the cost of the followed corners that shifts of the images explain, above which the crop of the picture
-floats (:mod:`dvo.odometry.checks.floating_crop`)."""
+"""Share of the cost of the followed corners of a pair of images that a shift explains, median over the pairs, above
+which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
 MOST_FIXED = 0.2
 """Share of the image that is fixed to the camera: it takes part until it is found, so that the beginning suffers."""
 WRONG_FOCAL = 0.12
@@ -60,7 +60,7 @@ class Quality:
         deviation: median distance of the followed corners from the epipolar lines of the poses, over the median
             displacement of the corners of their pair; NaN without pairs.
         check: share of these corners within a pixel of the lines; NaN without pairs.
-        crop: share of the cost of these corners that shifts of the images explain; NaN with too few pairs.
+        crop: share of the cost of the corners of a pair that a shift of the image explains, median; NaN with few pairs.
         checks: number of pairs of images with followed corners.
         jumps: number of frames between which the camera moved far more than before and after.
         fixed: share of the image that is fixed to the camera, is in no mask that was given, and was left out.

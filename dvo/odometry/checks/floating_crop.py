@@ -3,8 +3,7 @@
 Electronic stabilisation moves the part of the image that is kept, and with it the principal point. To the tracker a
 shift looks like a turn, which it nearly is; what tells them apart is the second order towards the edges of the image.
 So the motion between the two images of a pair is fitted twice to the corners, with and without a shift of the second
-image, and the shares of the robust cost that the shift takes away are added up. A camera whose principal point stays
-needs none.
+image. Of a camera whose principal point stays, the shift takes away little of the robust cost of most pairs.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _STRONGEST = 1e8  # damping beyond which no step helps
 
 
 def shift_gain(pairs: Sequence[CheckPair], motions: Sequence[np.ndarray]) -> float:
-    """Share of the cost of the corners of all pairs that shifts of the second images take away.
+    """Share of the cost of the corners of a pair that a shift of the second image takes away, median over the pairs.
 
     Args:
         pairs: their corners as a global shutter would have seen them.
@@ -44,11 +43,11 @@ def shift_gain(pairs: Sequence[CheckPair], motions: Sequence[np.ndarray]) -> flo
     if len(known) < MIN_PAIRS:
         return math.nan
     chosen = [known[at] for at in np.unique(np.linspace(0, len(known) - 1, MAX_PAIRS).astype(int))]
-    plain = shifted = 0.0
+    gains = []
     for at in chosen:
-        without = fitted_cost(pairs[at], motions[at], False)
-        plain, shifted = plain + without, shifted + min(fitted_cost(pairs[at], motions[at], True), without)
-    return 1 - shifted / plain if plain > 0 else math.nan
+        plain, shifted = (fitted_cost(pairs[at], motions[at], with_shift) for with_shift in (False, True))
+        gains.append(max(1 - shifted / plain, 0.0) if plain > 0 else 0.0)
+    return float(np.median(gains))
 
 
 def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:

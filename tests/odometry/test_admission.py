@@ -90,3 +90,11 @@ def test_a_repeated_image_has_the_pose_and_the_state_of_the_first(name):
     for number in range(len(clip)):
         pair = [poses.get(round(0.2 * number + later, 6)) for later in (0.0, 0.1)]
         assert np.allclose(*pair, atol=1e-9) if pair[0] is not None else pair[1] is None
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_times_are_numbers_whatever_was_given(name):
+    odometry, clip = build(name), frames(0)
+    for number, frame in enumerate(clip[:4]):
+        estimate = odometry.track(changed(frame, timestamp=np.float32(number)))
+        assert type(estimate.timestamp) is float and estimate.timestamp == number

@@ -83,8 +83,8 @@ class KltPnp:
     def track(self, frame: Frame) -> Estimate:
         admitted = self._gate.admit(frame)
         if admitted.repeated and not admitted.problem:
-            return self._log.repeat(frame.timestamp)
-        index, frame = self._log.begin(frame.timestamp), admitted.frame
+            return self._log.repeat(admitted.timestamp)
+        index, frame = self._log.begin(admitted.timestamp), admitted.frame
         self._intrinsics, self._size = frame.camera.intrinsics, (frame.camera.width, frame.camera.height)
         grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         if self._grey is None and admitted.problem:

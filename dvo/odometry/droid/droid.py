@@ -148,18 +148,18 @@ class DroidOdometry:
         """
         admitted = self._gate.admit(frame)
         if admitted.repeated and self._last is not None:
-            self._last = self._repeat(frame.timestamp, self._last)
+            self._last = self._repeat(admitted.timestamp, self._last)
             return self._last
-        record = self.log.add(frame.timestamp)
+        record = self.log.add(admitted.timestamp)
         record.segment = self._segment
         if admitted.problem:
-            self._last = self._lose(frame.timestamp, admitted.problem)
+            self._last = self._lose(admitted.timestamp, admitted.problem)
             return self._last
         gap, image, camera = admitted.gap, admitted.image, admitted.camera.intrinsics
         if gap is not None and not gap.frozen and self._recent and self._interruption is None:
             self._interruption = record.reason = str(gap)
         self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.tolist()}
-        self._last = self._place(self._view(frame.timestamp, image, camera))
+        self._last = self._place(self._view(admitted.timestamp, image, camera))
         return self._last
 
     @torch.inference_mode()

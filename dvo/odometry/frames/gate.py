@@ -164,7 +164,7 @@ class Admitted:
         mask: ``(h, w)`` bool, pixels that count; None for all.
         repeated: the image is that of the frame before it.
         gap: time without a new image before it; None if there is none, or for a repeated image.
-        problem: what the image shows nothing for, such as ``"black image"``; empty for an image with content.
+        problem: why the image shows nothing, such as ``"black image"``; empty for an image with content.
     """
 
     frame: Frame

@@ -148,7 +148,7 @@ class PatchOdometry:
             state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
             if state.map is not None:
                 begin_in_map(self.graph, self.loops.finder, state)
-            record = self.graph.log.add(frame.timestamp)
+            record = self.graph.log.add(admitted.timestamp)
             if admitted.repeated:
                 return self._repeat(record)
             state.last = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)

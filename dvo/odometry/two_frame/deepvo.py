@@ -120,14 +120,14 @@ class DeepVOOdometry:
         admitted = self._gate.admit(frame)
         if admitted.repeated:
             last = self._estimates[-1]
-            return self._record(frame.timestamp, last.confidence, last.reason)
+            return self._record(admitted.timestamp, last.confidence, last.reason)
         if admitted.problem:
             self._before = self._state = self._alone = None
-            return self._record(frame.timestamp, 0.0, admitted.problem)
+            return self._record(admitted.timestamp, 0.0, admitted.problem)
         gap, reason = admitted.gap, ""
         if gap and not gap.frozen and self._before is not None:
             self._before, self._alone, reason = None, None, str(gap)
-        return self._record(frame.timestamp, self._advance(admitted.image), reason)
+        return self._record(admitted.timestamp, self._advance(admitted.image), reason)
 
     def finish(self) -> Result:
         """End the sequence. Frames are refused afterwards; a second call gives the same result.

@@ -209,9 +209,9 @@ class TartanOdometry:
         """
         admitted = self._gate.admit(frame)
         repeated = admitted.repeated
-        estimate = replace(self._estimates[-1], timestamp=frame.timestamp) if repeated else self._measure(admitted)
+        estimate = replace(self._estimates[-1], timestamp=admitted.timestamp) if repeated else self._measure(admitted)
         if estimate.status is Status.LOST:
-            self._reasons[frame.timestamp] = estimate.reason
+            self._reasons[admitted.timestamp] = estimate.reason
         self._estimates.append(estimate)
         return own_copy(estimate)
 

@@ -112,8 +112,8 @@ class DirectOdometry:
     def track(self, frame: Frame) -> Estimate:
         admitted = self._gate.admit(frame)
         if admitted.repeated and not admitted.problem:
-            return self._log.repeat(frame.timestamp)
-        index, image, camera = self._log.begin(frame.timestamp), admitted.image, admitted.camera
+            return self._log.repeat(admitted.timestamp)
+        index, image, camera = self._log.begin(admitted.timestamp), admitted.image, admitted.camera
         self._intrinsics, self._size = camera.intrinsics, (camera.width, camera.height)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         levels = pyramid(grey.astype(np.float32), camera.intrinsics, len(self.config.iterations))

@@ -107,7 +107,7 @@ class MonoSlam:
 
     def track(self, frame: Frame) -> Estimate:
         admitted = self._gate.admit(frame)  # a repeated image is measured: the camera stands
-        image, camera = admitted.image, admitted.camera
+        frame, image, camera = admitted.frame, admitted.image, admitted.camera
         pyramid = image_pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self._size = (camera.width, camera.height)
         dt = frame.timestamp - self._times[-1] if self._times else 0.0

@@ -11,9 +11,6 @@ from torch import Tensor
 
 from dvo.nets.patch.config import ModelConfig
 
-MASK_MARGIN = 3 * ModelConfig.STRIDE
-"""Distance of patch centres from ignored pixels: the size of a patch of three feature pixels, in image pixels."""
-
 _ENOUGH = 100  # places for patches, for which the margin is kept
 _ROUNDS = 12  # of the selection, until it is completed from all places
 _STRIDE = ModelConfig.STRIDE

@@ -5,12 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from dvo.nets.patch.masks import MASK_MARGIN, shrunk
-
 MATCHED = 0.15
 """Least share of matched corners of two images of the same scene."""
 
 NO_MATCH = "no match with the frames before"
+MASK_MARGIN = 12
+"""Distance from ignored pixels within which nothing is measured: the size of a patch of three feature pixels, at a
+quarter of the resolution."""
 MASKED = "masked image"
 """Reason of a loss of a frame of which its mask leaves too little."""
 
@@ -63,7 +64,8 @@ def missing_content(image: np.ndarray, mask: np.ndarray | None = None) -> str:
 
 def _missing_in_mask(grey: np.ndarray, mask: np.ndarray) -> str:
     """Description of an image of which a part is used, as :func:`missing_content`: by the blocks that lie in it."""
-    if shrunk(mask, MASK_MARGIN).mean() < _LEAST_USED:
+    margin = np.ones((2 * MASK_MARGIN + 1,) * 2, np.uint8)
+    if cv2.erode(mask.astype(np.uint8), margin).mean() < _LEAST_USED:
         return MASKED
     height, width = (max(2, side // _BLOCK) for side in grey.shape)
     share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)

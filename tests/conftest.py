@@ -43,6 +43,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if any(folder in item.path.parents for folder in folders) and item.get_closest_marker("slow") is None:
             item.add_marker(pytest.mark.core)
 
+
 # The same examples on every run; no deadline, because machines are shared.
 settings.register_profile("dvo", deadline=None, derandomize=True)
 settings.load_profile("dvo")

@@ -24,7 +24,7 @@ LEAST_TRACKED = 0.5
 """Share of frames with a pose below which a result is doubtful."""
 CHECK_FOCAL, RUN_AGAIN = 0.2, 0.25
 """Lack of agreement, of what makes a result doubtful, above which it is asked for its focal length, and run again."""
-MAX_SHIFT_GAIN = 0.25
+MAX_SHIFT_GAIN = 0.3
 """Share of the cost of the followed corners of a pair of images that a shift explains, median over the pairs, above
 which the crop of the picture floats (:mod:`dvo.odometry.checks.floating_crop`)."""
 MOST_FIXED = 0.2

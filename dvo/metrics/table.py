@@ -69,7 +69,7 @@ SHOWN = "ate_percent", "ate_rmse", "rpe_trans", "rpe_rot_deg"
 
 
 def shown(found: Metrics | dict[str, Any], names: Sequence[str] = SHOWN) -> list[tuple[Metric, str]]:
-    """Errors that a run prints, of those that are defined, with their texts.
+    """Errors that a run prints, of those that are defined, with their texts to three significant digits.
 
     Args:
         found: errors, or as run.json has them.
@@ -78,4 +78,4 @@ def shown(found: Metrics | dict[str, Any], names: Sequence[str] = SHOWN) -> list
     values = found if isinstance(found, dict) else vars(found)
     rows = [metric for metric in ERRORS if metric.name in names]
     known = [(row, values.get(row.name)) for row in rows]
-    return [(row, row.text(value)) for row, value in known if value is not None and math.isfinite(value)]
+    return [(row, f"{row.factor * value:.3g}") for row, value in known if value is not None and math.isfinite(value)]

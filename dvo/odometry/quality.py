@@ -39,7 +39,7 @@ MOST_JUMPS = 2
 MASK = "mask what moves or is fixed to the camera (--mask), or film so that most of the picture stands still"
 CALIBRATE = "check the calibration (dvo calibrate), or run without --calib"
 FILM = "film textured surfaces at a few metres while the camera moves sideways, or use --preset accurate"
-STEADY = "turn electronic stabilisation off, or film with a wide margin that no software crops"
+STEADY = "turn electronic stabilisation off"
 MOVE = "move the camera sideways while filming; a tripod or a single picture has no trajectory"
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
 from dvo.data.trajectory import Trajectory
 from dvo.metrics.table import ERRORS, Metric
@@ -162,9 +163,31 @@ _OWN = (
 
 FOREIGN = Registry("metric", "dvo.metrics")
 """Metrics of other packages."""
-METRICS = {
-    metric.name: metric for metric in (*map(_of_errors, ERRORS), *_OWN, *(FOREIGN.resolve(name) for name in FOREIGN))
-}
+
+
+def all_metrics(foreign: Registry) -> dict[str, Metric]:
+    """Metrics of the package, and those of others after them.
+
+    Args:
+        foreign: those of others.
+
+    Returns:
+        All by name.
+
+    Raises:
+        DvoError: one of another package has the name of another, or is announced by a name that is not its own.
+    """
+    found = {metric.name: metric for metric in (*map(_of_errors, ERRORS), *_OWN)}
+    for name in foreign:
+        metric = foreign.resolve(name)
+        if metric.name != name or name in found:
+            fault = "a metric of dvo has this name" if name in found else f"the metric calls itself {metric.name}"
+            raise DvoError(fault, field=f"entry point {name}", remedy="give both one name of their own")
+        found[name] = metric
+    return found
+
+
+METRICS = all_metrics(FOREIGN)
 """All by name."""
 
 

@@ -98,3 +98,24 @@ def test_times_are_numbers_whatever_was_given(name):
     for number, frame in enumerate(clip[:4]):
         estimate = odometry.track(changed(frame, timestamp=np.float32(number)))
         assert type(estimate.timestamp) is float and estimate.timestamp == number
+
+
+def unreadable():
+    raise DvoError("cannot be read", field="depth", remedy="replace it")
+
+
+@pytest.mark.parametrize("at", [0, 3, 7])
+def test_a_frame_that_failed_is_not_there_and_the_next_one_repeats_nothing(at):
+    """Its depth is read while it is processed; the image comes again with a depth that can be read."""
+    settings = SETTINGS["patch_vo"] | {"scale": {"depth": True}}
+    odometry, clip = build_odometry(network("patch_vo"), **settings), frames(0)
+    depth = np.ones((72, 96), np.float32)
+    for number, frame in enumerate(clip):
+        if number == at:
+            with pytest.raises(DvoError, match="depth: cannot be read"):
+                odometry.track(changed(frame, timestamp=frame.timestamp - 0.01, depth=unreadable))
+        estimate = odometry.track(changed(frame, depth=depth))
+        assert estimate.timestamp == frame.timestamp
+    result = odometry.finish()
+    assert set(result.trajectory.timestamps) <= {frame.timestamp for frame in clip}
+    assert result.frames_read == len(clip) + 1, "it was read, and is lost"

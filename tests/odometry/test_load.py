@@ -124,3 +124,9 @@ class Spare:
 
     def __init__(self, size=1):
         self.size = size
+
+
+@pytest.mark.parametrize("sensors", [3, None, [["imu"]], {"imu": 1}])
+def test_sensors_are_a_list_of_names(sensors):
+    with pytest.raises(DvoError, match="sensors: not a list of names"):
+        TrackerConfig(sensors=sensors)

@@ -10,10 +10,11 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.metrics import evaluate
 from dvo.nets.patch.masks import in_sight
+from dvo.odometry.frames.content import missing_content
 from dvo.odometry.load import build_odometry
 from dvo.odometry.load_map import load_map
 from dvo.odometry.protocol import Status
-from dvo.odometry.window.evidence import measured, missing_content
+from dvo.odometry.window.evidence import measured
 from tests.support.overlay_clip import overlay_clip
 from tests.support.tiny_members import SETTINGS, frames, network, outcome
 

@@ -18,7 +18,7 @@ from dvo.data.frame import Frame
 from dvo.odometry.classical import two_view
 from dvo.odometry.classical.frame_log import FrameLog, map_of
 from dvo.odometry.classical.klt import Tracks, detect, follow
-from dvo.odometry.frames.gate import Gate
+from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
 
@@ -81,7 +81,10 @@ class KltPnp:
         self._map: list[tuple[np.ndarray, np.ndarray]] = []
 
     def track(self, frame: Frame) -> Estimate:
-        admitted = self._gate.admit(frame)
+        with self._gate.admit(frame) as admitted:
+            return self._process(admitted)
+
+    def _process(self, admitted: Admitted) -> Estimate:
         if admitted.repeated and not admitted.problem:
             return self._log.repeat(admitted.timestamp)
         index, frame = self._log.begin(admitted.timestamp), admitted.frame

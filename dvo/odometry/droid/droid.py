@@ -146,21 +146,21 @@ class DroidOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        admitted = self._gate.admit(frame)
-        if admitted.repeated and self._last is not None:
-            self._last = self._repeat(admitted.timestamp, self._last)
+        with self._gate.admit(frame) as admitted:
+            if admitted.repeated and self._last is not None:
+                self._last = self._repeat(admitted.timestamp, self._last)
+                return self._last
+            record = self.log.add(admitted.timestamp)
+            record.segment = self._segment
+            if admitted.problem:
+                self._last = self._lose(admitted.timestamp, admitted.problem)
+                return self._last
+            gap, image, camera = admitted.gap, admitted.image, admitted.camera.intrinsics
+            if gap is not None and not gap.frozen and self._recent and self._interruption is None:
+                self._interruption = record.reason = str(gap)
+            self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.tolist()}
+            self._last = self._place(self._view(admitted.timestamp, image, camera))
             return self._last
-        record = self.log.add(admitted.timestamp)
-        record.segment = self._segment
-        if admitted.problem:
-            self._last = self._lose(admitted.timestamp, admitted.problem)
-            return self._last
-        gap, image, camera = admitted.gap, admitted.image, admitted.camera.intrinsics
-        if gap is not None and not gap.frozen and self._recent and self._interruption is None:
-            self._interruption = record.reason = str(gap)
-        self._info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": camera.tolist()}
-        self._last = self._place(self._view(admitted.timestamp, image, camera))
-        return self._last
 
     @torch.inference_mode()
     def finish(self) -> Result:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import median
 
@@ -197,11 +199,12 @@ class Gate:
     Example:
         >>> from dvo.geometry.camera import Camera
         >>> gate = Gate(pixels=None)
-        >>> image = np.zeros((48, 64, 3), np.uint8)
-        >>> gate.admit(Frame(0, 0.0, image, Camera(50.0, 50.0, 31.5, 23.5, 64, 48))).problem
-        'black image'
-        >>> gate.admit(Frame(1, 0.1, image, Camera(50.0, 50.0, 31.5, 23.5, 64, 48))).repeated
-        True
+        >>> image, camera = np.zeros((48, 64, 3), np.uint8), Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
+        >>> for index in range(2):
+        ...     with gate.admit(Frame(index, 0.1 * index, image, camera)) as admitted:
+        ...         print(admitted.problem, admitted.repeated)
+        black image False
+        black image True
     """
 
     def __init__(self, pixels: int | None, max_gap: float = math.inf, *, masks: bool = False) -> None:
@@ -210,13 +213,16 @@ class Gate:
         self.finished = False
         self._last: tuple[np.ndarray, str] | None = None  # image of the last frame, and its problem
 
-    def admit(self, frame: Frame) -> Admitted:
-        """Check the next frame, and bring it to the working size.
+    @contextmanager
+    def admit(self, frame: Frame) -> Iterator[Admitted]:
+        """Check the next frame, bring it to the working size, and process it in the body of the ``with`` statement.
+
+        A frame whose processing raises has been seen by nobody: the one after it repeats no image.
 
         Args:
             frame: as given by the caller.
 
-        Returns:
+        Yields:
             The frame; of a repeated image with the problem that it had before.
 
         Raises:
@@ -233,12 +239,18 @@ class Gate:
             )
         image, camera, mask = working_image(frame, self.pixels)
         self.sequence.check(frame)
-        if self._last is not None and np.array_equal(image, self._last[0]):
+        repeated, gap = self._last is not None and np.array_equal(image, self._last[0]), None
+        if repeated:
             self.sequence.repeat(frame.timestamp)
-            return Admitted(frame, image, camera, mask, repeated=True, gap=None, problem=self._last[1])
-        gap, problem = self.sequence.tick(frame.timestamp), missing_content(image, mask)
-        self._last = image, problem
-        return Admitted(frame, image, camera, mask, repeated=False, gap=gap, problem=problem)
+        else:
+            gap = self.sequence.tick(frame.timestamp)
+            self._last = image, missing_content(image, mask)
+        assert self._last is not None
+        try:
+            yield Admitted(frame, image, camera, mask, repeated=repeated, gap=gap, problem=self._last[1])
+        except BaseException:
+            self._last = None
+            raise
 
     def finish(self) -> bool:
         """Admit no frame from now on.

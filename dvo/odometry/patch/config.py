@@ -179,6 +179,8 @@ class TrackerConfig:
 
     def __post_init__(self) -> None:
         names = self.sensors.split(",") if isinstance(self.sensors, str) else self.sensors
+        if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) for name in names):
+            raise DvoError(f"not a list of names: {shown(names)}", field="sensors", remedy="give NAME,NAME")
         object.__setattr__(self, "sensors", tuple(name for name in names if name and WINDOW_SENSORS.target(name)))
         object.__setattr__(self, "scale", settings_of(ScaleOptions, self.scale, "scale"))
         object.__setattr__(self, "loop", settings_of(LoopOptions, self.loop, "loop"))

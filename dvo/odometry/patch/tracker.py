@@ -143,8 +143,10 @@ class PatchOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        with core_left(self.loops.maintenance.occupies_core):
-            admitted, state = self.gate.admit(frame), self.state
+        state = self.state
+        with core_left(self.loops.maintenance.occupies_core), self.gate.admit(frame) as admitted:
+            for sensor in self.sensors:
+                sensor.observe(admitted.frame)
             state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
             if state.map is not None:
                 begin_in_map(self.graph, self.loops.finder, state)
@@ -159,8 +161,6 @@ class PatchOdometry:
         state, image = self.state, admitted.image
         if admitted.gap:
             state.interrupt(str(admitted.gap), is_gap=not admitted.gap.frozen)
-        for sensor in self.sensors:
-            sensor.observe(admitted.frame)
         mask = self._without_fixed(image, admitted.mask)
         seen = observe(self.model, image, admitted.camera, self.select, self.device, mask=mask)
         seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)

@@ -33,7 +33,7 @@ class RegressionConfig:
             own working image (0: full resolution).
         max_gap: time between two images above which a segment ends, in medians of the recent intervals.
         min_matches: share of the corners of an image that are found in the next one
-            (:func:`dvo.odometry.window.evidence.matched_share`) below which the two do not show the same scene; 0:
+            (:func:`dvo.odometry.frames.content.matched_share`) below which the two do not show the same scene; 0:
             every image follows the one before it.
 
     Raises:
@@ -52,8 +52,8 @@ class RegressionConfig:
 class DeepVOOdometry:
     """Odometry of one sequence with :class:`dvo.models.deepvo.DeepVO`.
 
-    A frame has a pose if its image has content (:func:`dvo.odometry.window.evidence.missing_content`) and shows the
-    scene of the image before it (:func:`dvo.odometry.window.evidence.matched_share`, since the network has no
+    A frame has a pose if its image has content (:func:`dvo.odometry.frames.content.missing_content`) and shows the
+    scene of the image before it (:func:`dvo.odometry.frames.content.matched_share`, since the network has no
     measurements of its own); the first one of a segment is its world. A frame that does not is lost. For want of
     measurements no step is taken across lost frames or a gap in time: the next segment begins, with a world and a scale
     of its own and an empty recurrent state. After a cut its first frame is the lost one, which the result gives a pose
@@ -117,17 +117,17 @@ class DeepVOOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        admitted = self._gate.admit(frame)
-        if admitted.repeated:
-            last = self._estimates[-1]
-            return self._record(admitted.timestamp, last.confidence, last.reason)
-        if admitted.problem:
-            self._before = self._state = self._alone = None
-            return self._record(admitted.timestamp, 0.0, admitted.problem)
-        gap, reason = admitted.gap, ""
-        if gap and not gap.frozen and self._before is not None:
-            self._before, self._alone, reason = None, None, str(gap)
-        return self._record(admitted.timestamp, self._advance(admitted.image), reason)
+        with self._gate.admit(frame) as admitted:
+            if admitted.repeated:
+                last = self._estimates[-1]
+                return self._record(admitted.timestamp, last.confidence, last.reason)
+            if admitted.problem:
+                self._before = self._state = self._alone = None
+                return self._record(admitted.timestamp, 0.0, admitted.problem)
+            gap, reason = admitted.gap, ""
+            if gap and not gap.frozen and self._before is not None:
+                self._before, self._alone, reason = None, None, str(gap)
+            return self._record(admitted.timestamp, self._advance(admitted.image), reason)
 
     def finish(self) -> Result:
         """End the sequence. Frames are refused afterwards; a second call gives the same result.

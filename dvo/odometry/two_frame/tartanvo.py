@@ -62,7 +62,7 @@ class TwoFrameConfig:
             one.
         max_gap: time between frames above which they are separated by a gap, in medians of the recent intervals.
         min_matches: share of the corners of an image that are found in the next one
-            (:func:`dvo.odometry.window.evidence.matched_share`) below which the two do not show the same scene; 0:
+            (:func:`dvo.odometry.frames.content.matched_share`) below which the two do not show the same scene; 0:
             every image is taken for a view.
 
     Raises:
@@ -144,7 +144,7 @@ class TartanOdometry:
     """Odometry of one sequence with :class:`dvo.models.tartanvo.TartanVO`.
 
     A frame gets a pose if its image has content and shows the scene of the image before it
-    (:func:`dvo.odometry.window.evidence.matched_share`); images of noise do not, nor does the first one of another
+    (:func:`dvo.odometry.frames.content.matched_share`); images of noise do not, nor does the first one of another
     scene, which the result gives a pose once the frame after it agrees with it. After such frames, or a gap in time,
     the motion since the last frame with a pose counts if the flow there and the flow back agree; if they do not, the
     frame begins a segment with a world and a scale of its own.
@@ -207,9 +207,10 @@ class TartanOdometry:
             DvoError: a frame that :func:`dvo.data.frame_checks.checked_frame` refuses, a timestamp that does not
                 increase, an image of another size than the first, a camera with distortion, or a call after ``finish``.
         """
-        admitted = self._gate.admit(frame)
-        repeated = admitted.repeated
-        estimate = replace(self._estimates[-1], timestamp=admitted.timestamp) if repeated else self._measure(admitted)
+        with self._gate.admit(frame) as admitted:
+            repeated = admitted.repeated
+            time = admitted.timestamp
+            estimate = replace(self._estimates[-1], timestamp=time) if repeated else self._measure(admitted)
         if estimate.status is Status.LOST:
             self._reasons[admitted.timestamp] = estimate.reason
         self._estimates.append(estimate)

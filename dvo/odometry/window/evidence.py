@@ -10,7 +10,6 @@ from torch import Tensor
 from dvo.geometry.projection import reproject
 from dvo.map.window import Window
 from dvo.odometry.frames.content import MATCHED, matched_share
-from dvo.odometry.frames.content import missing_content as missing_content  # its former place
 
 CONFIDENT = 0.1
 """Confidence of a measurement above which it can be an inlier."""

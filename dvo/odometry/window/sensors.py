@@ -27,7 +27,7 @@ class WindowSensor(Protocol):
         """Take what a frame carries.
 
         Args:
-            frame: each one with content, in order of time, whether it becomes a keyframe or not.
+            frame: each one, in order of time: also one that repeats an image or shows nothing.
         """
         ...
 

@@ -69,6 +69,24 @@ def test_order_and_size():
     sequence.check(frame(2.0))
 
 
+def admitted_by(gate, frame):
+    with gate.admit(frame) as admitted:
+        return admitted
+
+
+def test_a_frame_whose_processing_failed_is_not_repeated():
+    """What the odometry knows of the image before it belongs to another one."""
+    camera, image = Camera(50.0, 50.0, 31.5, 23.5, 64, 48), np.zeros((48, 64, 3), np.uint8)
+    gate = Gate(pixels=None)
+    with pytest.raises(DvoError, match="no depth"), gate.admit(Frame(0, 0.0, image, camera)):
+        raise DvoError("no depth")
+    assert not admitted_by(gate, Frame(1, 0.1, image, camera)).repeated
+    assert admitted_by(gate, Frame(2, 0.2, image, camera)).repeated
+    with pytest.raises(KeyboardInterrupt), gate.admit(Frame(3, 0.3, image, camera)):
+        raise KeyboardInterrupt
+    assert not admitted_by(gate, Frame(4, 0.4, image, camera)).repeated
+
+
 def test_a_gate_keeps_images_of_its_own():
     """A caller may use its buffers for the next frame."""
     camera, image, mask = (
@@ -78,16 +96,16 @@ def test_a_gate_keeps_images_of_its_own():
     )
     image[:, ::16] = 200
     gate = Gate(pixels=None, masks=True)
-    first = gate.admit(Frame(0, 0.0, image, camera, mask=mask))
+    first = admitted_by(gate, Frame(0, 0.0, image, camera, mask=mask))
     before = first.image.copy()
     image[:], mask[:] = np.roll(image, 5, 1), False
     assert np.array_equal(first.image, before) and first.mask.all()
-    assert not gate.admit(Frame(1, 0.1, image, camera)).repeated
+    assert not admitted_by(gate, Frame(1, 0.1, image, camera)).repeated
 
 
 @pytest.mark.parametrize(("pixels", "size"), [(None, (65, 49)), (0, (64, 48)), (32 * 24, (32, 32))])
 def test_a_gate_gives_the_working_image(pixels, size):
     camera, image = Camera(50.0, 50.0, 32.0, 24.0, 65, 49), np.zeros((49, 65, 3), np.uint8)
-    admitted = Gate(pixels).admit(Frame(0, 0.0, image, camera))
+    admitted = admitted_by(Gate(pixels), Frame(0, 0.0, image, camera))
     assert admitted.image.shape == (size[1], size[0], 3) and (admitted.camera.width, admitted.camera.height) == size
     assert admitted.problem == "black image" and admitted.mask is None and admitted.gap is None

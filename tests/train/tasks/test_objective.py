@@ -10,6 +10,7 @@ from dvo.ba.layer.layer import BAOptions, bundle_adjust
 from dvo.ba.multistart import COLD_STARTS, multistart
 from dvo.ba.patch_problem import PatchProblem
 from dvo.core.errors import DvoError
+from dvo.core.registry import Registry
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.pose import pose_errors
@@ -28,6 +29,22 @@ PATCHES = 24
 def test_a_setting_without_a_value_is_refused(settings, change):
     with pytest.raises(DvoError, match=f"{next(iter(change))}: must be a number, got None"):
         settings(**change)
+
+
+@pytest.mark.parametrize(
+    ("name", "weight", "words"),
+    [
+        ("flow", 1.0, "another loss term 'flow'"),
+        ("sharpness", float("nan"), "sharpness: must be a number, got nan"),
+        ("sharpness", "much", "sharpness: must be a number, got 'much'"),
+        ("softness", 1.0, "no loss term 'softness'"),
+    ],
+)
+def test_further_terms_have_names_and_weights_of_their_own(name, weight, words, monkeypatch):
+    targets = {name: "somewhere:TERM" for name in ("flow", "sharpness")}
+    monkeypatch.setattr("train.tasks.patch_vo.objective.LOSS_TERMS", Registry("loss term", targets=targets))
+    with pytest.raises(DvoError, match=words):
+        LossConfig(terms={name: weight})
 
 
 def state_of(graph, poses_cw, patches, coords, targets, weights):

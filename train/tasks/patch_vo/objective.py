@@ -3,6 +3,7 @@ V2V if wanted."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,8 +12,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
-from dvo.core.settings import check_settings
+from dvo.core.settings import check_settings, shown
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.balance import PARAMETER
@@ -26,6 +28,9 @@ LOSS_TERMS = Registry("loss term", "dvo.loss_terms")
 """Further terms of the loss by name, those of other packages; ``LossConfig.terms`` gives them a weight. A term is a
 function of the state after an update and of the truth (:class:`dvo.models.patch_vo.UpdateState`, :class:`Truth`), and
 gives a scalar tensor with a graph."""
+
+TERMS = "target", "flow", "translation", "rotation"
+"""Names of the terms that are always there."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,12 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         check_settings(self, {"trend_window": (1, 10_000)})
-        for name in self.terms:
+        for name, weight in self.terms.items():
             LOSS_TERMS.target(name)  # an unknown one is an error
+            if name in TERMS:
+                raise DvoError(f"another loss term '{name}'", field="terms", remedy=f"none of {', '.join(TERMS)}")
+            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not math.isfinite(weight):
+                raise DvoError(f"must be a number, got {shown(weight)}", field=f"terms: {name}", remedy="give a weight")
 
     @property
     def follows_gradients(self) -> bool:

@@ -22,7 +22,7 @@ from dvo.odometry.classical.direct.image import Level, pyramid
 from dvo.odometry.classical.direct.start import TwoViewStart, spread
 from dvo.odometry.classical.direct.stereo import StereoConfig, search_lines
 from dvo.odometry.classical.frame_log import FrameLog, map_of
-from dvo.odometry.frames.gate import Gate
+from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
 
@@ -110,7 +110,10 @@ class DirectOdometry:
         self._counts = {"maps_started": 0, "keyframes": 0}
 
     def track(self, frame: Frame) -> Estimate:
-        admitted = self._gate.admit(frame)
+        with self._gate.admit(frame) as admitted:
+            return self._process(admitted)
+
+    def _process(self, admitted: Admitted) -> Estimate:
         if admitted.repeated and not admitted.problem:
             return self._log.repeat(admitted.timestamp)
         index, image, camera = self._log.begin(admitted.timestamp), admitted.image, admitted.camera

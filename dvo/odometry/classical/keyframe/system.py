@@ -27,7 +27,7 @@ from dvo.odometry.classical.keyframe.map import Keyframe, Map
 from dvo.odometry.classical.keyframe.pose import centre, refine_pose
 from dvo.odometry.classical.keyframe.relocalise import relocalise, search
 from dvo.odometry.classical.klt import detect, follow
-from dvo.odometry.frames.gate import Gate
+from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 
 
@@ -59,7 +59,10 @@ class KeyframeOdometry:
         self._counts = {"maps_started": 0, "planar_starts": 0, "keyframes": 0, "culled": 0, "relocalised": 0}
 
     def track(self, frame: Frame) -> Estimate:
-        admitted = self._gate.admit(frame)
+        with self._gate.admit(frame) as admitted:
+            return self._process(admitted)
+
+    def _process(self, admitted: Admitted) -> Estimate:
         if admitted.repeated and not admitted.problem:
             return self._log.repeat(admitted.timestamp)
         index, frame = self._log.begin(admitted.timestamp), admitted.frame

@@ -35,7 +35,7 @@ from dvo.odometry.classical.monoslam.search import (
     self_likeness,
     templates,
 )
-from dvo.odometry.frames.gate import Gate
+from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
 
@@ -106,7 +106,10 @@ class MonoSlam:
         self._map: list[tuple[np.ndarray, np.ndarray]] = []
 
     def track(self, frame: Frame) -> Estimate:
-        admitted = self._gate.admit(frame)  # a repeated image is measured: the camera stands
+        with self._gate.admit(frame) as admitted:  # a repeated image is measured: the camera stands
+            return self._process(admitted)
+
+    def _process(self, admitted: Admitted) -> Estimate:
         frame, image, camera = admitted.frame, admitted.image, admitted.camera
         pyramid = image_pyramid(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
         self._size = (camera.width, camera.height)

@@ -23,7 +23,7 @@ class Status(StrEnum):
 
     INITIALISING = "initialising"
     TRACKING = "tracking"
-    LOST = "lost"  # the result may have a pose all the same (:mod:`dvo.odometry.patch.late_join`)
+    LOST = "lost"  # the result may have a pose all the same (:mod:`dvo.odometry.patch.retry`)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from eval.execution.plan import Manifest, groundtruth_file
 from eval.execution.predict import RECORD, read_prediction, read_segments
 from eval.reporting.loops import NOTE, TITLES, loop_lines, loop_table
 from eval.reporting.plots import plot_axis, plot_sequence, plot_speed, styles
-from eval.reporting.tables import MADE_UP_NOTE, SEGMENTS_NOTE, axis_table, markdown, one_line, speed_note, write_csv
+from eval.reporting.tables import FALSE_POSES_NOTE, SEGMENTS_NOTE, axis_table, markdown, one_line, speed_note, write_csv
 from eval.reporting.verdict import verdicts
 from eval.scoring.metric_table import BLACKOUT, FIGURES, METRICS, OVERALL, RESOURCES
 from eval.scoring.score import Row
@@ -143,7 +143,7 @@ def content(out: Path, manifest: Manifest, rows: list[Row], say: Callable[[str],
         "speed_note": speed_note(manifest, rows),
         "overall_titles": [metric.title for metric in (*OVERALL, *segment_columns(rows), *RESOURCES)],
         "overall": [(name, overall(name, rows)) for name in manifest.systems],
-        "notes": {"segments": SEGMENTS_NOTE, "made-up poses": MADE_UP_NOTE},
+        "notes": {"segments": SEGMENTS_NOTE, "false poses": FALSE_POSES_NOTE},
         "loops": {"note": NOTE, "titles": TITLES, "lines": loop_lines(manifest, rows)},
         "failures": [(row, one_line(row.reason)) for row in rows if row.failed],
         "sections": sections,

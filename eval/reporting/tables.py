@@ -30,7 +30,7 @@ SEGMENTS_NOTE = (
     f"without a view and each {FRAMES_PER_WORLD} frames; a run fails if the scored part is too small. Compare ATE of "
     f"different numbers of segments with care: cutting lowers it."
 )
-MADE_UP_NOTE = "Made-up poses: share of the frames without a view (black, white, noise) that have a pose nevertheless."
+FALSE_POSES_NOTE = "False poses: share of the frames without a view (black, white, noise) that have a pose."
 
 
 def axis_table(manifest: Manifest, rows: list[Row]) -> str:
@@ -140,7 +140,7 @@ def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
         f"A run fails if it crashes, takes over {suite.time_limit:g} s, leaves poses that are not finite or poses for "
         f"fewer than {100 * suite.lost_below:g} % of the frames; failed runs count as infinite errors.",
         SEGMENTS_NOTE if any(row.segments > 1 for row in rows) else "",
-        MADE_UP_NOTE if any(row.unseen for row in rows) else "",
+        FALSE_POSES_NOTE if any(row.unseen for row in rows) else "",
         f"Working resolution: {worked}." if worked else "",
         speed_note(manifest, rows),
     ]

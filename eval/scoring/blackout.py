@@ -53,7 +53,7 @@ def is_dark(image: np.ndarray) -> bool:
 def without_view(image: np.ndarray) -> bool:
     """Return True if a ``(H, W, 3)`` uint8 image is black, white, or noise: no pose can be found from it.
 
-    Independent of the criteria of the systems that are judged by it (:mod:`dvo.odometry.window.evidence`).
+    Independent of the criteria of the systems that are judged by it (:mod:`dvo.odometry.window.pose_validation`).
 
     Args:
         image: RGB.

@@ -75,7 +75,7 @@ class Scored:
         return found if self.status == "ok" and math.isfinite(found) else 0.0
 
 
-def made_up_share(unseen: Sequence[float], segments: Sequence[Segment]) -> float:
+def false_pose_share(unseen: Sequence[float], segments: Sequence[Segment]) -> float:
     """Share of the frames without a view that carry a pose; nan without such a frame.
 
     Args:
@@ -115,8 +115,8 @@ def _shape_percent(run: Scored) -> float:
     return 100 * run.errors.shape / path if path > 0 else math.nan
 
 
-def _made_up(run: Scored) -> float:
-    return made_up_share(run.prediction.unseen, run.segments) if run.prediction.status == "ok" else math.nan
+def _false_poses(run: Scored) -> float:
+    return false_pose_share(run.prediction.unseen, run.segments) if run.prediction.status == "ok" else math.nan
 
 
 _OWN = (
@@ -150,7 +150,7 @@ _OWN = (
     Metric("scored", "scored %", "%", 0, lambda run: run.scored, "high", 100.0),
     # Frames without a view (eval.scoring.blackout.without_view), and the share of them that carries a pose.
     Metric("unseen", "frames without a view", "", 0, lambda run: len(run.prediction.unseen), ""),
-    Metric("made_up", "made-up poses %", "%", 0, _made_up, "low", 100.0),
+    Metric("false_poses", "false poses %", "%", 0, _false_poses, "low", 100.0),
     # See eval.scoring.loops.LoopErrors.
     Metric("loops", "loops", "", 0, lambda run: run.loops.loops, ""),
     Metric("false_loops", "false loops", "", 0, lambda run: run.loops.false),
@@ -214,7 +214,7 @@ BLACKOUT = columns("segment_ate_percent", "recovery_s")
 """Where images are dark."""
 SEGMENTS = columns("segments", "scored")
 """Where a run has several segments."""
-MADE_UP = columns("made_up")
+FALSE_POSES = columns("false_poses")
 """Where there are frames without a view."""
 RESOURCES = columns("fps", "latency_p95_ms", "peak_memory_mb")
 """Which failed runs have too."""

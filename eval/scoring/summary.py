@@ -15,7 +15,7 @@ import numpy as np
 
 from dvo.metrics.table import Metric
 from eval.execution.plan import Manifest
-from eval.scoring.metric_table import MADE_UP, METRICS, SEGMENTS
+from eval.scoring.metric_table import FALSE_POSES, METRICS, SEGMENTS
 from eval.scoring.metric_table import NEVER_MADE as VOID
 from eval.scoring.score import Row
 from eval.suites.suite import Sequence as Recording
@@ -173,7 +173,7 @@ def segment_columns(rows: Iterable[Row]) -> list[Metric]:
     rows = list(rows)
     unseen = any(row.unseen for row in rows)
     several = any(row.segments > 1 for row in rows)
-    return [*(SEGMENTS if several or any(row.blackouts for row in rows) else ()), *(MADE_UP if unseen else ())]
+    return [*(SEGMENTS if several or any(row.blackouts for row in rows) else ()), *(FALSE_POSES if unseen else ())]
 
 
 def count_cell(rows: Iterable[Row], metric: Metric) -> Cell:

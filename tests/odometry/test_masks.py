@@ -1,4 +1,4 @@
-"""Masks in the tracker: patches, weights, evidence, saved maps, and a clip under an overlay."""
+"""Masks in the tracker: patches, weights, support, saved maps, and a clip under an overlay."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from dvo.odometry.frames.content import missing_content
 from dvo.odometry.load import build_odometry
 from dvo.odometry.load_map import load_map
 from dvo.odometry.protocol import Status
-from dvo.odometry.window.evidence import measured
+from dvo.odometry.window.pose_validation import measured
 from tests.support.overlay_clip import overlay_clip
 from tests.support.tiny_members import SETTINGS, frames, network, outcome
 

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from dvo.core.settings import check_settings
 
 _LONGEST = 2.0  # pixels that one iteration may move
-_NOISE = 1.0  # grey levels; texture weaker than this is no evidence
+_NOISE = 1.0  # grey levels; weaker texture does not count
 _SCALES = (0.25, 4.0)  # of the area of a patch, within which the affine warp of the grey levels is trusted
 
 

@@ -18,7 +18,7 @@ from dvo.odometry.checks.floating_crop import shift_gain
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.protocol import Result
 from dvo.odometry.quality import Quality, judge
-from dvo.odometry.window.evidence import AGREEMENT, CONFIDENT
+from dvo.odometry.window.pose_validation import AGREEMENT, CONFIDENT
 
 FIELDS = (4, 3)
 """Fields of the image, across and down, in which the spread of the measurements is counted."""

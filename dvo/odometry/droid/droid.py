@@ -83,7 +83,7 @@ class DroidOdometry:
     """Odometry of one sequence with :class:`dvo.models.droid.DroidVO`.
 
     Until the initialisation frames have the status ``initialising`` and no pose; ``finish`` gives them one. A frame
-    whose measurements do not bear out its pose is lost. After ``patience`` such frames the segment ends and the next
+    whose measurements do not support its pose is lost. After ``patience`` such frames the segment ends and the next
     one begins, with a world and a scale of its own. The same frames on the same machine give the same trajectory, bit
     for bit on the CPU with a fixed number of threads.
 

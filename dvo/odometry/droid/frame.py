@@ -17,7 +17,7 @@ from dvo.odometry.droid.window import Agreement, Keyframe, agreement
 
 @dataclass(frozen=True)
 class Placed:
-    """Pose of a frame and its evidence.
+    """Pose of a frame and its support.
 
     Attributes:
         pose_cw: ``(7,)`` world to camera; as given if only the flow was looked for.
@@ -51,7 +51,7 @@ def place_frame(
         kernel: robust kernel of the residuals, see :class:`dvo.models.dense_step.DenseOptions`.
 
     Returns:
-        Pose and evidence.
+        Pose and support.
     """
     config, count = model.config, len(anchors)
     h, w = matching.shape[-2:]

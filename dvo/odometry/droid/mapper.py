@@ -120,7 +120,7 @@ class DenseMapper:
         return True
 
     def supports(self, found: Agreement, joining: bool = False) -> bool:
-        """Decide if measurements bear out poses.
+        """Decide if measurements support poses.
 
         Args:
             found: their agreement.

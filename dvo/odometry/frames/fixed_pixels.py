@@ -21,7 +21,7 @@ EXPECTED = 0.8
 """Least mean displacement between samples, across the gradient of a fixed pixel, that the motion of the picture asks
 for, pixels."""
 LARGE = 3.0
-"""Displacement above which a sample counts no more, pixels: one jump is no evidence."""
+"""Displacement above which a sample counts no more, pixels: one jump proves nothing."""
 CORNERS = 80
 """Corners that the motion of the picture is taken from, found in the image at half its size."""
 MIN_CORNERS = 8

@@ -25,8 +25,8 @@ from dvo.models.patch_vo import PatchVO
 from dvo.models.step import StepOptions
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.frames.front_end import encode_image
-from dvo.odometry.window.evidence import related_share
 from dvo.odometry.window.patch_window import PatchWindow, StepSettings
+from dvo.odometry.window.pose_validation import related_share
 
 Group = tuple[ArchivedKeyframe, ...]
 """Keyframe with its neighbours."""

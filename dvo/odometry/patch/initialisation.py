@@ -11,9 +11,9 @@ from dvo.odometry.depth.depth_factor import MEASURED_SHARE, match_window, measur
 from dvo.odometry.frames.content import NO_MATCH
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.uncertainty.uncertainty import has_second_solution
-from dvo.odometry.window.evidence import last_unrelated, measured
 from dvo.odometry.window.motion import parallax
 from dvo.odometry.window.patch_window import PatchWindow
+from dvo.odometry.window.pose_validation import last_unrelated, measured
 
 RESTART_AGES = frozenset({4, 8, 16, 32})
 """Numbers of frames after the initialisation at which its solution is compared with others."""

@@ -44,17 +44,17 @@ from dvo.odometry.patch.initialisation import (
     leave_minimum,
     restart_due,
 )
-from dvo.odometry.patch.late_join import join_waiting
 from dvo.odometry.patch.loops import loop_closer
 from dvo.odometry.patch.new_recording import begin_in_map
+from dvo.odometry.patch.retry import retry_waiting
 from dvo.odometry.patch.saving import save_map
 from dvo.odometry.patch.state import Phase, TrackerState
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
 from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
-from dvo.odometry.window.evidence import newest_evidence
 from dvo.odometry.window.motion import flow_magnitude
 from dvo.odometry.window.patch_window import PatchWindow
+from dvo.odometry.window.pose_validation import newest_support
 from dvo.odometry.window.sensors import WINDOW_SENSORS, WindowSensor
 
 
@@ -126,11 +126,11 @@ class PatchOdometry:
     def track(self, frame: Frame) -> Estimate:
         """Process the next frame.
 
-        A frame without content, or whose pose its measurements do not bear out (:mod:`dvo.odometry.window.evidence`),
-        is lost and leaves the graph. Those after it are joined with the window if there is evidence for it, and may
-        bring it back (:mod:`dvo.odometry.patch.late_join`); after ``config.patience`` frames with content that could
-        not be joined, these begin the next segment. A loop (:mod:`dvo.odometry.loops.closure`) also moves and scales
-        earlier frames.
+        A frame without content, or whose pose is not valid (:mod:`dvo.odometry.window.pose_validation`), is lost and
+        leaves the graph. Those after it are joined with the window where their measurements validate it, and may bring
+        it back (:mod:`dvo.odometry.patch.retry`); after ``config.patience`` frames with content that could not be
+        joined, these begin the next segment. A loop (:mod:`dvo.odometry.loops.closure`) also moves and scales earlier
+        frames.
 
         Args:
             frame: of the same size as the first, later than the one before, without lens distortion.
@@ -264,7 +264,7 @@ class PatchOdometry:
         state.tracked += 1
         if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
             state.ambiguous = leave_minimum(self.patch_window, config)
-        join_waiting(self.graph, self.patch_window, state, config, record)
+        retry_waiting(self.graph, self.patch_window, state, config, record)
         if self.graph.located is not None and state.tracked % REFRESH_EVERY == 0:
             hold_to_map(self.graph, self.patch_window, self.loops.finder)
         self._reduce()  # may correct the window
@@ -308,7 +308,7 @@ class PatchOdometry:
         record.place(identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
             enough = initialise_related(self.graph, self.patch_window, config, state.waited)
-            if enough and newest_evidence(window).supports(config.lost_confidence, config.min_inliers):
+            if enough and newest_support(window).reaches(config.lost_confidence, config.min_inliers):
                 state.initialise(self.graph.segment)
                 if config.restart:
                     state.ambiguous = measured_share(window.measured) < MEASURED_SHARE  # until it is tried

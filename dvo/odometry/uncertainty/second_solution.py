@@ -1,4 +1,4 @@
-"""Second solutions of a window: other motions that its measurements bear out nearly as well (:mod:`dvo.ba.multistart`).
+"""Second solutions of a window: other motions that its measurements support nearly as well (:mod:`dvo.ba.multistart`).
 
 The curvature of the cost at one minimum says nothing of another one. While the motion is small, or the scene has little
 texture, a window may have two of similar cost, and the tracker may be at the wrong one. Each solution then has a

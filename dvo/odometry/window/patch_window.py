@@ -21,7 +21,7 @@ from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.frames.front_end import View, keyframe_of
 from dvo.odometry.window.alignment import AlignmentSnapshot, WindowAlignment
 from dvo.odometry.window.correlation import WindowCorrelation
-from dvo.odometry.window.evidence import Evidence, evidence_of
+from dvo.odometry.window.pose_validation import PoseSupport, support_of
 from dvo.odometry.window.sensors import WindowSensor
 
 
@@ -81,11 +81,11 @@ class Attempt:
 
     Attributes:
         accepted: the window holds it; otherwise the window is as it was before.
-        evidence: for its pose, after the last round.
+        support: of its pose, after the last round.
     """
 
     accepted: bool
-    evidence: Evidence
+    support: PoseSupport
 
 
 @dataclass(frozen=True)
@@ -235,18 +235,18 @@ class PatchWindow:
         before = self.snapshot()
         self.add(view, position, identifier, pose_cw, depth)
         self.connect(position, policy.lifetime)
-        evidence = Evidence(0.0, 0.0)
+        support = PoseSupport(0.0, 0.0)
         for one in policy.rounds:
             self.update(policy.optimised, one.updates)
-            found = [evidence_of(self.window, k) for k in range(position, position + 1 + policy.later)]
-            evidence = found[0]
-            if all(each.supports(policy.confidence, one.inliers) for each in found):
-                return Attempt(True, evidence)
+            found = [support_of(self.window, k) for k in range(position, position + 1 + policy.later)]
+            support = found[0]
+            if all(each.reaches(policy.confidence, one.inliers) for each in found):
+                return Attempt(True, support)
         if not policy.checked:
-            return Attempt(True, evidence)
+            return Attempt(True, support)
         self.window.remove(position)
         self.restore(before)
-        return Attempt(False, evidence)
+        return Attempt(False, support)
 
     def update(self, optimised: int, count: int = 1) -> None:
         """Take steps on the window of an initialised segment.

@@ -142,7 +142,7 @@ def line(found: Score) -> str:
     moved = f", moved {found.moved:.4f}" if found.kind == "frozen" else ""
     return (
         f"{found.clip:>24s} seed {found.seed} {found.kind:>11s} {found.duration:3d}: "
-        f"made up {found.made_up}/{found.dark}, posed {found.posed}/{found.good}, "
+        f"false {found.false_poses}/{found.dark}, posed {found.posed}/{found.good}, "
         f"tracked again after {found.recovery}, "
         f"{'told' if found.told else 'not told'}, {found.segments} segments{scale}{moved}, "
         f"ATE {found.error:.4f} m, uninterrupted {found.error_without:.4f} m"
@@ -159,21 +159,21 @@ def summary(scores: list[Score]) -> str:
         Table in Markdown. The ratio is the median over trials of the error to that without the interruption.
     """
     rows = [
-        "| interruption | trials | made-up poses | good frames posed | tracked again within 15 | told | ATE ratio |",
+        "| interruption | trials | false poses | good frames posed | tracked again within 15 | told | ATE ratio |",
         "|---|---|---|---|---|---|---|",
     ]
     for kind in [*WITHOUT_VIEW, *OTHERS, "all"]:
         chosen = [found for found in scores if kind in (found.kind, "all")]
         if not chosen:
             continue
-        dark, made_up = sum(found.dark for found in chosen), sum(found.made_up for found in chosen)
+        dark, false_poses = sum(found.dark for found in chosen), sum(found.false_poses for found in chosen)
         good, posed = sum(found.good for found in chosen), sum(found.posed for found in chosen)
         soon = sum(found.recovery is not None and found.recovery <= 15 for found in chosen)
         told = [found for found in chosen if found.kind != "frozen"]
         kept = [is_told(found) for found in told]
         ratio = np.nanmedian([found.error / max(found.error_without, 1e-9) for found in chosen])
         rows.append(
-            f"| {kind} | {len(chosen)} | {made_up} of {dark} | {posed} of {good} ({100 * posed / good:.1f} %) "
+            f"| {kind} | {len(chosen)} | {false_poses} of {dark} | {posed} of {good} ({100 * posed / good:.1f} %) "
             f"| {soon} of {len(chosen)} | {sum(kept)} of {len(told)} | {ratio:.2f} |"
         )
     return "\n".join(rows)

@@ -24,7 +24,7 @@ class Score:
         clip, kind, seed: of the trial.
         duration: of the interruption, frames (of a gap: 0).
         dark: frames without a view.
-        made_up: of these, frames with the status ``tracking``, or with a row in the result.
+        false_poses: of these, frames with the status ``tracking``, or with a row in the result.
         good: frames with a view.
         posed: of these, frames with a row in any segment.
         recovery: good frames after the interruption up to the first with the status ``tracking``, that one included;
@@ -43,7 +43,7 @@ class Score:
     seed: int
     duration: int
     dark: int
-    made_up: int
+    false_poses: int
     good: int
     posed: int
     recovery: int | None
@@ -92,7 +92,7 @@ def score(trial: Trial, clip: Clip, estimates: Sequence[Estimate], result: Resul
         seed=trial.seed,
         duration=trial.duration,
         dark=int(trial.without_view.sum()),
-        made_up=int((trial.without_view & (tracking | rows)).sum()),
+        false_poses=int((trial.without_view & (tracking | rows)).sum()),
         good=int(trial.good.sum()),
         posed=int((trial.good & rows).sum()),
         recovery=int(after[0]) + 1 if len(after) else None,

@@ -186,22 +186,22 @@ def test_curves_break_where_there_are_no_frames():
     assert len(with_breaks(curve[:1])) == 1 and len(with_breaks(curve[:0])) == 0
 
 
-def test_tables_and_page_tell_segments_and_made_up_poses(plan, rows):
+def test_tables_and_page_tell_segments_and_false_poses(plan, rows):
     manifest, suite = read_manifest(plan.out), plan.suites[0]
-    plain = [replace(row, unseen=0, made_up=math.nan) for row in rows]
+    plain = [replace(row, unseen=0, false_poses=math.nan) for row in rows]
     titles = markdown(manifest, suite, plain).splitlines()[2]
-    assert "segments" not in titles and "made-up" not in titles
-    good = [replace(r, segments=3, scored=0.8, unseen=4, made_up=0.25) if r.system == "good" else r for r in plain]
+    assert "segments" not in titles and "false poses" not in titles
+    good = [replace(r, segments=3, scored=0.8, unseen=4, false_poses=0.25) if r.system == "good" else r for r in plain]
     table = markdown(manifest, suite, good)
     titles, _, first = table.splitlines()[2:5]
     cells = dict(zip(titles.split("|"), first.split("|"), strict=True))
-    assert [cells[f" {name} "].strip() for name in ("segments", "scored %", "made-up poses %")] == ["3", "80", "25"]
-    assert "aligned on its own" in table and "Made-up poses: share" in table
+    assert [cells[f" {name} "].strip() for name in ("segments", "scored %", "false poses %")] == ["3", "80", "25"]
+    assert "aligned on its own" in table and "False poses: share" in table
     page = write_report(plan.out, manifest, good).read_text(encoding="utf-8")
-    for title in ("segments", "scored %", "made-up poses %"):
+    for title in ("segments", "scored %", "false poses %"):
         assert page.count(f"<th>{title}</th>") == 2, title  # systems, and the sequence
     page = write_report(plan.out, manifest, plain).read_text(encoding="utf-8")
     assert "<th>segments</th>" not in page
-    dark = [replace(row, blackouts=1, unseen=20, made_up=0.0) for row in plain]
+    dark = [replace(row, blackouts=1, unseen=20, false_poses=0.0) for row in plain]
     page = write_report(plan.out, manifest, dark).read_text(encoding="utf-8")
-    assert "<th>segments</th>" in page and "<th>made-up poses %</th>" in page  # always, where it goes dark
+    assert "<th>segments</th>" in page and "<th>false poses %</th>" in page  # always, where it goes dark

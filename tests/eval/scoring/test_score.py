@@ -13,7 +13,7 @@ from dvo.data.trajectory import read_tum
 from eval.execution.plan import read_manifest
 from eval.execution.predict import predict_here, read_segments
 from eval.scoring import score as score_module
-from eval.scoring.metric_table import made_up_share
+from eval.scoring.metric_table import false_pose_share
 from eval.scoring.score import COLUMNS, Row, score
 
 REQUIRED_COLUMNS = [
@@ -72,7 +72,7 @@ def test_columns():
     assert list(COLUMNS)[:16] == REQUIRED_COLUMNS
     assert list(COLUMNS)[16:18] == ["stride", "resolution"]
     assert {"scale_drift", "t_rel", "r_rel", "auc", "pose_auc_5", "ate_per_frame_scale", "recovery_s"} <= set(COLUMNS)
-    assert {"segments", "scored", "unseen", "made_up"} <= set(COLUMNS)
+    assert {"segments", "scored", "unseen", "false_poses"} <= set(COLUMNS)
 
 
 @pytest.fixture
@@ -113,11 +113,11 @@ def test_poses_in_the_dark_are_counted(scored, pieces, image_folder):
         cv2.imwrite(str(image_folder / f"{number:04d}.png"), image.astype(np.uint8))
     rows = [scored(pieces(*bounds)) for bounds in (((0, 20),), ((0, 8), (13, 20)), ((0, 10), (12, 20)))]
     assert [row.unseen for row in rows] == [5, 5, 5]
-    assert [row.made_up for row in rows] == pytest.approx([1.0, 0.0, 3 / 5])
-    assert np.isnan(scored(pieces((0, 20)), unseen=[]).made_up)
-    assert np.isnan(scored(pieces((0, 20)), status="crashed").made_up)
+    assert [row.false_poses for row in rows] == pytest.approx([1.0, 0.0, 3 / 5])
+    assert np.isnan(scored(pieces((0, 20)), unseen=[]).false_poses)
+    assert np.isnan(scored(pieces((0, 20)), status="crashed").false_poses)
     assert scored(pieces((0, 10), (10, 20))).scored == 1.0  # the dark in the middle allows a second segment
 
 
-def test_share_of_made_up_poses():
-    assert np.isnan(made_up_share([], [])) and made_up_share([1.0, 2.0], []) == 0
+def test_share_of_false_poses():
+    assert np.isnan(false_pose_share([], [])) and false_pose_share([1.0, 2.0], []) == 0

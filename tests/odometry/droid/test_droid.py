@@ -192,7 +192,7 @@ def test_black_images_are_lost_and_bridged(clip, knowing):
 
 
 def test_a_random_network_tracks_a_clip(model, clip):
-    """The images bear out nothing here: every stage of the odometry is run, and memory stays bounded."""
+    """The images support no pose here: every stage of the odometry is run, and memory stays bounded."""
     odometry = build_odometry(LoadedWeights.of(model, "dense"), config=EVERY)
     assert isinstance(odometry, Odometry) and isinstance(odometry, Interim) and odometry.name == "dvo-dense"
     for number, frame in enumerate(frames_of(clip)[:12]):

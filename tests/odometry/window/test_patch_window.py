@@ -7,8 +7,8 @@ import torch
 
 from dvo.odometry.frames.front_end import View, observe
 from dvo.odometry.patch.initial_pose import first_depth
-from dvo.odometry.window.evidence import Evidence
 from dvo.odometry.window.patch_window import PatchWindow, Round
+from dvo.odometry.window.pose_validation import PoseSupport
 from tests.support.tiny_tracker import SMALL, frames, tracker
 
 COUNT = 9
@@ -59,7 +59,7 @@ def test_what_is_not_supported_leaves_no_trace(tried, back):
     odometry, view = tried
     before, position = content(odometry.patch_window), len(odometry.window) - back
     found = attempt(odometry, view, position, inliers=2.0)
-    assert not found.accepted and 0 <= found.evidence.inliers <= 1
+    assert not found.accepted and 0 <= found.support.inliers <= 1
     assert same(content(odometry.patch_window), before)
 
 
@@ -90,10 +90,10 @@ def test_rounds_end_with_the_first_that_supports_it(tried, monkeypatch):
     assert attempt(odometry, view, len(odometry.window), inliers=2.0, checked=False).accepted and counts == [2, 1]
 
 
-def test_evidence_supports_a_pose_from_both_thresholds_on():
-    assert Evidence(0.2, 0.1).supports(0.2, 0.1)
-    assert not Evidence(0.2, 0.1).supports(0.21, 0.1) and not Evidence(0.2, 0.1).supports(0.2, 0.11)
-    assert not Evidence(float("nan"), 1.0).supports(0.0, 0.0)
+def test_a_pose_is_valid_from_both_thresholds_on():
+    assert PoseSupport(0.2, 0.1).reaches(0.2, 0.1)
+    assert not PoseSupport(0.2, 0.1).reaches(0.21, 0.1) and not PoseSupport(0.2, 0.1).reaches(0.2, 0.11)
+    assert not PoseSupport(float("nan"), 1.0).reaches(0.0, 0.0)
 
 
 def test_policies_follow_the_settings():

@@ -1,4 +1,4 @@
-"""Late join: another try for frames that could not be joined with the window, once a later frame has been.
+"""Retry of frames that could not be joined with the window, once a later frame has been.
 
 The first frame after an interruption is measured against the frames before the interruption alone. Once a frame after
 it is part of the window, the scene on its other side is known too. The view then takes its place in the window, before
@@ -26,7 +26,7 @@ MAX_VIEWS = 2
 """Number of waiting views that are tried again, the newest ones."""
 
 
-def join_waiting(
+def retry_waiting(
     graph: KeyframeGraph, patch_window: PatchWindow, state: TrackerState, config: TrackerConfig, joined: FrameRecord
 ) -> None:
     """Try the newest waiting views again, up to the first that is not supported; none waits any more afterwards.

@@ -1,4 +1,4 @@
-"""Late join: frames that could not be joined get a pose once a later frame has been, and only with evidence for it."""
+"""Retries: frames that could not be joined get a pose once a later frame has been, and only if it is valid."""
 
 from dataclasses import replace
 
@@ -8,11 +8,11 @@ import torch
 
 import dvo
 from dvo.metrics import align_trajectory
-from dvo.odometry.patch import late_join
+from dvo.odometry.patch import retry
 from dvo.odometry.protocol import Status
 from dvo.odometry.window import patch_window
-from dvo.odometry.window.evidence import Evidence, evidence_of, newest_evidence
 from dvo.odometry.window.patch_window import PatchWindow
+from dvo.odometry.window.pose_validation import PoseSupport, newest_support, support_of
 from dvo.synth.sequence import make_sequence
 from tests.support.changed_images import with_images
 from tests.support.outcome import content, told
@@ -55,8 +55,8 @@ def refuse(monkeypatch, *times):
 
 def count_tries(monkeypatch):
     """Whether each late try was successful, a list that grows."""
-    real, tries = late_join._join, []
-    monkeypatch.setattr(late_join, "_join", lambda *given: tries.append(real(*given)) or tries[-1])
+    real, tries = retry._join, []
+    monkeypatch.setattr(retry, "_join", lambda *given: tries.append(real(*given)) or tries[-1])
     return tries
 
 
@@ -113,7 +113,7 @@ def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch
     tries, kept = count_tries(monkeypatch), []
     for name in ("tried", "not"):
         if name == "not":
-            monkeypatch.setattr(late_join, "_join", lambda *given: False)
+            monkeypatch.setattr(retry, "_join", lambda *given: False)
         odometry = dvo.load("small", device="cpu", **FAST, align=align)
         estimates = []
         for frame in frames:
@@ -128,33 +128,33 @@ def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch
 
 def test_a_pose_that_would_cost_the_newest_frame_its_own_is_refused(dark, monkeypatch):
     refuse(monkeypatch, dark[BACK].timestamp)
-    try_insert, evidence = PatchWindow.try_insert, patch_window.evidence_of
+    try_insert, support = PatchWindow.try_insert, patch_window.support_of
 
     def tried(self, *given):
         late = given[-1].later
-        newest = lambda window, k: Evidence(1.0, 0.0) if late and k == len(window) - 1 else evidence(window, k)  # noqa: E731
+        newest = lambda window, k: PoseSupport(1.0, 0.0) if late and k == len(window) - 1 else support(window, k)  # noqa: E731
         with monkeypatch.context() as patch:
-            patch.setattr(patch_window, "evidence_of", newest)
+            patch.setattr(patch_window, "support_of", newest)
             return try_insert(self, *given)
 
     monkeypatch.setattr(PatchWindow, "try_insert", tried)
     assert BACK in lost_frames(dark, track(dark)[1])
 
 
-def test_later_frames_are_no_evidence(dark):
+def test_later_frames_do_not_count(dark):
     """What counts for a frame is what counted when it was the newest."""
     odometry = dvo.load("small", device="cpu", **FAST)
     for frame in dark[:14]:
         odometry.track(frame)
     window = odometry.window
     k = len(window) - 3
-    whole = evidence_of(window, k)
-    assert whole.inliers > 0 and evidence_of(window, len(window) - 1) == newest_evidence(window)
+    whole = support_of(window, k)
+    assert whole.inliers > 0 and support_of(window, len(window) - 1) == newest_support(window)
     into = window.jj == k
     for among, same in ((into & (window.ii > k), True), (into & (window.ii < k), False)):
         assert bool(among.any())
         kept, window.confidence = window.confidence, torch.where(among[:, None], 0.01, window.confidence)
-        assert (evidence_of(window, k) == whole) is same
+        assert (support_of(window, k) == whole) is same
         window.confidence = kept
 
 

@@ -1,4 +1,4 @@
-"""Evidence for the pose of a frame: agreement of its measurements with the window."""
+"""Pose validation: agreement of the measurements of a frame with the window."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AGREEMENT = 0.5
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PoseSupport:
     """Agreement of the measurements of a frame with those before it in the window.
 
     Attributes:
@@ -30,55 +30,55 @@ class Evidence:
     confidence: float
     inliers: float
 
-    def supports(self, confidence: float, inliers: float) -> bool:
-        """Decide if the images bear out the pose.
+    def reaches(self, confidence: float, inliers: float) -> bool:
+        """Decide if the pose is valid.
 
         Args:
-            confidence, inliers: that are needed at least.
+            confidence, inliers: least values of a valid pose.
 
         Returns:
-            True if they do.
+            True if both values are reached.
         """
         return self.confidence >= confidence and self.inliers >= inliers
 
 
-def newest_evidence(window: Window) -> Evidence:
-    """Evidence for the pose of the newest frame of a window, after a step.
+def newest_support(window: Window) -> PoseSupport:
+    """Support of the pose of the newest frame of a window, after a step.
 
     Args:
         window: after a step.
 
     Returns:
-        Evidence; zero for a window of one frame.
+        Support; zero for a window of one frame.
     """
-    return evidence_of(window, len(window) - 1)
+    return support_of(window, len(window) - 1)
 
 
-def evidence_of(window: Window, position: int) -> Evidence:
-    """Evidence for the pose of a frame of a window, after a step; later frames do not count.
+def support_of(window: Window, position: int) -> PoseSupport:
+    """Support of the pose of a frame of a window, after a step; later frames do not count.
 
     Args:
         window: after a step.
         position: of the frame in the window.
 
     Returns:
-        Evidence; without inliers for the first frame.
+        Support; without inliers for the first frame.
     """
     into = (window.jj == position) & (window.ii <= position)
     if not bool(into.any()):
-        return Evidence(0.0, 0.0)
+        return PoseSupport(0.0, 0.0)
     into = measured(window, window.confidence, into)
     if not bool(into.any()):
-        return Evidence(0.0, 0.0)
+        return PoseSupport(0.0, 0.0)
     confidence = float(window.confidence[into].mean())
     earlier = into & (window.ii < position)
     if not bool(earlier.any()):
-        return Evidence(confidence, 0.0)
-    return Evidence(confidence, _inliers(window, earlier))
+        return PoseSupport(confidence, 0.0)
+    return PoseSupport(confidence, _inliers(window, earlier))
 
 
 def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:
-    """Edges whose measurement counts as evidence: those that do not lie in ignored pixels.
+    """Edges whose measurement counts: those that do not lie in ignored pixels.
 
     Args:
         window: of the edges.
@@ -88,7 +88,7 @@ def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:
     Returns:
         ``(E,)`` bool; ``among`` itself if no frame has a mask.
     """
-    return among if window.visible is None else among & (confidence != 0).any(dim=-1)  # NaN is evidence against
+    return among if window.visible is None else among & (confidence != 0).any(dim=-1)  # NaN speaks against the pose
 
 
 def last_unrelated(window: Window, least_confidence: float, least_inliers: float) -> int:

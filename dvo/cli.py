@@ -188,6 +188,7 @@ def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
 
 def _tracking_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the results of an earlier run in --out")
     system = parser.add_mutually_exclusive_group()
     system.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
     system.add_argument(

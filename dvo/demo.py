@@ -83,7 +83,7 @@ def demo(arguments: argparse.Namespace) -> int:
         "seed": arguments.seed,
         "stride": 1,
     }
-    with results_folder(arguments.out, NAME) as folder:
+    with results_folder(arguments.out, NAME, overwrite=arguments.overwrite) as folder:
         odometry = load_odometry(arguments, device)  # before rendering, so that errors appear early
         code = track(odometry, render_clip(arguments.frames), folder, facts=facts)
     say("to track your own video: dvo run VIDEO --calib FILE")

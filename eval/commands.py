@@ -11,9 +11,9 @@ from typing import NoReturn
 
 from dvo.core.errors import DvoError
 from dvo.data.files.root import data_root
-from eval.execution.plan import Plan, read_manifest
+from eval.execution.plan import AXES, LOOPS, PAGE, RESULTS, TABLE, Plan, read_manifest
 from eval.execution.runner import predict_all
-from eval.reporting.report import AXES, LOOPS, PAGE, RESULTS, TABLE, write_report, write_tables
+from eval.reporting.report import write_report, write_tables
 from eval.scoring.score import score_all
 from eval.suites.selection import config_names, folder_of_data, is_rendered, load_suites, settle
 from eval.suites.suite import read_suites

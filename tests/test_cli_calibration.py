@@ -69,17 +69,17 @@ def test_a_calibration_nearby_is_named_and_that_of_somebody_else_is_kept(image_f
 def test_the_file_of_an_earlier_run_does_not_stay(image_folder, tmp_path, calibrated):
     out = tmp_path / "out"
     assert main(["run", str(image_folder), "--out", str(out)]) == 0 and (out / "calib.txt").is_file()
-    assert main(["run", str(image_folder), "--calib", "../calib.txt", "--out", str(out)]) == 0
+    assert main(["run", str(image_folder), "--calib", "../calib.txt", "--out", str(out), "--overwrite"]) == 0
     assert not (out / "calib.txt").exists()
 
 
 def test_the_file_of_an_earlier_run_stays_if_it_is_given(image_folder, tmp_path, calibrated, monkeypatch):
     out = tmp_path / "out"
     assert main(["run", str(image_folder), "--out", str(out)]) == 0
-    assert main(["run", str(image_folder), "--calib", str(out / "calib.txt"), "--out", str(out)]) == 0
+    assert main(["run", str(image_folder), "--calib", str(out / "calib.txt"), "--out", str(out), "--overwrite"]) == 0
     assert (out / "calib.txt").is_file()
     monkeypatch.chdir(tmp_path)
-    assert main(["run", str(image_folder), "--calib", "out/calib.txt", "--out", "out"]) == 0
+    assert main(["run", str(image_folder), "--calib", "out/calib.txt", "--out", "out", "--overwrite"]) == 0
     assert (out / "calib.txt").is_file() and len(calibrated) == 1
 
 

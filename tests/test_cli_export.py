@@ -35,7 +35,7 @@ def test_the_next_run_removes_exports(given, image_folder, tmp_path):
     out = tmp_path / "out"
     assert main(arguments(image_folder, out, "--export", "kitti")) == 0
     given()
-    assert main(arguments(image_folder, out)) == 0
+    assert main(arguments(image_folder, out, "--overwrite")) == 0
     assert "export" not in names(out)
 
 

@@ -96,7 +96,7 @@ def test_a_new_recording_in_a_map(in_map, image_folder, tmp_path, capsys):
     written = summary(tmp_path / "out")
     assert written["map"] == "old.dvo" and written["info"]["localised"] == LOCALISED
     assert written["segments"][0]["in_map"] is False
-    assert main(arguments(image_folder, tmp_path / "out", "--map", "old.dvo", "--weights", "w.safetensors")) == 0
+    assert main(arguments(image_folder, tmp_path / "two", "--map", "old.dvo", "--weights", "w.safetensors")) == 0
     assert in_map.asked["weights"] == "w.safetensors"
 
 
@@ -120,7 +120,7 @@ def test_pure_odometry_on_request(monkeypatch, image_folder, tmp_path):
     asked = []
     monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: asked.append(options) or FakeOdometry(curve))
     assert main(arguments(image_folder, tmp_path / "out")) == 0
-    assert main(arguments(image_folder, tmp_path / "out", "--no-loops")) == 0
+    assert main(arguments(image_folder, tmp_path / "two", "--no-loops")) == 0
     assert "loops" not in asked[0] and asked[1]["loops"] is False
 
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
-
 import pytest
 
 from dvo.cli import main
-from dvo.commands.observers import open_observers
-from dvo.core.errors import DvoError
 from dvo.viz.overlay import OverlayVideo
 from tests.support.command_line import arguments, summary
 
@@ -38,13 +34,3 @@ def test_a_run_that_cannot_begin_leaves_the_video_as_it_was(image_folder, tmp_pa
         command = arguments(image_folder, tmp_path / "out", "--overlay", str(file), "--weights", "none")
         assert main(command) == 2
     assert old.read_bytes() == b"of yesterday" and not new.exists() and not (tmp_path / "out").exists()
-
-
-def test_the_source_is_not_replaced_by_its_own_video(tmp_path, monkeypatch):
-    source = tmp_path / "walk.mp4"
-    source.write_bytes(b"recorded")
-    monkeypatch.chdir(tmp_path)
-    arguments = Namespace(source=str(source), overlay="walk.mp4", rerun=None)
-    with pytest.raises(DvoError, match="is the source"), open_observers(arguments, "walk"):
-        pass
-    assert source.read_bytes() == b"recorded"

@@ -21,7 +21,6 @@ from dvo.commands.console import describe_status
 from dvo.commands.report import describe_breaks
 from dvo.data.trajectory import read_tum
 from dvo.odometry.protocol import Break, Estimate, Status
-from dvo.session import files
 from tests.support.command_line import arguments, errors, names, summary
 
 resource = pytest.importorskip("resource")
@@ -267,7 +266,7 @@ def test_atomic_files_are_used_for_everything(given, image_folder, tmp_path, mon
     """Every file of the folder takes its name by a replacement, so that no reader meets half of one."""
     moved: set[str] = set()
     move = os.replace
-    monkeypatch.setattr(files.os, "replace", lambda a, b: (moved.add(Path(b).name), move(a, b))[1])
+    monkeypatch.setattr(os, "replace", lambda a, b: (moved.add(Path(b).name), move(a, b))[1])
     given(new_segment=(6,))
     assert main(arguments(image_folder, tmp_path / "out")) == 0
     assert moved == set(names(tmp_path / "out"))

@@ -147,7 +147,7 @@ def test_all_warnings_of_a_run_are_on_its_page(image_folder, tmp_path, given, mo
         raise ValueError("a wrong number")
 
     monkeypatch.setattr("dvo.commands.run.draw", fail)
-    assert main(arguments(image_folder, tmp_path / "out", *more)) == 2
+    assert main(arguments(image_folder, tmp_path / "out", "--overwrite", *more)) == 2
     warnings, text = summary(tmp_path / "out")["warnings"], (tmp_path / "out" / "summary.html").read_text()
     assert "trajectory.png: ValueError: a wrong number" in warnings[1] and escape(warnings[1]) in text
 

@@ -30,6 +30,9 @@ _RANGES = {
     "max_rms": (0, 1000),
 }
 
+HEADER = "# dvo calibrate"
+"""First words of a calibration file."""
+
 
 @dataclass(frozen=True)
 class BoardOptions:
@@ -138,7 +141,7 @@ class BoardCalibration:
         """
         path = Path(file)
         head = "".join(
-            f"# {line}\n" for line in (f"dvo calibrate, {self.width}x{self.height} images", *str(self).split("\n"))
+            f"# {line}\n" for line in (f"{HEADER[2:]}, {self.width}x{self.height} images", *str(self).split("\n"))
         )
         c = self.calibration
         pixels, lens = (c.fx, c.fy, c.cx, c.cy), ", ".join(f"{value:.9g}" for value in c.coefficients)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +14,18 @@ from rich.progress import Progress, TextColumn
 
 import dvo
 from dvo.boards.board import Board, CharucoBoard, Checkerboard
-from dvo.boards.calibrate import BoardCalibration, BoardOptions, calibrate_board
+from dvo.boards.calibrate import HEADER, BoardCalibration, BoardOptions, calibrate_board
 from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.camera import CALIBRATION
 from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
-from dvo.data.files.output import replaced
+from dvo.data.files.output import replaced, write_text
 from dvo.data.images.reduction import MAX_PIXELS
 from dvo.data.source import Source
 from dvo.data.streams.capture import is_stream
 from dvo.odometry.calibration.calibrate import calibrate as self_calibrate
+from dvo.odometry.calibration.camera_estimate import is_foreign
 from dvo.session import results
 
 FISHEYE = "calib.yaml"
@@ -53,10 +57,37 @@ def calibrate(arguments: argparse.Namespace) -> int:
     source = dvo.open(arguments.source, guess=True, undistort=False, fps=fps, max_pixels=limit)
     for warning in source.warnings:
         warn(warning, "note")
-    with results.results_folder(arguments.out, source.name) as folder:
+    file = FISHEYE if options.fisheye else CALIBRATION
+    with results.locked_folder(arguments.out, source.name) as folder:
+        _check_free(folder, (file,) if board is None else (file, FACTS, PICTURE), arguments.overwrite)
+        inputs = {"--weights": arguments.weights} if board is None else {}
+        check_outputs({"--out": folder / file}, inputs, arguments.source)
         if board is None:
             return _without_board(source, folder, arguments)
         return _with_board(source, board, options, folder)
+
+
+def _check_free(folder: Path, names: Sequence[str], overwrite: bool) -> None:
+    """Refuse a folder with files that would be replaced, unless a calibration has written them and they may be."""
+    taken = [name for name in names if os.path.lexists(folder / name)]
+    mine = _is_ours(folder / names[0])
+    for name in taken:
+        if not mine:
+            message = "is not a file of dvo calibrate, whose result would take its place"
+            raise DvoError(message, file=folder / name, field="--out", remedy="give a new folder")
+    if taken and not overwrite:
+        remedy = "give a new folder, or --overwrite to replace it"
+        raise DvoError("holds a calibration", file=folder, field="--out", remedy=remedy)
+
+
+def _is_ours(file: Path) -> bool:
+    """True for a calibration file that dvo has written."""
+    try:
+        with file.open("rb") as stream:
+            found = stream.read(len(HEADER)).startswith(HEADER.encode())
+    except OSError:
+        return False
+    return found or (file.is_file() and not is_foreign(file))
 
 
 def _board(arguments: argparse.Namespace) -> Board | None:
@@ -86,8 +117,7 @@ def _with_board(source: Source, board: Board, options: BoardOptions, folder: Pat
         warn(warning)
     file = folder / (FISHEYE if options.fisheye else CALIBRATION)
     found.write(file)
-    with replaced(folder / FACTS) as part:
-        part.write_text(json.dumps(_facts(found, str(source.path)), indent=2) + "\n", encoding="utf-8")
+    write_text(folder / FACTS, json.dumps(_facts(found, str(source.path)), indent=2) + "\n")
     with replaced(folder / PICTURE) as part:
         plot_board_calibration(part, found)
     say(f"calibration in {file}, picture in {folder / PICTURE}")
@@ -124,8 +154,6 @@ def _without_board(source: Source, folder: Path, arguments: argparse.Namespace) 
         )
     say(str(found))
     file = folder / CALIBRATION
-    if found.write(file):
-        say(f"calibration in {file}")
-    else:
-        warn(f"{file} is not a file of dvo, and was not replaced")
+    found.write(file)
+    say(f"calibration in {file}")
     return OK if found.found else NOTHING_TRACKED

@@ -38,6 +38,7 @@ def add_calibrate(commands: Any) -> None:
     parser.add_argument("--k3", action="store_true", help="third radial coefficient")
     parser.add_argument("--frames", type=int, default=300, metavar="N", help="frames to search (default: %(default)s)")
     parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
+    parser.add_argument("--overwrite", action="store_true", help="replace an earlier calibration in --out")
     parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="without a board (default: small)")
     parser.add_argument(
         "--device", metavar="D", default="auto", help="torch device (default: accelerator if available)"

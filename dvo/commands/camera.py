@@ -14,9 +14,10 @@ import torch
 from dvo.commands.console import TrackingProgress, say, seed_everything, warn
 from dvo.data.source import Source
 from dvo.odometry.calibration.calibrate import calibrate
-from dvo.odometry.calibration.camera_estimate import SelfCalibration, is_foreign
+from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Odometry
+from dvo.session.results import files_of_run
 
 CALIBRATION = "calib.txt"
 """Calibration file in the results folder of a run without a calibration, for the next run."""
@@ -43,6 +44,7 @@ def with_calibration(
         OSError: the calibration file cannot be written.
     """
     found, file, began = None, folder / CALIBRATION, time.perf_counter()
+    written = False
     if source.guess is not None:
         warn(_announcement(source), "note")
         weights = odometry.weights or arguments.weights if isinstance(odometry, PatchOdometry) else "small"
@@ -50,14 +52,16 @@ def with_calibration(
             found = calibrate(source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update)
         seed_everything(arguments.seed)  # the same bytes as a run with the calibration file
         say(str(found))
-        if not found.write(file):
-            warn(f"{file} is not a file of dvo, and was not replaced")
+        written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)
+        if not written:
+            warn(f"{file} is not a file of an earlier run, and was not replaced")
         source = source.recalibrated(found.calibration)
-    elif not (is_foreign(file) or _is_given(file, source, arguments.calib)):
+    elif CALIBRATION in files_of_run(folder) and not _is_given(file, source, arguments.calib):
         file.unlink(missing_ok=True)  # of an earlier run
     factor = 1 if source.reduction is None else source.reduction.factor
     camera = {**asdict(source.recorded_camera), "turned": source.turned, "reduced_by": factor}
     facts: dict[str, Any] = {"camera": camera, "self_calibration": None if found is None else _facts(found)}
+    facts["calibration_file"] = CALIBRATION if written else None
     return source, facts if found is None else facts | {"seconds": {"calibrating": time.perf_counter() - began}}
 
 

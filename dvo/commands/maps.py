@@ -11,11 +11,12 @@ import torch
 import dvo
 from dvo.commands import NOT_RECOGNISED, OK
 from dvo.commands.console import device_of, say, seed_everything, warn
+from dvo.commands.places import check_outputs
 from dvo.commands.report import describe_localisation
 from dvo.core.errors import DvoError
+from dvo.data.files.output import check_place
 from dvo.odometry.merging import merge_maps
 from dvo.odometry.protocol import Odometry
-from dvo.session.files import check_writable
 
 DEFAULT_WEIGHTS = "small"  # of --weights; with a map: those of the map
 
@@ -42,26 +43,6 @@ def load_in_map(file: str, weights: str, device: torch.device, seed: int, settin
     return dvo.load_map(file, device=device, weights=place, seed=seed, **settings)
 
 
-def check_place(file: Path, option: str) -> None:
-    """Check that a file can be written.
-
-    Args:
-        file: its folder is made if need be.
-        option: of the command line that names it.
-
-    Raises:
-        DvoError: it cannot.
-    """
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        check_writable(file.parent)
-        reason = "is a folder" if file.is_dir() else ""
-    except OSError as error:
-        reason = error.strerror or str(error)
-    if reason:
-        raise DvoError(reason, file=file, field=option, remedy="give a file in a folder that can be written")
-
-
 def merge(arguments: argparse.Namespace) -> int:
     """Entry point of ``dvo merge``.
 
@@ -75,6 +56,7 @@ def merge(arguments: argparse.Namespace) -> int:
         DvoError: an invalid map, maps that do not go together, or a file that cannot be written.
     """
     out = Path(arguments.out)
+    check_outputs({"--out": out}, {"FIRST": arguments.first, "SECOND": arguments.second})
     check_place(out, "--out")
     seed_everything(0)
     odometry = merge_maps(arguments.first, arguments.second, device=device_of(arguments.device))

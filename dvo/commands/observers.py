@@ -9,7 +9,6 @@ from pathlib import Path
 
 from dvo.commands.console import warn
 from dvo.commands.view_options import VIEWER
-from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.session.observer import Observer
@@ -105,9 +104,5 @@ def open_observers(arguments: argparse.Namespace, name: str) -> Iterator[list[Ob
         if arguments.overlay is not None:
             from dvo.viz.overlay import OverlayVideo
 
-            file = Path(arguments.overlay)
-            if file.exists() and file.samefile(arguments.source):
-                message = "is the source, which it would replace"
-                raise DvoError(message, file=file, field="--overlay", remedy="give another file")
-            add(OverlayVideo(file), "--overlay")
+            add(OverlayVideo(Path(arguments.overlay)), "--overlay")
         yield found

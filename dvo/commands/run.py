@@ -19,20 +19,21 @@ from dvo.commands.base_frame import base_observers
 from dvo.commands.camera import CALIBRATION, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.commands.input_options import input_facts, input_settings
-from dvo.commands.maps import check_place, load_in_map
+from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
+from dvo.commands.places import check_outputs
 from dvo.commands.report import Scores, headline, print_report, score
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
 from dvo.commands.streams import print_counts, stream_facts, stream_settings
 from dvo.commands.summary import Pages
 from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings, read_settings
+from dvo.data.files.output import check_place
 from dvo.data.frame import Frame
 from dvo.data.streams.capture import shown
 from dvo.data.trajectory import Trajectory
-from dvo.export.formats import check_formats, export_run, remove_exports
-from dvo.odometry.calibration.camera_estimate import is_foreign
+from dvo.export.formats import check_formats, export_run
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
@@ -40,7 +41,6 @@ from dvo.session.frame_table import FrameTable
 from dvo.session.observer import Observer
 from dvo.session.recorder import Recorder
 
-EXPORT = "export"  # folder of the exports in the results folder
 _ABORTED = "aborted by a second Ctrl-C or SIGTERM"
 
 
@@ -109,8 +109,13 @@ def run(arguments: argparse.Namespace) -> int:
         **input_facts(arguments),
     }
     seed_everything(arguments.seed)
-    folders = results.results_folder(arguments.out, source.name)  # checked before the weights load
-    with folders as folder, open_observers(arguments, source.name) as observers:
+    folders = results.results_folder(
+        arguments.out, source.name, overwrite=arguments.overwrite, exports=arguments.export
+    )  # checked before the weights load
+    with contextlib.ExitStack() as stack:
+        folder = stack.enter_context(folders)
+        _check_outputs(arguments, folder)
+        observers = stack.enter_context(open_observers(arguments, source.name))
         observers += base_observers(arguments, folder, source.path)
         observers += scale_observers(arguments, folder)
         odometry = load_odometry(arguments, device)
@@ -135,17 +140,30 @@ def run(arguments: argparse.Namespace) -> int:
         return code
 
 
+def _check_outputs(arguments: argparse.Namespace, folder: Path) -> None:
+    """Refuse outputs that are inputs, and places that cannot be written."""
+    outputs = {"--save-map": arguments.save_map, "--overlay": arguments.overlay, "--rerun": arguments.rerun}
+    options = ("calib", "times", "groundtruth", "extrinsics", "mask", "depth", "right", "depth_calib", "config", "map",
+               "weights")  # fmt: skip
+    inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in options}
+    if arguments.calib is not None and arguments.out is not None:
+        del inputs["--calib"]  # the calibration of an earlier run in the folder stays there
+        check_outputs(outputs, {"--calib": arguments.calib}, arguments.source)
+    check_outputs(outputs, inputs, arguments.source, folder)
+    if arguments.save_map is not None:
+        check_place(Path(arguments.save_map), "--save-map")
+
+
 def _reseeded(arguments: argparse.Namespace) -> argparse.Namespace:
     """Arguments with another seed."""
     return argparse.Namespace(**{**vars(arguments), "seed": (arguments.seed + 1) % 2**63})
 
 
 def _map_file(text: str, odometry: Odometry) -> Path:
-    """File of ``--save-map``, if the odometry can be saved and its folder written."""
+    """File of ``--save-map``, if the odometry can be saved."""
     if not isinstance(odometry, Saveable):
         message = f"the odometry {odometry.name} has no map that can be saved"
         raise DvoError(message, field="--save-map", remedy="use weights of patch_vo, such as small")
-    check_place(Path(text), "--save-map")
     return Path(text)
 
 
@@ -209,7 +227,7 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
 def track(
     odometry: Odometry,
     clip: Clip,
-    out: Path | str | None,
+    folder: Path,
     *,
     stride: int = 1,
     facts: dict[str, Any],
@@ -218,7 +236,7 @@ def track(
     observers: Sequence[Observer] = (),
     again: Callable[[], Odometry] | None = None,
 ) -> int:
-    """Track a clip, write the results folder and print a summary.
+    """Track a clip, fill the results folder and print a summary.
 
     Results are written from the first frame on (:class:`dvo.session.recorder.Recorder`) and replaced at the end. The
     first Ctrl-C or SIGTERM ends tracking and still writes all results; a second one aborts, and what the recorder has
@@ -227,7 +245,7 @@ def track(
     Args:
         odometry: newly built.
         clip: frames in order of time, with or without ground truth.
-        out: results folder; None for ``runs/NAME-TIME``.
+        folder: of the results (:func:`dvo.session.results.results_folder`).
         stride: distance of tracked frames, in frames of the clip.
         facts: metadata to write into run.json.
         export: formats to write the results in too, into ``export/NAME`` of the results folder.
@@ -241,30 +259,13 @@ def track(
     Raises:
         DvoError: no frame could be read, or a result cannot be written.
     """
-    with results.results_folder(out, clip.name) as folder:
-        return _track(odometry, clip, folder, stride, facts, export, save_map, observers, again)
-
-
-def _track(
-    odometry: Odometry,
-    clip: Clip,
-    folder: Path,
-    stride: int,
-    facts: dict[str, Any],
-    export: Sequence[str],
-    save_map: Path | None,
-    observers: Sequence[Observer],
-    again: Callable[[], Odometry] | None,
-) -> int:
     printed = set(clip.warnings)
     for observer in observers:
         observer.begin(odometry)
-    facts = {"odometry": odometry.name, **facts}
+    facts = {"odometry": odometry.name, **facts, "export": list(export)}
     recorder, table = Recorder(folder, odometry, facts, warn=warn), FrameTable()
 
     def on_frame(frame: Frame, estimate: Estimate | None) -> None:
-        if not recorder.started:
-            remove_exports(folder / EXPORT)
         recorder.update(frame, estimate)
         table.update(frame, estimate)
         for observer in observers:
@@ -297,8 +298,7 @@ def _track(
         progress.finish(done.result)
     for warning in new_warnings:
         warn(warning)
-    found = facts.get("self_calibration") is not None and not is_foreign(folder / CALIBRATION)
-    print_report(folder, done, scores, [CALIBRATION] * found)
+    print_report(folder, done, scores, [CALIBRATION] * (facts.get("calibration_file") is not None))
     for observer in observers:
         file = getattr(observer, "file", None)
         # Files in the folder are listed already; a video without a frame is removed.
@@ -307,7 +307,7 @@ def _track(
     if save_map is not None:
         say(f"map in {save_map}")
     if export:
-        _export(odometry, done, folder / EXPORT, export)
+        _export(odometry, done, folder / results.EXPORT, export)
     if done.interrupted:
         return TERMINATED if switch.pressed is signal.SIGTERM else INTERRUPTED
     return OK if done.result.frames_tracked else NOTHING_TRACKED

@@ -15,6 +15,7 @@ from dvo.commands import OK
 from dvo.commands.console import say
 from dvo.commands.page_tables import figures, headline_of, tables
 from dvo.commands.picture import world_root
+from dvo.commands.places import check_outputs
 from dvo.commands.report import score
 from dvo.data.files.output import replaced
 from dvo.data.trajectory import Trajectory, read_tum
@@ -47,6 +48,8 @@ def summary(arguments: argparse.Namespace) -> int:
     if arguments.groundtruth is not None:
         stored = _with_truth(stored, Path(arguments.groundtruth))
     out = folder / results.PAGE if arguments.out is None else Path(arguments.out)
+    inputs = {name: folder / name for name in (*sorted(results.files_of_run(folder)),) if name != results.PAGE}
+    check_outputs({"--out": arguments.out}, {"--groundtruth": arguments.groundtruth, **inputs})
     try:
         with replaced(out) as part:
             name = Path(str(stored.facts.get("source") or folder.resolve())).name
@@ -107,16 +110,17 @@ class Pages:
 
         Args:
             folder: of the results.
-            warnings: sentences; nothing is written for none.
+            warnings: sentences; without one only the list of files is written anew.
 
         Raises:
             DvoError: a file cannot be read or written.
         """
-        if not warnings:
-            return
         file = folder / results.SUMMARY
         try:
             values = json.loads(file.read_text(encoding="utf-8"))
+            if not warnings:
+                results.write_summary(folder, values)  # lists what observers have written at the end
+                return
             values["warnings"] += warnings
             results.write_summary(folder, values)
             file = folder / results.PAGE

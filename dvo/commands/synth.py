@@ -12,7 +12,9 @@ from rich.console import Console
 from rich.progress import Progress
 
 from dvo.commands.console import device_of
+from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
+from dvo.data.files.output import check_place, replaced
 from dvo.synth import FAMILIES, MeshScene, load_mesh
 from dvo.synth.export import export_sequence, mesh_sequence
 from dvo.synth.preview import contact_sheet, family_sheet, sequence_rows
@@ -37,6 +39,8 @@ def preview(arguments: argparse.Namespace) -> int:
     out = Path(arguments.out)
     if not out.parent.is_dir() or out.suffix.lower() not in (".png", ".jpg"):
         raise DvoError("cannot be written", file=out, field="--out", remedy="name a .png in a folder that exists")
+    check_outputs({"--out": out}, {"SOURCE": arguments.source}, arguments.textures)
+    check_place(out, "--out")
     width, height = arguments.size
     most = arguments.rows or len(list(FAMILIES))
     if most * width * height > MOST_PIXELS:
@@ -58,8 +62,9 @@ def preview(arguments: argparse.Namespace) -> int:
         mesh, form = _mesh(arguments, arguments.source), SequenceFormat(60, height, width, fps=10)
         sequences = [mesh_sequence(mesh, arguments.seed + i, form) for i in range(rows)]
         sheet = np.concatenate([sequence_rows(sequence) for sequence in sequences])
-    if not cv2.imwrite(str(out), sheet[..., ::-1]):
-        raise DvoError("cannot be written", file=out, field="--out", remedy="name a file elsewhere")
+    with replaced(out) as part:
+        if not cv2.imwrite(str(part), sheet[..., ::-1]):
+            raise DvoError("cannot be written", file=out, field="--out", remedy="name a file elsewhere")
     print(f"{out}: frames, depth (near is red), flow (hue is direction), path from above")
     return 0
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.files.files import parse_number, read_rows
+from dvo.data.files.output import replaced, write_text
 from dvo.geometry.poses import pose_matrices, poses_from_matrices, slerp
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
@@ -70,10 +71,17 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
         path: file to write.
         trajectory: camera-to-world poses.
     """
+    write_text(path, tum_text(trajectory))
+
+
+def tum_text(trajectory: Trajectory) -> str:
+    """Content of a TUM file: a header, and a row for each pose.
+
+    Args:
+        trajectory: camera-to-world poses.
+    """
     rows = np.column_stack([trajectory.timestamps, trajectory.poses_wc])
-    with open(path, "w", encoding="utf-8", newline="\n") as file:
-        file.write(TUM_HEADER)
-        file.writelines(tum_row(row) for row in rows)
+    return TUM_HEADER + "".join(tum_row(row) for row in rows)
 
 
 def tum_row(values: Iterable[float]) -> str:
@@ -242,6 +250,6 @@ def write_kitti_poses(path: Path | str, poses_wc: np.ndarray) -> None:
         poses_wc: ``(N, 7)`` camera to world.
     """
     rows = pose_matrices(poses_wc)[:, :3].reshape(len(poses_wc), 12)
-    with open(path, "w", encoding="utf-8") as file:
+    with replaced(path) as part, part.open("w", encoding="utf-8") as file:
         for row in rows:
             file.write(" ".join(f"{value:z.9e}" for value in row) + "\n")

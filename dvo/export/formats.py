@@ -7,15 +7,13 @@ format one of a :class:`~dvo.data.trajectory.Trajectory` and a folder. Other pac
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
-from dvo.data.files.output import PART
+from dvo.data.files.output import new_folder
 from dvo.data.trajectory import Trajectory
 from dvo.session.files import write_error
 
@@ -98,7 +96,7 @@ def export_graph(graph: KeyframeGraph, segment: int, format: str, folder: Path |
 
     write: Callable[[Reconstruction, Path], None] = MAP_FORMATS.resolve(format)
     reconstruction = reconstruct(graph, segment)
-    with _new_folder(Path(folder)) as part:
+    with _written(Path(folder)) as part:
         write(reconstruction, part)
     return reconstruction
 
@@ -121,12 +119,12 @@ def export_trajectory(trajectory: Trajectory, folder: Path | str, format: str = 
     write: Callable[[Trajectory, Path], None] = TRAJECTORY_FORMATS.resolve(format)
     if not len(trajectory):
         raise DvoError("no poses", field="trajectory", remedy="export a trajectory of at least one pose")
-    with _new_folder(Path(folder)) as part:
+    with _written(Path(folder)) as part:
         write(trajectory, part)
 
 
 def export_run(odometry: Odometry, result: Result, formats: Iterable[str], folder: Path) -> list[str]:
-    """Write the exports of a run into ``folder/NAME`` each, in place of earlier ones.
+    """Write the exports of a run into a new folder ``folder/NAME`` each.
 
     Map formats hold the longest segment. Trajectory formats hold the longest segment too, and with several segments
     all of them in folders ``segment-0``, ``segment-1``, ...
@@ -143,7 +141,6 @@ def export_run(odometry: Odometry, result: Result, formats: Iterable[str], folde
     Raises:
         DvoError: as :func:`export_map`.
     """
-    remove_exports(folder)
     said = []
     for name in formats:
         if name in MAP_FORMATS:
@@ -220,36 +217,11 @@ def graph_of(source: object) -> KeyframeGraph:
     )
 
 
-def remove_exports(folder: Path) -> None:
-    """Remove the exports of an earlier run, as far as they can be removed; other files stay.
-
-    Args:
-        folder: of the exports, which need not exist.
-    """
-    for name in [*MAP_FORMATS, *TRAJECTORY_FORMATS]:
-        shutil.rmtree(folder / name, ignore_errors=True)
-        shutil.rmtree(folder / (PART + name), ignore_errors=True)
-    with contextlib.suppress(OSError):  # missing, or with other files
-        folder.rmdir()
-
-
 @contextlib.contextmanager
-def _new_folder(folder: Path) -> Iterator[Path]:
-    """Write into a folder beside it and rename that at the end, so that a reader never meets half of an export."""
-    folder = folder.absolute()
-    part = folder.parent / (PART + folder.name)
+def _written(folder: Path) -> Iterator[Path]:
+    """:func:`dvo.data.files.output.new_folder`, with errors of the system as invalid input."""
     try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise DvoError("is not an empty folder", file=folder, remedy="give a new folder")
-        shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
-        part.mkdir(parents=True)
-        yield part
-        if not folder.exists():
-            os.replace(part, folder)
-            return
-        for child in part.iterdir():
-            os.replace(child, folder / child.name)
+        with new_folder(folder) as part:
+            yield part
     except OSError as error:
         raise write_error(folder, error) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)

@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import replaced
 from dvo.models.pickles import check_plain, load_pickle
 from dvo.models.published import read_published
 from dvo.models.registry import (
@@ -279,7 +280,8 @@ def save_weights(path: str | Path, model: nn.Module, card: dict[str, Any], half:
     }  # fmt: skip
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, path, metadata)
+        with replaced(path) as part:
+            save_file(tensors, part, metadata)
     except (OSError, SafetensorError) as error:
         raise DvoError(f"cannot be written ({error})", file=path, remedy="give a file in another folder") from error
 

@@ -1,49 +1,15 @@
-"""Files of results: whether they can be written, and the map as PLY."""
+"""Files of results: errors of writing them, and the map as PLY."""
 
 from __future__ import annotations
 
-import contextlib
-import os
 from pathlib import Path
 
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.output import PART
 from dvo.odometry.protocol import SparseMap
 
 _PLY_LAYOUT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-
-
-def check_writable(folder: Path) -> None:
-    """Write a small file into a folder and remove it.
-
-    Args:
-        folder: an existing folder.
-
-    Raises:
-        OSError: the folder cannot be written, or there is no space.
-    """
-    probe = folder / f"{PART}probe-{os.getpid()}"
-    try:
-        with open(probe, "xb") as file:
-            file.write(bytes(4096))
-            file.flush()
-            os.fsync(file.fileno())
-    finally:
-        with contextlib.suppress(OSError):
-            probe.unlink(missing_ok=True)
-
-
-def remove_empty(file: Path) -> None:
-    """Remove a file without content, which only a check that it can be written has made.
-
-    Args:
-        file: may be missing.
-    """
-    with contextlib.suppress(OSError):
-        if file.stat().st_size == 0:
-            file.unlink()
 
 
 def write_error(path: Path, error: OSError) -> DvoError:

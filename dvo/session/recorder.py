@@ -18,7 +18,7 @@ from dvo.data.frame import Frame
 from dvo.data.trajectory import TUM_HEADER, Trajectory, tum_row
 from dvo.odometry.protocol import Estimate, Interim, Odometry, Result, Segment, SparseMap, Status
 from dvo.session.files import write_ply
-from dvo.session.results import MAP, TRAJECTORY, remove_files, segment_file, summary, write_summary
+from dvo.session.results import MAP, TRAJECTORY, remove_results, segment_file, summary, write_summary
 from dvo.session.session import Run
 
 INTERVAL = 10.0  # seconds between two versions of map and run.json
@@ -160,7 +160,8 @@ class Recorder:
         """Write the rows and, if ``everything``, map and run.json; a failure becomes a warning."""
         try:
             if not self._clean:
-                remove_files(self.folder)
+                remove_results(self.folder)
+                self._write_state(interrupted)  # what follows is known to be of a run, also if this one is killed
                 self._clean = True
             self._write_rows(durable=everything)
             if everything:

@@ -11,8 +11,10 @@ import importlib.metadata
 import itertools
 import json
 import math
+import os
 import platform
 import re
+import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, is_dataclass, replace
@@ -24,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.output import PART, replaced
-from dvo.data.trajectory import write_tum
-from dvo.session.files import check_writable, write_error, write_ply
+from dvo.data.files.output import check_writable, only_writer, replaced, sweep_parts, write_text
+from dvo.data.trajectory import Trajectory, tum_text
+from dvo.session.files import write_error, write_ply
 from dvo.session.session import Run
 
 TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
@@ -37,13 +39,43 @@ FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, CLOUD, MESH, SUMMARY, BASE)
 VIEWS = (PICTURE, FRAMES, PAGE)
 """Files that show what the others hold; an error in drawing one costs no other file."""
 SEGMENT_FILE = re.compile(r"trajectory-\d+\.txt")
+EXPORT = "export"
+"""Folder of the exports in the results folder."""
+_EXPORTED = re.compile(EXPORT + r"/[A-Za-z0-9_-]+")
+_LARGEST = 64 * 2**20  # bytes of a run.json
 
 
 @contextlib.contextmanager
-def results_folder(out: Path | str | None, name: str) -> Iterator[Path]:
-    """Create and check the results folder, for the time of a run.
+def results_folder(
+    out: Path | str | None, name: str, *, overwrite: bool = False, exports: Sequence[str] = ()
+) -> Iterator[Path]:
+    """Create and check the results folder, and keep other runs out of it for the time of a run.
 
-    If the run ends with an exception, a new folder that is still empty is removed.
+    Nothing in it is touched here; see also :func:`locked_folder`.
+
+    Args:
+        out: the folder; None for ``runs/<name>-<time>``.
+        name: of the sequence.
+        overwrite: accept the results of an earlier run, which are replaced (:func:`remove_results`).
+        exports: formats that the run exports to.
+
+    Yields:
+        The folder.
+
+    Raises:
+        DvoError: the path is a file or cannot be written, another run is writing into it, it holds results and
+            ``overwrite`` is not set, or a file of the name of a result that no run of dvo has written.
+    """
+    with locked_folder(out, name) as folder:
+        _check_free(folder, overwrite, exports)
+        yield folder
+
+
+@contextlib.contextmanager
+def locked_folder(out: Path | str | None, name: str) -> Iterator[Path]:
+    """Create and check a folder, and keep other writers out of it.
+
+    If the block ends with an exception, a new folder that is still empty is removed.
 
     Args:
         out: the folder; None for ``runs/<name>-<time>``.
@@ -53,12 +85,13 @@ def results_folder(out: Path | str | None, name: str) -> Iterator[Path]:
         The folder.
 
     Raises:
-        DvoError: the path is a file or cannot be written.
+        DvoError: the path is a file or cannot be written, or another run is writing into it.
     """
     before = None if out is None else Path(out).exists()
     folder = make_folder(out, name)
     try:
-        yield folder
+        with only_writer(folder, "--out"):
+            yield folder
     except BaseException:
         if not before:
             with contextlib.suppress(OSError):  # not empty
@@ -120,20 +153,83 @@ def segment_file(number: int) -> str:
     return f"trajectory-{number}.txt"
 
 
-def remove_files(folder: Path, *, keep: Collection[str] = ()) -> None:
-    """Remove the results of an earlier run from a folder; other files stay.
+def is_result(name: str) -> bool:
+    """True for the name of a file that a run writes into its results folder.
+
+    Args:
+        name: of the file.
+    """
+    return name in FILES or SEGMENT_FILE.fullmatch(name) is not None
+
+
+def files_of_run(folder: Path) -> frozenset[str]:
+    """Files of the run whose results a folder holds: what a later run may replace.
+
+    Args:
+        folder: of results, or any other.
+
+    Returns:
+        Names, of exports ``export/NAME``; none without a ``run.json`` of dvo. Of a run that has not ended, and of one
+        that does not list its files, all names of results.
+    """
+    file = folder / SUMMARY
+    try:
+        if file.stat().st_size > _LARGEST:
+            return frozenset()
+        facts = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return frozenset()
+    found = facts.get("versions") if isinstance(facts, dict) else None
+    if not isinstance(found, dict) or "dvo" not in found or "odometry" not in facts:
+        return frozenset()
+    listed = facts.get("files")
+    names = {name for name in listed if isinstance(name, str)} if isinstance(listed, list) else set()
+    if not names or facts.get("finished") is not True:
+        with contextlib.suppress(OSError):
+            names |= {child.name for child in folder.iterdir() if is_result(child.name)}
+    return frozenset(names | {SUMMARY})
+
+
+def _check_free(folder: Path, overwrite: bool, exports: Sequence[str]) -> None:
+    """Refuse a folder with files that a run would replace, unless they are results that may be."""
+    try:
+        taken = [child.name for child in sorted(folder.iterdir()) if is_result(child.name)]
+    except OSError as error:
+        raise DvoError(error.strerror or str(error), file=folder, field="--out", remedy="give another") from error
+    taken += [name for name in (f"{EXPORT}/{one}" for one in exports) if os.path.lexists(folder / name)]
+    mine = files_of_run(folder) if taken else frozenset()
+    for name in taken:
+        if name not in mine:
+            message = "is not a file of a run of dvo, whose results would take its place"
+            raise DvoError(message, file=folder / name, field="--out", remedy="give a new folder")
+    if taken and not overwrite:
+        remedy = "give a new folder, or --overwrite to replace them"
+        raise DvoError("holds the results of a run", file=folder, field="--out", remedy=remedy)
+
+
+def remove_results(folder: Path) -> None:
+    """Remove the results of an earlier run from a folder, and what killed runs have left; other files stay.
 
     Args:
         folder: the folder.
-        keep: names of files that stay.
 
     Raises:
         OSError: a file cannot be removed.
     """
-    for file in folder.iterdir():
-        ours = file.name in FILES or SEGMENT_FILE.fullmatch(file.name) or file.name.startswith(PART)
-        if ours and file.name not in keep:
-            file.unlink(missing_ok=True)
+    mine = files_of_run(folder)
+    for name in sorted(mine):
+        if _EXPORTED.fullmatch(name):
+            shutil.rmtree(folder / name, ignore_errors=True)
+    with contextlib.suppress(OSError):  # missing, or with other files
+        (folder / EXPORT).rmdir()
+    _remove(folder, mine)
+    sweep_parts(folder)
+
+
+def _remove(folder: Path, names: Collection[str]) -> None:
+    """Remove the results of these names, run.json last: until then the others are known to be of a run."""
+    for name in sorted(filter(is_result, names), key=lambda name: name == SUMMARY):
+        (folder / name).unlink(missing_ok=True)
 
 
 def write_results(
@@ -166,10 +262,10 @@ def write_results(
         DvoError: a file cannot be written.
     """
     result = run.result
-    writers: dict[str, Callable[[Path], None]] = {TRAJECTORY: lambda path: write_tum(path, result.trajectory)}
+    writers: dict[str, Callable[[Path], None]] = {TRAJECTORY: _rows(result.trajectory)}
     if len(result.segments) > 1:
         for number, segment in enumerate(result.segments):
-            writers[segment_file(number)] = lambda path, rows=segment.trajectory: write_tum(path, rows)  # type: ignore
+            writers[segment_file(number)] = _rows(segment.trajectory)
     writers[MAP] = lambda path: write_ply(path, result.map)
     if draw is not None:
         writers[PICTURE] = draw
@@ -186,12 +282,21 @@ def write_results(
         failures.append(found)
         values |= {"warnings": [*values["warnings"], str(found)], "finished": False}
     try:
-        remove_files(folder, keep={*FILES, *writers})
+        _remove(folder, {child.name for child in folder.iterdir()} - {*FILES, *writers})
         write_summary(folder, values)
     except OSError as error:
         failures.append(write_error(folder / SUMMARY, error))
     if failures:
         raise failures[0]
+
+
+def _rows(trajectory: Trajectory) -> Callable[[Path], None]:
+    """Writer of a trajectory file."""
+
+    def write(path: Path) -> None:
+        path.write_text(tum_text(trajectory), encoding="utf-8", newline="\n")
+
+    return write
 
 
 def _failure(file: Path, write: Callable[[Path], None]) -> DvoError | None:
@@ -209,18 +314,20 @@ def _failure(file: Path, write: Callable[[Path], None]) -> DvoError | None:
 
 
 def write_summary(folder: Path, values: dict[str, Any]) -> None:
-    """Write run.json.
+    """Write run.json, with a list of the results that the folder holds.
 
     Args:
         folder: an existing folder.
-        values: for :func:`jsonable`.
+        values: for :func:`jsonable`; ``export`` and ``calibration_file`` name further files of the run.
 
     Raises:
         OSError: the file cannot be written.
     """
-    text = json.dumps(jsonable(values), indent=2, allow_nan=False)
-    with replaced(folder / SUMMARY) as part:
-        part.write_text(text + "\n", encoding="utf-8")
+    files = {SUMMARY, *(child.name for child in folder.iterdir() if is_result(child.name))}
+    files |= {f"{EXPORT}/{name}" for name in values.get("export") or ()}
+    files |= {name for name in (values.get("calibration_file"),) if name}
+    text = json.dumps(jsonable({**values, "files": sorted(files)}), indent=2, allow_nan=False)
+    write_text(folder / SUMMARY, text + "\n")
 
 
 def summary(run: Run, segment_facts: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import new_folder
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import NED_FROM_CAMERA, invert_rodrigues, pose_matrices, poses_from_matrices, split
@@ -109,12 +110,10 @@ def export_sequence(
         raise DvoError("TartanAir's layout has no lens distortion", field="layout", remedy="choose tum")
     out = Path(out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()):
-            raise DvoError("holds something already", file=out, field="--out", remedy="name a new folder")
-        write_calibration(sequence.camera, out)
-        write = _write_tum if layout == "tum" else _write_tartanair
-        notes = write(_frames(sequence, on_frame), sequence, out)
+        with new_folder(out) as part:
+            write_calibration(sequence.camera, part)
+            write = _write_tum if layout == "tum" else _write_tartanair
+            notes = write(_frames(sequence, on_frame), sequence, part)
     except OSError as error:
         raise DvoError(f"cannot be written ({error.strerror})", file=out, remedy="name a folder elsewhere") from error
     return [*sequence.warnings, *notes]

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import begin_part, check_place, drop_part, end_part
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Odometry, Status
-from dvo.session.files import remove_empty
 from dvo.session.observer import graph_of, window_view
 from dvo.session.session import Run
 from dvo.viz.marks import pixels, shade
@@ -34,10 +34,8 @@ class OverlayVideo:
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
         self._odometry: Odometry | None = None
-        try:
-            file.open("ab").close()  # OpenCV does not tell why it cannot write; an earlier video stays until a frame
-        except OSError as error:
-            raise self._error(error.strerror or str(error)) from error
+        self._part: Path | None = None
+        check_place(file, "--overlay")  # OpenCV does not tell why it cannot write
 
     def begin(self, odometry: Odometry) -> None:
         """Take the odometry whose window is read.
@@ -63,7 +61,8 @@ class OverlayVideo:
         if self._writer is None:
             self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2  # codecs want even sizes
             codec = cv2.VideoWriter.fourcc(*("MJPG" if self.file.suffix.lower() == ".avi" else "mp4v"))
-            self._writer = cv2.VideoWriter(str(self.file), codec, RATE, self._size)
+            self._part = begin_part(self.file)
+            self._writer = cv2.VideoWriter(str(self._part), codec, RATE, self._size)
             if not self._writer.isOpened():
                 raise self._error("no codec for this kind of video")
         self._writer.write(np.ascontiguousarray(picture[: self._size[1], : self._size[0], ::-1]))
@@ -77,10 +76,20 @@ class OverlayVideo:
         self.close()
 
     def close(self) -> None:
-        """Close the file; without a frame an empty one is removed."""
-        if self._writer is not None:
-            self._writer.release()
-        remove_empty(self.file)
+        """Close the video, which takes the place of an earlier one; without a frame there is none."""
+        part, self._part = self._part, None
+        if self._writer is None or part is None:
+            return
+        opened = self._writer.isOpened()
+        self._writer.release()
+        if not opened:
+            drop_part(part)
+            return
+        try:
+            end_part(part, self.file)
+        except OSError:
+            drop_part(part)
+            raise
 
     def _picture(self, frame: Frame, estimate: Estimate) -> np.ndarray:
         """RGB image of the frame with the marks of its patches."""

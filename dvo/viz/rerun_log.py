@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import begin_part, check_place, drop_part, end_part
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
-from dvo.session.files import remove_empty
 from dvo.session.observer import WindowView, archived_lines, graph_of, window_view
 from dvo.session.session import Run
 from dvo.viz.marks import pixels, shade
@@ -63,6 +63,7 @@ class RerunLog:
         self._rr = rr = import_rerun()
         self._stream = rr.RecordingStream(APPLICATION)
         self.file = file
+        self._part: Path | None = None
         self._odometry: Odometry | None = None
         self._path: list[np.ndarray] = []
         self._piece = self._segment = self._count = 0
@@ -72,10 +73,7 @@ class RerunLog:
             if file is None:
                 self._stream.spawn(default_blueprint=self._layout())
             else:
-                file.open("ab").close()  # rerun only prints an error if it cannot write the file
-        except OSError as error:
-            remedy = "give a file in a folder that can be written"
-            raise DvoError(error.strerror or str(error), file=file, field="--rerun", remedy=remedy) from error
+                check_place(file, "--rerun")  # rerun only prints an error if it cannot write the file
         except RuntimeError as error:  # no viewer, or no display
             message = f"the viewer cannot be started ({str(error).strip().splitlines()[0]})"
             raise DvoError(message, field="--rerun", remedy="write a file with --rerun FILE.rrd") from error
@@ -90,8 +88,9 @@ class RerunLog:
             odometry: newly built.
         """
         self._odometry = odometry
-        if self.file is not None:  # now, so that a run that cannot begin leaves an earlier file as it is
-            self._stream.save(self.file, default_blueprint=self._layout())
+        if self.file is not None:
+            self._part = begin_part(self.file)
+            self._stream.save(self._part, default_blueprint=self._layout())
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
         """Log a frame.
@@ -136,13 +135,18 @@ class RerunLog:
             self._lines("final/edges", archived_lines(graph, result.longest), [120, 130, 145])
 
     def close(self) -> None:
-        """Write what is buffered, and close the file; one without content is removed."""
+        """Write what is buffered, and close the file, which takes the place of an earlier one."""
+        part, self._part = self._part, None
         try:
             self._stream.flush()
         finally:
             self._stream.disconnect()
-            if self.file is not None:
-                remove_empty(self.file)
+            if self.file is not None and part is not None:
+                try:
+                    end_part(part, self.file)
+                except OSError:
+                    drop_part(part)
+                    raise
 
     # -- parts of a frame ----------------------------------------------------------------------------------------------
 

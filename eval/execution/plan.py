@@ -10,12 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import write_text
 from dvo.session.results import jsonable
 from eval.execution.cache import SystemFacts, slug
 from eval.suites.selection import suite_from
 from eval.suites.suite import Sequence, Suite
 
 MANIFEST, PREDICTIONS, GROUNDTRUTH = "run.json", "predictions", "groundtruth"
+RESULTS, TABLE, AXES, PAGE, FIGURE_FOLDER = "results.csv", "table.md", "axes.md", "report.html", "figures"
+LOOPS = "loops.md"
+WRITTEN = (MANIFEST, PREDICTIONS, GROUNDTRUTH, RESULTS, TABLE, AXES, PAGE, FIGURE_FOLDER, LOOPS)
+"""Names in the folder of an evaluation."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +115,29 @@ def write_manifest(plan: Plan, runs: list[Run], facts: dict[str, SystemFacts]) -
         machine() if plan.ray is None else f"Ray cluster at {plan.ray}",
         {"data": str(plan.data), "weights": plan.weights},
     )
-    path = plan.out / MANIFEST
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(jsonable(asdict(manifest)), indent=1) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    write_text(plan.out / MANIFEST, json.dumps(jsonable(asdict(manifest)), indent=1) + "\n")
     return manifest
+
+
+def check_folder(out: Path) -> None:
+    """Check that a folder is free for an evaluation, or holds one, which goes on.
+
+    Args:
+        out: the folder.
+
+    Raises:
+        DvoError: it holds a file or folder of the name of a result that no evaluation has written.
+    """
+    taken = [name for name in WRITTEN if os.path.lexists(out / name)]
+    if not taken:
+        return
+    try:
+        found = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        found = None
+    if not isinstance(found, dict) or not {"suites", "systems", "runs"} <= set(found):
+        message = "is not of an evaluation, whose results would take its place"
+        raise DvoError(message, file=out / taken[0], field="--out", remedy="give a new folder")
 
 
 def read_manifest(out: Path) -> Manifest:

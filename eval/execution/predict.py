@@ -20,6 +20,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.threads import process_environment
+from dvo.data.files.output import write_text
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory, read_tum, write_tum
@@ -254,10 +255,7 @@ def write_segments(folder: Path | str, segments: Sequence[Segment]) -> None:
         folder: of a run.
         segments: of its trajectory.
     """
-    path = Path(folder) / TRAJECTORY
-    part = path.with_suffix(".part")
-    write_tum(part, _all_rows(segments))
-    os.replace(part, path)
+    write_tum(Path(folder) / TRAJECTORY, _all_rows(segments))
 
 
 def read_segments(folder: Path | str) -> tuple[Segment, ...]:
@@ -318,10 +316,7 @@ def write_prediction(job: Job, prediction: Prediction) -> Prediction:
     """
     prediction.threads, prediction.device = job.threads, job.device
     prediction.parallel, prediction.time_limit = job.parallel, job.time_limit
-    path = Path(job.folder) / RECORD
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(jsonable(prediction), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    write_text(Path(job.folder) / RECORD, json.dumps(jsonable(prediction), indent=1, allow_nan=False) + "\n")
     return prediction
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import only_writer
 from dvo.data.trajectory import write_tum
 from dvo.session.results import jsonable
 from eval.execution import process
@@ -25,14 +25,21 @@ from eval.execution.cache import (
     sweep,
     system_facts,
 )
-from eval.execution.plan import PREDICTIONS, Plan, Run, groundtruth_file, prediction_folder, write_manifest
+from eval.execution.plan import (
+    PREDICTIONS,
+    Plan,
+    Run,
+    check_folder,
+    groundtruth_file,
+    prediction_folder,
+    write_manifest,
+)
 from eval.execution.predict import Job, Prediction, predict, write_prediction
 from eval.suites.selection import is_rendered, settle
 from eval.suites.suite import Sequence, Suite, open_sequence
 
 # Fields of a suite that change how it is judged and described, not its images.
 _JUDGING = ("label", "sequences", "alignment", "rpe_gap", "stride", "lost_below", "time_limit", "download")
-_LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -78,7 +85,8 @@ def predict_all(plan: Plan, say: Callable[[str], None], run: Callable[[Job], Pre
     for label in labels:
         if labels.count(label) > 1:
             raise DvoError(f"two systems of the name '{label}'", field="--systems", remedy="rename one of the files")
-    with _hold(plan.out):
+    with only_writer(plan.out, "--out"):
+        check_folder(plan.out)
         sweep(plan.out / PREDICTIONS)
         opened = {(suite.name, seq.name): open_once(plan, suite, seq, say) for suite, seq in plan.sequences()}
         tasks, runs = [], []
@@ -193,21 +201,3 @@ def _no_data(task: Task) -> Prediction:
     prediction = write_prediction(replace(task.job, folder=str(part)), Prediction("no data", task.problem or ""))
     commit(part, Path(task.job.folder), task.key)
     return prediction
-
-
-@contextmanager
-def _hold(out: Path) -> Iterator[None]:
-    """Keep a second evaluation out of the same folder; the lock ends with the process."""
-    try:
-        import fcntl
-    except ImportError:  # no such lock on this system
-        yield
-        return
-    with open(out / _LOCK, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise DvoError(
-                "another evaluation is at work in this folder", file=out, field="--out", remedy="wait, or give another"
-            ) from None
-        yield

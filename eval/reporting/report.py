@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import write_text
 from dvo.data.trajectory import read_tum
 from dvo.odometry.protocol import Segment
 from eval.execution.cache import slug
-from eval.execution.plan import Manifest, groundtruth_file
+from eval.execution.plan import AXES, FIGURE_FOLDER, LOOPS, PAGE, RESULTS, TABLE, Manifest, groundtruth_file
 from eval.execution.predict import RECORD, read_prediction, read_segments
 from eval.reporting.loops import NOTE, TITLES, loop_lines, loop_table
 from eval.reporting.plots import plot_axis, plot_sequence, plot_speed, styles
@@ -43,8 +44,6 @@ from eval.scoring.summary import (
 )
 from eval.suites.suite import Sequence, Suite
 
-RESULTS, TABLE, AXES, PAGE, FIGURE_FOLDER = "results.csv", "table.md", "axes.md", "report.html", "figures"
-LOOPS = "loops.md"
 TEMPLATES = Path(__file__).resolve().parent / "templates"
 
 
@@ -69,11 +68,11 @@ def write_tables(out: Path, manifest: Manifest, rows: list[Row]) -> str:
     """
     write_csv(out / RESULTS, rows)
     table = "\n".join(markdown(manifest, suite, rows) for suite in manifest.suites)
-    (out / TABLE).write_text(table, encoding="utf-8")
-    (out / AXES).write_text(axis_table(manifest, rows), encoding="utf-8")
+    write_text(out / TABLE, table)
+    write_text(out / AXES, axis_table(manifest, rows))
     loops = loop_table(manifest, rows)
     if loops:
-        (out / LOOPS).write_text(loops, encoding="utf-8")
+        write_text(out / LOOPS, loops)
     else:
         (out / LOOPS).unlink(missing_ok=True)
     return table
@@ -108,7 +107,7 @@ def write_report(
         lstrip_blocks=True,
     )
     page = environment.get_template("report.html").render(**content(out, manifest, rows, say))
-    (out / PAGE).write_text(page, encoding="utf-8")
+    write_text(out / PAGE, page)
     return out / PAGE
 
 
@@ -162,7 +161,7 @@ class Figures:
 
     def __call__(self, name: str, svg: str) -> str:
         text = svg if "xmlns=" in svg[:400] else svg.replace("<svg", '<svg xmlns="http://www.w3.org/2000/svg"', 1)
-        (self.folder / f"{slug(name)}.svg").write_text(text, encoding="utf-8")
+        write_text(self.folder / f"{slug(name)}.svg", text)
         return "data:image/svg+xml;base64," + base64.b64encode(text.encode()).decode()
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
+from dvo.data.files.output import replaced
 from dvo.metrics.segment_metrics import FRAMES_PER_WORLD, SEGMENT_POSES
 from eval.execution.plan import Manifest
 from eval.scoring.metric_table import FIGURES, METRICS, RECOVERY, RESOURCES, SCALE
@@ -58,7 +59,7 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
         path: file; replaced if it exists.
         rows: in the order of the file.
     """
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with replaced(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for row in rows:

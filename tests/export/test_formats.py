@@ -112,15 +112,16 @@ def result(*parts, lost=0):
     return Result(longest, SparseMap(), sum(map(len, parts)) + lost, lost, segments=segments)
 
 
-def test_exports_of_a_run_replace_earlier_ones(tmp_path):
+def test_exports_of_a_run_lie_beside_each_other_and_replace_nothing(tmp_path):
     odometry = Tracker(walk(6))
     out = tmp_path / "export"
     export_run(odometry, result(poses(6)), ["colmap", "tum"], out)
-    (out / "notes.txt").write_text("stays")
     said = export_run(odometry, result(poses(6), lost=2), ["nerfstudio", "kitti"], out)
-    assert names(out) == ["kitti", "nerfstudio", "notes.txt"]
+    assert names(out) == ["colmap", "kitti", "nerfstudio", "tum"]
     assert said[0].startswith("nerfstudio: 6 images, ") and "reprojection error 0.0" in said[0]
     assert said[1] == "kitti: 6 poses; 2 of 8 frames have no pose in it and no row; times.txt has the time of each row"
+    with pytest.raises(DvoError, match="not an empty folder"):
+        export_run(odometry, result(poses(6)), ["tum"], out)
 
 
 def test_every_segment_of_a_run_has_a_trajectory(tmp_path):

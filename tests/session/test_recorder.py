@@ -183,22 +183,16 @@ def test_segments_have_files_and_the_longest_is_the_trajectory(tmp_path):
 
 
 def test_results_of_an_earlier_run_go_at_the_first_frame(tmp_path):
-    for name in (
-        "trajectory.txt",
-        "trajectory-0.txt",
-        "trajectory-12.txt",
-        "map.ply",
-        "trajectory.png",
-        "frames.csv",
-        "summary.html",
-        ".part-map.ply",
-    ):
+    old = ("trajectory.txt", "trajectory-0.txt", "trajectory-12.txt", "map.ply", "trajectory.png", "frames.csv")
+    for name in (*old, "summary.html"):  # the last one is not of that run
         (tmp_path / name).write_text("old")
+    facts = {"odometry": "old", "versions": {"dvo": "0"}, "finished": True, "files": ["run.json", *old]}
+    (tmp_path / "run.json").write_text(json.dumps(facts))
     (tmp_path / "notes.txt").write_text("mine")
     run = Run(tmp_path)
     assert len(names(tmp_path)) == 9, "a run that fails before its first frame changes nothing"
     run.feed()
-    assert names(tmp_path) == ["notes.txt", "run.json", "trajectory.txt"]
+    assert names(tmp_path) == ["notes.txt", "run.json", "summary.html", "trajectory.txt"]
 
 
 def test_a_stop_before_the_first_frame_writes_nothing(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from dvo.core.errors import DvoError
+from dvo.data.files import output
 from dvo.data.frame import Frame
 from dvo.data.trajectory import read_tum
 from dvo.geometry.camera import Camera
@@ -96,7 +97,7 @@ def test_a_folder_that_cannot_be_written_is_found_at_once(tmp_path, monkeypatch,
 
 
 def test_the_probe_finds_a_full_disk_and_leaves_nothing(tmp_path, monkeypatch):
-    files.check_writable(tmp_path)
+    output.check_writable(tmp_path)
     assert names(tmp_path) == []
 
     def full(*_: object) -> None:
@@ -104,7 +105,7 @@ def test_the_probe_finds_a_full_disk_and_leaves_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="full"):
-        files.check_writable(tmp_path)
+        output.check_writable(tmp_path)
     assert names(tmp_path) == []
 
 

@@ -96,9 +96,10 @@ def test_patches_are_marked_where_they_are(tmp_path, monkeypatch):
     assert later[24:].max() == 0, "a frame that has left the window has no marks"
 
 
-@pytest.mark.parametrize("name", ["none/a.mp4", "a.txt"])
+@pytest.mark.parametrize("name", ["taken/a.mp4", "a.txt"])
 def test_a_video_that_cannot_be_written(name, given, image_folder, tmp_path, capsys):
     odometry = given()
+    (tmp_path / "taken").write_text("a file")
     assert main(arguments(image_folder, tmp_path / "out", "--overlay", str(tmp_path / name))) == 2
     assert any("--overlay" in line and name[-5:] in line for line in capsys.readouterr().err.splitlines())
     assert not odometry.asked

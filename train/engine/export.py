@@ -11,6 +11,7 @@ import torch
 
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import read_text
+from dvo.data.files.output import replaced
 from dvo.models.weights import save_weights
 from train.engine.checkpoint import Which, facts_of, network_of, portable, read_state
 
@@ -57,5 +58,6 @@ def export_state(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     state = portable(read_state(options.checkpoint))
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(state, options.out)
+    with replaced(options.out) as part, part.open("wb") as stream:
+        torch.save(state, stream)
     print(f"{options.out}: step {state['global_step']}")

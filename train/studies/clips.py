@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from dvo.data.files.output import replaced
 from dvo.synth.dataset import ClipDataset
 from train.data.stream import ClipStream, StreamSampler
 
@@ -66,9 +66,8 @@ class DiskClips(Dataset[dict[str, Tensor]]):
         if not file.is_file():
             clip = self.rendered[index]
             self.folder.mkdir(parents=True, exist_ok=True)
-            part = file.with_suffix(f".{os.getpid()}.part")  # another run may render the same clip
-            torch.save(clip, part)
-            part.replace(file)
+            with replaced(file) as part, part.open("wb") as stream:  # another run may render the same clip
+                torch.save(clip, stream)
         return torch.load(file, weights_only=True)
 
     def _file(self, index: int) -> Path:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.data.files.output import write_text
 from dvo.viz.plot import ACCENT, INK, PAPER, START, TRUTH
 from train.studies.config import StudyConfig
 
@@ -116,7 +117,7 @@ held-out clips. Reproduced by
 Lines are medians over {len(config.seeds)} seeds, bands their range. A step took {seconds:.2f} s of the processor.
 """
     report = out.with_suffix(".md")
-    report.write_text(text, encoding="utf-8")
+    write_text(report, text)
     return [report, picture]
 
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import replaced, write_text
 from train.engine.build import task_settings
 from train.engine.checkpoint import network_of, read_state
 from train.engine.program import TrainingProgram
@@ -110,9 +111,8 @@ def _start_of(seed: int, config: StudyConfig, clips: DiskClips) -> dict[str, Ten
         if config.start_steps > 0:
             fit(folder, program, StudyClips(clips), config.start_steps, [], 100)
         folder.mkdir(parents=True, exist_ok=True)
-        part = done.with_suffix(".part")
-        torch.save(program.net.state_dict(), part)
-        part.replace(done)  # whole, or not there
+        with replaced(done) as part, part.open("wb") as stream:
+            torch.save(program.net.state_dict(), stream)
     return torch.load(done, weights_only=True)
 
 
@@ -156,9 +156,7 @@ def run_arm(arm: str, rate: float, seed: int, config: StudyConfig) -> dict[str, 
         "arm": arm, "rate": rate, "seed": seed, "curve": curve.rows, "skipped": int(program.skipped),
         "recovered": program.recovered, "seconds_a_step": curve.train_seconds / max(config.steps, 1),
     }  # fmt: skip
-    part = done.with_suffix(".part")
-    part.write_text(json.dumps(result, indent=1), encoding="utf-8")
-    part.replace(done)  # whole, or not there
+    write_text(done, json.dumps(result, indent=1))
     return result
 
 

@@ -25,6 +25,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
+from dvo.data.files.output import replaced
 
 PLACE_DESCRIPTORS = Registry(
     "place descriptor", "dvo.place_descriptors", {"grid": "dvo.odometry.loops.place_descriptors:shipped_descriptor"}
@@ -214,7 +215,8 @@ def save_descriptor(file: Path | str, fitted: GridDescriptor, facts: dict[str, A
         Path(file).parent.mkdir(parents=True, exist_ok=True)
         # Arrays in Fortran order would be written with their entries in another order.
         arrays = {name: np.ascontiguousarray(getattr(fitted, name)) for name in ("mean", "projection")}
-        save_file(arrays, file, {"facts": json.dumps(facts)})  # one key: several are written in any order
+        with replaced(file) as part:
+            save_file(arrays, part, {"facts": json.dumps(facts)})  # one key: several are written in any order
     except (OSError, SafetensorError) as error:
         raise DvoError(f"cannot be written ({error})", file=file, remedy="give a file in another folder") from error
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import write_text
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import align_trajectory
 from dvo.viz.plot import Panel, Track, plot_panels
@@ -40,7 +41,7 @@ def write_page(file: Path, judged: list[Judged], table: str) -> None:
     text = (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Videos</title><style>{STYLE}</style>{body}</html>'
     )
-    file.write_text(text, encoding="utf-8")
+    write_text(file, text)
 
 
 def _tracks(one: Judged) -> list[Track]:

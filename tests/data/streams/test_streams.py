@@ -11,6 +11,7 @@ from dvo.core.errors import DvoError
 from dvo.data import Frame, open_source, stream
 from dvo.data.frame_checks import checked_frame
 from dvo.geometry.camera import Camera
+from dvo.session.results import results_folder
 from dvo.session.session import run
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
@@ -150,5 +151,6 @@ def test_options_that_do_not_fit():
 def test_a_session_and_the_command_line_take_a_stream(fake_odometry, tmp_path):
     done = run(fake_odometry(), stream(images(20), CAMERA, fps=10), stride=3)
     assert len(done.result.trajectory) == 20
-    code = track(fake_odometry(), stream(images(20), CAMERA, fps=10), str(tmp_path / "out"), facts={})
+    with results_folder(tmp_path / "out", "clip") as folder:
+        code = track(fake_odometry(), stream(images(20), CAMERA, fps=10), folder, facts={})
     assert code == 0 and (tmp_path / "out/trajectory.txt").is_file()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 from dataclasses import asdict, dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import torch
 
+from dvo.data.files.output import replaced
 from dvo.metrics.relative_pose import recall_area
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.load import build_odometry
@@ -203,6 +203,5 @@ def _train_phase(
 
 
 def _save(content: dict[str, Any], file: Path) -> None:
-    part = file.with_suffix(f".{os.getpid()}.part")
-    torch.save(content, part)
-    part.replace(file)
+    with replaced(file) as part, part.open("wb") as stream:
+        torch.save(content, stream)

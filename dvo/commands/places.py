@@ -1,0 +1,85 @@
+"""Outputs of a command must not be its inputs, however their paths are spelled."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from dvo.core.errors import DvoError
+from dvo.session.results import EXPORT, is_result
+
+_Given = Mapping[str, Path | str | None]
+
+
+def check_outputs(
+    outputs: _Given, inputs: _Given, source: Path | str | None = None, folder: Path | None = None
+) -> None:
+    """Check that no output of a command is one of its inputs, or another output of it.
+
+    Files are the same by identity: links and other spellings of a path do not hide one.
+
+    Args:
+        outputs: files that will be created or replaced, by option; None for options that are not given.
+        inputs: files and folders that are read, by option. A relative path is also looked up in the folder of the
+            source, and a suffix ``:ID`` of a calibration does not count.
+        source: file or folder that is read; of a folder, an existing file in it is an input too unless its name ends
+            as that of the output's kind.
+        folder: of results, the files in which may be replaced.
+
+    Raises:
+        DvoError: an output that is an input; the message names both.
+    """
+    written = {option: Path(path) for option, path in outputs.items() if path}
+    for option, output in written.items():
+        for name, path in inputs.items():
+            if path and any(os.path.lexists(place) and _is_same(output, place) for place in _places(path, source)):
+                raise _error(output, option, name)
+        if source and _is_same(output, Path(source)):
+            raise _error(output, option, "the source")
+        if source and _is_in(output, Path(source)) and output.suffix.lower() not in (".dvo", ".rrd", ".mp4", ".avi"):
+            raise _error(output, option, "the source")
+        for other, path in written.items():
+            if other != option and _is_same(output, path):
+                raise DvoError(f"is also the file of {other}", file=output, field=option, remedy="give another file")
+        if folder is not None and _is_same(output.parent, folder) and is_result(output.name):
+            raise DvoError("is a file of the results", file=output, field=option, remedy="give another file")
+    if folder is None:
+        return
+    for name, path in {**inputs, "the source": source}.items():
+        for place in _places(path, source) if path else ():
+            within = is_result(place.name) and _is_same(place.parent, folder)
+            if os.path.lexists(place) and (within or _is_in(place, folder / EXPORT)):
+                raise _error(place, "--out", name)
+
+
+def _error(file: Path, option: str, name: str) -> DvoError:
+    what = name if name == "the source" else f"the file of {name}"
+    return DvoError(f"is {what}, which it would replace", file=file, field=option, remedy="give another place")
+
+
+def _places(path: Path | str, source: Path | str | None) -> Iterator[Path]:
+    """Files that a path may name."""
+    spellings = [str(path)]
+    head, colon, _ = str(path).rpartition(":")
+    if colon and head:
+        spellings.append(head)  # of several cameras, the one with an identifier
+    for text in spellings:
+        yield Path(text)
+        if source and not os.path.isabs(text):
+            base = Path(source) if Path(source).is_dir() else Path(source).parent
+            yield base / text
+
+
+def _is_same(first: Path, second: Path) -> bool:
+    try:
+        return os.path.samefile(first, second)
+    except (OSError, ValueError):  # one is missing, or no path at all
+        return os.path.realpath(first) == os.path.realpath(second)
+
+
+def _is_in(file: Path, folder: Path) -> bool:
+    """True for an existing file somewhere in a folder."""
+    if not (folder.is_dir() and file.exists()):
+        return False
+    return any(_is_same(parent, folder) for parent in Path(os.path.realpath(file)).parents)

@@ -161,7 +161,8 @@ class Recorder:
         try:
             if not self._clean:
                 remove_results(self.folder)
-                self._write_state(interrupted)  # what follows is known to be of a run, also if this one is killed
+                # Before the other files, which then are known to be of a run, also if this one is killed.
+                self._write_summary(self._rows_so_far(), interrupted)
                 self._clean = True
             self._write_rows(durable=everything)
             if everything:
@@ -180,11 +181,14 @@ class Recorder:
 
     def _write_state(self, interrupted: bool) -> None:
         result = self._result()
-        elapsed = {"elapsed": self.clock() - self._started}
-        run = Run(result, self._fed, interrupted, tuple(self.warnings), elapsed)
         if len(result.map.points):
             with replaced(self.folder / MAP) as part:
                 write_ply(part, result.map)
+        self._write_summary(result, interrupted)
+
+    def _write_summary(self, result: Result, interrupted: bool) -> None:
+        elapsed = {"elapsed": self.clock() - self._started}
+        run = Run(result, self._fed, interrupted, tuple(self.warnings), elapsed)
         write_summary(self.folder, {**self.facts, **summary(run), "finished": False})
 
     def _result(self) -> Result:
@@ -192,6 +196,9 @@ class Recorder:
         if isinstance(self.odometry, Interim):
             result = self.odometry.current()  # where a frame may have a row that was lost at first
             return replace(result, frames_read=self._read, frames_lost=min(self._lost, result.frames_lost))
+        return self._rows_so_far()
+
+    def _rows_so_far(self) -> Result:
         segments: list[Segment] = []
         for _, rows in sorted(self._rows.items()):
             table = np.array(rows).reshape(-1, _COLUMNS)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import read_times
 from dvo.data.open import open_source
@@ -37,7 +38,21 @@ CALIBRATIONS = {
     "orbslam": ("calib.yaml", ["Camera.fx: 50", "Camera.fy: 51", "Camera.cx: 31.5", "Camera.cy: 23.5",
                                "Camera.k1: -0.1", "Camera.k2: 0.01", "Camera.p1: 0.001", "Camera.p2: 0.001",
                                "Camera.width: 64", "Camera.height: 48", "Camera.bf: 5", "DepthMapFactor: 5000"]),
+    "named": ("calib.txt", ["fx=50 fy=51 cx=31.5 cy=23.5"]),
+    "euroc": ("sensor.yaml", ["sensor_type: camera", "T_BS:", "  cols: 4", "  rows: 4",
+                              "  data: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]", "rate_hz: 20",
+                              "resolution: [64, 48]", "camera_model: pinhole", "intrinsics: [50, 51, 31.5, 23.5]",
+                              "distortion_model: radial-tangential",
+                              "distortion_coefficients: [-0.1, 0.01, 0.001, 0.001]"]),
+    "kitti": ("calib.txt", [f"P{k}: 50 0 31.5 {-5 * k} 0 50 23.5 0 0 0 1 0" for k in range(4)]),
+    "ros": ("camera_info.yaml", ["image_width: 64", "image_height: 48", "camera_name: left",
+                                 "camera_matrix: {rows: 3, cols: 3, data: [50, 0, 31.5, 0, 51, 23.5, 0, 0, 1]}",
+                                 "distortion_model: plumb_bob",
+                                 "distortion_coefficients: {rows: 1, cols: 5, data: [-0.1, 0.01, 0.001, 0.001, 0]}"]),
+    "colmap": ("cameras.txt", ["# Camera list", "1 OPENCV 64 48 50 51 32 24 -0.1 0.01 0.001 0.001"]),
+    "colmap_of_two": ("cameras.txt", ["1 PINHOLE 64 48 50 51 32 24", "7 OPENCV_FISHEYE 64 48 50 51 32 24 0.01 0 0 0"]),
 }  # fmt: skip
+SELECTED = {"colmap_of_two": ":7"}
 
 
 def _write(folder: Path, name: str, rows: list[str]) -> None:
@@ -146,12 +161,42 @@ def _stream(folder: Path, random: np.random.Generator | None) -> None:
     check_frames(stream(items, Camera(50.0, 51.0, 31.5, 23.5, WIDTH, HEIGHT), **options))
 
 
+SECRET = "S3cr3t"
+SCHEMES = ["rtsp", "rtsps", "http", "https", "RTSP", " rtsp", "rtmp", "ftp", "rstp", "udp", "file", "h264+rtsp", ""]
+USERS = ["", "user:{}@", "user:a@{}@", "user:a/{}@", "{}@", "user:{}%40@", "u@v:{}:w@", "user:{}#@", "user:?{}@"]
+TAILS = ["", "/", "/live", "/a@b", "/live?token={}", "?access_token={}", "/x?a=1&sig={}&b=2", "/x?password={}#t",
+         "/x?api_key={}", "/x;jsessionid={}"]  # fmt: skip
+
+
+def _odd_address(folder: Path, random: np.random.Generator) -> str:
+    scheme, user, tail = (str(part[int(random.integers(len(part)))]) for part in (SCHEMES, USERS, TAILS))
+    separator = ["://", "://", "://", ":/", "//"][int(random.integers(5))]
+    text = f"{scheme}{separator}{user.format(SECRET)}127.0.0.1:1{tail.format(SECRET)}"
+    (folder / "empty.txt").write_text(text)
+    return text.replace(SECRET, "...")
+
+
+def _address(folder: Path, random: np.random.Generator | None) -> None:
+    """Open an address at which nobody answers: no message holds its secret."""
+    address = (folder / "empty.txt").read_text()
+    if not address:
+        return
+    try:
+        open_source(address)
+    except DvoError as error:
+        found: BaseException | None = error
+        while found is not None:
+            require(SECRET not in str(found), "a secret in a message")
+            found = found.__cause__ or found.__context__
+        raise
+
+
 def _one(name: str, file: str, rows: list[str], read: Any) -> Target:
     return Target(name, partial(_write, name=file, rows=rows), read, modules=MODULES)
 
 
 TARGETS = (
-    *(_one(f"calibration_{name}", file, rows, partial(_calibration, name=file))
+    *(_one(f"calibration_{name}", file, rows, partial(_calibration, name=file + SELECTED.get(name, "")))
       for name, (file, rows) in CALIBRATIONS.items()),
     _one("times", "times.txt", ["time", *(f"{0.1 * i:.3f}" for i in range(5))], _times),
     _one("times_ns", "times.txt", [str(1_403_636_579_763_555_584 + 50_000_000 * i) for i in range(5)], _times),
@@ -163,6 +208,7 @@ TARGETS = (
     _one("truth_kitti", "t.txt", [f"1 0 0 {0.1 * i} 0 1 0 0 0 0 1 {i}" for i in range(4)],
          partial(_truth, name="t.txt")),
     _one("truth_ned", "t.txt", [row.split(maxsplit=1)[1] for row in poses()], partial(_truth, name="t.txt")),
+    Target("addresses", _nothing, _address, _odd_address, MODULES),
     Target("options", _places, _options, _no_mutation, MODULES),
     Target("stream", _nothing, _stream, _odd_stream, MODULES),
 )  # fmt: skip

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from dvo.core.errors import DvoError
+from dvo.data.files.output import only_writer
 from eval.__main__ import main
 from eval.execution.plan import read_manifest
 from eval.execution.predict import Job, predict_here
@@ -137,11 +138,17 @@ def test_parallel_is_serial(tmp_path, image_folder, suite_file, walk):
 
 
 def test_two_evaluations_do_not_share_a_folder(plan, image_folder):
-    fcntl = pytest.importorskip("fcntl")
-    with open(plan.out / ".lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with pytest.raises(DvoError, match="another evaluation"):
-            predict_all(replace(plan, systems=("null",)), lambda text: None, predict_here)
+    with only_writer(plan.out, "--out"), pytest.raises(DvoError, match="another run is writing"):
+        predict_all(replace(plan, systems=("null",)), lambda text: None, predict_here)
+
+
+@pytest.mark.parametrize("name", ["results.csv", "run.json", "predictions", "report.html"])
+def test_files_that_no_evaluation_has_written_stay(plan, image_folder, name):
+    """Also run.json of a results folder of dvo."""
+    (plan.out / name).mkdir() if name == "predictions" else (plan.out / name).write_text('{"frames": 3}')
+    with pytest.raises(DvoError, match="not of an evaluation") as caught:
+        predict_all(replace(plan, systems=("null",)), lambda text: None, predict_here)
+    assert caught.value.file == plan.out / name and [file.name for file in plan.out.iterdir()] == [name]
 
 
 def test_hang_and_nan_are_rows(tmp_path, image_folder, suite_file, capsys):

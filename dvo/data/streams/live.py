@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import GeneratorType
 from typing import Generic, TypeVar
 
@@ -32,6 +34,85 @@ class StreamCounts:
     dropped: int = 0
 
 
+@dataclass(eq=False)
+class _Queue(Generic[T]):
+    """What the thread and the consumer share. The thread refers to nothing else, so that it does not keep the
+    :class:`LiveFrames` alive.
+
+    Attributes:
+        size: elements that may wait.
+        drop: drop the oldest waiting element if it is full; otherwise wait.
+        interrupt: ends a read that blocks.
+        counts: received and dropped elements.
+        changed: its lock is reentrant, so that a signal handler, or a finaliser, may call ``stop`` while its thread
+            holds it.
+        ended, stopping: the thread has ended; it shall end.
+        error: that ended the thread.
+        process: that the thread runs in; None before its start.
+    """
+
+    size: int
+    drop: bool
+    interrupt: Callable[[], object] | None
+    counts: StreamCounts = field(default_factory=StreamCounts)
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    waiting: deque[T] = field(init=False)
+    ended: bool = False
+    stopping: bool = False
+    error: Exception | None = None
+    process: int | None = None
+
+    def __post_init__(self) -> None:
+        self.waiting = deque(maxlen=self.size)
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """The thread is one of the process that this one was forked from; it may have held the lock then."""
+        return self.process not in (None, os.getpid())
+
+    def stop(self) -> None:
+        """End the thread as soon as possible; what waits is dropped."""
+        if self.is_elsewhere:
+            return
+        with self.changed:
+            # The lock of an event is not reentrant: a signal handler must not set it while this thread does.
+            is_first, self.stopping = not self.stopping, True
+            self.counts.dropped += len(self.waiting)
+            self.waiting.clear()
+            self.changed.notify_all()
+        if is_first and self.interrupt is not None:
+            self.interrupt()
+
+    def put(self, item: T) -> bool:
+        """Add an element; False if nobody wants one any more."""
+        with self.changed:
+            while not self.drop and len(self.waiting) >= self.size and not self.stopping:
+                self.changed.wait()
+            if self.stopping:
+                return False
+            self.counts.received += 1
+            self.counts.dropped += len(self.waiting) >= self.size
+            self.waiting.append(item)  # drops the oldest if need be
+            self.changed.notify_all()
+            return True
+
+    def read(self, frames: Iterable[T]) -> None:
+        """Body of the thread."""
+        error: Exception | None = None
+        try:
+            for item in frames:
+                if not self.put(item):
+                    break
+            if isinstance(frames, GeneratorType):
+                frames.close()
+        except Exception as caught:  # whatever it is, also of the generator's end, the consumer gets it
+            error = caught
+        finally:
+            with self.changed:
+                self.error, self.ended = error, True
+                self.changed.notify_all()
+
+
 class LiveFrames(Generic[T]):
     """Elements of a stream for a consumer that may be slower than the stream.
 
@@ -40,7 +121,9 @@ class LiveFrames(Generic[T]):
     With ``drop=False`` the thread waits instead, and every element is processed. Neither side polls.
 
     An error of ``frames`` is raised in the consumer, after the elements before it. It can be iterated once; the end of
-    the iteration, or leaving it early, ends the thread. A generator given as ``frames`` is closed in its thread.
+    the iteration, or leaving it early, ends the thread, and so does the last reference to it and its iterator. A
+    generator given as ``frames`` is closed in its thread. A forked process has no such thread: reading there is an
+    error.
 
     Args:
         frames: frames, or anything else, for instance pairs ``(time.monotonic(), image)`` for :func:`dvo.stream`. Only
@@ -82,14 +165,16 @@ class LiveFrames(Generic[T]):
         if queue < 1:
             raise DvoError(f"must be 1 or more, got {queue}", field="queue", remedy="give a whole number of frames")
         self.name, self.groundtruth = name, groundtruth
-        self.counts = StreamCounts()
-        self._frames, self._queue, self._drop, self._interrupt = frames, queue, drop, interrupt
-        # The lock of a condition is reentrant, so that a signal handler may call stop while its thread holds it.
-        self._changed = threading.Condition()
-        self._waiting: deque[T] = deque()
+        self._frames, self._queue = frames, _Queue[T](queue, drop, interrupt)
         self._thread: threading.Thread | None = None
-        self._ended = self._stopping = self._iterated = False
-        self._error: Exception | None = None
+        self._iterated = False
+        # It asks the thread to end, and does not wait for that: it may run in any thread, whatever this one holds.
+        weakref.finalize(self, self._queue.stop).atexit = False
+
+    @property
+    def counts(self) -> StreamCounts:
+        """Received and dropped elements."""
+        return self._queue.counts
 
     @property
     def warnings(self) -> list[str]:
@@ -100,10 +185,18 @@ class LiveFrames(Generic[T]):
         return [f"{dropped} of {received} frames were dropped, the stream is faster than tracking"]
 
     def start(self) -> None:
-        """Begin to read; otherwise the iteration does. What is dropped before the iteration is not counted."""
-        with self._changed:
-            if self._thread is None and not self._stopping:
-                self._thread = threading.Thread(target=self._read, name=f"dvo stream {self.name}", daemon=True)
+        """Begin to read; otherwise the iteration does. What is dropped before the iteration is not counted.
+
+        Raises:
+            DvoError: a process that was forked while the stream was being read.
+        """
+        self._check_process()
+        with self._queue.changed:
+            if self._thread is None and not self._queue.stopping:
+                self._queue.process = os.getpid()
+                self._thread = threading.Thread(
+                    target=self._queue.read, args=(self._frames,), name=f"dvo stream {self.name}", daemon=True
+                )
                 self._thread.start()
 
     def peek(self, timeout: float | None = None) -> T:
@@ -116,12 +209,12 @@ class LiveFrames(Generic[T]):
             DvoError: the stream has ended, or there is nothing in time; any error of the stream.
         """
         self.start()
-        with self._changed:
+        with self._queue.changed:
             in_time = self._wait(timeout)
-            if self._waiting:
-                return self._waiting[0]
-            if self._error is not None:
-                raise self._error
+            if self._queue.waiting:
+                return self._queue.waiting[0]
+            if self._queue.error is not None:
+                raise self._queue.error
         problem = "ends without an image" if in_time else f"no image within {timeout:g} s"
         raise DvoError(problem, file=self.name, remedy="check that the camera or the stream is on")
 
@@ -131,36 +224,30 @@ class LiveFrames(Generic[T]):
         Args:
             item: the same object.
         """
-        with self._changed:
-            if self._waiting and self._waiting[0] is item:
-                self._waiting.popleft()
-                self._changed.notify_all()
+        with self._queue.changed:
+            if self._queue.waiting and self._queue.waiting[0] is item:
+                self._queue.waiting.popleft()
+                self._queue.changed.notify_all()
 
     def __iter__(self) -> Iterator[T]:
         """Elements in order of arrival.
 
         Raises:
-            DvoError: a second iteration.
+            DvoError: a second iteration; a process that was forked while the stream was being read.
         """
+        self._check_process()
         if self._iterated:
             raise DvoError("a stream can be read only once", file=self.name, remedy="open it anew")
         self._iterated = True
-        with self._changed:
-            self.counts.received, self.counts.dropped = len(self._waiting), 0
+        with self._queue.changed:
+            self.counts.received, self.counts.dropped = len(self._queue.waiting), 0
         self.start()
         return self._take_all()
 
     def stop(self) -> None:
         """End the iteration as soon as possible; what waits is dropped. May be called from any thread, and in a signal
         handler."""
-        with self._changed:
-            # The lock of an event is not reentrant: a signal handler must not set it while this thread does.
-            is_first, self._stopping = not self._stopping, True
-            self.counts.dropped += len(self._waiting)
-            self._waiting.clear()
-            self._changed.notify_all()
-        if is_first and self._interrupt is not None:
-            self._interrupt()
+        self._queue.stop()
 
     def close(self) -> None:
         """Stop, and wait for the end of the thread."""
@@ -179,59 +266,37 @@ class LiveFrames(Generic[T]):
     def _take_all(self) -> Iterator[T]:
         try:
             while True:
-                with self._changed:
+                self._check_process()
+                with self._queue.changed:
                     self._wait(None)
-                    if not self._waiting:
-                        error, self._error = self._error, None
-                        if error is not None and not self._stopping:
+                    if not self._queue.waiting:
+                        error, self._queue.error = self._queue.error, None
+                        if error is not None and not self._queue.stopping:
                             raise error
                         return
                     try:
-                        item = self._waiting.popleft()
+                        item = self._queue.waiting.popleft()
                     except IndexError:  # a signal handler has called stop since the line above
                         return
-                    self._changed.notify_all()
+                    self._queue.changed.notify_all()
                 yield item
         finally:
             self.close()
 
+    def _check_process(self) -> None:
+        """Raise DvoError where the thread cannot be waited for."""
+        if self._queue.is_elsewhere:
+            remedy = "open the stream in the process that reads it"
+            raise DvoError(
+                "is read by a thread of the process that this one was forked from", file=self.name, remedy=remedy
+            )
+
     def _wait(self, timeout: float | None) -> bool:
         """Wait, with the lock held, for an element or the end; False if there is neither in time."""
         # A signal handler that calls stop between the test and the wait wakes nobody: hence the second look.
-        done = lambda: bool(self._waiting) or self._ended or self._stopping  # noqa: E731
+        done = lambda: bool(self._queue.waiting) or self._queue.ended or self._queue.stopping  # noqa: E731
         if timeout is not None:
-            return self._changed.wait_for(done, timeout)
-        while not self._changed.wait_for(done, _CHECK):
+            return self._queue.changed.wait_for(done, timeout)
+        while not self._queue.changed.wait_for(done, _CHECK):
             pass
         return True
-
-    def _read(self) -> None:
-        """Body of the thread."""
-        error: Exception | None = None
-        try:
-            for item in self._frames:
-                if not self._put(item):
-                    break
-            if isinstance(self._frames, GeneratorType):
-                self._frames.close()
-        except Exception as caught:  # whatever it is, also of the generator's end, the consumer gets it
-            error = caught
-        finally:
-            with self._changed:
-                self._error, self._ended = error, True
-                self._changed.notify_all()
-
-    def _put(self, item: T) -> bool:
-        """Add an element; False if nobody wants one any more."""
-        with self._changed:
-            while not self._drop and len(self._waiting) >= self._queue and not self._stopping:
-                self._changed.wait()
-            if self._stopping:
-                return False
-            self.counts.received += 1
-            if len(self._waiting) >= self._queue:
-                self._waiting.popleft()
-                self.counts.dropped += 1
-            self._waiting.append(item)
-            self._changed.notify_all()
-            return True

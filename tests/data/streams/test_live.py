@@ -1,4 +1,6 @@
+import gc
 import itertools
+import os
 import threading
 import time
 
@@ -11,6 +13,7 @@ from dvo.data.frame import Frame
 from dvo.data.streams.live import LiveFrames
 from dvo.data.streams.streams import stream
 from dvo.geometry.camera import Camera
+from tests.support.forked import in_fork
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 LIMIT = 20.0  # seconds after which a wait has failed; none takes so long
@@ -191,3 +194,80 @@ def test_an_error_at_the_end_of_a_generator_reaches_the_consumer():
     assert gone("dvo stream stream")
     with pytest.raises(OSError, match="at its release"):
         live.peek(LIMIT)
+
+
+@pytest.mark.parametrize("use", ["started", "looked at", "iterator", "iterating", "full", "in a cycle"])
+def test_a_stream_without_references_ends_its_thread(use):
+    """Without ``stop`` or ``close``: a camera would stay open as long as the process."""
+    closed = threading.Event()
+
+    def camera():
+        try:
+            yield from itertools.count()
+        finally:
+            closed.set()
+
+    live = LiveFrames(camera(), name="forgotten", drop=use != "full")
+    live.start()
+    holder = [live]
+    if use == "looked at":
+        live.peek(LIMIT)
+    elif use == "iterator":
+        holder.append(iter(live))
+    elif use == "iterating":
+        holder.append(iter(live))
+        next(holder[-1])
+    elif use == "in a cycle":
+        live.itself = live
+    assert not closed.is_set()
+    holder.clear()
+    del live
+    gc.collect()
+    assert closed.wait(LIMIT)
+    until(lambda: gone("dvo stream forgotten"))
+
+
+def test_a_stream_that_waits_for_its_camera_is_interrupted_by_its_last_reference():
+    interrupted = threading.Event()
+
+    def camera():
+        interrupted.wait(LIMIT)
+        yield 0
+
+    live = LiveFrames(camera(), name="silent", interrupt=interrupted.set)
+    live.start()
+    del live
+    assert interrupted.wait(LIMIT)
+    until(lambda: gone("dvo stream silent"))
+
+
+def test_an_iterator_keeps_its_stream():
+    found = iter(LiveFrames(iter(range(100)), drop=False))
+    gc.collect()
+    assert list(found) == list(range(100))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.parametrize("use", [list, lambda live: live.peek(), lambda live: next(live.begun), LiveFrames.start])
+def test_a_forked_process_does_not_wait_for_the_thread(use):
+    wait = threading.Event()
+
+    def camera():
+        yield 0
+        wait.wait(LIMIT)
+
+    with LiveFrames(camera(), name="parent", interrupt=wait.set) as live:
+        if use not in (list, LiveFrames.start):
+            live.begun = iter(live)
+            assert next(live.begun) == 0
+        assert in_fork(lambda: use(live)) == (
+            "DvoError: parent: is read by a thread of the process that this one was forked from. "
+            "Open the stream in the process that reads it."
+        )
+        assert in_fork(live.close) == "None", "nor does its end"
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_stream_that_was_not_begun_is_read_by_the_forked_process():
+    live = LiveFrames(iter(range(5)), drop=False)
+    assert in_fork(lambda: list(live)) == "[0, 1, 2, 3, 4]"

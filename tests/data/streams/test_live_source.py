@@ -1,5 +1,6 @@
 """Cameras (a fake one), addresses (a server on this machine) and pipes as sources."""
 
+import gc
 import gzip
 import http.server
 import io
@@ -310,3 +311,40 @@ def test_a_pipe_that_is_closed_is_told(monkeypatch):
     monkeypatch.setattr("sys.stdin", None)
     with pytest.raises(DvoError, match="standard input: is closed"):
         open_stream("-")
+
+
+def _ended():
+    return not [thread for thread in threading.enumerate() if thread.name.startswith("dvo stream")]
+
+
+@pytest.mark.parametrize("address", ["webcam:0", "rtsp://host/stream"])
+@pytest.mark.parametrize("begun", [False, True])
+def test_a_camera_is_released_with_the_last_reference_to_its_source(camera, address, begun):
+    camera.images = camera.images * 1000
+    source = open_stream(address)
+    frames = iter(source) if begun else None
+    assert frames is None or next(frames).index >= 0
+    assert not camera.last.released
+    del source, frames
+    gc.collect()
+    end = time.monotonic() + 20
+    while not (camera.last.released and _ended()):
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+def test_a_pipe_is_left_with_the_last_reference_to_its_source(make):
+    """Its writer waits, and so does the thread that reads it."""
+    reader, writer = os.pipe()
+    with open(reader, "rb") as file, open(writer, "wb") as out:
+        out.write(jpegs(make)[0])
+        out.flush()
+        source = open_stream(file)
+        assert not _ended()
+        del source
+        gc.collect()
+        end = time.monotonic() + 20
+        while not _ended():
+            assert time.monotonic() < end
+            time.sleep(0.001)
+        assert not file.closed, "it belongs to the caller"

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from eval.execution.plan import Manifest
+from eval.reporting.tables import escape, table_line
 from eval.scoring.loops import NEAR, OLDER, RIGHT
 from eval.scoring.score import Row
 from eval.scoring.summary import Cell, error_cell, summarise
@@ -90,8 +91,9 @@ def loop_table(manifest: Manifest, rows: Sequence[Row]) -> str:
     lines = loop_lines(manifest, rows)
     if not lines:
         return ""
-    table = [["sequence", "system", *TITLES], ["---", "---", *["--:"] * len(TITLES)], *lines]
-    return NOTE + "\n\n" + "".join("| " + " | ".join(cells) + " |\n" for cells in table)
+    table = [["sequence", "system", *TITLES], ["---", "---", *["--:"] * len(TITLES)]]
+    table += [[escape(sequence), escape(system), *cells] for sequence, system, *cells in lines]
+    return NOTE + "\n\n" + "".join(f"{table_line(cells)}\n" for cells in table)
 
 
 def _line(sequence: Recording, pair: tuple[str | None, str | None], here: Iterable[Row]) -> list[str]:

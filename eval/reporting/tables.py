@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -45,10 +46,11 @@ def axis_table(manifest: Manifest, rows: list[Row]) -> str:
         Markdown.
     """
     systems = list(manifest.systems)
-    lines = [_line(["axis", "median", *systems]), _line(["---", "---", *["--:"] * len(systems)])]
+    lines = [table_line(["axis", "median", *map(escape, systems)])]
+    lines.append(table_line(["---", "---", *["--:"] * len(systems)]))
     for axis in axes_of(manifest):
         cells = axis_cells(axis, systems, rows)
-        lines.append(_line([axis.title, axis.unit, *(cell.short(axis.digits) for cell in cells.values())]))
+        lines.append(table_line([escape(axis.title), axis.unit, *(cell.short(axis.digits) for cell in cells.values())]))
     return "\n".join(lines) + "\n"
 
 
@@ -85,7 +87,12 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     figures += RECOVERY if any(one.judged_by == "recovery_s" for one in suite.sequences) else ()
     names = ["sequence", "system", "runs failed", *(metric.title for metric in figures), METRICS["completeness"].title]
     names += [metric.title for metric in (*extra, *RESOURCES)]
-    lines = [protocol(manifest, suite, rows), "", _line(names), _line(["---"] * 2 + ["--:"] * (len(names) - 2))]
+    lines = [
+        protocol(manifest, suite, rows),
+        "",
+        table_line(names),
+        table_line(["---"] * 2 + ["--:"] * (len(names) - 2)),
+    ]
     for sequence in suite.sequences:
         groups = {name: [r for r in rows if r.sequence == sequence.name and r.system == name] for name in systems}
         groups = {name: group for name, group in groups.items() if group}
@@ -100,12 +107,15 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
             cells += [resource_cell(group, metric.name).text(metric.digits) for metric in RESOURCES]
             failed = sum(row.failed for row in group)
             title = f"{sequence.name} ({sequence.about})" if sequence.about else sequence.name
-            lines.append(_line([title if position == 0 else "", name, f"{failed}/{len(group)}", *cells]))
+            lines.append(
+                table_line([escape(title) if position == 0 else "", escape(name), f"{failed}/{len(group)}", *cells])
+            )
     failures = [row for row in rows if row.failed]
     if failures:
         lines += ["", "Failed runs:", ""]
         lines += [
-            f"- {r.system}, {r.sequence}, seed {r.seed}: {r.status}: {one_line(r.reason) or 'no reason given'}"
+            f"- {escape(r.system)}, {escape(r.sequence)}, seed {r.seed}: {escape(r.status)}: "
+            f"{escape(r.reason) or 'no reason given'}"
             for r in failures
         ]
     return "\n".join(lines) + "\n"
@@ -124,14 +134,15 @@ def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
         name: ", ".join(dict.fromkeys(r.resolution for r in rows if r.system == name and r.resolution))
         for name in dict.fromkeys(row.system for row in rows)
     }
-    worked = "; ".join(f"{name}: {size}" for name, size in sizes.items() if size)
+    worked = "; ".join(f"{escape(name)}: {escape(size)}" for name, size in sizes.items() if size)
     judges = list(dict.fromkeys(sequence.judged_by for sequence in suite.sequences))
     names = {judge: [sequence.name for sequence in suite.sequences if sequence.judged_by == judge] for judge in judges}
     usual = max(judges, key=lambda judge: len(names[judge]))
     said = f"by {METRICS[usual].title}"
-    said += "".join(f", {', '.join(names[judge])} by {METRICS[judge].title}" for judge in judges if judge != usual)
+    others = [judge for judge in judges if judge != usual]
+    said += "".join(f", {', '.join(map(escape, names[judge]))} by {METRICS[judge].title}" for judge in others)
     sentences = [
-        f"**{suite.label}** (suite `{suite.name}`).",
+        f"**{escape(suite.label)}** (suite {escape(suite.name)}).",
         f"Alignment {suite.alignment}; every {suite.stride}. image fed;"
         if suite.stride > 1
         else f"Alignment {suite.alignment}; stride 1;",
@@ -143,7 +154,7 @@ def protocol(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
         SEGMENTS_NOTE if any(row.segments > 1 for row in rows) else "",
         FALSE_POSES_NOTE if any(row.unseen for row in rows) else "",
         f"Working resolution: {worked}." if worked else "",
-        speed_note(manifest, rows),
+        escape(speed_note(manifest, rows)),
     ]
     return " ".join(sentence for sentence in sentences if sentence)
 
@@ -162,11 +173,35 @@ def one_line(text: str) -> str:
     return " ".join(text.split())
 
 
+def escape(text: str) -> str:
+    """The text as Markdown shows it: on one line, without markup, HTML, links or the end of a cell.
+
+    Args:
+        text: name of a system, a sequence or a suite, message of a program: anything.
+
+    Returns:
+        Markdown for a cell or a sentence.
+
+    Example:
+        >>> escape("a|b [c](http://d) <e>")
+        'a\\|b \\[c\\](http\\://d) &lt;e&gt;'
+    """
+    plain = "".join(letter if letter.isprintable() else " " for letter in one_line(text)).replace("&", "&amp;")
+    marked = re.sub(r"[\\`*\[\]|~#]|(?<!\w)_|_(?!\w)|@(?=\w)", r"\\\g<0>", plain)
+    unlinked = re.sub(r"(?i)\b(https?|ftp)(:)(?=//)|\b(www)(\.)", r"\1\3\\\2\4", marked)
+    return re.sub(r"^(\d*)([-+.)])(?=\s)", r"\1\\\2", unlinked.replace("<", "&lt;").replace(">", "&gt;"))
+
+
 def _csv(value: object) -> str:
     if isinstance(value, float):
         return "" if math.isnan(value) else f"{value:.9g}"
     return one_line(str(value))
 
 
-def _line(cells: list[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |"
+def table_line(cells: Iterable[str]) -> str:
+    """A line of a table in Markdown.
+
+    Args:
+        cells: Markdown; names and other texts escaped.
+    """
+    return "| " + " | ".join(cells) + " |"

@@ -22,6 +22,7 @@ from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.schur_pattern import make_schur_pattern
 from dvo.core.errors import DvoError
+from dvo.core.threads import use_threads
 from dvo.geometry import se3, sim3, so3
 from dvo.geometry.precision import full_precision
 
@@ -94,6 +95,7 @@ def optimise_pose_graph(
         >>> result = optimise_pose_graph(poses_cw, ii, jj, measurements)
         >>> result.poses_cw, result.chi2
     """
+    use_threads()
     dim = _check(poses_cw, ii, jj, measurements, options.chart)
     with torch.no_grad(), full_precision(poses_cw.device):
         measurements = measurements.to(poses_cw)

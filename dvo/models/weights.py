@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dvo.core.errors import DvoError
+from dvo.core.threads import use_threads
 from dvo.data.files.output import replaced
 from dvo.models.pickles import check_plain, load_pickle
 from dvo.models.published import read_published
@@ -196,8 +197,10 @@ def load_weights(name_or_file: str | Path, device: torch.device | str = "cpu") -
 
     Raises:
         DvoError: no such file; not safetensors (a pickle is never opened here); an architecture that is not
-            registered; tensors that are missing, of the wrong shape, or not finite.
+            registered; tensors that are missing, of the wrong shape, or not finite; a forked process, see
+            :func:`dvo.core.threads.use_threads`.
     """
+    use_threads()
     path = find_weights(name_or_file)
     tensors, metadata = _open(path)
     info = _parse(path, tensors, metadata)

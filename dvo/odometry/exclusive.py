@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, TypeVar
+
+from dvo.core.errors import DvoError
+from dvo.core.threads import use_threads
 
 T = TypeVar("T")
 
@@ -18,7 +22,9 @@ def exclusive(cls: type[T]) -> type[T]:
 
     A method of :data:`METHODS` that is called while another thread is in one of them, of the same object, begins when
     that one has ended: ``current`` and ``save`` see the state between two frames. Attributes are not protected. The
-    lock is an attribute of the object, which its constructor makes first.
+    lock is an attribute of the object, which its constructor makes first. In a forked process that cannot compute
+    (:func:`dvo.core.threads.use_threads`), or that was forked while another thread was in a method, all of them raise a
+    :class:`DvoError`.
 
     Args:
         cls: any of the methods may be missing.
@@ -45,15 +51,29 @@ def exclusive(cls: type[T]) -> type[T]:
 def _with_lock(construct: Callable[..., None]) -> Callable[..., None]:
     @wraps(construct)
     def call(self: Any, *args: Any, **keywords: Any) -> None:
-        self._lock = threading.RLock()
+        self._lock, self._lock_process = threading.RLock(), os.getpid()
         construct(self, *args, **keywords)
 
     return call
 
 
+def _check_forked(lock: threading.RLock) -> None:
+    """Raise DvoError if the lock is held by a thread that the forked process does not have."""
+    if not lock.acquire(blocking=False):
+        raise DvoError(
+            "this process was forked while another thread used the odometry, which is between two states here",
+            field="fork",
+            remedy="fork between two calls, or build an odometry in each process",
+        )
+    lock.release()
+
+
 def _locked(method: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(method)
     def call(self: Any, *args: Any, **keywords: Any) -> Any:
+        use_threads()
+        if self._lock_process != os.getpid():
+            _check_forked(self._lock)
         with self._lock:
             return method(self, *args, **keywords)
 

@@ -11,8 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
+import dvo
 from dvo.core import threads
+from dvo.core.errors import DvoError
 from dvo.core.threads import available_cores, process_environment, processor_quota, thread_rule
+from dvo.synth.clip import make_clip
 from eval.benchmarks import threads as benchmark
 from eval.benchmarks.threads import Speed
 
@@ -186,3 +189,77 @@ def test_benchmark_refuses_bad_input(capsys):
     assert benchmark.main(["--states", "asleep"]) == 2
     assert benchmark.main(["--frames", "5", "--warmup", "5"]) == 2
     assert "choose from idle, busy" in capsys.readouterr().err.lower()
+
+
+FORK = """
+import os, sys
+import numpy as np
+import dvo, torch
+from dvo.synth.clip import ClipSpec, make_clip
+from tests.support.forked import in_fork
+torch.set_num_threads(1)  # for the tensors
+camera = dvo.Camera(200.0, 200.0, 159.5, 119.5, 320, 240)
+images = np.random.default_rng(0).integers(0, 255, (4, 240, 320, 3), dtype=np.uint8)
+frames = [dvo.Frame(i, 0.1 * i, image, camera) for i, image in enumerate(images)]
+edges = 200_000
+poses = torch.tensor([0, 0, 0, 0, 0, 0, 1.0]).repeat(1, 2, 1)
+patches = torch.ones(1, 50, 3, 1, 1)
+index = torch.zeros(edges, dtype=torch.long), torch.ones(edges, dtype=torch.long), torch.arange(edges) % 50
+measured = torch.ones(1, edges, 2), torch.ones(1, edges, 2)
+intrinsics = torch.tensor([100.0, 100, 50, 50]).repeat(1, 2, 1)
+torch.set_num_threads(2)
+def adjust(): return dvo.bundle_adjust(poses, patches, intrinsics, *measured, *index).poses_cw.shape
+def load(): return type(dvo.load("small")).__name__
+def model(): return type(dvo.load_model("small")).__name__
+def render(): return make_clip(0, 0, ClipSpec(frames=2)) is None
+def run(): return dvo.run(dvo.load("small"), frames).frames_fed
+def one_thread():
+    torch.set_num_threads(1)
+    return run()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.parametrize("before", ["adjust", "load", "render"])
+def test_a_fork_after_work_of_several_threads_is_one_error(before):
+    """At every entry to computation; without it, each hangs in its first parallel loop."""
+    code = FORK + f"{before}()\nwork = [adjust, load, model, render, run]\n"
+    if before == "load":  # and of an odometry of the parent
+        code += "odometry = dvo.load('small')\nodometry.track(frames[0])\n"
+        code += "work += [lambda: odometry.track(frames[1]), odometry.current, odometry.finish]\n"
+    code += "for each in work: print(in_fork(each))\n"
+    code += "print(in_fork(one_thread), load())"
+    *lines, last = said(code, OMP_NUM_THREADS="2")
+    assert len(lines) == (8 if before == "load" else 5) and len(set(lines)) == 1, lines
+    assert lines[0].startswith("DvoError: fork: this process was forked after threads of torch had computed")
+    assert '"spawn"' in lines[0] and '"forkserver"' in lines[0]
+    assert last == "4 PatchOdometry", "one thread waits for no others, and the parent goes on"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_fork_before_work_of_several_threads_computes():
+    """Also after work of one thread."""
+    code = FORK + "print(in_fork(run)); torch.set_num_threads(1); load(); torch.set_num_threads(2); print(in_fork(run))"
+    assert said(code, OMP_NUM_THREADS="2") == ["4", "4"]
+
+
+def test_work_of_several_threads_is_noted_at_its_entries(monkeypatch):
+    """As :data:`FORK` does in processes of their own; a fork is only told here."""
+    forks = {"work": False, "after work": False}
+    monkeypatch.setattr(threads, "_forks", forks)
+    dvo.load_model("small")
+    threads._after_fork()
+    assert not any(forks.values()), "one thread"
+    try:
+        torch.set_num_threads(2)
+        threads.use_threads()
+        assert forks["work"] and not forks["after work"]
+        threads._after_fork()
+        for work in (lambda: dvo.load("small"), lambda: dvo.load_model("small"), lambda: make_clip(0, 0)):
+            with pytest.raises(DvoError, match="fork: .*forked after threads of torch.*spawn"):
+                work()
+    finally:
+        torch.set_num_threads(1)
+    dvo.load_model("small")

@@ -1,5 +1,6 @@
 """Calls of an odometry from another thread, while a frame is tracked."""
 
+import os
 import threading
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import dvo
 from dvo.odometry.exclusive import METHODS, exclusive
 from dvo.odometry.load import build_odometry
 from dvo.odometry.patch.tracker import PatchOdometry
+from tests.support.forked import in_fork
 from tests.support.tiny_members import MEMBERS, SETTINGS, frames, network
 
 SOON = 0.3  # seconds in which a call that does not wait is done
@@ -106,3 +108,29 @@ def test_two_objects_do_not_wait_for_each_other():
     thread.start()
     Meeting().track(barrier)
     thread.join()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_does_not_wait_for_a_thread_that_it_does_not_have():
+    begun, release = threading.Event(), threading.Event()
+
+    @exclusive
+    class Slow:
+        def track(self):
+            begun.set()
+            return release.wait(60)
+
+        def current(self):
+            return "now"
+
+    slow = Slow()
+    assert in_fork(slow.current) == "'now'"
+    thread = threading.Thread(target=slow.track)
+    thread.start()
+    begun.wait(60)
+    try:
+        assert in_fork(slow.current).startswith("DvoError: fork: this process was forked while another thread used")
+    finally:
+        release.set()
+        thread.join()
+    assert in_fork(slow.current) == "'now'"

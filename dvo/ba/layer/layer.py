@@ -24,6 +24,7 @@ from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
 from dvo.core.errors import DvoError
+from dvo.core.threads import use_threads
 from dvo.geometry.precision import full_precision
 
 __all__ = ["BADamping", "BAOptions", "BAResult", "Sensors", "bundle_adjust", "make_problem"]
@@ -89,6 +90,7 @@ def bundle_adjust(
 
 def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
     """The dense solution of a batch; see :func:`bundle_adjust` and :func:`dvo.ba.solve.solve`."""
+    use_threads()
     _check_shapes(given)
     if options.check or (options.check is None and given.weights.device.type == "cpu"):
         _check_values(given)

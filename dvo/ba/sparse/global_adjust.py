@@ -23,6 +23,7 @@ from dvo.ba.sparse.global_edges import ReprojectionEdges
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
 from dvo.ba.sparse.schur_pattern import SchurPattern, make_schur_pattern
 from dvo.core.errors import DvoError
+from dvo.core.threads import use_threads
 from dvo.geometry.precision import full_precision
 
 
@@ -121,6 +122,7 @@ def global_bundle_adjust(
 
 def adjust_sparse(problem: PatchProblem, options: GlobalBAOptions) -> GlobalBAResult:
     """The sparse solution of one graph; see :func:`global_bundle_adjust` and :func:`dvo.ba.solve.solve`."""
+    use_threads()
     _check(problem)
     with torch.no_grad(), full_precision(problem.poses_cw.device):
         system = SparseProblem(problem, options)

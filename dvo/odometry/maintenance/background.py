@@ -12,6 +12,8 @@ from typing import Generic, TypeVar
 
 import torch
 
+from dvo.core.errors import DvoError
+
 T = TypeVar("T")
 
 # Added to that of the process. More than a little would starve the thread beside other busy processes, and tracking,
@@ -27,19 +29,26 @@ class Task(Generic[T]):
     """
 
     def __init__(self, outcome: Future[T]) -> None:
-        self._outcome = outcome
+        self._outcome, self._process = outcome, os.getpid()
 
     @property
     def done(self) -> bool:
-        """True if :meth:`result` returns at once."""
-        return self._outcome.done()
+        """True if :meth:`result` returns, or raises, at once."""
+        return self._outcome.done() or self._process != os.getpid()
 
     def result(self) -> T:
         """Result of the work, waited for if need be.
 
         Raises:
+            DvoError: the work goes on in the process that this one was forked from.
             Exception: that ended the work.
         """
+        if self._process != os.getpid() and not self._outcome.done():
+            raise DvoError(
+                "this process was forked while a thread worked for the map, which it does not have",
+                field="fork",
+                remedy="fork before the first frame, or build an odometry in each process",
+            )
         return self._outcome.result()
 
 
@@ -104,6 +113,7 @@ class Background:
 
     def __init__(self) -> None:
         self._executor: ThreadPoolExecutor | None = None
+        self._process = 0  # that the thread runs in
 
     def start(self, work: Callable[[], T]) -> Task[T]:
         """Begin a piece of work.
@@ -111,7 +121,8 @@ class Background:
         Args:
             work: called in the thread.
         """
-        if self._executor is None:
+        if self._executor is None or self._process != os.getpid():  # a forked process has none of the threads
+            self._process = os.getpid()
             count = torch.get_num_threads()
             self._executor = ThreadPoolExecutor(1, "dvo-background")
             self._executor.submit(_give_way).result()

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from dvo.core.errors import DvoError
+from dvo.core.threads import use_threads
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.render.antialias import smooth_outlines
 from dvo.synth.render.meshes import mesh_depth, render_mesh, trace_mesh
@@ -123,6 +124,7 @@ def view_scene(
     Raises:
         DvoError: moving bodies and no time for every camera.
     """
+    use_threads()
     if not isinstance(scene, Stage):
         return scene, look(scene, poses_wc, intrinsics, size)
     when = np.asarray(times, np.float64) if times is not None else np.zeros(0)

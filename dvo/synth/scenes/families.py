@@ -12,6 +12,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
+from dvo.core.threads import use_threads
 from dvo.synth import salts
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.textures.texture import TexturePool, texture_pool
@@ -56,6 +57,7 @@ def random_scene(seed: int, family: str | None = None, *, pool: TexturePool | No
     Raises:
         DvoError: an unknown family.
     """
+    use_threads()
     rng = np.random.default_rng([seed, salts.SCENE])
     drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     name = family or drawn

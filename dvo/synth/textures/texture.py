@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from dvo.core.threads import use_threads
 from dvo.synth import salts
 from dvo.synth.textures.patterns import PATTERNS, SPECIAL, Rng
 from dvo.synth.textures.photographs import folder_photographs, photographs
@@ -172,6 +173,7 @@ def texture_pool(seed: int, count: int = 224, size: int = 256, *, folder: Path |
     Returns:
         The pool.
     """
+    use_threads()
     return TexturePool(seed, count, size, folder)
 
 

@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dvo.odometry.maintenance.background import Background, Steps, all_steps
+from dvo.odometry.maintenance.maintenance import MapMaintenance
+from tests.support.forked import in_fork
 
 
 def counted(number, taken):
@@ -94,3 +96,38 @@ def test_the_thread_gives_way_to_tracking():
         own = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
         there = background.start(lambda: os.getpriority(os.PRIO_PROCESS, threading.get_native_id())).result()
         assert there == min(own + 5, 19)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_does_not_wait_for_the_thread():
+    """It has none: what was begun is an error at once, what had ended is there, and new work gets a thread."""
+    release, background = threading.Event(), Background()
+    ended = background.start(lambda: 1)
+    assert ended.result() == 1
+    running = background.start(lambda: release.wait(60))
+    waiting = background.start(lambda: 2)
+    for task in (running, waiting):
+        assert in_fork(lambda task=task: task.done) == "True"
+        assert in_fork(task.result).startswith("DvoError: fork: this process was forked while a thread worked")
+    assert in_fork(ended.result) == "1"
+    assert in_fork(lambda: background.start(lambda: 3).result()) == "3"
+    release.set()
+    assert running.result() is True and waiting.result() == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.parametrize("real_time", [False, True])
+def test_a_forked_process_does_not_wait_for_a_job(real_time):
+    release, maintenance = threading.Event(), MapMaintenance(real_time=real_time)
+    maintenance.job = maintenance.beside("search", lambda: release.wait(60), dict, 0)
+    assert in_fork(lambda: maintenance.advance(None)).startswith("DvoError: fork: ")
+    release.set()
+
+
+def test_the_thread_ends_with_the_last_reference():
+    before, background = set(threading.enumerate()), Background()
+    background.start(lambda: None).result()
+    (thread,) = set(threading.enumerate()) - before
+    del background
+    thread.join(20)
+    assert not thread.is_alive()

@@ -136,6 +136,8 @@ class Frame:
         inertial: samples later than the previous frame of the same pass, up to this frame's time; without samples for
             the first frame.
         mask: ``(H, W)`` bool or uint8, 0 (False) for pixels of ``image`` to ignore; None: all are used.
+        interruption: why the time since the frame before it is not known, such as a clock that was set back; empty
+            where it is.
 
     Example:
         >>> import numpy as np
@@ -155,3 +157,4 @@ class Frame:
     right: Lazy[StereoView] = Lazy()
     inertial: Lazy[InertialSamples] = Lazy()
     mask: np.ndarray | None = None
+    interruption: str = ""

@@ -43,8 +43,9 @@ def checked_frame(frame: Frame) -> Frame:
 
     Raises:
         DvoError: an object that is not a frame; an index that is not a whole number; a time that is not a finite
-            number; an image of another form or type, without pixels, or with values not finite or out of range; no
-            camera, or one of another image size; a mask of another type or size. Names the frame and the field.
+            number; an interruption that is no text; an image of another form or type, without pixels, or with
+            values not finite or out of range; no camera, or one of another image size; a mask of another type or
+            size. Names the frame and the field.
 
     Example:
         >>> import numpy as np
@@ -59,6 +60,11 @@ def checked_frame(frame: Frame) -> Frame:
             remedy="give dvo.Frame(index, timestamp, image, camera)",
         )
     name = _name(frame.index)
+    if not isinstance(frame.interruption, str):
+        remedy = "give the reason, or an empty text"
+        raise DvoError(
+            f"expected a text, got {_kind(frame.interruption)}", field=f"{name}: interruption", remedy=remedy
+        )
     timestamp = _seconds(frame.timestamp, f"{name}: timestamp")
     image = checked_image(frame.image, frame.camera, name)
     mask = checked_mask(frame.mask, image.shape[0], image.shape[1], f"{name}: mask")

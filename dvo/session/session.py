@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import itertools
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
-from dvo.odometry.protocol import Estimate, Odometry, Result
+from dvo.odometry.protocol import Break, Estimate, Odometry, Result
 from dvo.odometry.segments import find_breaks
 from dvo.session.second_run import compare_again, is_due
 
@@ -128,7 +129,9 @@ def run(
             result = replace(result, quality=compare_again(result, again(), beginning, stride, stop))
         feeding.seconds["checking"] = time.perf_counter() - started
     return Run(
-        result=over_source(result, np.array(feeding.fed), np.array(feeding.skipped), feeding.reasons),
+        result=over_source(
+            result, np.array(feeding.fed), np.array(feeding.skipped), feeding.reasons, feeding.interruptions
+        ),
         frames_fed=len(feeding.fed),
         interrupted=interrupted,
         warnings=(*getattr(source, "warnings", ()), *warnings),
@@ -137,7 +140,13 @@ def run(
     )
 
 
-def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: dict[float, str]) -> Result:
+def over_source(
+    result: Result,
+    fed: np.ndarray,
+    skipped: np.ndarray,
+    reasons: Mapping[float, str],
+    interruptions: Mapping[float, str] | None = None,
+) -> Result:
     """Describe a result in frames of the source instead of frames of the odometry.
 
     Args:
@@ -145,6 +154,7 @@ def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: d
         fed: ``(F,)`` increasing timestamps of the frames passed to the odometry, seconds.
         skipped: ``(S,)`` timestamps of the skipped frames, seconds.
         reasons: causes of lost frames by timestamp, for an odometry that reports no breaks.
+        interruptions: why the time before a tracked frame is not known, by its timestamp.
 
     Returns:
         The result with rows for skipped frames, each between two frames of one segment; with counts and breaks in
@@ -159,6 +169,9 @@ def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: d
         owner[np.isin(times, segment.trajectory.timestamps)] = number
     causes = {time: cause for time, cause in reasons.items() if owner[np.searchsorted(times, time)] < 0}
     breaks = result.breaks or find_breaks(times, owner, causes)
+    told = find_breaks(times, owner, interruptions or {})
+    untold = [b for b in told if b.reason in (interruptions or {}).values() and not any(_overlap(b, a) for a in breaks)]
+    breaks = tuple(sorted((*breaks, *untold), key=lambda b: -np.inf if b.start is None else b.start))
     if len(skipped):
         lost = times[owner < 0]
         breaks = tuple(replace(b, frames=_count_between(lost, b.start, b.end)) for b in breaks)
@@ -170,6 +183,14 @@ def over_source(result: Result, fed: np.ndarray, skipped: np.ndarray, reasons: d
         segments=segments,
         breaks=breaks,
     )
+
+
+def _overlap(one: Break, other: Break) -> bool:
+    """Whether two breaks have an interval in common."""
+    (start, end), (begin, stop) = (
+        (-np.inf if b.start is None else b.start, np.inf if b.end is None else b.end) for b in (one, other)
+    )
+    return bool(start < stop and begin < end)
 
 
 def _count_between(times: np.ndarray, start: float | None, end: float | None) -> int:
@@ -210,6 +231,8 @@ class _Feeding:
         self.seconds = {"reading": 0.0, "tracking": 0.0, "finishing": 0.0}
         self.frame_seconds: list[float] = []
         self.reasons: dict[float, str] = {}
+        self.interruptions: dict[float, str] = {}
+        self.interruption = ""  # of the frames skipped since the last tracked one
         self.pending: Frame | None = None  # last skipped frame, tracked after all if the source ends with it
 
     @property
@@ -218,6 +241,7 @@ class _Feeding:
 
     def take(self, frame: Frame) -> None:
         frame = checked_frame(frame)
+        self.interruption = frame.interruption or self.interruption
         if self.frames_read % self.stride:
             self.pending = frame
             self.skipped.append(frame.timestamp)
@@ -234,6 +258,11 @@ class _Feeding:
             self.pending = None
 
     def _track(self, frame: Frame) -> Estimate:
+        if self.interruption:
+            if not frame.interruption:  # dataclasses.replace would load depth, right image and inertial samples
+                frame = copy.copy(frame)
+                object.__setattr__(frame, "interruption", self.interruption)
+            self.interruptions[frame.timestamp], self.interruption = self.interruption, ""
         started = time.perf_counter()
         estimate = self.odometry.track(frame)
         self.frame_seconds.append(time.perf_counter() - started)

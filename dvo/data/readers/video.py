@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # A damaged packet fails one grab, and the packets after it may be good; the end of the file fails every grab.
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
+_JUMP = 5000.0  # milliseconds: frames in another order than that of their times lie far less apart
 _SECONDS = 4  # to open, and to find the next frame: gigabytes without one are no video
 
 
@@ -160,14 +161,17 @@ class VideoRecording:
 
     def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; frames that are not wanted are decoded, but not converted."""
-        read, last, previous, dropped = 0, 0.0, -np.inf, 0
+        read, last, previous, dropped, offset = 0, 0.0, -np.inf, 0, 0.0
 
         def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
-            nonlocal read, last
+            nonlocal read, last, offset
             for index, milliseconds, failed in _grabs(capture):
                 log.unreadable.extend(f"frame {number}" for number in range(index - failed, index))
-                read, last = read + 1, milliseconds
-                yield index, milliseconds
+                if self._use_container and milliseconds + offset < last - _JUMP:
+                    offset = last + 1000 / self._fps - milliseconds
+                    log.notes.append(f"the clock was set back before frame {index}: times go on from there")
+                read, last = read + 1, milliseconds + offset
+                yield index, last
 
         with _capture(self.path) as capture:
             for index, milliseconds in selection.interval.select(

@@ -118,7 +118,7 @@ class Capture:
         """
         import cv2
 
-        clock, index, previous = StreamClock(), 0, -math.inf
+        clock, index, previous, offset = StreamClock(), 0, -math.inf, 0.0
         try:
             while not stopped() and self._capture.grab():
                 arrival = time.monotonic()
@@ -127,8 +127,11 @@ class Capture:
                 if decoded and image is not None:
                     if self.times in ("arrival", "stream"):
                         seconds = clock(arrival, stated if self.times == "stream" else None)
-                    elif self.times == "file" and stated > previous:
-                        seconds = stated
+                    elif self.times == "file" and stated + offset > previous:
+                        seconds = stated + offset
+                    elif self.times == "file" and stated + offset < previous - _JUMP:  # another clock begins
+                        seconds = previous + 1 / self._nominal
+                        offset = seconds - stated
                     else:
                         seconds = index / (self._fps or self._nominal)
                     if seconds > previous:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+from collections import deque
 from collections.abc import Iterable, Iterator
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,9 @@ from dvo.geometry.undistort import Undistorter, needs_undistortion
 
 Item = np.ndarray | tuple[float, np.ndarray] | Frame
 """One element of a stream: an image, a time in seconds with an image, or a frame."""
+
+_RUN = 3  # images in a row that are late, each later than the one before it: the clock was set back
+_RECENT = 30  # intervals that the usual one is the median of
 
 
 class FrameStream:
@@ -36,19 +42,26 @@ class FrameStream:
     def __init__(self, frames: Iterator[Frame], name: str, groundtruth: Trajectory | None = None) -> None:
         self.name, self.groundtruth = name, groundtruth
         self._frames: Iterator[Frame] | None = frames
-        self._late = 0
-        self._first_late = 0
+        self._late = self._first_late = 0
+        self._set_back: list[int] = []  # first images after the clock was set back
 
     @property
     def warnings(self) -> list[str]:
         """Faults so far, a sentence each."""
-        if not self._late:
-            return []
-        first = f"the first is {self._first_late}"
-        return [f"{self._late} images were not later than the one before and were dropped, {first}"]
+        found = []
+        if self._late:
+            first = f"the first is {self._first_late}"
+            found.append(f"{self._late} images were not later than the one before and were dropped, {first}")
+        if self._set_back:
+            times = f"{len(self._set_back)} times, first " if len(self._set_back) > 1 else ""
+            found.append(f"the clock was set back {times}before image {self._set_back[0]}")
+        return found
 
     def __iter__(self) -> Iterator[Frame]:
         """Frames with strictly increasing timestamps; those that are not later than the one before are dropped.
+
+        Three in a row that are late, each later than the one before it, show that the clock was set back: times go on
+        from there, the usual interval after the last one, with an :attr:`dvo.data.frame.Frame.interruption`.
 
         Raises:
             DvoError: a second iteration, or an element that is no image or has no time.
@@ -60,14 +73,49 @@ class FrameStream:
         return self._increasing(frames)
 
     def _increasing(self, frames: Iterator[Frame]) -> Iterator[Frame]:
-        previous = -np.inf
+        previous, offset = -np.inf, 0.0
+        intervals: deque[float] = deque(maxlen=_RECENT)
+        late: list[Frame] = []
         for frame in frames:
-            if not frame.timestamp > previous:
-                self._first_late = self._first_late if self._late else frame.index
-                self._late += 1
-                continue
-            previous = frame.timestamp
-            yield frame
+            if frame.timestamp + offset > previous:
+                self._drop(late)
+                ready, late, reason = [frame], [], ""
+            else:
+                if late and not frame.timestamp > late[-1].timestamp:
+                    self._drop(late)
+                    late = []
+                late.append(frame)
+                if len(late) < _RUN:
+                    continue
+                back = previous - (late[0].timestamp + offset)
+                usual = median(intervals) if intervals else late[1].timestamp - late[0].timestamp
+                offset = previous + usual - late[0].timestamp
+                self._set_back.append(late[0].index)
+                ready, late, reason = late, [], f"clock set back by {back:.2f} s"
+            for one in ready:
+                seconds = one.timestamp + offset
+                if not seconds > previous:  # rounded to the same number
+                    self._drop([one])
+                    continue
+                if previous > -np.inf and not reason:
+                    intervals.append(seconds - previous)
+                previous = seconds
+                yield _changed(one, seconds, reason) if offset else one
+                reason = ""
+        self._drop(late)
+
+    def _drop(self, late: list[Frame]) -> None:
+        if late and not self._late:
+            self._first_late = late[0].index
+        self._late += len(late)
+
+
+def _changed(frame: Frame, seconds: float, reason: str) -> Frame:
+    """The frame at another time, perhaps after an interruption."""
+    changed = copy.copy(frame)  # dataclasses.replace would load depth, right image and inertial samples
+    object.__setattr__(changed, "timestamp", seconds)
+    object.__setattr__(changed, "interruption", reason or frame.interruption)
+    return changed
 
 
 def stream(

@@ -34,12 +34,16 @@ class Gap:
     Attributes:
         seconds: its length.
         frozen: frames were there, but with an old image.
+        reason: why its length is not known; empty where it is.
     """
 
     seconds: float
     frozen: bool
+    reason: str = ""
 
     def __str__(self) -> str:
+        if self.reason:
+            return self.reason
         return f"image frozen for {self.seconds:.2f} s" if self.frozen else f"gap of {self.seconds:.2f} s"
 
 
@@ -124,11 +128,12 @@ class FrameSequence:
             self.required.check(frame)
         self._size = size
 
-    def tick(self, time: float) -> Gap | None:
+    def tick(self, time: float, interruption: str = "") -> Gap | None:
         """Record a frame with a new image.
 
         Args:
             time: seconds.
+            interruption: why the time since the frame before is not known; empty where it is.
 
         Returns:
             Gap since the image before it was first seen; None if there is none.
@@ -136,6 +141,8 @@ class FrameSequence:
         last, new, self._last, self._new = self._last, self._new, time, time
         if last is None:
             return None
+        if interruption:
+            return Gap(time - last, frozen=False, reason=interruption)
         usual = median(self._intervals) if len(self._intervals) > 1 else None
         long = usual is not None and time - last > self.max_gap * usual
         if not long:
@@ -243,7 +250,7 @@ class Gate:
         if repeated:
             self.sequence.repeat(frame.timestamp)
         else:
-            gap = self.sequence.tick(frame.timestamp)
+            gap = self.sequence.tick(frame.timestamp, frame.interruption)
             self._last = image, missing_content(image, mask)
         assert self._last is not None
         try:

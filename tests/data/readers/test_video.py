@@ -175,3 +175,14 @@ def test_a_turned_video_has_no_rows_to_read_out(make, degrees):
     assert frame.camera.readout == (0 if degrees else 0.02)
     assert any("readout" in warning for warning in source.warnings) == bool(degrees)
     assert open_source(video, calib=CALIB if degrees in (0, 180) else replace(calib, readout=0.0)).warnings == []
+
+
+def test_parts_with_clocks_of_their_own(make, monkeypatch):
+    """The times of the second part begin anew: it is read, after the first."""
+    milliseconds = [0, 40, *range(20_000, 20_400, 40), *range(0, 400, 40), *range(10, 410, 40)]
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: StampsLike(milliseconds))
+    source = open_source(make.video("a.avi", "MJPG", frames=2), calib=make.text("c.txt", "50 50 31.5 23.5"))
+    frames = list(source)
+    stamps = [frame.timestamp for frame in frames]
+    assert len(frames) >= 22 and (np.diff(stamps) > 0).all() and max(np.diff(stamps)[3:21]) < 0.05
+    assert any("clock was set back before frame 12" in text for text in source.warnings)

@@ -348,3 +348,15 @@ def test_a_pipe_is_left_with_the_last_reference_to_its_source(make):
             assert time.monotonic() < end
             time.sleep(0.001)
         assert not file.closed, "it belongs to the caller"
+
+
+def test_the_clock_of_a_served_file_that_is_set_back(camera, monkeypatch):
+    """Parts with clocks of their own, one after the other, in a file whose rate is stated wrong."""
+    rate = {cv2.CAP_PROP_FPS: 30.0, cv2.CAP_PROP_FRAME_COUNT: 12.0}
+    plain = camera.get
+    monkeypatch.setattr(camera, "get", lambda self, key: rate.get(key) or plain(self, key))
+    camera.stated = [10_000.0 + 1000 * (i % 4) for i in range(12)]
+    camera.stated[:4] = [20_000.0 + 1000 * i for i in range(4)]
+    frames = list(open_stream("http://host/file.mp4"))
+    assert [frame.index for frame in frames][:6] == list(range(6))
+    assert (np.diff([frame.timestamp for frame in frames]) > 0).all()

@@ -18,7 +18,7 @@ CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 
 
 def images(count=5):
-    return (np.full((48, 64, 3), 10 * i, np.uint8) for i in range(count))
+    return (np.full((48, 64, 3), 10 * i % 256, np.uint8) for i in range(count))
 
 
 def test_three_ways_to_give_times():
@@ -62,6 +62,81 @@ def test_late_images_are_dropped_with_a_warning():
     frames = stream(images(), CAMERA, timestamps=[0, 0.2, 0.1, 0.2, 0.3])
     assert [frame.index for frame in frames] == [0, 1, 4]
     assert frames.warnings == ["2 images were not later than the one before and were dropped, the first is 2"]
+
+
+def regular(*starts, count=10):
+    """Times of a clock of ten images a second that is set to each start in turn."""
+    return [start + 0.1 * i for start in starts for i in range(count)]
+
+
+@pytest.mark.parametrize("start", [0.0, -5.0, 0.35, -1e9, 1e9])
+def test_a_clock_that_is_set_back_is_an_interruption(start):
+    """Without it, every later image is dropped until the clock has made up for it."""
+    times = regular(1.0, 1.0 + start if start < 1e9 else 2.0)
+    times = times if start < 1e9 else [1e9 + time for time in times[:10]] + times[10:]
+    frames = stream(images(20), CAMERA, timestamps=times)
+    found = list(frames)
+    assert [frame.index for frame in found] == list(range(20))
+    stamps = np.array([frame.timestamp for frame in found])
+    assert np.array_equal(stamps[:10], times[:10]) and np.allclose(np.diff(stamps), 0.1, atol=1e-6)
+    assert [bool(frame.interruption) for frame in found] == [index == 10 for index in range(20)]
+    assert found[10].interruption == f"clock set back by {times[9] - times[10]:.2f} s"
+    assert frames.warnings == ["the clock was set back before image 10"]
+
+
+def test_a_clock_that_is_set_back_again_and_goes_on():
+    frames = stream(images(40), CAMERA, timestamps=regular(5.0, 3.0, 3.0, 100.0))
+    found = list(frames)
+    assert [frame.index for frame in found if frame.interruption] == [10, 20]
+    assert len(found) == 40 and (np.diff([frame.timestamp for frame in found]) > 0).all()
+    assert np.isclose(found[30].timestamp - found[29].timestamp, 96.1), "forward is a gap in time"
+    assert frames.warnings == ["the clock was set back 2 times, first before image 10"]
+
+
+@pytest.mark.parametrize(
+    ("times", "kept"),
+    [
+        ([0, 1, 2, 0.5, 0.6, 3, 4], [0, 1, 2, 5, 6]),  # two stragglers
+        ([0, 1, 2, 2, 2, 2, 2, 3], [0, 1, 2, 7]),  # a clock that stands
+        ([6, 5, 4, 3, 2, 1, 0], [0]),  # one that runs backward
+        ([0, 1, 2, -1, 3, -2, 4, -3, 5], [0, 1, 2, 4, 6, 8]),
+        ([0, 1, 2, 0.5, 0.2, 0.3], [0, 1, 2]),
+        ([0, 1, 2, 0.5, 0.2, 0.3, 0.4], [0, 1, 2, 4, 5, 6]),
+        ([1, 0], [0]),
+        ([5, 0, 1, 2], [0, 1, 2, 3]),
+    ],
+)
+def test_images_that_are_late_are_not_a_clock_that_was_set_back(times, kept):
+    frames = stream(images(len(times)), CAMERA, timestamps=times)
+    assert [frame.index for frame in frames] == kept
+    late = len(times) - len(kept)
+    assert sum(f"{late} images were not later" in text for text in frames.warnings) == (late > 0)
+
+
+def test_frames_of_a_clock_that_was_set_back_keep_their_fields():
+    loaded = []
+    own = [
+        Frame(i, time, np.zeros((48, 64, 3), np.uint8), CAMERA, depth=lambda: loaded.append(1))
+        for i, time in enumerate(regular(9.0, 0.0))
+    ]
+    found = list(stream(own))
+    assert not loaded and all(frame.image is given.image for frame, given in zip(found, own, strict=True))
+    assert own[10].timestamp == 0.0 and own[10].interruption == "" and found[10].interruption
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_a_run_tells_of_a_clock_that_was_set_back(fake_odometry, stride):
+    done = run(fake_odometry(), stream(images(20), CAMERA, timestamps=regular(9.0, 0.0)), stride=stride)
+    assert len(done.result.trajectory) == 20 and "the clock was set back before image 10" in done.warnings
+    (found,) = done.result.breaks
+    assert found.reason == "clock set back by 9.90 s" and found.frames == 0 and not found.new_segment
+    assert found.start < 9.95 + 0.1 * stride and found.end > found.start
+
+
+def test_a_run_tells_it_once(fake_odometry):
+    """An odometry that tells of a break at that place has the word."""
+    done = run(fake_odometry(lost=range(9, 12)), stream(images(20), CAMERA, timestamps=regular(9.0, 0.0)))
+    assert len(done.result.breaks) == 1
 
 
 def test_grey_and_distorted_images(make):

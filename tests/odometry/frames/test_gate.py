@@ -53,6 +53,15 @@ def test_every_second_image_repeated_is_no_gap():
         sequence.repeat(step / 30 + 1 / 60)
 
 
+def test_an_interruption_is_a_gap_whatever_its_length():
+    sequence = FrameSequence(4.5)
+    assert sequence.tick(0.0, "clock set back") is None, "nothing before it"
+    assert [sequence.tick(0.1 * i) for i in range(1, 6)] == [None] * 5
+    gap = sequence.tick(0.6, "clock set back")
+    assert str(gap) == "clock set back" and not gap.frozen
+    assert sequence.tick(0.7) is None and sequence.tick(5.7).reason == ""
+
+
 def test_order_and_size():
     def frame(time, width=64):
         image = np.zeros((48, width, 3), np.uint8)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.edges import free_slots
+from dvo.ba.limits import LARGEST, LARGEST_TURN, SHORTEST_FOCAL
 from dvo.ba.problem import StateBlock
 from dvo.geometry import se3, sim3
 
@@ -69,11 +70,11 @@ def intrinsics_block(intrinsics: Tensor, refine: str = "none", shared: bool = Tr
     count = intrinsics.shape[1]
     slot = torch.zeros(count, dtype=torch.long, device=intrinsics.device) if shared else None
     free = min(count, 1) if shared else count
-    return StateBlock(intrinsics, REFINED.get(refine, 1), _retract_intrinsics, slot, free, held=refine == "none")
+    held = refine == "none"
+    return StateBlock(intrinsics, REFINED.get(refine, 1), _retract_intrinsics, slot, free, held, longest=LARGEST_TURN)
 
 
 def _retract_intrinsics(intrinsics: Tensor, step: Tensor) -> Tensor:
     focal, centre = intrinsics.split(2, -1)
-    if step.shape[-1] == 1:
-        return torch.cat((focal * step.exp(), centre), -1)
-    return torch.cat((focal * step[..., :2].exp(), centre + focal * step[..., 2:]), -1)
+    grown = (focal * step[..., :2].exp()).clamp(SHORTEST_FOCAL, LARGEST)
+    return torch.cat((grown, centre if step.shape[-1] == 1 else centre + focal * step[..., 2:]), -1)

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 
 CHUNK = 1 << 17
 """Places linearised at a time: bounds the memory when every pixel of a feature map is a patch."""
@@ -111,11 +114,32 @@ def free_slots(fixed: int | Tensor | Sequence[bool], frames: int, device: torch.
         fixed: number of leading frames that stay, or which: bool ``(N,)``.
         frames: number of frames ``N``.
         device: of the result.
+
+    Raises:
+        DvoError: a number that is negative or greater than that of the frames, or no mask of all frames.
     """
-    if isinstance(fixed, int):
-        free = max(frames - fixed, 0)
-        slot = torch.arange(frames, device=device) - fixed
+    if isinstance(fixed, Integral) and not isinstance(fixed, bool):
+        if not 0 <= fixed <= frames:
+            raise DvoError(f"is {fixed}, of {frames} frames", field="fixed", remedy=f"give 0 to {frames}")
+        free = frames - int(fixed)
+        slot = torch.arange(frames, device=device) - int(fixed)
         return torch.where(slot < 0, free, slot), free
-    stays = torch.as_tensor(fixed, dtype=torch.bool, device=device)
+    stays = _mask(fixed, frames).to(device)
     free = int((~stays).sum())
     return torch.where(stays, free, (~stays).cumsum(0) - 1), free
+
+
+def _mask(fixed: object, frames: int) -> Tensor:
+    """A mask of all frames, or DvoError. Numbers are no mask: they could be meant as indices."""
+    if isinstance(fixed, Sequence) and all(isinstance(x, (bool, np.bool_)) for x in fixed):
+        fixed = torch.tensor(fixed, dtype=torch.bool)
+    if isinstance(fixed, np.ndarray) and fixed.dtype == bool:
+        fixed = torch.from_numpy(fixed)
+    if isinstance(fixed, Tensor) and fixed.dtype == torch.bool and fixed.shape == (frames,):
+        return fixed
+    is_tensor = isinstance(fixed, Tensor)
+    found = f"{fixed.dtype} of shape {tuple(fixed.shape)}" if isinstance(fixed, Tensor) else shown(fixed)
+    raise DvoError(
+        f"is {'a tensor of ' if is_tensor else ''}{found}, neither a number of frames nor a mask of {frames}",
+        field="fixed", remedy=f"give a whole number, or bool ({frames},)",
+    )  # fmt: skip

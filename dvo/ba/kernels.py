@@ -8,7 +8,9 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from dvo.ba.limits import check_positive
 from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 
 KernelName = Literal["none", "huber", "cauchy"]
 
@@ -22,18 +24,17 @@ class Kernel:
         width: whitened residual norm ``sqrt(sum w r^2)`` at which the kernel leaves the quadratic.
 
     Raises:
-        DvoError: unknown name, or a width that is not positive.
+        DvoError: unknown name, or a width that is not a number from 1e-12 to 1e12.
     """
 
     name: KernelName = "none"
     width: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.name not in get_args(KernelName):
+        if not isinstance(self.name, str) or self.name not in get_args(KernelName):
             known = ", ".join(get_args(KernelName))
-            raise DvoError(f"unknown kernel {self.name!r}", field="kernel", remedy=f"use one of {known}")
-        if not self.width > 0:
-            raise DvoError(f"is {self.width}, not positive", field="kernel.width", remedy="give a positive width")
+            raise DvoError(f"unknown kernel {shown(self.name)}", field="kernel", remedy=f"use one of {known}")
+        check_positive(self.width, "kernel.width")
 
     def cost(self, s: Tensor) -> Tensor:
         """``rho(s)`` of squared whitened residuals ``s = r^T W r``; a term of a robust cost is ``rho(s) / 2``.

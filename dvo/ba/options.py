@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Literal, get_args
 
 from torch import Tensor
 
 from dvo.ba.kernels import Kernel
+from dvo.ba.limits import LARGEST, check_number, check_positive, check_range, check_size, check_switch, check_whole
 from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 
 Refine = Literal["none", "focal", "all"]
 _REFINE = get_args(Refine)
@@ -26,11 +30,18 @@ class BADamping:
             per unit squared.
         relative: this fraction of that diagonal is added too.
         depth: added to the curvature of each inverse depth.
+
+    Raises:
+        DvoError: a value that is not a number from 0 to 1e30.
     """
 
     pose: float = 0.1
     relative: float = 1e-4
     depth: float = 1e-4
+
+    def __post_init__(self) -> None:
+        for name in ("pose", "relative", "depth"):
+            check_number(getattr(self, name), f"damping.{name}", 0.0, 1e30)
 
 
 @dataclass(frozen=True)
@@ -53,26 +64,26 @@ class BAOptions:
     """Options of :func:`dvo.ba.layer.layer.bundle_adjust`.
 
     Attributes:
-        fixed: number of leading poses that stay, or which: bool ``(N,)``.
+        fixed: number of leading poses that stay, at most all, or which: bool ``(N,)``.
         iterations: number of Gauss-Newton steps.
         damping: see :class:`BADamping`.
         structure_only: poses stay.
         motion_only: inverse depths stay.
-        bounds: ``(width, height)`` of the feature map; a projection more than 64 px outside does not count.
-        max_residual: pixels; an edge with a longer residual does not count.
-        depth_range: inverse depths are clamped to it.
+        bounds: ``(width, height)`` of the feature map, positive; a projection more than 64 px outside does not count.
+        max_residual: pixels, positive, infinity for no limit; an edge with a longer residual does not count.
+        depth_range: inverse depths are clamped to it; the smaller one first, from 0 to 1e8.
         kernel: robust kernel of the weighted residuals.
         refine_intrinsics: ``none``; ``focal`` (one common factor of fx and fy); ``all`` (fx, fy, cx, cy). The
             correction is shared by all frames, or is one for each sensor.
         sensors: cameras of a rig; then poses are world to body and intrinsics ``(B, S, 4)``.
-        check: raise on edge indices out of range and on negative weights. None: only if the tensors are on the CPU, as
-            an accelerator would have to be waited for.
+        check: look at the values of the tensors, as :func:`dvo.ba.layer.layer.bundle_adjust` says; an accelerator is
+            waited for once. False: they are taken as they are, and nothing is promised for invalid ones. None: True.
         report: fill ``cost`` and ``inliers`` of the result.
         covariance: frames whose joint covariance is wanted.
         sigma: standard deviation of a measurement of weight 1, for the covariance alone.
 
     Raises:
-        DvoError: unknown ``refine_intrinsics``, a negative number of iterations, or a ``sigma`` that is not positive.
+        DvoError: a value of another type or outside the limits above.
     """
 
     fixed: int | Tensor | Sequence[bool] = 1
@@ -92,15 +103,35 @@ class BAOptions:
     sigma: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.refine_intrinsics not in _REFINE:
-            known = ", ".join(_REFINE)
+        if not isinstance(self.refine_intrinsics, str) or self.refine_intrinsics not in _REFINE:
+            known, value = ", ".join(_REFINE), shown(self.refine_intrinsics)
+            raise DvoError(f"unknown value {value}", field="refine_intrinsics", remedy=f"use one of {known}")
+        kinds = (("damping", BADamping), ("kernel", Kernel), ("sensors", Sensors | None))
+        for name, kind in kinds:
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise DvoError(f"is {shown(value)}", field=name, remedy=f"give a {name.rstrip('s')} object")
+        check_whole(self.iterations, "iterations")
+        for name in ("structure_only", "motion_only", "report"):
+            check_switch(getattr(self, name), name)
+        if self.check is not None:
+            check_switch(self.check, "check")
+        if self.bounds is not None:
+            check_size(self.bounds)
+        if self.max_residual != math.inf:
+            check_positive(self.max_residual, "max_residual")
+        check_range(self.depth_range, "depth_range", 0.0, LARGEST)
+        check_positive(self.sigma, "sigma")
+        if self.covariance is not None and not _whole_numbers(self.covariance):
             raise DvoError(
-                f"unknown value {self.refine_intrinsics!r}", field="refine_intrinsics", remedy=f"use one of {known}"
+                f"is {shown(self.covariance)}, not frames", field="covariance", remedy="give a list of whole numbers"
             )
-        if self.iterations < 0:
-            raise DvoError(f"is {self.iterations}, negative", field="iterations", remedy="give 0 or more")
-        if not self.sigma > 0:
-            raise DvoError(f"is {self.sigma}, not positive", field="sigma", remedy="give a positive number of pixels")
+
+
+def _whole_numbers(values: object) -> bool:
+    if isinstance(values, Tensor):
+        return values.dim() == 1 and not (values.is_floating_point() or values.is_complex())
+    return isinstance(values, Sequence) and all(isinstance(x, Integral) and not isinstance(x, bool) for x in values)
 
 
 @dataclass(frozen=True)

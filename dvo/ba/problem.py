@@ -60,6 +60,11 @@ class Factor(ABC):
         """Parameters that may need a gradient: the floating-point tensors among the fields."""
         return tuple(getattr(self, name) for name in self._parameters())
 
+    def indices(self) -> tuple[Tensor, ...]:
+        """The other tensors that a pass depends on, which must not change before its backward pass."""
+        values = (getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
+        return tuple(x for x in values if isinstance(x, Tensor) and not x.is_floating_point())
+
     def with_tensors(self, tensors: Sequence[Tensor]) -> Factor:
         """The same factor with other :meth:`tensors`."""
         return replace(self, **dict(zip(self._parameters(), tensors, strict=True)))  # type: ignore[type-var]
@@ -103,6 +108,11 @@ class Problem:
     def tensors(self) -> list[Tensor]:
         """Everything that a step depends on: values of the blocks, then parameters of the factors."""
         return [*self.state.values().values(), *(x for factor in self.factors for x in factor.tensors())]
+
+    def indices(self) -> list[Tensor]:
+        """The other tensors that a step depends on."""
+        slots = (block.slot for block in self.state.blocks.values() if block.slot is not None)
+        return [*slots, *(x for factor in self.factors for x in factor.indices())]
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> Problem:
         """The same problem with other :meth:`tensors`."""

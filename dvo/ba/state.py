@@ -9,6 +9,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dvo.ba.limits import LARGEST
+
 
 @dataclass(frozen=True)
 class StateBlock:
@@ -24,6 +26,7 @@ class StateBlock:
         free: number of unknowns among the elements.
         held: the whole block stays in this call; it has no unknowns, whatever the value of ``slot``.
         eliminated: removed by Schur complement; at most one block, the last, with ``dim`` 1 and ``slot`` None.
+        longest: a Gauss-Newton step with a larger number is not taken.
     """
 
     value: Tensor
@@ -33,6 +36,7 @@ class StateBlock:
     free: int
     held: bool = False
     eliminated: bool = False
+    longest: float = LARGEST
 
     @property
     def unknowns(self) -> int:
@@ -128,6 +132,16 @@ class State:
         """The unknowns ``(B, unknowns, dim)`` of one block in a vector ``(B, size)`` of the reduced system."""
         block, start = self.blocks[name], self.offsets[name]
         return reduced[:, start : start + block.unknowns * block.dim].view(len(reduced), block.unknowns, block.dim)
+
+    def is_short(self, reduced: Tensor) -> Tensor:
+        """``(B, 1)`` bool, elements of the batch with a step ``(B, size)`` within :attr:`StateBlock.longest`."""
+        size = reduced.abs()
+        if len({block.longest for block in self.blocks.values()}) == 1:
+            return (size <= next(iter(self.blocks.values())).longest).all(1, keepdim=True)
+        short = torch.ones_like(size[:, :1], dtype=torch.bool)
+        for name in self.offsets:
+            short = short & (self.part(name, size) <= self.blocks[name].longest).flatten(1).all(1, keepdim=True)
+        return short
 
     def moved(self, reduced: Tensor, landmarks: Tensor) -> State:
         """The state after a step ``(B, size)`` of the reduced system and ``(B, K)`` of the eliminated block."""

@@ -47,6 +47,14 @@ class Problem:
         return replace(self, targets=self.targets[:, which], weights=self.weights[:, which], ii=self.ii[which],
                        jj=self.jj[which], kk=self.kk[which])  # fmt: skip
 
+    def shifted(self, pixels: float) -> Problem:
+        """The same in images whose origin is elsewhere."""
+        move = torch.zeros(3, 1, 1, dtype=self.patches.dtype)
+        move[:2] = pixels
+        intrinsics = torch.cat((self.intrinsics[..., :2], self.intrinsics[..., 2:] + pixels), -1)
+        return replace(self, patches=self.patches + move, true_patches=self.true_patches + move, intrinsics=intrinsics,
+                       targets=self.targets + pixels)  # fmt: skip
+
     def leaves(self) -> Problem:
         """Copies that gather gradients."""
         floats = ("poses", "patches", "intrinsics", "targets", "weights")

@@ -28,6 +28,7 @@ from dvo.ba.layer.normal_equations import (
     view,
 )
 from dvo.ba.layer.reprojection import MARGIN
+from dvo.ba.limits import LARGEST
 from dvo.ba.problem import AdjointConstants, Factor, Linearisation, NormalEquations, State, StateBlock
 from dvo.geometry import so3
 
@@ -53,6 +54,10 @@ class GroupedReprojection(Factor):
 
     def tensors(self) -> tuple[Tensor, ...]:
         return self.rays, self.target, self.weight
+
+    def indices(self) -> tuple[Tensor, ...]:
+        plan = self.plan
+        return plan.pair_i, plan.pair_j, plan.group_pair, plan.kk
 
     def with_tensors(self, tensors: Sequence[Tensor]) -> GroupedReprojection:
         rays, target, weight = tensors
@@ -160,7 +165,8 @@ def _edge_terms(
     depth = state[INVERSE_DEPTHS].value.index_select(1, kk).view(b, -1, 1, size)
     motion = t.index_select(1, group)
     v = view(rotation.index_select(1, group), motion, factor.rays[:, part], depth)
-    j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
+    # The Jacobian of an edge that does not count may be so large that products with zero weights are NaN.
+    j_d = torch.where(use, (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z, 0.0)
     residual = torch.where(use, factor.target[:, part] - v.xy, 0.0)
     weight = torch.where(use, factor.weight[:, part], 0.0)
     if scale is not None:
@@ -170,7 +176,7 @@ def _edge_terms(
     if held is None:
         return (weight * flow[:, :, 0] * (residual - flow[:, :, 1])).sum()
 
-    jacobian = torch.cat(pose_jacobian(v), -2).view(b, -1, 6, 2 * size)
+    jacobian = torch.where(use, torch.cat(pose_jacobian(v), -2), 0.0).view(b, -1, 6, 2 * size)
     adjoint = _adjoint(rotation, t)
     # Along both directions, frame j moves relative to frame i by xi_j - Ad_ij xi_i.
     xi = torch.stack((held.lambda_p, held.delta_p), -1)
@@ -221,10 +227,12 @@ def group_measurements(
     f_j, c_j = intrinsics.index_select(1, plan.pair_j[plan.group_pair])[:, :, None].split(2, -1)
     source = (centres.index_select(1, plan.kk).view(shape) - c_i) / f_i
     rays = torch.cat((source, torch.ones_like(source[..., :1])), -1).mT.contiguous()
-    target = (targets.index_select(1, plan.order).view(shape) - c_j) / f_j
-    weight = weights.index_select(1, plan.order).view(shape)
-    # A weight that is not finite is none at all; the empty places of a group have none either.
-    weight = torch.where(plan.filled[..., None] & torch.isfinite(weight).all(-1, keepdim=True), weight, 0.0)
+    target, weight = targets.index_select(1, plan.order).view(shape), weights.index_select(1, plan.order).view(shape)
+    # A weight that is not finite is none at all, as is that of a target that nothing can be near; the empty places of a
+    # group have none either. Both are left out here, as autograd would multiply them by zero further down.
+    near = (target.abs() <= LARGEST).all(-1, keepdim=True)
+    target = (torch.where(near, target, 0.0) - c_j) / f_j
+    weight = torch.where(plan.filled[..., None] & near & torch.isfinite(weight).all(-1, keepdim=True), weight, 0.0)
     weight = weight * (f_j * f_j)
     gate = Gate(max_residual, f_j.detach().mT, kernel=kernel)
     if bounds is not None:

@@ -11,19 +11,24 @@ Patch Visual Odometry", 2023.)
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, inverse_depth_block, pose_block
 from dvo.ba.covariance import pose_covariance
-from dvo.ba.edges import EdgePlan, check_index, plan_edges
+from dvo.ba.edges import EdgePlan, plan_edges
+from dvo.ba.layer.checks import FLOATS, INDICES, check_structure, check_values
 from dvo.ba.layer.grouped import group_measurements
 from dvo.ba.layer.step import gauss_newton
+from dvo.ba.layer.transforms import composed, is_transformed
 from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
 from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 from dvo.core.threads import use_threads
 from dvo.geometry.precision import full_precision
 
@@ -50,19 +55,28 @@ def bundle_adjust(
     """Refine poses and inverse depths so that the patches project onto their targets.
 
     Gradients flow to poses, patches, intrinsics, targets, weights and the parameters of the factors, through all
-    iterations. Neither the result nor a gradient is ever NaN for finite input: an edge whose point is not in front of
-    frame j (``Z <= 0.2``), whose residual is too long, or which leaves the bounds counts for nothing in that iteration,
-    and where the system cannot be solved the step is zero.
+    iterations, and may be differentiated again (``create_graph``); kernel weights are constants of every derivative.
+    ``torch.func`` (grad, vjp, jacrev, jvp, jacfwd, hessian, vmap) works: a vmap is a loop over its elements. Indices and
+    tensors must not be changed in place before the backward pass, or autograd raises.
+
+    Neither the result nor a gradient is ever NaN or infinite for input that is not refused: an edge whose point is not in
+    front of frame j (``Z <= 0.2``), whose residual is too long, which leaves the bounds, or whose target or weight is
+    not finite counts for nothing in that iteration, and where the system cannot be solved, or its step is longer than
+    1e8, the step is zero. A gradient too large for its type is zero.
 
     Args:
-        poses_cw: ``(B, N, 7)`` world to camera.
+        poses_cw: ``(B, N, 7)`` world to camera, unit quaternions; their dtype is that of the result (float32 for half
+            precision). No number of poses, patches and intrinsics is larger than 1e8.
         patches: ``(B, K, 3, p, p)`` x, y (feature-map pixels) and inverse depth; all pixels of a patch share the one
             of its centre.
-        intrinsics: ``(B, N, 4)`` fx fy cx cy in the same pixels; ``(B, S, 4)`` with several sensors.
-        targets: ``(B, E, 2)`` measured positions of the patch centres, pixels of frame j.
+        intrinsics: ``(B, N, 4)`` fx fy cx cy in the same pixels, focal lengths of at least 1e-3; ``(B, S, 4)`` with
+            several sensors.
+        targets: ``(B, E, 2)`` measured positions of the patch centres, pixels of frame j; an edge with a target that is
+            not finite, or larger than 1e8, does not count.
         weights: ``(B, E, 2)`` confidence per axis (inverse variance, pixels^-2), not negative; an edge with a weight
             that is not finite does not count.
-        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, in any order, shared by the batch.
+        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, whole numbers in any order, shared by the
+            batch.
         options: see :class:`BAOptions`.
         factors: further measurements, for example priors (:mod:`dvo.ba.factors`).
         blocks: further unknowns that the factors concern, by name, for example velocities; see
@@ -74,8 +88,10 @@ def bundle_adjust(
         New poses and patches, and what the options ask for beyond.
 
     Raises:
-        DvoError: shapes that do not belong together; an edge index out of range or a negative weight (see
-            ``options.check``).
+        DvoError: types, devices or shapes that do not belong together, an empty batch, options out of their limits, a
+            factor that does not fit. Unless ``options.check`` is False: poses, patches, intrinsics, blocks or factors
+            with a number that is not finite or out of the limits above, an index out of range, a negative weight, a
+            ``plan`` of other edges. Forward-mode dual numbers outside ``torch.func``.
 
     Example:
         >>> from dvo.ba.layer.layer import BAOptions, bundle_adjust
@@ -84,16 +100,24 @@ def bundle_adjust(
         >>> loss = pose_loss(result.poses_cw, true_poses_cw)
         >>> loss.backward()
     """
+    if not isinstance(options, BAOptions):
+        raise DvoError(f"is {shown(options)}", field="options", remedy="give a BAOptions object")
+    if not isinstance(factors, Iterable):
+        raise DvoError(f"is {shown(factors)}", field="factors", remedy="give a list of factors")
     given = poses_cw, patches, intrinsics, targets, weights, ii, jj, kk
-    return adjust_dense(PatchProblem(*given, options.sensors, tuple(factors), blocks or {}, plan), options)
+    further = {} if blocks is None else blocks
+    return adjust_dense(PatchProblem(*given, options.sensors, tuple(factors), further, plan), options)
 
 
 def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
     """The dense solution of a batch; see :func:`bundle_adjust` and :func:`dvo.ba.solve.solve`."""
     use_threads()
-    _check_shapes(given)
-    if options.check or (options.check is None and given.weights.device.type == "cpu"):
-        _check_values(given)
+    check_structure(given)
+    if is_transformed():
+        return _transformed(given, options)
+    given = _with_whole_indices(given)
+    if options.check is not False:
+        check_values(given)
     with full_precision(given.poses_cw.device):
         problem = gauss_newton(make_problem(given, options), options.iterations, options.damping)
         state, patches = problem.state, given.patches
@@ -112,6 +136,59 @@ def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
             cost, inliers = _report(make_problem(now, options, grouped=False))
         further = {name: state[name].value for name in given.blocks}
         return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance, further)
+
+
+def _with_whole_indices(given: PatchProblem) -> PatchProblem:
+    """The same with indices of the type that everything takes; nearly always they have it."""
+    values: dict[str, Any] = {n: getattr(given, n).long() for n in INDICES if getattr(given, n).dtype != torch.int64}
+    sensors = given.sensors
+    if sensors is not None and (sensors.source.dtype, sensors.target.dtype) != (torch.int64, torch.int64):
+        values["sensors"] = replace(sensors, source=sensors.source.long(), target=sensors.target.long())
+    return replace(given, **values) if values else given
+
+
+def _transformed(given: PatchProblem, options: BAOptions) -> BAResult:
+    """The same within ``torch.func``, whose tensors are taken apart: see :mod:`dvo.ba.layer.transforms`."""
+    named: list[tuple[Any, ...]] = [("given", name) for name in (*FLOATS, *INDICES)]
+    if given.sensors is not None:
+        named += [("sensors", name) for name in ("source", "target", "from_body")]
+    named += [("blocks", name) for name in given.blocks]
+    for i, factor in enumerate(given.factors):
+        named += [("factors", i, f.name) for f in fields(factor) if isinstance(getattr(factor, f.name), Tensor)]  # type: ignore[arg-type]
+
+    def value(kind: str, *name: Any) -> Tensor:
+        if kind == "blocks":
+            return given.blocks[name[0]].value
+        holder = given.factors[name[0]] if kind == "factors" else given.sensors if kind == "sensors" else given
+        found: Tensor = getattr(holder, name[-1])
+        return found
+
+    def rebuilt(tensors: tuple[Tensor, ...]) -> PatchProblem:
+        values = dict(zip(named, tensors, strict=True))
+
+        def part(*start: Any) -> dict[str, Tensor]:
+            return {name[-1]: x for name, x in values.items() if name[:-1] == start}
+
+        sensors = None if given.sensors is None else replace(given.sensors, **part("sensors"))
+        blocks = {name: block.with_value(values["blocks", name]) for name, block in given.blocks.items()}
+        factors = tuple(replace(f, **part("factors", i)) for i, f in enumerate(given.factors))  # type: ignore[type-var]
+        return replace(given, **part("given"), sensors=sensors, blocks=blocks, factors=factors)
+
+    asked = tuple(name for name in ("cost", "inliers", "covariance") if _asked(options, name))
+
+    def run(*tensors: Tensor) -> tuple[Tensor, ...]:
+        result = adjust_dense(rebuilt(tensors), options)
+        plain = result.poses_cw, result.patches, result.intrinsics, *(getattr(result, name) for name in asked)
+        return *plain, *result.blocks.values()
+
+    found = composed(run, *(value(*name) for name in named))
+    extra = dict(zip(asked, found[3:], strict=False))
+    further = dict(zip(given.blocks, found[3 + len(asked) :], strict=True))
+    return BAResult(*found[:3], **extra, blocks=further)  # type: ignore[arg-type]
+
+
+def _asked(options: BAOptions, name: str) -> bool:
+    return options.covariance is not None if name == "covariance" else options.report
 
 
 def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped: bool = True) -> Problem:
@@ -160,41 +237,3 @@ def _report(problem: Problem) -> tuple[Tensor, Tensor]:
     values = problem.state.values()
     linear = [factor.linearise(values) for factor in problem.factors]
     return torch.stack([x.cost() for x in linear]).sum(0), (linear[0].weight > 0).any(-1)
-
-
-def _check_shapes(given: PatchProblem) -> None:
-    poses_cw, patches, sensors = given.poses_cw, given.patches, given.sensors
-    b, n = poses_cw.shape[:2] if poses_cw.dim() == 3 else (-1, -1)
-    count = len(given.ii)
-    wanted: dict[str, tuple[Tensor, tuple[int, ...]]] = {"poses_cw": (poses_cw, (b, n, 7))}
-    if sensors is None:
-        wanted["intrinsics"] = (given.intrinsics, (b, n, 4))
-    else:
-        cameras = sensors.from_body.shape[-2] if sensors.from_body.dim() > 1 else -1
-        wanted["intrinsics"] = (given.intrinsics, (b, cameras, 4))
-        wanted |= {"sensors.source": (sensors.source, (count,)), "sensors.target": (sensors.target, (count,))}
-    wanted |= {"targets": (given.targets, (b, count, 2)), "weights": (given.weights, (b, count, 2))}
-    wanted |= {name: (getattr(given, name), (count,)) for name in ("ii", "jj", "kk")}
-    if patches.dim() == 5:
-        wanted["patches"] = (patches, (b, patches.shape[1], 3, *patches.shape[3:]))
-    else:
-        wanted["patches"] = (patches, (b, -1, 3, -1, -1))
-    for name, (tensor, shape) in wanted.items():
-        if tensor.shape != shape:
-            raise DvoError(
-                f"has shape {tuple(tensor.shape)}, not {shape}", field=name, remedy="see the help of bundle_adjust"
-            )
-
-
-def _check_values(given: PatchProblem) -> None:
-    frames, patches, cameras = given.poses_cw.shape[1], given.patches.shape[1], given.intrinsics.shape[1]
-    for field, index, count in (("ii", given.ii, frames), ("jj", given.jj, frames), ("kk", given.kk, patches)):
-        check_index(index, count, field)
-    if given.sensors is not None:
-        check_index(given.sensors.source, cameras, "sensors.source")
-        check_index(given.sensors.target, cameras, "sensors.target")
-    # The smallest weight is NaN if any is; only then look at each.
-    weights = given.weights
-    least = float(weights.detach().amin()) if weights.numel() else 0.0
-    if least < 0 or (least != least and bool((weights < 0).any())):
-        raise DvoError("negative", field="weights", remedy="give inverse variances, zero for an edge to leave out")

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
 from dvo.ba.kernels import Kernel
+from dvo.ba.limits import LARGEST
 from dvo.ba.problem import Factor, Linearisation
 from dvo.geometry import se3
 from dvo.geometry.projection import MIN_Z_VALID
@@ -29,7 +30,8 @@ class PatchReprojection(Factor):
     Attributes:
         centres: ``(B, K, 2)`` pixels x, y of the patch centres.
         targets: ``(B, E, 2)`` pixels in frame j.
-        weights: ``(B, E, 2)`` confidence per axis, pixels^-2. An edge with a weight that is not finite does not count.
+        weights: ``(B, E, 2)`` confidence per axis, pixels^-2. An edge with a weight or a target that is not finite
+            does not count.
         ii, jj, kk: ``(E,)`` source frame, target frame and patch.
         camera_i, camera_j: ``(E,)`` rows of the block of intrinsics, and of ``extrinsics``.
         extrinsics: ``(B, S, 7)`` body to sensor; None for a single camera.
@@ -76,11 +78,15 @@ class PatchReprojection(Factor):
         if self.bounds is not None:
             limit = pixel.new_tensor(self.bounds) + MARGIN
             use = use & (pixel > -MARGIN).all(-1) & (pixel < limit).all(-1)
-        use = use & torch.isfinite(self.weights).all(-1)
+        use = use & torch.isfinite(self.weights).all(-1) & (self.targets.abs() <= LARGEST).all(-1)
+        # What does not count gets a point ahead: products of a huge Jacobian with zero weights would be NaN.
+        px, py, pz, h = (torch.where(use, x, ahead) for x, ahead in ((px, 0.0), (py, 0.0), (pz, 1.0), (h, 0.0)))
+        z = torch.where(use, z, 1.0)
+        xy = torch.where(use[..., None], xy, 0.0)
         residual = torch.where(use[..., None], residual, 0.0)
         weight = torch.where(use[..., None], self.weights, 0.0)
 
-        fx, fy = (focal_j * seen[..., None]).unbind(-1)
+        fx, fy = (focal_j * use[..., None]).unbind(-1)
         o = torch.zeros_like(z)
         by_point = torch.stack((fx / z, o, -fx * px / z**2, o, fy / z, -fy * py / z**2), -1).unflatten(-1, (2, 3))
         move = torch.stack((h, o, o, o, pz, -py, o, h, o, -pz, o, px, o, o, h, py, -px, o), -1).unflatten(-1, (3, 6))

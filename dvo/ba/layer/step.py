@@ -1,19 +1,23 @@
 """One damped Gauss-Newton step as a differentiable function.
 
 Forward assembles ``H delta = g`` without recording a graph. Backward needs only one more solve with the same factor,
-and the derivative of one scalar; see :mod:`dvo.ba.layer.adjoint`.
+and the derivative of one scalar; see :mod:`dvo.ba.layer.adjoint`. A backward pass that is itself recorded
+(``create_graph``), or run within ``torch.func``, differentiates the step as autograd records it: :func:`plain_step`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dvo.ba.layer.adjoint import adjoint_constants, gradients
-from dvo.ba.layer.schur import SchurFactor, eliminate
+from dvo.ba.layer.schur import SchurFactor, damped, eliminate, factorise, invert_blocks
+from dvo.ba.layer.transforms import Tensors, composed, is_batched, is_transformed, pulled_back
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
 from dvo.core.errors import DvoError
@@ -29,7 +33,16 @@ def normal_equations(problem: Problem, depth_damping: float) -> tuple[NormalEqua
     total: NormalEquations | None = None
     memos = []
     for factor in problem.factors:
-        equations, memo = factor.normal_equations(problem.state)
+        try:
+            equations, memo = factor.normal_equations(problem.state)
+        except (RuntimeError, IndexError) as error:
+            if memos and not isinstance(error, torch.OutOfMemoryError):  # the first factor is not from outside
+                reason = str(error).partition("\n")[0]
+                raise DvoError(
+                    f"{type(factor).__name__} does not fit: {reason}", field="factors",
+                    remedy="give it indices and shapes of this problem",
+                ) from error  # fmt: skip
+            raise
         memos.append(memo)
         if total is None:
             h_ll = equations.h_ll + depth_damping
@@ -51,6 +64,42 @@ def reduced_system(equations: NormalEquations, damping: BADamping) -> SchurFacto
     return eliminate(equations.h_pp, h_pl, h_ll, damping.pose, damping.relative)
 
 
+def solved(problem: Problem, damping: BADamping) -> tuple[SchurFactor, Tensor, Tensor, list[Any]]:
+    """Factor of the system, step ``(B, P)`` of the reduced and ``(B, K)`` of the eliminated block, memos.
+
+    An element of the batch with a step that is too long moves nothing, and has neither ``q`` nor ``ok``.
+    """
+    equations, memos = normal_equations(problem, damping.depth)
+    solver = reduced_system(equations, damping)
+    dp, dl = solver.solve(equations.g_p, equations.g_l[..., None])
+    dl = dl[..., 0]
+    short = problem.state.is_short(dp)
+    q = torch.where(short[..., None, None], solver.q, 0.0)
+    solver = SchurFactor(solver.h_pl, q, solver.factor, solver.ok & short[:, 0])
+    return solver, torch.where(short, dp, 0.0), torch.where(short & torch.isfinite(dl), dl, 0.0), memos
+
+
+def plain_step(problem: Problem, damping: BADamping) -> tuple[Tensor, Tensor]:
+    """The steps of :class:`GaussNewtonStep` by operations that autograd records, any number of times."""
+    with torch.no_grad():
+        _, dp, dl, _ = solved(problem, damping)
+        short = problem.state.is_short(dp)
+    equations, _ = normal_equations(problem, damping.depth)
+    q = invert_blocks(equations.h_ll[..., None, None])[..., 0, 0]
+    weighted = equations.h_pl * q[:, None]
+    s = damped(equations.h_pp - weighted @ equations.h_pl.mT, damping.pose, damping.relative)
+    with torch.no_grad():
+        factor, ok = factorise(s)
+        boost = factor @ factor.mT - s  # a constant, as in the first derivative
+    good = (ok & short[:, 0])[:, None, None]
+    eye = torch.eye(s.shape[-1], dtype=s.dtype, device=s.device)
+    s = torch.where(good, s + torch.where(good, boost, 0.0), eye)
+    y = equations.g_p - (weighted @ equations.g_l[..., None])[..., 0]
+    moved = torch.linalg.solve_ex(s, torch.where(good[:, 0], y, 0.0)[..., None])[0][..., 0]
+    depths = q * (equations.g_l - (equations.h_pl.mT @ moved[..., None])[..., 0])
+    return torch.where(good[:, 0], moved, dp), torch.where(short & torch.isfinite(dl), depths, dl)
+
+
 class GaussNewtonStep(torch.autograd.Function):
     """``(problem, damping, *problem.tensors())`` to steps ``(B, P)`` of the reduced system and ``(B, K)`` of the
     eliminated block. Gradients flow to the tensors."""
@@ -58,26 +107,46 @@ class GaussNewtonStep(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, problem: Problem, damping: BADamping, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         # The tensors are those of the problem; they are arguments for autograd to see them.
-        equations, memos = normal_equations(problem, damping.depth)
-        solver = reduced_system(equations, damping)
-        dp, dl = solver.solve(equations.g_p, equations.g_l[..., None])
-        ctx.problem, ctx.damping, ctx.memos = problem, damping, memos
-        ctx.save_for_backward(*tensors, solver.h_pl, solver.q, solver.factor, solver.ok, dp, dl)
-        return dp, dl[..., 0]
+        solver, dp, dl, memos = solved(problem, damping)
+        ctx.problem, ctx.damping, ctx.memos, ctx.count = problem, damping, memos, len(tensors)
+        # Indices are saved for autograd to notice if they are changed before the backward pass.
+        kept = *tensors, *problem.indices()
+        ctx.save_for_backward(*kept, solver.h_pl, solver.q, solver.factor, solver.ok, dp, dl)
+        return dp, dl
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        *tensors, h_pl, q, factor, ok, dp, dl = ctx.saved_tensors
+        if is_batched(grads[0]):
+            raise DvoError(
+                "a batch of gradients (is_grads_batched, vectorize)", field="bundle_adjust",
+                remedy="use torch.func.vmap of torch.func.vjp, or torch.func.jacrev",
+            )  # fmt: skip
+        *kept, h_pl, q, factor, ok, dp, dl = ctx.saved_tensors
+        tensors = kept[: ctx.count]
         out: list[Tensor | None] = [None] * len(tensors)
         needed = [i for i in range(len(tensors)) if ctx.needs_input_grad[i + 2]]
+        found: Sequence[Tensor | None]
         with full_precision(dp.device):
-            lp, ll = SchurFactor(h_pl, q, factor, ok).solve(grads[0], grads[1][..., None])
-            constants = adjoint_constants(
-                ctx.damping.relative, h_pl[..., 0], q[..., 0, 0], lp, dp, ll[..., 0], dl[..., 0]
-            )
-            for i, gradient in zip(needed, gradients(ctx.problem, tensors, needed, constants, ctx.memos), strict=True):
-                out[i] = gradient
+            if torch.is_grad_enabled() or is_transformed():
+                step = partial(_recorded, ctx.problem, ctx.damping)
+                found = composed(partial(pulled_back, step, needed, len(tensors)), *tensors, *grads)
+            else:
+                lp, ll = SchurFactor(h_pl, q, factor, ok).solve(grads[0], grads[1][..., None])
+                constants = adjoint_constants(ctx.damping.relative, h_pl[..., 0], q[..., 0, 0], lp, dp, ll[..., 0], dl)
+                found = gradients(ctx.problem, tensors, needed, constants, ctx.memos)
+            # Of finite gradients come finite ones: what is too large for its type is none. A NaN stays one.
+            nothing = (grads[0] * 0).sum() + (grads[1] * 0).sum()
+            for i, gradient in zip(needed, found, strict=True):
+                out[i] = None if gradient is None else torch.where(torch.isfinite(gradient), gradient, nothing)
         return None, None, *out
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
+        raise DvoError("dual numbers are not followed", field="bundle_adjust", remedy="use torch.func.jvp")
+
+
+def _recorded(problem: Problem, damping: BADamping, *tensors: Tensor) -> Tensors:
+    return plain_step(problem.with_tensors(tensors), damping)
 
 
 def gauss_newton(problem: Problem, iterations: int, damping: BADamping) -> Problem:

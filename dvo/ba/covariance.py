@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.blocks import POSES
+from dvo.ba.layer.linearisation import landmark_count, landmark_part, reduced_part
+from dvo.ba.layer.schur import SchurFactor
 from dvo.ba.layer.step import normal_equations, reduced_system
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
@@ -58,9 +60,16 @@ def pose_covariance(
         raise DvoError(f"frame {bad[0]} outside 0..{count - 1}", field="frames", remedy="give frames that exist")
     index = torch.tensor(list(frames), dtype=torch.long, device=state[block].value.device)
     column = None if constraint is None else _column(problem, block, constraint)
+    rows = state.rows(block, index).flatten()
     with full_precision(state[block].value.device):
-        equations, _ = normal_equations(problem, damping.depth)
-        found = marginal_covariance(equations, state.rows(block, index).flatten(), damping, column)
+        # The reduced Hessian is a difference: in single precision, a weight of 1e8 leaves nothing of the small ones.
+        exact = problem.with_tensors([x.double() for x in problem.tensors()])
+        equations, _ = normal_equations(exact, damping.depth)
+        solver, prior = _reduced(equations, damping, column)
+        good = _keeps_digits(equations, solver, damping)
+        found = _marginal(solver, rows, column)
+        if not bool(good.all()):
+            found = torch.where(good[:, None, None], found, _marginal(_from_rows(exact, damping, prior), rows, column))
     return (sigma**2 * found).to(state[block].value.dtype)
 
 
@@ -81,18 +90,34 @@ def marginal_covariance(
         the Hessian is not positive definite.
     """
     equations = NormalEquations(*(getattr(equations, field.name).double() for field in fields(equations)))
+    solver, _ = _reduced(equations, damping, constraint)
+    return _marginal(solver, rows, constraint)
+
+
+def _reduced(
+    equations: NormalEquations, damping: BADamping, constraint: Tensor | None
+) -> tuple[SchurFactor, Tensor | None]:
+    """Factor of the reduced Hessian; with a constraint the row ``(B, P)`` of a prior that is part of it.
+
+    The prior on the constrained sum makes the system regular, and changes nothing where the sum is zero.
+    """
+    prior = None
     if constraint is not None:
         a = constraint.double()
-        # A prior on the constrained sum makes the system regular, and changes nothing where the sum is zero.
         mean = equations.h_pp.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
-        weighted = mean / a.square().sum(1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny) * a
-        equations = replace(equations, h_pp=equations.h_pp + weighted[:, :, None] * a[:, None])
-    solver = reduced_system(equations, replace(damping, relative=0.0))
-    b, size = equations.g_p.shape
+        share = mean / a.square().sum(1, keepdim=True).clamp(min=torch.finfo(a.dtype).tiny)
+        equations = replace(equations, h_pp=equations.h_pp + (share * a)[:, :, None] * a[:, None])
+        prior = share.sqrt() * a
+    return reduced_system(equations, replace(damping, relative=0.0)), prior
+
+
+def _marginal(solver: SchurFactor, rows: Tensor, constraint: Tensor | None) -> Tensor:
+    """Part of the inverse of a factored Hessian; see :func:`marginal_covariance`."""
+    b, size = solver.factor.shape[:2]
     # One unit column for each row; that of something fixed, past the last row, is zero.
     columns = torch.nn.functional.one_hot(rows, size + 1)[:, :size].T.to(solver.factor).expand(b, -1, -1)
     if constraint is not None:
-        columns = torch.cat((columns, a[..., None]), -1)
+        columns = torch.cat((columns, constraint.double()[..., None]), -1)
     # The inverse of L L^T between columns is the product of their L^-1.
     half = torch.linalg.solve_triangular(solver.factor, columns, upper=False)
     covariance = half.mT @ half
@@ -102,6 +127,63 @@ def marginal_covariance(
     good = (solver.ok & torch.isfinite(covariance).all(-1).all(-1))[:, None, None]
     infinite = torch.diag_embed(torch.full_like(covariance[..., 0], torch.inf))
     return torch.where(good, covariance, infinite)
+
+
+def _keeps_digits(equations: NormalEquations, solver: SchurFactor, damping: BADamping) -> Tensor:
+    """``(B,)`` bool: what rounding did to the reduced Hessian is small against its least eigenvalue."""
+    factor = solver.factor
+    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device).expand_as(factor)
+    inverse = torch.linalg.solve_triangular(factor, eye, upper=False).square().sum((1, 2))
+    error = torch.finfo(factor.dtype).eps * equations.h_pp.diagonal(dim1=-2, dim2=-1).sum(-1)
+    # A factorisation that failed at first has more damping, 1e-6 of the largest entry or more.
+    of_landmarks = (solver.h_pl[..., 0].square() * solver.q[:, None, :, 0, 0]).sum(-1)
+    diagonal = equations.h_pp.diagonal(dim1=-2, dim2=-1) - of_landmarks + damping.pose
+    if diagonal.shape[1]:
+        more = (factor.square().sum(-1) - diagonal).abs().amax(1)
+        return solver.ok & (error * inverse < 1e-3) & (more <= 1e-7 * diagonal.abs().amax(1))
+    return solver.ok
+
+
+def _from_rows(problem: Problem, damping: BADamping, prior: Tensor | None) -> SchurFactor:
+    """Factor of the reduced Hessian by QR of its rows. They are not squared, so that it keeps twice the digits.
+
+    The rows of a landmark are projected off its column, which leaves rows of the reduced system.
+    """
+    state, values = problem.state, problem.state.values()
+    size, count = state.size, landmark_count(state)
+    rows, columns, places = [], [], []
+    for factor in problem.factors:
+        linear = factor.linearise(values)
+        jacobian, at = reduced_part(linear, state)
+        root = linear.weight.sqrt()
+        unit = torch.nn.functional.one_hot(at, size + 1)[..., :size].to(jacobian)
+        rows.append((root[..., None] * (jacobian @ unit)).flatten(1, 2))
+        found = landmark_part(linear, state)
+        column, place = (torch.zeros_like(root), at.new_full((root.shape[1],), count)) if found is None else found
+        columns.append((root * column).flatten(1))
+        places.append(place.repeat_interleave(root.shape[2]))
+    a, b, place = torch.cat(rows, 1), torch.cat(columns, 1), torch.cat(places)
+    # Damping of a landmark is a row of its own, without a reduced part.
+    batch = len(a)
+    own = torch.arange(count, device=place.device)
+    a = torch.cat((a, a.new_zeros(batch, count, size)), 1)
+    b = torch.cat((b, b.new_full((batch, count), damping.depth**0.5)), 1)
+    place = torch.cat((place, own))
+    square = b.new_zeros(batch, count + 1).index_add_(1, place, b.square())
+    along = a.new_zeros(batch, count + 1, size).index_add_(1, place, b[..., None] * a)
+    share = torch.where(square > 0, 1 / square, 0.0)[..., None] * along
+    a = a - b[..., None] * share.index_select(1, place)
+    eye = torch.eye(size, dtype=a.dtype, device=a.device).expand(batch, -1, -1)
+    more = [damping.pose**0.5 * eye, *([] if prior is None else [prior[:, None]])]
+    a = torch.cat((a, *more), 1)
+    # The longest rows first: then the short ones lose nothing to them.
+    order = a.square().sum(-1).argsort(1, descending=True)
+    a = a.gather(1, order[..., None].expand_as(a))
+    good = torch.isfinite(a).all(-1).all(-1)
+    r = torch.linalg.qr(torch.where(good[:, None, None], a, 0.0), mode="r")[1]
+    good = good & (r.diagonal(dim1=-2, dim2=-1) != 0).all(-1)
+    none = a.new_zeros(batch, size, 0, 1)
+    return SchurFactor(none, none[:, 0, :, :, None], torch.where(good[:, None, None], r.mT, eye), good)
 
 
 def size_gradient(poses_cw: Tensor, reference: int, members: Sequence[int]) -> Tensor:

@@ -33,6 +33,7 @@ class EdgePlan:
         order: ``(G * M,)`` edge of each place (any edge, if empty).
         filled: ``(G, M)`` bool.
         kk: ``(G * M,)`` patch of each place.
+        numbers: ``(E,)`` of the edges in the given order, see :func:`edge_numbers`.
     """
 
     frames: int
@@ -43,6 +44,7 @@ class EdgePlan:
     order: Tensor
     filled: Tensor
     kk: Tensor
+    numbers: Tensor
 
     @property
     def groups(self) -> int:
@@ -75,6 +77,11 @@ def check_index(index: Tensor, count: int, field: str) -> None:
         )
 
 
+def edge_numbers(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) -> Tensor:
+    """Numbers ``(E,)`` that tell edges apart, ``(i frames + j) patches + k``."""
+    return torch.add(kk, torch.add(jj, ii, alpha=frames), alpha=patches)
+
+
 def plan_edges(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) -> EdgePlan:
     """Sort edges into groups. A graph that does not change needs this once.
 
@@ -89,7 +96,7 @@ def plan_edges(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) ->
     device, edges = ii.device, ii.shape[0]
     if edges == 0:
         none = torch.zeros(0, dtype=torch.long, device=device)
-        return EdgePlan(frames, patches, none, none, none, none, none.view(0, 1).bool(), none)
+        return EdgePlan(frames, patches, none, none, none, none, none.view(0, 1).bool(), none, none)
     by_pair, order = (ii * frames + jj).sort(stable=True)
     pairs, count = torch.unique_consecutive(by_pair, return_counts=True)
     # Groups as long as the longest pair if pairs are alike; else shorter, so that at most two thirds of the places
@@ -103,8 +110,9 @@ def plan_edges(ii: Tensor, jj: Tensor, kk: Tensor, frames: int, patches: int) ->
     rank = within[:, None] + torch.arange(size, device=device)
     filled = rank < count[group_pair][:, None]
     order = order[torch.where(filled, start[group_pair][:, None] + rank, 0).flatten()]
+    numbers = edge_numbers(ii, jj, kk, frames, patches)
     pair_i, pair_j = torch.div(pairs, frames, rounding_mode="floor"), pairs % frames
-    return EdgePlan(frames, patches, pair_i, pair_j, group_pair, order, filled, kk[order])
+    return EdgePlan(frames, patches, pair_i, pair_j, group_pair, order, filled, kk[order], numbers)
 
 
 def free_slots(fixed: int | Tensor | Sequence[bool], frames: int, device: torch.device) -> tuple[Tensor, int]:
@@ -119,10 +127,11 @@ def free_slots(fixed: int | Tensor | Sequence[bool], frames: int, device: torch.
         DvoError: a number that is negative or greater than that of the frames, or no mask of all frames.
     """
     if isinstance(fixed, Integral) and not isinstance(fixed, bool):
-        if not 0 <= fixed <= frames:
-            raise DvoError(f"is {fixed}, of {frames} frames", field="fixed", remedy=f"give 0 to {frames}")
-        free = frames - int(fixed)
-        slot = torch.arange(frames, device=device) - int(fixed)
+        leading = int(fixed)
+        if not 0 <= leading <= frames:
+            raise DvoError(f"is {leading}, of {frames} frames", field="fixed", remedy=f"give 0 to {frames}")
+        free = frames - leading
+        slot = torch.arange(frames, device=device) - leading
         return torch.where(slot < 0, free, slot), free
     stays = _mask(fixed, frames).to(device)
     free = int((~stays).sum())

@@ -29,7 +29,7 @@ def check_number(value: Any, field: str, low: float, high: float = math.inf) -> 
     Raises:
         DvoError: something else, or NaN.
     """
-    if isinstance(value, Real) and not isinstance(value, bool) and low <= value <= high:
+    if isinstance(value, Real) and not isinstance(value, bool) and low <= float(value) <= high:
         return
     limits = f"from {low:g} to {high:g}" if math.isfinite(high) else f"of at least {low:g}"
     raise DvoError(f"is {shown(value)}, not a number {limits}", field=field, remedy=f"give a number {limits}")
@@ -41,7 +41,7 @@ def check_positive(value: Any, field: str) -> None:
     Raises:
         DvoError: something else, or NaN.
     """
-    if isinstance(value, Real) and not value > 0:
+    if isinstance(value, Real) and not float(value) > 0:
         raise DvoError(f"is {shown(value)}, not positive", field=field, remedy="give a positive number")
     check_number(value, field, 1e-12, 1e12)
 
@@ -55,7 +55,7 @@ def check_size(value: Any, field: str = "bounds") -> None:
     if not isinstance(value, (tuple, list)) or len(value) != 2:
         raise DvoError(f"is {shown(value)}, not two numbers", field=field, remedy="give (width, height) in pixels")
     for x in value:
-        if not (isinstance(x, Real) and not isinstance(x, bool) and 0 < x <= LARGEST):
+        if not (isinstance(x, Real) and not isinstance(x, bool) and 0 < float(x) <= LARGEST):
             raise DvoError(f"is {shown(value)}, no size", field=field, remedy="give a positive (width, height)")
 
 

@@ -133,11 +133,14 @@ class State:
         block, start = self.blocks[name], self.offsets[name]
         return reduced[:, start : start + block.unknowns * block.dim].view(len(reduced), block.unknowns, block.dim)
 
+    @property
+    def longest(self) -> float:
+        """The least :attr:`StateBlock.longest`."""
+        return min(block.longest for block in self.blocks.values())
+
     def is_short(self, reduced: Tensor) -> Tensor:
         """``(B, 1)`` bool, elements of the batch with a step ``(B, size)`` within :attr:`StateBlock.longest`."""
         size = reduced.abs()
-        if len({block.longest for block in self.blocks.values()}) == 1:
-            return (size <= next(iter(self.blocks.values())).longest).all(1, keepdim=True)
         short = torch.ones_like(size[:, :1], dtype=torch.bool)
         for name in self.offsets:
             short = short & (self.part(name, size) <= self.blocks[name].longest).flatten(1).all(1, keepdim=True)

@@ -1,14 +1,16 @@
-"""Checks of a batch at the door of the layer: of types and shapes always, of values with one wait for the device."""
+"""Checks of a batch at the door of the layer: of types and shapes always; of values in a few reductions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
-from dvo.ba.edges import EdgePlan, check_index
+from dvo.ba.edges import EdgePlan, edge_numbers
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.limits import LARGEST, SHORTEST_FOCAL
 from dvo.ba.patch_problem import PatchProblem
@@ -35,7 +37,7 @@ def check_structure(given: PatchProblem) -> None:
 
 
 def _check_tensors(given: PatchProblem) -> None:
-    kinds = [(name, getattr(given, name), REAL) for name in FLOATS]
+    kinds: list[tuple[str, Any, tuple[torch.dtype, ...]]] = [(name, getattr(given, name), REAL) for name in FLOATS]
     kinds += [(name, getattr(given, name), WHOLE) for name in INDICES]
     sensors = given.sensors
     if sensors is not None:
@@ -109,11 +111,11 @@ def _check_further(given: PatchProblem) -> None:
         return
     if not isinstance(plan, EdgePlan):
         raise DvoError(f"is {shown(plan)}", field="plan", remedy="give a layout of plan_edges")
-    if (plan.frames, plan.patches) != (frames, patches) or plan.order.device != device:
-        raise DvoError(
-            f"is of {plan.frames} frames and {plan.patches} patches on {plan.order.device}", field="plan",
-            remedy="make it of these edges",
-        )  # fmt: skip
+    if (plan.frames, plan.patches, len(plan.numbers)) != (frames, patches, len(given.ii)):
+        what = f"is of {plan.frames} frames, {plan.patches} patches and {len(plan.numbers)} edges"
+        raise DvoError(what, field="plan", remedy="make it of these edges")
+    if plan.order.device != device:
+        raise DvoError(f"is on {plan.order.device}", field="plan", remedy="make it of these edges")
 
 
 def check_values(given: PatchProblem) -> None:
@@ -123,87 +125,96 @@ def check_values(given: PatchProblem) -> None:
         DvoError: a number that is not finite or too large, a quaternion that is not a unit one, a focal length that is
             not positive, a negative weight, an index out of range, a layout of other edges.
     """
+    with torch.no_grad():
+        _check_indices(given)
+        limits = [x for x in (*_limits(given), *_further_limits(given)) if x.tensor.numel()]
+        # A minimum or maximum is NaN if any number is.
+        values = _read([x for limit in limits for x in limit.tensor.aminmax()])
+    for limit in limits:
+        low, high = next(values), next(values)
+        if not (limit.low <= low and high <= limit.high) and not (limit.skips_nan and _is_fine(limit)):
+            raise DvoError(limit.message, field=limit.field, remedy=limit.remedy)
+
+
+class _Limit(NamedTuple):
+    """The numbers of a tensor lie within ``low`` and ``high``, and are not NaN unless that is skipped."""
+
+    field: str
+    tensor: Tensor
+    low: float
+    high: float
+    message: str
+    remedy: str
+    skips_nan: bool = False
+
+
+def _is_fine(limit: _Limit) -> bool:
+    """The slow check, done only if there is a NaN."""
+    return not bool(((limit.tensor < limit.low) | (limit.tensor > limit.high)).any())
+
+
+def _limits(given: PatchProblem) -> list[_Limit]:
+    poses = "give finite translations and unit quaternions"
+    bodies = [("poses_cw", given.poses_cw)]
+    if given.sensors is not None:
+        bodies.append(("sensors.from_body", given.sensors.from_body))
+    limits = [_finite(name, x, poses) for name, x in bodies]
+    for name, x in bodies:
+        length = torch.linalg.vector_norm(x[..., 3:], dim=-1)
+        limits.append(_Limit(name, length, 0.95, 1.05, "a quaternion is not of unit length", poses))
+    focal, pixels = given.intrinsics[..., :2], "give fx fy cx cy in pixels"
+    limits += [_finite("patches", given.patches), _finite("intrinsics", given.intrinsics, pixels)]
+    short = f"a focal length is below {SHORTEST_FOCAL:g}"
+    limits.append(_Limit("intrinsics", focal, SHORTEST_FOCAL, math.inf, short, pixels))
+    inverse = "give inverse variances, zero for an edge to leave out"
+    limits.append(_Limit("weights", given.weights, 0.0, math.inf, "negative", inverse, skips_nan=True))
+    return limits
+
+
+def _further_limits(given: PatchProblem) -> list[_Limit]:
+    limits = [_finite(f"blocks[{name!r}]", block.value) for name, block in given.blocks.items()]
+    for factor in given.factors:
+        field = f"factors, {type(factor).__name__}"
+        for tensor in factor.tensors():
+            what = f"parameters of shape {tuple(tensor.shape)} are not finite"
+            largest = torch.finfo(tensor.dtype).max
+            limits.append(_Limit(field, tensor, -largest, largest, what, "give finite numbers"))
+        if isinstance(factor, RelativePose) and factor.weight.dim() == 4:
+            failed = torch.linalg.cholesky_ex(factor.weight)[1]
+            limits.append(_Limit(field, failed, 0, 0, "no positive definite weights", "give information matrices"))
+        elif isinstance(factor, (DepthPrior, DepthDamping, PosePrior, RelativePose)):
+            limits.append(_Limit(field, factor.weight, 0.0, math.inf, "negative weights", "give inverse variances"))
+    return limits
+
+
+def _finite(field: str, x: Tensor, remedy: str = "give finite numbers") -> _Limit:
+    return _Limit(field, x, -LARGEST, LARGEST, f"not finite, or larger than {LARGEST:g}", remedy)
+
+
+def _check_indices(given: PatchProblem) -> None:
     frames, patches, cameras = given.poses_cw.shape[1], given.patches.shape[1], given.intrinsics.shape[1]
     indices = [("ii", given.ii, frames), ("jj", given.jj, frames), ("kk", given.kk, patches)]
     if given.sensors is not None:
         indices += [(f"sensors.{x}", getattr(given.sensors, x), cameras) for x in ("source", "target")]
-    flags = [flag for _, index, count in indices if len(index) for flag in _outside(index, count)]
-    with torch.no_grad():
-        flags += [bad.any() for bad in _bad_values(given).values()]
-        if given.plan is not None:
-            flags.append(_other_edges(given, given.plan))
-    if not bool(torch.stack(flags).any()):  # the only place where an accelerator is waited for
-        return
-    for name, index, count in indices:
-        check_index(index, count, name)
-    for (name, what), bad in _bad_values(given).items():
-        if bool(bad.any()):
-            raise DvoError(what, field=name, remedy=_REMEDIES.get(name, "give finite numbers"))
-    raise DvoError("is of other edges", field="plan", remedy="make it of these edges")
+    if len(given.ii) == 0:
+        indices = []
+    reductions = [x for _, index, _ in indices for x in index.aminmax()]
+    if given.plan is not None:
+        numbers = edge_numbers(given.ii, given.jj, given.kk, frames, patches)
+        reductions.append((numbers != given.plan.numbers).any())
+    found = _read(reductions)
+    for field, _, count in indices:
+        low, high = next(found), next(found)
+        if low < 0 or high >= count:
+            remedy = "give indices of frames and patches of this problem"
+            raise DvoError(f"index {low if low < 0 else high} outside 0..{count - 1}", field=field, remedy=remedy)
+    if any(found):
+        raise DvoError("is of other edges", field="plan", remedy="make it of these edges")
 
 
-_REMEDIES = {
-    "weights": "give inverse variances, zero for an edge to leave out",
-    "intrinsics": "give fx fy cx cy in pixels",
-    "poses_cw": "give finite translations and unit quaternions",
-}
-
-
-def _outside(index: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    low, high = index.aminmax()
-    return low < 0, high >= count
-
-
-def _bad_values(given: PatchProblem) -> dict[tuple[str, str], Tensor]:
-    """What may be wrong with the values, and where it is: bool tensors."""
-    large = f"not finite, or larger than {LARGEST:g}"
-    poses_cw, intrinsics, weights = given.poses_cw, given.intrinsics, given.weights
-    bad = {
-        ("poses_cw", large): _beyond(poses_cw),
-        ("poses_cw", "a quaternion is not of unit length"): _not_unit(poses_cw),
-        ("patches", large): _beyond(given.patches),
-        ("intrinsics", large): _beyond(intrinsics),
-        ("intrinsics", f"a focal length is below {SHORTEST_FOCAL:g}"): intrinsics[..., :2] < SHORTEST_FOCAL,
-        ("weights", "negative"): weights < 0,
-    }
-    if given.sensors is not None:
-        bad["sensors.from_body", large] = _beyond(given.sensors.from_body)
-        bad["sensors.from_body", "a quaternion is not of unit length"] = _not_unit(given.sensors.from_body)
-    for name, block in given.blocks.items():
-        bad[f"blocks[{name!r}]", large] = _beyond(block.value)
-    for factor in given.factors:
-        for tensor in factor.tensors():
-            bad[
-                f"factors, {type(factor).__name__}", f"parameters of shape {tuple(tensor.shape)}: not finite"
-            ] = ~torch.isfinite(tensor)
-        if isinstance(factor, (DepthPrior, DepthDamping, PosePrior, RelativePose)):
-            bad[f"factors, {type(factor).__name__}", "a weight is negative, or no positive definite matrix"] = (
-                torch.linalg.cholesky_ex(factor.weight)[1] != 0
-                if isinstance(factor, RelativePose) and factor.weight.dim() == 4
-                else factor.weight < 0
-            )
-    return bad
-
-
-def _beyond(x: Tensor) -> Tensor:
-    return ~(x.abs() <= LARGEST)  # NaN too
-
-
-def _not_unit(poses: Tensor) -> Tensor:
-    """Far from unit length: half precision leaves a hundredth."""
-    return ~((poses[..., 3:].float().square().sum(-1) - 1).abs() <= 0.1)
-
-
-def _other_edges(given: PatchProblem, plan: EdgePlan) -> Tensor:
-    """True if a layout does not hold the edges, each once and nothing else."""
-    edges, places = len(given.ii), plan.order.shape[0]
-    if places != plan.filled.numel() or plan.kk.shape[0] != places:
-        return torch.ones((), dtype=torch.bool, device=plan.order.device)
-    if edges == 0:
-        return plan.filled.any()
-    order = plan.order.clamp(0, edges - 1).view_as(plan.filled)
-    group = plan.group_pair
-    wrong = given.ii[order] != plan.pair_i[group][:, None]
-    wrong |= given.jj[order] != plan.pair_j[group][:, None]
-    wrong |= given.kk[order] != plan.kk.view_as(order)
-    return (wrong & plan.filled).any() | (plan.filled.sum() != edges) | (plan.order >= edges).any()
+def _read(scalars: Sequence[Tensor]) -> Iterator[float]:
+    """Numbers of one kind; an accelerator is waited for once."""
+    if not scalars or scalars[0].device.type == "cpu":
+        return iter([x.item() for x in scalars])
+    kind = scalars[0].dtype if scalars[0].is_floating_point() else torch.int64
+    return iter(torch.stack([x.to(kind) for x in scalars]).tolist())

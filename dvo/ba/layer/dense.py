@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dvo.ba.edges import EdgePlan
+from dvo.ba.edges import EdgePlan, edge_numbers
 from dvo.ba.factors import DepthDamping
 from dvo.ba.options import BAOptions
 from dvo.ba.patch_problem import PatchProblem
@@ -34,7 +34,10 @@ def dense_plan(ii: Int[Tensor, " E"], jj: Int[Tensor, " E"], frames: int, pixels
     each = torch.arange(edges, device=device)
     kk = (ii[:, None] * pixels + torch.arange(pixels, device=device)).flatten()
     filled = torch.ones(edges, pixels, dtype=torch.bool, device=device)
-    return EdgePlan(frames, frames * pixels, ii, jj, each, torch.arange(edges * pixels, device=device), filled, kk)
+    order = torch.arange(edges * pixels, device=device)
+    source, target = ii.repeat_interleave(pixels), jj.repeat_interleave(pixels)
+    numbers = edge_numbers(source, target, kk, frames, frames * pixels)
+    return EdgePlan(frames, frames * pixels, ii, jj, each, order, filled, kk, numbers)
 
 
 def pixel_grid(height: int, width: int, device: torch.device | str | None = None) -> Float[Tensor, "2 h w"]:

@@ -6,6 +6,7 @@ through the rays, targets and weights.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -164,9 +165,9 @@ def _edge_terms(
     rotation, t = relative_motion(state[POSES].value, plan)
     depth = state[INVERSE_DEPTHS].value.index_select(1, kk).view(b, -1, 1, size)
     motion = t.index_select(1, group)
-    v = view(rotation.index_select(1, group), motion, factor.rays[:, part], depth)
-    # The Jacobian of an edge that does not count may be so large that products with zero weights are NaN.
-    j_d = torch.where(use, (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z, 0.0)
+    # Only what counts is projected: the rest may be so far off that its products with zero weights are NaN.
+    v = view(rotation.index_select(1, group), motion, factor.rays[:, part], depth, use)
+    j_d = (motion[..., :2, :] - v.xy * motion[..., 2:, :]) * v.inv_z
     residual = torch.where(use, factor.target[:, part] - v.xy, 0.0)
     weight = torch.where(use, factor.weight[:, part], 0.0)
     if scale is not None:
@@ -176,7 +177,7 @@ def _edge_terms(
     if held is None:
         return (weight * flow[:, :, 0] * (residual - flow[:, :, 1])).sum()
 
-    jacobian = torch.where(use, torch.cat(pose_jacobian(v), -2), 0.0).view(b, -1, 6, 2 * size)
+    jacobian = torch.cat(pose_jacobian(v), -2).view(b, -1, 6, 2 * size)
     adjoint = _adjoint(rotation, t)
     # Along both directions, frame j moves relative to frame i by xi_j - Ad_ij xi_i.
     xi = torch.stack((held.lambda_p, held.delta_p), -1)
@@ -230,9 +231,9 @@ def group_measurements(
     target, weight = targets.index_select(1, plan.order).view(shape), weights.index_select(1, plan.order).view(shape)
     # A weight that is not finite is none at all, as is that of a target that nothing can be near; the empty places of a
     # group have none either. Both are left out here, as autograd would multiply them by zero further down.
-    near = (target.abs() <= LARGEST).all(-1, keepdim=True)
-    target = (torch.where(near, target, 0.0) - c_j) / f_j
-    weight = torch.where(plan.filled[..., None] & near & torch.isfinite(weight).all(-1, keepdim=True), weight, 0.0)
+    known = ((target.abs() <= LARGEST) & (weight.abs() < math.inf)).all(-1, keepdim=True)
+    target = (torch.where(known, target, 0.0) - c_j) / f_j
+    weight = torch.where(plan.filled[..., None] & known, weight, 0.0)
     weight = weight * (f_j * f_j)
     gate = Gate(max_residual, f_j.detach().mT, kernel=kernel)
     if bounds is not None:

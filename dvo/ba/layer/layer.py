@@ -56,13 +56,13 @@ def bundle_adjust(
 
     Gradients flow to poses, patches, intrinsics, targets, weights and the parameters of the factors, through all
     iterations, and may be differentiated again (``create_graph``); kernel weights are constants of every derivative.
-    ``torch.func`` (grad, vjp, jacrev, jvp, jacfwd, hessian, vmap) works: a vmap is a loop over its elements. Indices and
-    tensors must not be changed in place before the backward pass, or autograd raises.
+    ``torch.func`` (grad, vjp, jacrev, jvp, jacfwd, hessian, vmap) works: a vmap is a loop over its elements. A
+    backward pass raises if indices or tensors have been changed in place since.
 
-    Neither the result nor a gradient is ever NaN or infinite for input that is not refused: an edge whose point is not in
-    front of frame j (``Z <= 0.2``), whose residual is too long, which leaves the bounds, or whose target or weight is
-    not finite counts for nothing in that iteration, and where the system cannot be solved, or its step is longer than
-    1e8, the step is zero. A gradient too large for its type is zero.
+    Neither the result nor a gradient is ever NaN or infinite for input that is not refused: an edge whose point is not
+    in front of frame j (``Z <= 0.2``), whose residual is too long, which leaves the bounds, or whose target or weight
+    is not finite counts for nothing in that iteration, and where the system cannot be solved, or its step is longer
+    than 1e8, the step is zero. A gradient too large for its type is zero.
 
     Args:
         poses_cw: ``(B, N, 7)`` world to camera, unit quaternions; their dtype is that of the result (float32 for half
@@ -75,8 +75,8 @@ def bundle_adjust(
             not finite, or larger than 1e8, does not count.
         weights: ``(B, E, 2)`` confidence per axis (inverse variance, pixels^-2), not negative; an edge with a weight
             that is not finite does not count.
-        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, whole numbers in any order, shared by the
-            batch.
+        ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, whole numbers in any order, shared by
+            the batch.
         options: see :class:`BAOptions`.
         factors: further measurements, for example priors (:mod:`dvo.ba.factors`).
         blocks: further unknowns that the factors concern, by name, for example velocities; see
@@ -172,7 +172,8 @@ def _transformed(given: PatchProblem, options: BAOptions) -> BAResult:
         sensors = None if given.sensors is None else replace(given.sensors, **part("sensors"))
         blocks = {name: block.with_value(values["blocks", name]) for name, block in given.blocks.items()}
         factors = tuple(replace(f, **part("factors", i)) for i, f in enumerate(given.factors))  # type: ignore[type-var]
-        return replace(given, **part("given"), sensors=sensors, blocks=blocks, factors=factors)
+        own: dict[str, Any] = part("given")
+        return replace(given, **own, sensors=sensors, blocks=blocks, factors=factors)
 
     asked = tuple(name for name in ("cost", "inliers", "covariance") if _asked(options, name))
 
@@ -184,7 +185,7 @@ def _transformed(given: PatchProblem, options: BAOptions) -> BAResult:
     found = composed(run, *(value(*name) for name in named))
     extra = dict(zip(asked, found[3:], strict=False))
     further = dict(zip(given.blocks, found[3 + len(asked) :], strict=True))
-    return BAResult(*found[:3], **extra, blocks=further)  # type: ignore[arg-type]
+    return replace(BAResult(*found[:3], blocks=further), **extra)  # type: ignore[arg-type]
 
 
 def _asked(options: BAOptions, name: str) -> bool:

@@ -61,11 +61,14 @@ def relative_motion(poses_cw: Tensor, plan: EdgePlan) -> tuple[Tensor, Tensor]:
     return rotation, t.index_select(1, plan.pair_j) - rotation @ t.index_select(1, plan.pair_i)
 
 
-def view(rotation: Tensor, t: Tensor, rays: Tensor, inverse_depth: Tensor) -> View:
-    """Move ``rays (B, G, 3, M)`` = (x, y, 1) with ``inverse_depth (B, G, 1, M)`` by each group's motion; project."""
+def view(rotation: Tensor, t: Tensor, rays: Tensor, inverse_depth: Tensor, seen: Tensor | None = None) -> View:
+    """Move ``rays (B, G, 3, M)`` = (x, y, 1) with ``inverse_depth (B, G, 1, M)`` by each group's motion; project.
+
+    ``seen``: those in front of the camera that are projected, None for all; the rest are zero.
+    """
     moved = rotation @ rays + t * inverse_depth
     z = moved[..., 2:, :]
-    seen = z > MIN_Z_VALID
+    seen = z > MIN_Z_VALID if seen is None else seen
     inv_z = seen / torch.where(seen, z, 1.0)
     return View(moved[..., :2, :] * inv_z, inverse_depth * inv_z, inv_z, seen)
 

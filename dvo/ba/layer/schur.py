@@ -10,6 +10,7 @@ synthesis", 6.1.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -32,6 +33,8 @@ def factorise(s: Tensor) -> tuple[Tensor, Tensor]:
         Lower factors ``(B, P, P)``, and ``(B,)`` bool, true where the factor is one of ``s`` (damped if need be).
     """
     factor, info = torch.linalg.cholesky_ex(s)
+    if sums_up(factor) and not info.any():
+        return factor, info == 0
     ok = (info == 0) & torch.isfinite(factor).all(-1).all(-1)
     if bool(ok.all()):  # the only place of a step where an accelerator is waited for
         return factor, ok
@@ -48,6 +51,11 @@ def factorise(s: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(ok[:, None, None], factor, eye), ok
 
 
+def sums_up(*tensors: Tensor) -> bool:
+    """True if tensors are on the CPU, where a look costs no wait, and are known to be finite by their sums."""
+    return all(x.device.type == "cpu" and math.isfinite(x.sum().item()) for x in tensors)
+
+
 def solve_with(factor: Tensor, ok: Tensor, y: Tensor) -> Tensor:
     """Solve ``L L^T x = y``.
 
@@ -59,6 +67,8 @@ def solve_with(factor: Tensor, ok: Tensor, y: Tensor) -> Tensor:
         ``x (B, P)``, zero where the factor is not ``ok`` or the result is not finite.
     """
     x = torch.cholesky_solve(y[..., None], factor)[..., 0]
+    if sums_up(x) and ok.all():
+        return x
     return torch.where((ok & torch.isfinite(x).all(-1))[:, None], x, 0.0)
 
 

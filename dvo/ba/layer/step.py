@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from dvo.ba.layer.adjoint import adjoint_constants, gradients
-from dvo.ba.layer.schur import SchurFactor, damped, eliminate, factorise, invert_blocks
+from dvo.ba.layer.schur import SchurFactor, damped, eliminate, factorise, invert_blocks, sums_up
 from dvo.ba.layer.transforms import Tensors, composed, is_batched, is_transformed, pulled_back
+from dvo.ba.limits import LARGEST
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
 from dvo.core.errors import DvoError
@@ -31,7 +32,7 @@ def normal_equations(problem: Problem, depth_damping: float) -> tuple[NormalEqua
         DvoError: a problem without factors.
     """
     total: NormalEquations | None = None
-    memos = []
+    memos: list[Any] = []
     for factor in problem.factors:
         try:
             equations, memo = factor.normal_equations(problem.state)
@@ -73,10 +74,13 @@ def solved(problem: Problem, damping: BADamping) -> tuple[SchurFactor, Tensor, T
     solver = reduced_system(equations, damping)
     dp, dl = solver.solve(equations.g_p, equations.g_l[..., None])
     dl = dl[..., 0]
+    # The usual case at the cost of one look, where a look costs no wait.
+    if dp.device.type == "cpu" and torch.cat((dp, dl), 1).abs().amax().item() <= problem.state.longest:
+        return solver, dp, dl, memos
     short = problem.state.is_short(dp)
     q = torch.where(short[..., None, None], solver.q, 0.0)
     solver = SchurFactor(solver.h_pl, q, solver.factor, solver.ok & short[:, 0])
-    return solver, torch.where(short, dp, 0.0), torch.where(short & torch.isfinite(dl), dl, 0.0), memos
+    return solver, torch.where(short, dp, 0.0), torch.where(short & (dl.abs() <= LARGEST), dl, 0.0), memos
 
 
 def plain_step(problem: Problem, damping: BADamping) -> tuple[Tensor, Tensor]:
@@ -97,7 +101,7 @@ def plain_step(problem: Problem, damping: BADamping) -> tuple[Tensor, Tensor]:
     y = equations.g_p - (weighted @ equations.g_l[..., None])[..., 0]
     moved = torch.linalg.solve_ex(s, torch.where(good[:, 0], y, 0.0)[..., None])[0][..., 0]
     depths = q * (equations.g_l - (equations.h_pl.mT @ moved[..., None])[..., 0])
-    return torch.where(good[:, 0], moved, dp), torch.where(short & torch.isfinite(dl), depths, dl)
+    return torch.where(good[:, 0], moved, dp), torch.where(short & (depths.detach().abs() <= LARGEST), depths, 0.0)
 
 
 class GaussNewtonStep(torch.autograd.Function):
@@ -134,15 +138,22 @@ class GaussNewtonStep(torch.autograd.Function):
                 lp, ll = SchurFactor(h_pl, q, factor, ok).solve(grads[0], grads[1][..., None])
                 constants = adjoint_constants(ctx.damping.relative, h_pl[..., 0], q[..., 0, 0], lp, dp, ll[..., 0], dl)
                 found = gradients(ctx.problem, tensors, needed, constants, ctx.memos)
-            # Of finite gradients come finite ones: what is too large for its type is none. A NaN stays one.
-            nothing = (grads[0] * 0).sum() + (grads[1] * 0).sum()
-            for i, gradient in zip(needed, found, strict=True):
-                out[i] = None if gradient is None else torch.where(torch.isfinite(gradient), gradient, nothing)
+        for i, gradient in zip(needed, _finite(found, grads), strict=True):
+            out[i] = gradient
         return None, None, *out
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> None:
         raise DvoError("dual numbers are not followed", field="bundle_adjust", remedy="use torch.func.jvp")
+
+
+def _finite(found: Sequence[Tensor | None], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
+    """Of finite gradients come finite ones: what is too large for its type is none. A NaN stays one."""
+    given = [x for x in found if x is not None]
+    if not is_transformed() and sums_up(*(x.detach() for x in given)):
+        return list(found)
+    nothing = (grads[0] * 0).sum() + (grads[1] * 0).sum()
+    return [None if x is None else torch.nan_to_num(x, 0.0, 0.0, 0.0) + nothing for x in found]
 
 
 def _recorded(problem: Problem, damping: BADamping, *tensors: Tensor) -> Tensors:

@@ -1,6 +1,6 @@
-"""Functions of tensors that differentiate themselves: derivatives of any order, ``torch.func`` and batches of gradients.
+"""Functions of tensors that differentiate themselves: derivatives of any order, and ``torch.func``.
 
-The functions are those of :func:`composed`. A function that reads values (a factorisation that may fail, a number of groups that depends on indices) can neither be
+A function that reads values (a factorisation that may fail, a number of groups that depends on indices) can neither be
 traced by ``torch.func.vmap`` nor be run on the tensors that ``torch.func`` wraps. :func:`composed` runs it on plain
 tensors only: a vmap is a loop, a derivative is another such function that runs autograd inside.
 """
@@ -24,7 +24,7 @@ def is_transformed() -> bool:
 
 
 def is_batched(x: Tensor) -> bool:
-    """True for a tensor of ``torch.autograd.grad(..., is_grads_batched=True)``, whose vmap knows no custom functions."""
+    """True for a tensor of ``torch.autograd.grad(..., is_grads_batched=True)``, whose vmap is another."""
     keys = str(torch._C._dispatch_keys(x))
     return "Batched" in keys and "FuncTorch" not in keys
 

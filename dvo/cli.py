@@ -23,7 +23,9 @@ from dvo.commands.input_options import add_input_options
 from dvo.commands.scale_options import add_scale_options
 from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line, print_traceback
 
 EXIT_CODES = (
     "exit codes: 0 done, 1 no frame could be tracked, 2 bad input or results that cannot be written, 130 interrupted, "
@@ -33,19 +35,13 @@ EXIT_CODES = (
 _MERGE_CODES = "exit codes: 0 done, 1 the second map was not recognised in the first (nothing is written), 2 bad input"
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Exit with the message on one line, as for every other invalid input."""
-        self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
-
-
 def build_parser() -> argparse.ArgumentParser:
     """Build the command line.
 
     Returns:
         The parser; the default ``run`` of each command is ``"module:function"``, called with the parsed arguments.
     """
-    parser = _Parser(prog="dvo", description="Learned monocular visual odometry.", epilog=EXIT_CODES)
+    parser = OneLineParser(prog="dvo", description="Learned monocular visual odometry.", epilog=EXIT_CODES)
     parser.add_argument("--version", action="version", version=f"dvo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -290,6 +286,9 @@ def _run(argv: Sequence[str] | None) -> int:
         return OK
     except OSError as error:
         return _complain(_as_input_error(error), BAD_INPUT)
+    except Exception:
+        sys.excepthook = print_traceback  # of an error of this program: it may quote names and addresses too
+        raise
 
 
 @contextlib.contextmanager
@@ -318,7 +317,7 @@ def _complain(problem: DvoError | str, code: int) -> int:
     """Print a line to stderr, if it can be written, and return the exit code."""
     text = problem if isinstance(problem, str) else f"error: {' '.join(str(problem).split())}"
     with contextlib.suppress(OSError):
-        print(f"dvo: {text}", file=sys.stderr)
+        print_line(f"dvo: {text}", error=True)
     return code
 
 

@@ -8,6 +8,7 @@ import os
 import sys
 
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from eval.commands import VERBS, parser
 
 
@@ -29,10 +30,10 @@ def main(arguments: list[str] | None = None) -> int:
         options = parser().parse_args(given)
         VERBS[options.verb](options)
     except DvoError as error:
-        print(f"eval: error: {error}", file=sys.stderr)
+        print_line(f"eval: error: {error}", error=True)
         return 2
     except KeyboardInterrupt:
-        print("eval: stopped; the same command goes on from here", file=sys.stderr)
+        print_line("eval: stopped; the same command goes on from here", error=True)
         return 130
     except BrokenPipeError:  # the reader of stdout has seen enough; the interpreter flushes it again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

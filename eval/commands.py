@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from dvo.data.files.root import data_root
 from eval.execution.plan import AXES, LOOPS, PAGE, RESULTS, TABLE, Plan, read_manifest
 from eval.execution.runner import predict_all
@@ -123,27 +123,30 @@ def report(given: argparse.Namespace) -> None:
 
 def show_list(given: argparse.Namespace) -> None:
     """``list``: systems and suites, and what they lack."""
-    print("Systems")
+    print_line("Systems")
     for system in list_systems():
-        print(f"  {system.name:14} {system.licence:10} {system.missing() or 'available'}\n      {system.about}")
+        print_line(f"  {system.name:14} {system.licence:10} {system.missing() or 'available'}")
+        print_line(f"      {system.about}")
     try:
         data: Path | None = data_root(getattr(given, "data", None))
-        print(f"\nSuites (data in {data})")
+        print_line()
+        print_line(f"Suites (data in {data})")
     except DvoError as error:
         data = None
-        print(f"\nSuites ({error})")
+        print_line()
+        print_line(f"Suites ({error})")
     for name in config_names():
         try:
             suites = load_suites([name])
         except DvoError as error:
-            print(f"  {name}: {error}")
+            print_line(f"  {name}: {error}")
             continue
         for suite in suites:
-            print(f"  {suite.name:14} {suite.label}")
+            print_line(f"  {suite.name:14} {suite.label}")
             for sequence in suite.sequences:
-                print(f"      {sequence.name:28} {_state(suite, sequence, data)}")
+                print_line(f"      {sequence.name:28} {_state(suite, sequence, data)}")
             if suite.download:
-                print(f"      data: {suite.download}")
+                print_line(f"      data: {suite.download}")
 
 
 def prepare(given: argparse.Namespace) -> None:
@@ -160,12 +163,12 @@ def vocabulary(given: argparse.Namespace) -> None:
     from eval.systems.peers.vocabulary import train_on_renderings
 
     options = {name: value for name, value in vars(given).items() if name not in ("verb", "out")}
-    print(train_on_renderings(given.out, **options))
+    print_line(train_on_renderings(given.out, **options))
 
 
 def progress(text: str) -> None:
     """Print progress to the error stream, so that the table can be piped."""
-    print(text, file=sys.stderr, flush=True)
+    print_line(text, error=True)
 
 
 def names_in(text: str) -> list[str]:
@@ -176,7 +179,7 @@ def names_in(text: str) -> list[str]:
 def _finish(out: Path, page: bool) -> None:
     manifest = read_manifest(out)
     rows = score_all(out, manifest)
-    print(write_tables(out, manifest, rows), end="")
+    print_line(write_tables(out, manifest, rows).removesuffix("\n"), lines=True)
     files = [RESULTS, TABLE, AXES, *([LOOPS] if (out / LOOPS).is_file() else [])]
     if page:
         write_report(out, manifest, rows)

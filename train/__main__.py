@@ -35,11 +35,12 @@ COMMANDS = {
 def main() -> None:
     """Entry point; bad input ends with code 2 and one line."""
     from dvo.core.errors import DvoError
+    from dvo.core.text import print_line
 
     try:
         run()
     except DvoError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print_line(f"error: {error}", error=True)
         sys.exit(2)
 
 

@@ -6,7 +6,6 @@ network, and fits mean and projection of :class:`dvo.odometry.loops.place_descri
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from dvo.core.threads import settle_threads
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import load_weights
@@ -67,7 +68,7 @@ def main(arguments: list[str]) -> None:
     Raises:
         DvoError: weights of another architecture, a number out of range, or a file that cannot be written.
     """
-    parser = argparse.ArgumentParser(prog="python -m train places", description=__doc__.split("\n")[0])
+    parser = OneLineParser(prog="python -m train places", description=__doc__.split("\n")[0])
     parser.add_argument("--weights", default="small", help="name or file (%(default)s)")
     parser.add_argument("--out", type=Path, default=SHIPPED, help="safetensors file (%(default)s)")
     parser.add_argument("--scenes", type=int, default=5, help="of each family (%(default)s)")
@@ -87,4 +88,4 @@ def main(arguments: list[str]) -> None:
         "families": list(SHARES), "pictures": len(cells), "seed": given.seed,
     }  # fmt: skip
     save_descriptor(given.out, fitted, facts)
-    print(f"{given.out}: {fitted.dimensions} numbers an image, fitted on {len(cells)} pictures")
+    print_line(f"{given.out}: {fitted.dimensions} numbers an image, fitted on {len(cells)} pictures")

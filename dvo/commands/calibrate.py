@@ -17,7 +17,7 @@ from dvo.boards.board import Board, CharucoBoard, Checkerboard
 from dvo.boards.calibrate import HEADER, BoardCalibration, BoardOptions, calibrate_board
 from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.camera import CALIBRATION
-from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, say_all, seed_everything, warn
 from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
 from dvo.data.files.output import replaced, write_text
@@ -112,7 +112,7 @@ def _with_board(source: Source, board: Board, options: BoardOptions, folder: Pat
                 progress.update(task, text=f"{frames} of {source.frame_count or '?'} frames, {views} views")
 
         found = calibrate_board(source, board, options, name=str(source.path), on_frame=show)
-    say(str(found))
+    say_all(found)
     for warning in found.warnings:
         warn(warning)
     file = folder / (FISHEYE if options.fisheye else CALIBRATION)
@@ -152,7 +152,7 @@ def _without_board(source: Source, folder: Path, arguments: argparse.Namespace) 
         found = self_calibrate(
             source, weights=arguments.weights, device=device, seed=arguments.seed, on_frame=progress.update
         )
-    say(str(found))
+    say_all(found)
     file = folder / CALIBRATION
     found.write(file)
     say(f"calibration in {file}")

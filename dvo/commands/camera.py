@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from dvo.commands.console import TrackingProgress, say, seed_everything, warn
+from dvo.commands.console import TrackingProgress, say_all, seed_everything, warn
 from dvo.data.source import Source
 from dvo.odometry.calibration.calibrate import calibrate
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
@@ -51,7 +51,7 @@ def with_calibration(
         with TrackingProgress(None) as progress:
             found = calibrate(source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update)
         seed_everything(arguments.seed)  # the same bytes as a run with the calibration file
-        say(str(found))
+        say_all(found)
         written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)
         if not written:
             warn(f"{file} is not a file of an earlier run, and was not replaced")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import random
 import signal
-import sys
 import threading
 import time
 from collections import deque
@@ -21,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from dvo.commands import Terminated
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line, printable
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Result, Status
 
@@ -79,11 +79,21 @@ def say(text: str) -> None:
         DvoError: another failure of stdout, such as a full disk.
     """
     try:
-        print(text, flush=True)
+        print_line(text)
     except BrokenPipeError:
         pass
     except OSError as error:
         raise DvoError(error.strerror or str(error), file="standard output") from error
+
+
+def say_all(value: object) -> None:
+    """Print the lines of the text of a value to stdout, see :func:`say`.
+
+    Args:
+        value: whose text may have several lines.
+    """
+    for line in str(value).split("\n"):
+        say(line)
 
 
 def warn(text: str, kind: str = "warning") -> None:
@@ -94,7 +104,7 @@ def warn(text: str, kind: str = "warning") -> None:
         kind: word before it.
     """
     with contextlib.suppress(OSError):
-        print(f"dvo: {kind}: {text}", file=sys.stderr, flush=True)
+        print_line(f"dvo: {kind}: {text}", error=True)
 
 
 class InterruptSwitch:
@@ -215,5 +225,5 @@ def describe_status(estimate: Estimate) -> str:
     """
     text = estimate.status.value
     if estimate.status is Status.LOST and estimate.reason:
-        text += f": {escape(estimate.reason)}"
+        text += f": {escape(printable(estimate.reason))}"
     return f"{text}, segment {estimate.segment}" if estimate.segment else text

@@ -28,6 +28,7 @@ from dvo.commands.probes import (
     version_of,
     video_state,
 )  # fmt: skip
+from dvo.core.text import print_line
 
 Section = dict[str, str]
 
@@ -77,17 +78,17 @@ def doctor(arguments: argparse.Namespace) -> int:
     """
     report, problems = diagnose()
     if arguments.json:
-        print(json.dumps({**report, "problems": problems}, indent=2))
+        print_line(json.dumps({**report, "problems": problems}, indent=2), lines=True)
         return 0
     for title, section in report.items():
-        print(title)
+        print_line(title)
         width = max(map(len, section), default=0)
         for name, value in section.items():
-            print(f"  {name:<{width}}  {value}".rstrip())
-        print()
-    print("problems:" if problems else "problems: none")
+            print_line(f"  {name:<{width}}  {value}".rstrip())
+        print_line()
+    print_line("problems:" if problems else "problems: none")
     for problem in problems:
-        print(f"  - {problem}")
+        print_line(f"  - {problem}")
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 import cv2
@@ -11,9 +10,10 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from dvo.commands.console import device_of
+from dvo.commands.console import device_of, say, warn
 from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from dvo.data.files.output import check_place, replaced
 from dvo.synth import FAMILIES, MeshScene, load_mesh
 from dvo.synth.export import export_sequence, mesh_sequence
@@ -65,7 +65,7 @@ def preview(arguments: argparse.Namespace) -> int:
     with replaced(out) as part:
         if not cv2.imwrite(str(part), sheet[..., ::-1]):
             raise DvoError("cannot be written", file=out, field="--out", remedy="name a file elsewhere")
-    print(f"{out}: frames, depth (near is red), flow (hue is direction), path from above")
+    say(f"{out}: frames, depth (near is red), flow (hue is direction), path from above")
     return 0
 
 
@@ -107,9 +107,9 @@ def export(arguments: argparse.Namespace) -> int:
             sequence, arguments.out, arguments.layout, on_frame=lambda done: progress.update(task, completed=done)
         )
     for note in notes:
-        print(f"dvo: note: {note}", file=sys.stderr)
-    print(f"{arguments.out}: {arguments.frames} frames of {sequence.name}, {width}x{height}, {arguments.layout} layout")
-    print(f"track it: dvo run {arguments.out}")
+        warn(note, "note")
+    say(f"{arguments.out}: {arguments.frames} frames of {sequence.name}, {width}x{height}, {arguments.layout} layout")
+    say(f"track it: dvo run {arguments.out}")
     return 0
 
 
@@ -119,7 +119,7 @@ def _mesh(arguments: argparse.Namespace, path: str) -> MeshScene:
         raise DvoError(f"neither a mesh file nor a family: {path}", field="SOURCE", remedy=f"families: {known}")
     scene = load_mesh(path, up=arguments.up, view=arguments.view, light=not arguments.unlit, seed=arguments.seed)
     where = "within" if scene.space.inside else "around"
-    print(f"{path}: {len(scene):,} triangles; the camera moves {where} it", file=sys.stderr)
+    print_line(f"{path}: {len(scene):,} triangles; the camera moves {where} it", error=True)
     for warning in scene.warnings:
-        print(f"dvo: warning: {warning}", file=sys.stderr)
+        warn(warning)
     return scene

@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
+from dvo.commands.console import say
 from dvo.core.errors import DvoError
+from dvo.core.text import printable
 from dvo.models.weights import WeightsInfo, import_checkpoint, list_weights, weights_info
 from dvo.session.results import jsonable
 
@@ -26,7 +29,7 @@ def list_shipped(arguments: argparse.Namespace) -> int:
     """
     found = list_weights()
     if not found:
-        print("this installation of dvo has no weights")
+        say("this installation of dvo has no weights")
         return 0
     table = Table(box=None, pad_edge=False)
     table.add_column("name")
@@ -36,9 +39,15 @@ def list_shipped(arguments: argparse.Namespace) -> int:
     table.add_column("MB", justify="right")
     for weights in found:
         size = f"{weights.path.stat().st_size / 1e6:.1f}"
-        table.add_row(weights.name, weights.architecture, weights.preset, f"{weights.parameters:,}", size)
+        table.add_row(
+            *map(_cell, (weights.name, weights.architecture, weights.preset)), f"{weights.parameters:,}", size
+        )
     Console().print(table)
     return 0
+
+
+def _cell(text: object) -> str:
+    return escape(printable(text))
 
 
 def import_file(arguments: argparse.Namespace) -> int:
@@ -60,7 +69,7 @@ def import_file(arguments: argparse.Namespace) -> int:
     if out.exists():
         raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")
     describe(import_checkpoint(file, out))
-    print(f"use it with: dvo run SOURCE --weights {out}")
+    say(f"use it with: dvo run SOURCE --weights {out}")
     return 0
 
 
@@ -83,8 +92,8 @@ def export_onnx(arguments: argparse.Namespace) -> int:
         raise DvoError("already exists", file=out, field="--out", remedy="give another file, or remove this one")
     found = export_encoder(arguments.weights, out)
     outputs = ", ".join(f"{name} ({channels} channels)" for name, channels in found.outputs.items())
-    print(f"encoder in {out}: images (n, 3, H, W) float32, RGB 0 to 255, to {outputs}")
-    print(f"largest difference to torch {found.difference:.2g}, {found.relative:.2g} of the largest value")
+    say(f"encoder in {out}: images (n, 3, H, W) float32, RGB 0 to 255, to {outputs}")
+    say(f"largest difference to torch {found.difference:.2g}, {found.relative:.2g} of the largest value")
     return 0
 
 
@@ -122,4 +131,4 @@ def describe(weights: WeightsInfo) -> None:
     width = max(map(len, [*facts, *weights.card]))
     for name, value in [*facts.items(), *weights.card.items()]:
         text = value if isinstance(value, str) and value.isprintable() else json.dumps(jsonable(value))
-        print(f"{name if name.isprintable() else json.dumps(name):<{width}}  {text}")
+        say(f"{name if name.isprintable() else json.dumps(name):<{width}}  {text}")

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+
+from dvo.core.text import printable, redacted, visible
+
 
 class DvoError(Exception):
     """Invalid input that the user can fix.
@@ -12,7 +16,8 @@ class DvoError(Exception):
         field: field, option or row with the problem, if any.
         remedy: instruction to fix it.
 
-    ``str(error)`` is one line: ``file: field: message. remedy``.
+    ``str(error)`` is one line: ``file: field: message. remedy``. It may be printed and stored as it is: addresses in it
+    have no user names, passwords and tokens, and characters that would steer a terminal are escapes.
 
     Example:
         >>> str(DvoError("no such file", file="calib.txt", field="--calib", remedy="give a calibration file"))
@@ -27,7 +32,18 @@ class DvoError(Exception):
         field: str | None = None,
         remedy: str | None = None,
     ) -> None:
-        self.message, self.file, self.field, self.remedy = message, file, field, remedy
-        where = "".join(f"{part}: " for part in (file, field) if part is not None)
-        tail = f" {remedy[0].upper()}{remedy[1:]}." if remedy else ""
-        super().__init__(f"{where}{message.rstrip('.')}.{tail}")
+        self.message, self.field, self.remedy = (
+            _sentence(message),
+            field and _sentence(field),
+            remedy and _sentence(remedy),
+        )
+        where = None if file is None else redacted(visible(str(file)), whole=True)
+        hidden = redacted(str(file), whole=True)
+        self.file = file if file is None or hidden == str(file) else hidden
+        head = "".join(f"{part}: " for part in (where, self.field) if part is not None)
+        tail = f" {self.remedy[0].upper()}{self.remedy[1:]}." if self.remedy else ""
+        super().__init__(f"{head}{self.message.rstrip('.')}.{tail}")
+
+
+def _sentence(text: str) -> str:
+    return printable(re.sub(r"\s*\n\s*", " ", str(text)))

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.text import redacted
 from dvo.data.files.output import check_writable, only_writer, replaced, sweep_parts, write_text
 from dvo.data.trajectory import Trajectory, tum_text
 from dvo.session.files import write_error, write_ply
@@ -421,7 +422,8 @@ def jsonable(value: Any) -> Any:
         value: dataclass, enum, path, array, container or scalar.
 
     Returns:
-        Dictionaries, lists, strings, numbers, booleans and None; numbers that are not finite become None.
+        Dictionaries, lists, strings, numbers, booleans and None; numbers that are not finite become None, and addresses
+        in strings lose user names, passwords and tokens.
     """
     if is_dataclass(value) and not isinstance(value, type):
         return jsonable(asdict(value))
@@ -437,6 +439,6 @@ def jsonable(value: Any) -> Any:
         return jsonable(value.value)
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if value is None or isinstance(value, (bool, int, str)):
+    if value is None or isinstance(value, (bool, int)):
         return value
-    return str(value)
+    return redacted(str(value))

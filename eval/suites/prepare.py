@@ -37,7 +37,9 @@ def prepare(suites: list[Suite]) -> list[Path]:
             took = (
                 "in the cache" if there else f"{facts['seconds']:.1f} s, {facts['processor_seconds']:.1f} s of a core"
             )
-            print(f"{sequence.name:32} {facts['frames']} frames, {facts['path_m']:.2f} m, {facts['scene']}: {took}")
+            print_line(
+                f"{sequence.name:32} {facts['frames']} frames, {facts['path_m']:.2f} m, {facts['scene']}: {took}"
+            )
             sys.stdout.flush()
             folders.append(folder)
     size = sum(file.stat().st_size for folder in folders for file in folder.rglob("*") if file.is_file())

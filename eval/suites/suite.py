@@ -181,6 +181,9 @@ def _suite(table: Any, path: Path) -> Suite:
         _check_name(sequence.name, f"{place}: name", path)
         if sequence.name in names[:number]:
             raise DvoError(f"twice the name '{sequence.name}'", file=path, field=place, remedy="give another name")
+        if "://" in sequence.path:
+            remedy = "give a folder or file of the data"
+            raise DvoError("a stream cannot be evaluated", file=path, field=f"{place}: path", remedy=remedy)
         if not sequence.path and sequence.rendered is None:
             raise DvoError(f"{sequence.name} has no path", file=path, field=f"{place}: path", remedy="add it")
     _check_name(suite.name, "name", path)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import get_args
 
 import torch
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from dvo.core.yaml_files import read_text
 from dvo.data.files.output import replaced
 from dvo.models.weights import save_weights
@@ -23,7 +24,7 @@ def export(arguments: list[str]) -> None:
     Raises:
         DvoError: no such checkpoint or card, or one that cannot be read.
     """
-    parser = argparse.ArgumentParser(prog="python -m train export")
+    parser = OneLineParser(prog="python -m train export")
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--card", type=Path, help="JSON with further facts for the model card")
@@ -43,7 +44,7 @@ def export(arguments: list[str]) -> None:
         except (ValueError, TypeError, RecursionError) as error:
             raise DvoError(f"is no model card ({error})", file=options.card, remedy=remedy) from error
     save_weights(options.out, network_of(state, options.which, options.checkpoint), facts)
-    print(f"{options.out}: {facts}")
+    print_line(f"{options.out}: {facts}")
 
 
 def export_state(arguments: list[str]) -> None:
@@ -52,7 +53,7 @@ def export_state(arguments: list[str]) -> None:
     Raises:
         DvoError: no such checkpoint, or one that cannot be read.
     """
-    parser = argparse.ArgumentParser(prog="python -m train state")
+    parser = OneLineParser(prog="python -m train state")
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("out", type=Path)
     options = parser.parse_args(arguments)
@@ -60,4 +61,4 @@ def export_state(arguments: list[str]) -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     with replaced(options.out) as part, part.open("wb") as stream:
         torch.save(state, stream)
-    print(f"{options.out}: step {state['global_step']}")
+    print_line(f"{options.out}: step {state['global_step']}")

@@ -7,6 +7,8 @@ from typing import NoReturn
 
 from lightning.pytorch.cli import LightningArgumentParser
 
+from dvo.core.text import printable
+
 PROGRAM = "train"
 BAD_INPUT = 2
 NOISE = re.compile(
@@ -22,7 +24,8 @@ class OneLineParser(LightningArgumentParser):
         """Print the message and exit."""
         if not self.exit_on_error:
             super().error(message, ex)
-        self.exit(BAD_INPUT, f"{PROGRAM}: error: {in_one_line(message)} (see python -m train fit --help)\n")
+        text = f"{PROGRAM}: error: {in_one_line(message)} (see python -m train fit --help)"
+        self.exit(BAD_INPUT, printable(text) + "\n")
 
 
 def in_one_line(message: str) -> str:

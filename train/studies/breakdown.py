@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import functools
 import time
 from collections import defaultdict
@@ -16,6 +15,7 @@ import torch
 import dvo.models.step as step_module
 import train.tasks.patch_vo.objective as objective
 from dvo.ba.layer.step import GaussNewtonStep
+from dvo.core.command_line import OneLineParser
 from dvo.nets.correlation import correlation
 from dvo.nets.patch.patchifier import Patchifier
 from dvo.nets.update.update import Update
@@ -141,7 +141,7 @@ def table(seconds: dict[str, float]) -> str:
 
 def main(arguments: list[str]) -> None:
     """``python -m train profile``; prints the table."""
-    parser = argparse.ArgumentParser(prog="python -m train profile", description=__doc__)
+    parser = OneLineParser(prog="python -m train profile", description=__doc__)
     parser.add_argument("--model", default="small")
     parser.add_argument("--steps", type=int, default=5)
     parser.add_argument("--batch", type=int, default=1)

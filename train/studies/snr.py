@@ -12,7 +12,6 @@ With N clips even pure noise has an SNR of about 1 / sqrt(N), which is printed b
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from dvo.core.command_line import OneLineParser
 from dvo.synth.dataset import ClipDataset
 from train.engine.checkpoint import fill, read_state, task_of
 from train.tasks.task import Batch, Task
@@ -124,7 +124,7 @@ def main(arguments: list[str]) -> None:
     Raises:
         DvoError: no such checkpoint, or one that cannot be read.
     """
-    parser = argparse.ArgumentParser(prog="python -m train snr", description=__doc__.split("\n")[0])
+    parser = OneLineParser(prog="python -m train snr", description=__doc__.split("\n")[0])
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--clips", type=int, default=200)
     parser.add_argument("--frames", type=int, default=8)

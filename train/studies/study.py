@@ -9,7 +9,6 @@ goes on from its last checkpoint.
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,9 @@ import lightning as L
 import torch
 from torch import Tensor, nn
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from dvo.data.files.output import replaced, write_text
 from train.engine.build import task_settings
 from train.engine.checkpoint import network_of, read_state
@@ -166,7 +167,7 @@ def main(arguments: list[str]) -> None:
     Raises:
         DvoError: no such file, or a setting that does not exist.
     """
-    parser = argparse.ArgumentParser(prog="python -m train study", description=__doc__.split("\n")[0])
+    parser = OneLineParser(prog="python -m train study", description=__doc__.split("\n")[0])
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--rehearse", type=int, metavar="STEPS", help="run every arm for so many steps, elsewhere")
     parser.add_argument("--seeds", type=int, nargs="*")
@@ -190,4 +191,4 @@ def main(arguments: list[str]) -> None:
                 errors = ", ".join(f"{label} {last[name]:.4f}" for name, label in config.measures.items())
                 print(f"seed {seed} rate {rate:g} {arm}: {errors}, {result['seconds_a_step']:.2f} s a step", flush=True)
     for file in write_report(results, config, options.config):
-        print(file)
+        print_line(str(file))

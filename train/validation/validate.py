@@ -5,8 +5,6 @@ These sequences choose weights and settings; they are never a test.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
@@ -14,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings
+from dvo.core.text import print_line
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame
 from dvo.data.open import open_source
@@ -75,7 +75,7 @@ def main(arguments: list[str]) -> None:
     Raises:
         DvoError: no such file, weights whose architecture has no odometry, or sequences that are not there.
     """
-    parser = argparse.ArgumentParser(prog="python -m train validate", description=__doc__)
+    parser = OneLineParser(prog="python -m train validate", description=__doc__)
     parser.add_argument("weights", help="a training checkpoint (.ckpt, .pt), or weights by name or file")
     parser.add_argument("--frames", type=int, help="only the first frames of each sequence")
     parser.add_argument("--rendered", type=int, default=0, help="number of rendered validation clips")
@@ -85,7 +85,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="tracker settings to try")
     options = parser.parse_args(arguments)
     if Path(options.weights).suffix in SUFFIXES:
-        print(facts_of(read_state(options.weights)))
+        print_line(str(facts_of(read_state(options.weights))))
     weights = load_any(options.weights)
     settings = parse_settings(options.set)
 
@@ -99,15 +99,14 @@ def main(arguments: list[str]) -> None:
                 raise DvoError("no ground truth", file=source.path, remedy="name sequences with ground truth")
             m, done = track_sequence(new_odometry(seed), islice(source, options.frames), source.groundtruth)
             errors = "  ".join(f"{metric.title} {metric.text(metric.find(m)):>7s}" for metric in ERRORS)
-            print(
+            print_line(
                 f"{name:24s} seed {seed} {errors}  lost {done.result.frames_lost}  segments "
-                f"{len(worlds_of(done.result.segments))}  {done.frames_per_second:5.1f} fps",
-                flush=True,
+                f"{len(worlds_of(done.result.segments))}  {done.frames_per_second:5.1f} fps"
             )
             if m.reason:
-                print(f"{name}: note: {m.reason}", file=sys.stderr)
+                print_line(f"{name}: note: {m.reason}", error=True)
             for warning in done.warnings:
-                print(f"{name}: note: {warning}", file=sys.stderr)
+                print_line(f"{name}: note: {warning}", error=True)
     found = []
     for index in range(options.rendered):
         source = rendered_clip(index, 60, (240, 320), 15.0)

@@ -61,7 +61,7 @@ def lookups(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         file, reason = error.filename or path, error.strerror or type(error).__name__
-        raise DvoError(f"cannot be read ({reason})", file=file, remedy="check the path and the permissions") from error
+        raise DvoError(f"cannot be read ({reason})", file=file, remedy="check the path and the permissions") from None
 
 
 def read_rows(path: Path, remedy: str, field: str | None = None) -> Iterator[tuple[int, list[str]]]:

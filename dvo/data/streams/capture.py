@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from dvo.core.errors import DvoError
+from dvo.core.text import first_line, redacted
 from dvo.data.files.stamps import NOMINAL_FPS, RATES
 from dvo.data.images.images import to_rgb8
 from dvo.data.recording import RawFrame
@@ -36,12 +37,12 @@ def is_stream(source: object) -> bool:
 
 
 def shown(address: str) -> str:
-    """Address without user name and password, for messages and files.
+    """Address without user name, password and tokens, for messages and files.
 
     Args:
-        address: of a stream, or any other text.
+        address: of a stream, or any other source.
     """
-    return re.sub(r"(?<=://)[^/@]*@", "", address) if NETWORK.match(address) else address
+    return redacted(address, whole=True)
 
 
 class StreamClock:
@@ -83,7 +84,7 @@ class Capture:
         fps: images a second, for the times; None for those of the stream, or of arrival.
 
     Attributes:
-        name: address without a password.
+        name: address without user name, password and tokens.
         is_recording: a video file that is served, not a live stream.
         times: ``arrival``; ``stream``, those of an RTSP stream on the clock of this machine; ``file``, those of a video
             file that is served; or ``fps``.
@@ -155,6 +156,9 @@ def _open(address: str, name: str) -> cv2.VideoCapture:
             capture = cv2.VideoCapture(int(webcam[1]))
         else:
             capture = cv2.VideoCapture(address, cv2.CAP_FFMPEG, [*limits, 1000 * _SECONDS])
+    except cv2.error as error:  # its text, and that of a traceback, may hold the address
+        reason = first_line(error).replace(address, name)
+        raise DvoError(f"cannot be opened ({reason})", file=name, remedy="check the address") from None
     finally:
         cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():

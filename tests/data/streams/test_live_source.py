@@ -105,7 +105,7 @@ def server(make):
 def test_streams_are_told_from_files():
     assert all(map(is_stream, ["webcam:0", "webcam:12", "rtsp://host/a", "HTTPS://host/a.m3u8", "-"]))
     assert not any(map(is_stream, ["webcam:", "webcam:x", "video.mp4", "./-", "C:/a.mp4", "ftp://a", None, 0]))
-    assert shown("rtsp://user:pass@host:554/a@b") == "rtsp://host:554/a@b"
+    assert shown("rtsp://user:p@ss/word@host:554/a?token=abc") == "rtsp://host:554/a?token=***"
     assert shown("a@b.mp4") == "a@b.mp4"
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 
 
 def apart(function: Callable[..., None], *arguments: Any) -> None:
@@ -42,7 +43,7 @@ def _run(function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     try:
         function(*arguments)
     except DvoError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print_line(f"error: {error}", error=True)
         sys.exit(2)
 
 

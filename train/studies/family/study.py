@@ -8,11 +8,12 @@ last training state. ``--report`` prints page and figure again from the tables.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from train.studies.family.config import NULL, FamilyConfig
 from train.studies.family.evaluation import Measured, errors_of, held_out_sequence, measure, straight_line
 from train.studies.family.process import apart
@@ -114,7 +115,7 @@ def main(arguments: list[str]) -> None:
         DvoError: no such file, a setting that does not exist, a task that is not registered, or measurements that were
             made with other settings.
     """
-    parser = argparse.ArgumentParser(prog="python -m train family", description=__doc__.split("\n")[0])
+    parser = OneLineParser(prog="python -m train family", description=__doc__.split("\n")[0])
     parser.add_argument("--config", type=Path, default=CONFIG)
     parser.add_argument("--members", nargs="+", metavar="NAME", help="train these alone; the page has all")
     parser.add_argument("--seeds", type=int, nargs="+")
@@ -145,4 +146,4 @@ def main(arguments: list[str]) -> None:
     from train.studies.family.report import write_report
 
     for file in write_report(records):
-        print(file)
+        print_line(str(file))

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import NoReturn
 
 from dvo import __version__
-from dvo.commands import BAD_INPUT, INTERRUPTED, OK, TERMINATED, Terminated
+from dvo.commands import BAD_INPUT, HUNG_UP, INTERRUPTED, OK, Terminated, ending_signals
 from dvo.commands.calibrate_options import add_calibrate
 from dvo.commands.input_options import add_input_options
 from dvo.commands.scale_options import add_scale_options
@@ -25,13 +25,15 @@ from dvo.commands.stream_options import add_stream_options
 from dvo.commands.view_options import add_view_options
 from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
+from dvo.core.limits import LOADING, TRACKING, check_limits, limit_error
 from dvo.core.text import print_line, print_traceback
 
 EXIT_CODES = (
-    "exit codes: 0 done, 1 no frame could be tracked, 2 bad input or results that cannot be written, 130 interrupted, "
-    "143 terminated (results so far are written)"
+    "exit codes: 0 done, 1 no frame could be tracked, 2 bad input or results that cannot be written, 129 hung up, "
+    "130 interrupted, 143 terminated (results so far are written)"
 )
 
+_TRACKING = ("demo", "run", "calibrate")  # commands
 _MERGE_CODES = "exit codes: 0 done, 1 the second map was not recognised in the first (nothing is written), 2 bad input"
 
 
@@ -271,6 +273,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     try:
         arguments = build_parser().parse_args(argv)
+        check_limits(TRACKING if arguments.command in _TRACKING else LOADING)
         module, function = arguments.run.split(":")
         command: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
         return command(arguments)
@@ -278,35 +281,38 @@ def _run(argv: Sequence[str] | None) -> int:
         return exit_.code if isinstance(exit_.code, int) else BAD_INPUT
     except DvoError as error:
         return _complain(error, BAD_INPUT)
-    except Terminated:
-        return _complain("terminated", TERMINATED)
+    except Terminated as end:
+        return _complain("hung up" if end.code == HUNG_UP else "terminated", end.code)
     except KeyboardInterrupt:
         return _complain("interrupted", INTERRUPTED)
     except BrokenPipeError:  # the reader of stdout has seen enough
         return OK
     except OSError as error:
         return _complain(_as_input_error(error), BAD_INPUT)
-    except Exception:
+    except Exception as error:
+        limited = limit_error(error)
+        if limited is not None:
+            return _complain(limited, BAD_INPUT)
         sys.excepthook = print_traceback  # of an error of this program: it may quote names and addresses too
         raise
 
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Raise :class:`Terminated` at SIGTERM, so that a command can clean up; unless the caller handles or ignores it."""
-    default = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM)
+    """Raise :class:`Terminated` at SIGTERM and SIGHUP, so that a command can clean up; unless they are handled."""
 
     def terminate(number: int, frame: FrameType | None) -> NoReturn:
-        raise Terminated
+        raise Terminated(number)
 
-    if default is not signal.SIG_DFL:
-        yield
-        return
-    signal.signal(signal.SIGTERM, terminate)
+    is_main = threading.current_thread() is threading.main_thread()
+    ours = [number for number in ending_signals() if is_main and signal.getsignal(number) is signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, terminate)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _as_input_error(error: OSError) -> DvoError:

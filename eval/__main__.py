@@ -8,6 +8,7 @@ import os
 import sys
 
 from dvo.core.errors import DvoError
+from dvo.core.limits import limit_error
 from dvo.core.text import print_line
 from eval.commands import VERBS, parser
 
@@ -37,6 +38,12 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
     except BrokenPipeError:  # the reader of stdout has seen enough; the interpreter flushes it again at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except Exception as error:
+        limited = limit_error(error)
+        if limited is None:
+            raise
+        print_line(f"eval: error: {limited}", error=True)
+        return 2
     return 0
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
 import random
@@ -114,10 +116,16 @@ def test_kill_at_ten_moments_of_a_real_clip(data_root, tmp_path, repository):
         assert len(lines) - 1 >= recorded[:, 1].sum(), "every row is written at once"
 
 
-def test_sigterm_finishes_and_exits_143(given, image_folder, tmp_path, capsys):
-    given(at_frame={8: lambda: os.kill(os.getpid(), signal.SIGTERM)})
-    assert main(arguments(image_folder, tmp_path / "out")) == 143
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+ENDING = pytest.mark.parametrize(
+    ("number", "code", "said"), [(signal.SIGTERM, 143, "terminated"), (signal.SIGHUP, 129, "hung up")]
+)
+
+
+@ENDING
+def test_a_signal_finishes_and_has_its_exit_code(number, code, said, given, image_folder, tmp_path, capsys):
+    given(at_frame={8: lambda: os.kill(os.getpid(), number)})
+    assert main(arguments(image_folder, tmp_path / "out")) == code
+    assert signal.getsignal(number) is signal.SIG_DFL
     assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 9
     written = summary(tmp_path / "out")
     assert written["interrupted"] is True and written["finished"] is True
@@ -126,23 +134,64 @@ def test_sigterm_finishes_and_exits_143(given, image_folder, tmp_path, capsys):
     assert "interrupted after 9 frames" in capsys.readouterr().err
 
 
-def test_second_sigterm_aborts(given, image_folder, tmp_path, capsys):
+@ENDING
+def test_a_second_signal_aborts(number, code, said, given, image_folder, tmp_path, capsys):
     def twice() -> None:
         for _ in range(2):
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), number)
 
     given(at_frame={5: twice})
-    assert main(arguments(image_folder, tmp_path / "out")) == 143
+    assert main(arguments(image_folder, tmp_path / "out")) == code
     assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 5
     assert summary(tmp_path / "out")["interrupted"] is True and summary(tmp_path / "out")["finished"] is False
-    assert errors(capsys.readouterr().err)[-1] == "dvo: terminated"
+    assert errors(capsys.readouterr().err)[-1] == f"dvo: {said}"
 
 
-def test_sigterm_before_tracking_leaves_no_folder(monkeypatch, image_folder, tmp_path, capsys):
-    monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: os.kill(os.getpid(), signal.SIGTERM))
-    assert main(arguments(image_folder, tmp_path / "out")) == 143
+@ENDING
+def test_a_signal_before_tracking_leaves_no_folder(number, code, said, monkeypatch, image_folder, tmp_path, capsys):
+    monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: os.kill(os.getpid(), number))
+    assert main(arguments(image_folder, tmp_path / "out")) == code
     assert not (tmp_path / "out").exists()
-    assert errors(capsys.readouterr().err) == ["dvo: terminated"]
+    assert errors(capsys.readouterr().err) == [f"dvo: {said}"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+def test_a_signal_that_is_ignored_stays_ignored(number, given, image_folder, tmp_path):
+    """As under ``nohup``."""
+    given(at_frame={k: lambda: os.kill(os.getpid(), number) for k in (3, 4)})
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        assert main(arguments(image_folder, tmp_path / "out")) == 0
+        assert signal.getsignal(number) is signal.SIG_IGN
+    finally:
+        signal.signal(number, before)
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 20
+
+
+@pytest.mark.parametrize(("first", "second", "code"), [("SIGHUP", "SIGINT", 130), ("SIGINT", "SIGHUP", 129)])
+def test_two_different_signals(first, second, code, given, image_folder, tmp_path):
+    def both() -> None:
+        for name in (first, second):
+            os.kill(os.getpid(), getattr(signal, name))
+
+    given(at_frame={5: both})
+    assert main(arguments(image_folder, tmp_path / "out")) == code
+
+
+def test_a_closed_terminal(given, image_folder, tmp_path, monkeypatch):
+    """What is printed after the terminal is gone fails with an input/output error, which is none of the run."""
+
+    class Gone(io.StringIO):
+        def write(self, text: str = "") -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+        flush = write  # type: ignore[assignment]
+
+    given(at_frame={8: lambda: os.kill(os.getpid(), signal.SIGHUP)})
+    monkeypatch.setattr(sys, "stdout", Gone())
+    monkeypatch.setattr(sys, "stderr", Gone())
+    assert main(arguments(image_folder, tmp_path / "out")) == 129
+    assert summary(tmp_path / "out")["finished"] is True
 
 
 def test_second_ctrl_c_while_the_results_are_written(given, image_folder, tmp_path, monkeypatch):

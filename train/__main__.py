@@ -35,12 +35,19 @@ COMMANDS = {
 def main() -> None:
     """Entry point; bad input ends with code 2 and one line."""
     from dvo.core.errors import DvoError
+    from dvo.core.limits import limit_error
     from dvo.core.text import print_line
 
     try:
         run()
     except DvoError as error:
         print_line(f"error: {error}", error=True)
+        sys.exit(2)
+    except Exception as error:
+        limited = limit_error(error)
+        if limited is None:
+            raise
+        print_line(f"error: {limited}", error=True)
         sys.exit(2)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import random
 import signal
 import threading
@@ -18,7 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-from dvo.commands import Terminated
+from dvo.commands import Terminated, ending_signals
 from dvo.core.errors import DvoError
 from dvo.core.text import print_line, printable
 from dvo.data.frame import Frame
@@ -70,7 +71,7 @@ def seed_everything(seed: int) -> None:
 
 
 def say(text: str) -> None:
-    """Print a line to stdout, unless its reader has closed the pipe: what it says is in the results folder too.
+    """Print a line to stdout, unless its reader has closed the pipe or the terminal: the results folder says it too.
 
     Args:
         text: the line.
@@ -83,6 +84,8 @@ def say(text: str) -> None:
     except BrokenPipeError:
         pass
     except OSError as error:
+        if error.errno == errno.EIO:  # the terminal is gone
+            return
         raise DvoError(error.strerror or str(error), file="standard output") from error
 
 
@@ -108,7 +111,8 @@ def warn(text: str, kind: str = "warning") -> None:
 
 
 class InterruptSwitch:
-    """Context in which the first Ctrl-C or SIGTERM only sets :attr:`pressed`; the second raises KeyboardInterrupt.
+    """Context in which the first Ctrl-C, SIGTERM or SIGHUP only sets :attr:`pressed`; the second raises
+    KeyboardInterrupt. A SIGHUP or SIGTERM that is ignored, as by ``nohup``, stays ignored.
 
     An interrupt in the middle of an update would leave the tracker in an inconsistent state; the caller checks
     :attr:`pressed` between frames instead.
@@ -127,8 +131,9 @@ class InterruptSwitch:
 
     def __enter__(self) -> InterruptSwitch:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._press)
+            for number in (signal.SIGINT, *ending_signals()):
+                if number is signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._press)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -137,7 +142,7 @@ class InterruptSwitch:
 
     def _press(self, number: int, frame: FrameType | None) -> None:
         if self.pressed is not None:
-            raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+            raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
         self.pressed = signal.Signals(number)
         if self.on_press is not None:
             self.on_press()

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 
 import dvo
-from dvo.commands import INTERRUPTED, NOTHING_TRACKED, OK, TERMINATED
+from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.base_frame import base_observers
 from dvo.commands.camera import CALIBRATION, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
@@ -41,7 +41,7 @@ from dvo.session.frame_table import FrameTable
 from dvo.session.observer import Observer
 from dvo.session.recorder import Recorder
 
-_ABORTED = "aborted by a second Ctrl-C or SIGTERM"
+_ABORTED = "aborted by a second Ctrl-C, SIGTERM or SIGHUP"
 
 
 class Clip(Protocol):
@@ -239,8 +239,8 @@ def track(
     """Track a clip, fill the results folder and print a summary.
 
     Results are written from the first frame on (:class:`dvo.session.recorder.Recorder`) and replaced at the end. The
-    first Ctrl-C or SIGTERM ends tracking and still writes all results; a second one aborts, and what the recorder has
-    written stays.
+    first Ctrl-C, SIGTERM or SIGHUP ends tracking and still writes all results; a second one aborts, and what the
+    recorder has written stays.
 
     Args:
         odometry: newly built.
@@ -254,7 +254,7 @@ def track(
         again: builds the odometry with another seed, for a result that leaves doubt.
 
     Returns:
-        Exit code: 0, 1 if no frame was tracked, 130 after Ctrl-C, 143 after SIGTERM.
+        Exit code: 0, 1 if no frame was tracked, 129, 130 or 143 after SIGHUP, Ctrl-C or SIGTERM.
 
     Raises:
         DvoError: no frame could be read, or a result cannot be written.
@@ -309,7 +309,7 @@ def track(
     if export:
         _export(odometry, done, folder / results.EXPORT, export)
     if done.interrupted:
-        return TERMINATED if switch.pressed is signal.SIGTERM else INTERRUPTED
+        return 128 + (switch.pressed or signal.SIGINT)
     return OK if done.result.frames_tracked else NOTHING_TRACKED
 
 

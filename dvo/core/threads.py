@@ -242,22 +242,36 @@ def processor_quota(membership: Path, root: Path) -> float:
         Cores; infinity without a limit.
     """
     limit = math.inf
+    for folder, is_first in group_folders(membership, root, "cpu"):
+        if is_first:
+            quota, period = _text(folder / "cpu.cfs_quota_us"), _text(folder / "cpu.cfs_period_us")
+        else:
+            quota, _, period = _text(folder / "cpu.max").partition(" ")
+        if quota.isdigit() and period.isdigit() and int(period) > 0:
+            limit = min(limit, int(quota) / int(period))
+    return limit
+
+
+def group_folders(membership: Path, root: Path, controller: str) -> Iterator[tuple[Path, bool]]:
+    """Folders of the control groups of a process that may limit it.
+
+    Args:
+        membership: file that lists the control groups of the process.
+        root: folder of the control groups.
+        controller: such as ``cpu`` or ``memory``.
+
+    Yields:
+        The folder of each level, and whether its files are those of the first version of control groups.
+    """
     for line in _text(membership).splitlines():
         _, _, rest = line.partition(":")
         controllers, _, path = rest.partition(":")
-        if controllers and "cpu" not in controllers.split(","):
+        if controllers and controller not in controllers.split(","):
             continue
         base = root / controllers if controllers else root
         # A container may see its own group as the root, or see the path of the host: try all levels.
         for level in (path.strip("/"), *map(str, Path(path.strip("/")).parents)):
-            folder = base / level
-            if controllers:
-                quota, period = _text(folder / "cpu.cfs_quota_us"), _text(folder / "cpu.cfs_period_us")
-            else:
-                quota, _, period = _text(folder / "cpu.max").partition(" ")
-            if quota.isdigit() and period.isdigit() and int(period) > 0:
-                limit = min(limit, int(quota) / int(period))
-    return limit
+            yield base / level, bool(controllers)
 
 
 def _text(file: Path) -> str:

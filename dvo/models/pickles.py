@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 import zipfile
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from dvo.core.errors import DvoError
+from dvo.core.limits import limit_error
 
 MAX_BYTES = 2 * 1024**3
 """Largest file; the training state of the ``full`` network has 60 MB."""
@@ -47,8 +49,28 @@ def load_pickle(file: str | Path, remedy: str) -> Any:
     except DvoError:
         raise
     except Exception as error:  # the readers of damaged archives and pickles raise errors of many types
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-        raise DvoError(f"cannot be read as plain tensors ({lines[0][:200]})", file=path, remedy=remedy) from error
+        message = f"cannot be read as plain tensors ({_reason(error)})"
+        raise limit_error(error, path) or DvoError(message, file=path, remedy=remedy) from None
+
+
+# What torch says of files that it refuses, without its advice to read them unchecked.
+_REASONS = (
+    (r"GLOBAL (\S{1,80})", "it holds objects of the type {}, which could run code"),
+    (r"(?:instruction|opcode|operand|[Uu]nsupported)\D{0,40}(\d+)", "it holds instructions that could run code ({})"),
+    (r"legacy \.tar|TorchScript|torch\.jit", "it is of a format that could run code"),
+)
+_ADVICE = re.compile(r"weights_only|allow_pickle|unsafe|arbitrary code|trust|safe_globals|full_load", re.IGNORECASE)
+
+
+def _reason(error: Exception) -> str:
+    """Reason of a refusal in a few words, never an advice to switch a check off."""
+    text = " ".join(str(error).split())
+    for pattern, reason in _REASONS:
+        found = re.search(pattern, text)
+        if found and _ADVICE.search(text):
+            return reason.format(*found.groups())
+    sentences = [part for part in re.split(r"(?<=[.!?:]) ", text) if part and not _ADVICE.search(part)]
+    return sentences[0].rstrip(".:")[:200] if sentences else "it holds more than tensors and containers"
 
 
 def check_plain(tensors: dict[str, Any], file: object, remedy: str) -> None:

@@ -14,6 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dvo.core.errors import DvoError
+from dvo.core.limits import limit_error
 from dvo.core.threads import use_threads
 from dvo.data.files.output import replaced
 from dvo.models.pickles import check_plain, load_pickle
@@ -129,8 +130,17 @@ def _open(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     try:
         with safe_open(path, framework="pt") as file:
             return {key: file.get_tensor(key) for key in file.keys()}, file.metadata() or {}  # noqa: SIM118
-    except (SafetensorError, OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
-        raise DvoError(
+    except (
+        MemoryError,
+        SafetensorError,
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        RuntimeError,
+    ) as error:
+        raise limit_error(error, path) or DvoError(
             f"not a safetensors file ({' '.join(str(error).split())[:200]})",
             file=path,
             remedy="give dvo weights; a checkpoint of DPVO is converted by 'dvo weights import FILE'",

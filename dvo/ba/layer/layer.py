@@ -185,7 +185,8 @@ def _transformed(given: PatchProblem, options: BAOptions) -> BAResult:
     found = composed(run, *(value(*name) for name in named))
     extra = dict(zip(asked, found[3:], strict=False))
     further = dict(zip(given.blocks, found[3 + len(asked) :], strict=True))
-    return replace(BAResult(*found[:3], blocks=further), **extra)  # type: ignore[arg-type]
+    poses_cw, patches, intrinsics = found[:3]
+    return replace(BAResult(poses_cw, patches, intrinsics, blocks=further), **extra)  # type: ignore[arg-type]
 
 
 def _asked(options: BAOptions, name: str) -> bool:

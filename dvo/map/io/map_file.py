@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.limits import limit_error
 from dvo.core.settings import from_table
 from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import replaced
@@ -32,6 +33,7 @@ _DIGITS = 19  # of a whole number in the description
 _LARGEST = {np.dtype(np.float16): 65504.0, np.dtype(np.float32): 1e9, np.dtype(np.float64): 1e12}
 _UNIT = 1e-2  # largest deviation of the length of a quaternion from 1
 _FARTHEST, _SMALLEST_SCALE = 1e9, 1e-9  # of similarities
+_LARGE = 2**27  # bytes of a file that memory may not hold
 _REMEDY = "give a map file as dvo has written it"
 _HEADER = re.compile(
     rb"\{'descr': '([<|][a-z][0-9])', 'fortran_order': False, 'shape': \(((?:[0-9]{1,12},? ?){0,8})\), \} *\n"
@@ -86,9 +88,15 @@ def open_map_file(file: str | Path) -> Iterator[MapReader]:
         try:
             container = zipfile.ZipFile(path)
         except (zipfile.BadZipFile, ValueError, NotImplementedError, OverflowError, MemoryError) as error:
-            raise DvoError(f"not a map file ({error})", file=path, remedy=_REMEDY) from error
+            message = f"not a map file ({error})"
+            raise _too_large(path, error) or DvoError(message, file=path, remedy=_REMEDY) from error
         with container:
             yield MapReader(path, container)
+
+
+def _too_large(file: Path, error: Exception) -> DvoError | None:
+    """Error of a file that memory cannot hold; a short one that asks for much is damaged."""
+    return limit_error(error, file) if file.stat().st_size >= _LARGE else None
 
 
 class MapReader:
@@ -267,7 +275,7 @@ class MapReader:
         try:
             return self._container.read(name)
         except (zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError, EOFError, MemoryError) as error:
-            raise self.refused(f"damaged ({str(error)[:100]})", name) from error
+            raise _too_large(self.file, error) or self.refused(f"damaged ({str(error)[:100]})", name) from error
 
     def _read(self, name: str, dtype: np.dtype) -> np.ndarray:
         """Array of an entry, of the given type and any shape."""

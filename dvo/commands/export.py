@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from dvo.commands.console import say
@@ -20,6 +19,7 @@ from dvo.export.formats import (
 from dvo.map.io.serialisation import load_graph
 from dvo.odometry.segments import result_of_log
 from dvo.session import results
+from dvo.session.run_facts import read_facts
 
 
 def export(arguments: argparse.Namespace) -> int:
@@ -85,7 +85,6 @@ def _trajectory_file(folder: Path, segment: int | None) -> Path:
 def _frames_read(folder: Path) -> int | None:
     """Number of frames of the source, if run.json tells."""
     try:
-        count = json.loads((folder / results.SUMMARY).read_text(encoding="utf-8"))["frames"]["read"]
-    except (OSError, ValueError, KeyError, TypeError):
+        return int(read_facts(folder / results.SUMMARY)["frames"]["read"])
+    except DvoError:
         return None
-    return count if isinstance(count, int) else None

@@ -33,7 +33,8 @@ def headline_of(facts: dict[str, Any]) -> str:
     text += f" (dvo {version})" if version else ""
     quality = facts.get("quality") or {}
     if quality.get("reason"):
-        text = f"{quality['verdict']}: {quality['reason']}. What may help: {quality['remedy']}. {text}"
+        advice = f" What may help: {quality['remedy']}." if quality.get("remedy") else ""
+        text = f"{quality['verdict']}: {quality['reason']}.{advice} {text}"
     if facts.get("interrupted"):
         text += "; interrupted"
     return text.strip("; ")
@@ -133,8 +134,8 @@ def _breaks(breaks: list[dict[str, Any]], start: float) -> str:
         return ""
     rows = [
         [
-            "the start" if found["from"] is None else f"{found['from'] - start:.2f}",
-            "the end" if found["to"] is None else f"{found['to'] - start:.2f}",
+            "the start" if found.get("from") is None else f"{found['from'] - start:.2f}",
+            "the end" if found.get("to") is None else f"{found['to'] - start:.2f}",
             str(found["frames"]),
             escape(str(found["reason"])),
             "a new segment" if found["new_segment"] else "the same segment",

@@ -232,7 +232,8 @@ def _true_world(
     points, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if result.longest in fits:
         scale, rotation, shift = fits[result.longest]
-        points, colors = scale * result.map.points @ rotation.T + shift, result.map.colors
+        with np.errstate(invalid="ignore", over="ignore"):  # of points that are not finite, which are not drawn
+            points, colors = scale * result.map.points @ rotation.T + shift, result.map.colors
     return [World("ground truth", tracks, True, _truth(rows), points, colors, _loop_positions(tracks, facts))]
 
 

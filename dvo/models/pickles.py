@@ -56,7 +56,10 @@ def load_pickle(file: str | Path, remedy: str) -> Any:
 # What torch says of files that it refuses, without its advice to read them unchecked.
 _REASONS = (
     (r"GLOBAL (\S{1,80})", "it holds objects of the type {}, which could run code"),
-    (r"(?:instruction|opcode|operand|[Uu]nsupported)\D{0,40}(\d+)", "it holds instructions that could run code ({})"),
+    (
+        r"(?:instruction|opcode|operand|[Uu]nsupported)\D{0,40}(\d+)",
+        "it holds instruction {}, which plain tensors do not need",
+    ),
     (r"legacy \.tar|TorchScript|torch\.jit", "it is of a format that could run code"),
 )
 _ADVICE = re.compile(r"weights_only|allow_pickle|unsafe|arbitrary code|trust|safe_globals|full_load", re.IGNORECASE)
@@ -70,7 +73,8 @@ def _reason(error: Exception) -> str:
         if found and _ADVICE.search(text):
             return reason.format(*found.groups())
     sentences = [part for part in re.split(r"(?<=[.!?:]) ", text) if part and not _ADVICE.search(part)]
-    return sentences[0].rstrip(".:")[:200] if sentences else "it holds more than tensors and containers"
+    said = next((part for part in sentences if any(map(str.isalpha, part))), "")
+    return said.rstrip(".:")[:200] or "it is damaged, or holds more than tensors and containers"
 
 
 def check_plain(tensors: dict[str, Any], file: object, remedy: str) -> None:

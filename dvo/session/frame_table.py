@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.files import MAX_NUMBER
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
 from dvo.session.observer import graph_of
@@ -248,11 +248,13 @@ def _row(cells: dict[str, str]) -> FrameRow:
         raise ValueError(f"unknown status '{cells['status'][:40]}'")
     values: dict[str, Any] = {"status": cells["status"], "reason": cells["reason"]}
     values["segment"] = int(cells["segment"]) if cells["segment"] else None
+    if values["segment"] is not None and not 0 <= values["segment"] <= _MAX_ROWS:
+        raise ValueError("no number of a segment")
     values["keyframe"] = cells["keyframe"] == "1" if cells["keyframe"] else None
     for name in (*_DIGITS, *_SIGMAS):
         values[name] = float(cells[name]) if cells.get(name) else None
-        if values[name] is not None and not math.isfinite(values[name]):
-            raise ValueError(f"{name} is not finite")
+        if values[name] is not None and not abs(values[name]) <= MAX_NUMBER:  # false for nan too
+            raise ValueError(f"{name} is not a number within ±{MAX_NUMBER:g}")
     if values["timestamp"] is None:
         raise ValueError("no timestamp")
     return FrameRow(**values)

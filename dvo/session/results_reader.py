@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,7 @@ from dvo.odometry.protocol import Break, Result, Segment, SparseMap, Status
 from dvo.session import results
 from dvo.session.files import read_ply
 from dvo.session.frame_table import FrameRow, read_frames
-
-_LIMIT = 64 * 2**20  # bytes of run.json
-_REMEDY = "give a folder that dvo run has written"
+from dvo.session.run_facts import REMEDY, read_facts
 
 
 @dataclass(frozen=True)
@@ -49,18 +46,14 @@ def read_results(folder: Path) -> Stored:
         DvoError: not a results folder, or a file that cannot be read.
     """
     if not folder.is_dir():
-        raise DvoError("not a results folder", file=folder, remedy=_REMEDY)
-    facts = _read_facts(folder / results.SUMMARY)
-    try:
-        breaks = tuple(
-            Break(found["from"], found["to"], int(found["frames"]), str(found["reason"]), bool(found["new_segment"]))
-            for found in facts["breaks"]
-        )
-        described = [(str(part["file"]), part["joined_to"], bool(part.get("in_map"))) for part in facts["segments"]]
-        counts = int(facts["frames"]["read"]), int(facts["frames"]["lost"])
-        info = dict(facts["info"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise DvoError(f"has no valid {error}", file=folder / results.SUMMARY, remedy=_REMEDY) from None
+        raise DvoError("not a results folder", file=folder, remedy=REMEDY)
+    facts = read_facts(folder / results.SUMMARY)
+    breaks = tuple(
+        Break(found.get("from"), found.get("to"), found["frames"], found["reason"], found["new_segment"])
+        for found in facts["breaks"]
+    )
+    described = [(part["file"], part.get("joined_to"), bool(part.get("in_map"))) for part in facts["segments"]]
+    counts, info = (facts["frames"]["read"], facts["frames"]["lost"]), facts["info"]
     segments = tuple(_read_segment(folder, *part) for part in described)
     nothing = Trajectory(np.zeros(0), np.zeros((0, 7)))
     trajectory = read_tum(folder / results.TRAJECTORY) if segments else nothing
@@ -72,26 +65,12 @@ def read_results(folder: Path) -> Stored:
     return Stored(result, rows, facts)
 
 
-def _read_facts(file: Path) -> dict[str, Any]:
-    try:
-        if file.stat().st_size > _LIMIT:
-            raise DvoError("too large", file=file, remedy=_REMEDY)
-        facts = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DvoError(error.strerror or str(error), file=file, remedy=_REMEDY) from error
-    except (ValueError, RecursionError):
-        raise DvoError("not JSON", file=file, remedy=_REMEDY) from None
-    if not isinstance(facts, dict):
-        raise DvoError("not the description of a run", file=file, remedy=_REMEDY)
-    return facts
-
-
 def _read_segment(folder: Path, name: str, joined: int | None, in_map: bool) -> Segment:
     if name != results.TRAJECTORY and not results.SEGMENT_FILE.fullmatch(name):
-        raise DvoError(f"unknown file '{name[:60]}' of a segment", file=folder / results.SUMMARY, remedy=_REMEDY)
+        raise DvoError(f"unknown file '{name[:200]}' of a segment", file=folder / results.SUMMARY, remedy=REMEDY)
     trajectory = read_tum(folder / name)
     times = trajectory.timestamps
-    return Segment(trajectory, float(times[0]), float(times[-1]), None if joined is None else int(joined), in_map)
+    return Segment(trajectory, float(times[0]), float(times[-1]), joined, in_map)
 
 
 def rows_of(result: Result) -> list[FrameRow]:

@@ -5,21 +5,26 @@ information matrix; with the chart "log" that of :class:`dvo.ba.factors.Relative
 ``X = T^-1`` and ``Z_ij = M_ij^-1`` it is ``chart(Z_ij^-1 X_i^-1 X_j)``, the error of g2o (Kuemmerle et al., "g2o: a
 general framework for graph optimization", 2011). In Sim(3) each pose has a scale of its own, so that a loop can correct
 drift of scale (Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010).
+
+Poses of a trajectory that drifted far lie in the basin of a poor local minimum. The problem is therefore started from
+the poses given, from those of a spanning tree or from a linear relaxation, whichever cost least.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from dvo.ba.edges import free_slots
 from dvo.ba.kernels import Kernel
+from dvo.ba.pose_graph_start import relaxation, spanning_tree
 from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
+from dvo.ba.sparse.multifrontal import scipy_is_installed
 from dvo.ba.sparse.schur_pattern import make_schur_pattern
 from dvo.core.errors import DvoError
 from dvo.core.threads import use_threads
@@ -30,6 +35,9 @@ Chart = Literal["log", "split", "quaternion"]
 """Coordinates of an error ``(R, t)`` or ``(s, R, t)``: "log" is the logarithm of the group; "split" is ``[t, log R]``,
 that of 2-D graphs; "quaternion" is ``[t, q_xyz]`` with ``q_w >= 0``, that of 3-D graphs in g2o files. In Sim(3)
 ``log s`` comes last."""
+Start = Literal["given", "tree", "relaxation"]
+PLANE = (0, 1, 5)
+"""Coordinates of a motion in the plane."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +48,22 @@ class PoseGraphOptions:
         fixed: how many leading poses stay, or which: bool ``(N,)``.
         chart: coordinates of the residual.
         kernel: robust kernel on ``e^T Omega e``.
-        solver: of Levenberg-Marquardt and its linear systems.
+        solver: of Levenberg-Marquardt and its linear systems. "auto" is "fronts" on the CPU where SciPy is installed,
+            else "tiles".
+        start: "best" is that of least chi2 of the poses given, a spanning tree and a linear relaxation; "given" keeps
+            to the poses given.
     """
 
     fixed: int | Tensor | Sequence[bool] = 1
     chart: Chart = "log"
     kernel: Kernel = field(default_factory=Kernel)
-    solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=100, damping=1e-6))
+    solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=100, damping=1e-8, decrease=0.1))
+    start: Literal["best", "given"] = "best"
+
+
+LOOP_OPTIONS = PoseGraphOptions(solver=LMOptions(max_iterations=100, damping=1e-6, solver="tiles"), start="given")
+"""Of a trajectory whose loops were found as it went on: its poses are near, and the result is the same with and without
+the optional SciPy."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +73,11 @@ class PoseGraphResult:
     Attributes:
         poses_cw: ``(N, 7)`` or ``(N, 8)``.
         initial_chi2, chi2: sum of ``e^T Omega e`` (of its kernel), without a factor 1/2, before and after.
+            Before is of the poses given, whatever the start.
         iterations: steps tried.
         converged: whether a criterion was met before the limit of iterations.
+        start: what was started from.
+        start_chi2: of the start.
     """
 
     poses_cw: Tensor
@@ -65,6 +85,8 @@ class PoseGraphResult:
     chi2: float
     iterations: int
     converged: bool
+    start: Start
+    start_chi2: float
 
 
 def optimise_pose_graph(
@@ -96,17 +118,28 @@ def optimise_pose_graph(
         >>> result.poses_cw, result.chi2
     """
     use_threads()
-    dim = _check(poses_cw, ii, jj, measurements, options.chart)
+    dim = _check(poses_cw, ii, jj, measurements, options)
     with torch.no_grad(), full_precision(poses_cw.device):
         measurements = measurements.to(poses_cw)
-        root = _square_root(information, dim, poses_cw, len(ii))
+        full = _full_information(information, dim, len(ii))
+        plane = _in_plane(poses_cw, measurements, full)
+        axes = list(PLANE) if plane else list(range(dim))
+        root = None
+        if full is not None:
+            diagonal = information is not None and information.dim() == 2
+            root = _square_root(full[:, axes][:, :, axes] if plane else full, poses_cw, diagonal)
         slot, free = free_slots(options.fixed, len(poses_cw), poses_cw.device)
         group = se3 if dim == 6 else sim3
         none = torch.zeros(0, dtype=torch.long, device=ii.device)
         pattern = make_schur_pattern(free, none, none, none, slot[ii], slot[jj])
+        solver = options.solver
+        if solver.solver == "auto":
+            fronts = poses_cw.device.type == "cpu" and scipy_is_installed()
+            solver = replace(solver, solver="fronts" if fronts else "tiles")
 
         def whitened(poses: Tensor) -> Tensor:
             e = residuals(poses, ii, jj, measurements, options.chart)
+            e = e[:, axes] if plane else e
             return e if root is None else (root @ e[..., None])[..., 0]
 
         def cost(poses: Tensor) -> float:
@@ -114,25 +147,43 @@ def optimise_pose_graph(
             return 0.5 * float(options.kernel.cost(s).sum(dtype=torch.float64))
 
         def linearise(poses: Tensor) -> SparseSystem:
-            e, j_i, j_j = residuals_and_jacobians(poses, ii, jj, measurements, options.chart)
+            e, j_i, j_j = _linear(poses, ii, jj, measurements, options.chart, axes if plane else slice(None))
             if root is not None:
                 e, j_i, j_j = (root @ e[..., None])[..., 0], root @ j_i, root @ j_j
             weight = options.kernel.slope(e.square().sum(-1, keepdim=True)).expand_as(e)
-            zeros = poses.new_zeros
+            zeros, unknowns = poses.new_zeros, len(axes)
             system = SparseSystem(
-                pattern, zeros(pattern.h_pp.count, dim, dim), zeros(0, dim), zeros(0), zeros(free, dim), zeros(0), False
-            )
+                pattern, zeros(pattern.h_pp.count, unknowns, unknowns), zeros(0, unknowns), zeros(0),
+                zeros(free, unknowns), zeros(0), False,
+            )  # fmt: skip
             system.add(e, weight, [(slot[ii], -j_i), (slot[jj], -j_j)])
             return system
 
         def move(poses: Tensor, step: tuple[Tensor, Tensor]) -> Tensor:
-            moved = group.retract(poses, torch.nn.functional.pad(step[0], (0, 0, 0, 1))[slot])
+            change = step[0]
+            if plane:
+                change = change.new_zeros(free, dim).index_copy_(1, torch.tensor(axes, device=change.device), change)
+            moved = group.retract(poses, torch.nn.functional.pad(change, (0, 0, 0, 1))[slot])
             return torch.where((slot == free)[:, None], poses, moved)
 
-        outcome = levenberg_marquardt(poses_cw, linearise, cost, move, options.solver)
+        begin, start, initial = poses_cw, "given", None
+        if options.start == "best" and free and solver.max_iterations > 0:
+            initial = cost(poses_cw)
+            least = initial
+            tree = spanning_tree(poses_cw, ii, jj, measurements, full, slot == free)
+            same = bool((tree.roots == (slot == free)).all())
+            loose = relaxation(tree, ii, jj, measurements, full, solver.solver, pattern.h_pp if same else None)
+            for name, poses in (("tree", tree.poses), ("relaxation", loose)):
+                poses = _flattened(poses) if plane else poses
+                found = cost(poses)
+                if found < least:  # False for NaN
+                    begin, start, least = poses, name, found
+        outcome = levenberg_marquardt(begin, linearise, cost, move, solver)
+    before = outcome.initial_cost if initial is None else initial
     return PoseGraphResult(
-        outcome.state, 2 * outcome.initial_cost, 2 * outcome.cost, outcome.iterations, outcome.converged
-    )
+        outcome.state, 2 * before, 2 * outcome.cost, outcome.iterations, outcome.converged, start,
+        2 * outcome.initial_cost,
+    )  # fmt: skip
 
 
 def residuals(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, chart: Chart = "log") -> Tensor:
@@ -156,11 +207,53 @@ def residuals_and_jacobians(
     Returns:
         ``e (E, D)``, ``J_i (E, D, D)`` and ``J_j (E, D, D)``.
     """
+    return _linear(poses_cw, ii, jj, measurements, chart, slice(None))
+
+
+def _linear(
+    poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, chart: Chart, axes: list[int] | slice
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same for some of the coordinates, which must not depend on the others."""
     error, motion = _errors(poses_cw, ii, jj, measurements)
     e = _coordinates(error, chart)
-    by_right = _chart_jacobian(error, e, chart)
     adjoint = se3.adjoint(motion) if e.shape[-1] == 6 else sim3.adjoint(motion)
-    return e, by_right @ adjoint, -by_right
+    if chart == "log" and e.shape[-1] == 6:
+        by_right = _inverse_right_jacobian(e, axes)
+    else:
+        by_right = _chart_jacobian(error, e, chart)[:, axes][..., axes]
+    return e[:, axes], by_right @ adjoint[:, axes][..., axes], -by_right
+
+
+def _inverse_right_jacobian(xi: Tensor, axes: list[int] | slice) -> Tensor:
+    """Of SE(3): ``x / (1 - e^-x)`` at ``x = ad(xi)``, in closed form.
+
+    The even part is ``1 + a x^2 + b x^4``, as ``x (x^2 + theta^2)^2 = 0``; with ``f = (1 - theta/2 cot(theta/2)) /
+    theta^2`` it takes the value ``1 - f theta^2`` at ``x^2 = -theta^2``, and its derivative there.
+    """
+    x = _small_adjoint(xi)[:, axes][..., axes]
+    square = xi[..., 3:6].square().sum(-1)[..., None, None]
+    small = square < 0.04
+    safe = torch.where(small, 1.0, square)
+    theta = safe.sqrt()
+    half = theta / 2
+    cot = half.cos() / half.sin()
+    f = torch.where(
+        small, _even(square, 1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160), (1 - half * cot) / safe
+    )
+    # f' / theta, of 1 - half cot(half) and its derivative half / 2 (1 + cot^2) - cot / 2
+    slope = ((half * (1 + cot * cot) - cot) / (2 * theta) - 2 * f) / safe
+    slope = torch.where(small, _even(square, 1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520), slope)
+    xx = x @ x
+    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    return eye + 0.5 * x + (f - 0.5 * slope * square) * xx - 0.5 * slope * (xx @ xx)
+
+
+def _even(square: Tensor, *coefficients: float) -> Tensor:
+    """``sum c_k square^k``."""
+    out = torch.zeros_like(square)
+    for c in reversed(coefficients):
+        out = out * square + c
+    return out
 
 
 def right_jacobian(xi: Tensor) -> Tensor:
@@ -237,8 +330,8 @@ def _chart_jacobian(error: Tensor, e: Tensor, chart: Chart) -> Tensor:
     return out
 
 
-def _square_root(information: Tensor | None, dim: int, like: Tensor, edges: int) -> Tensor | None:
-    """``(E, D, D)`` with ``root^T root = information``."""
+def _full_information(information: Tensor | None, dim: int, edges: int) -> Tensor | None:
+    """``(E, D, D)`` float64."""
     if information is None:
         return None
     if information.shape not in ((edges, dim, dim), (edges, dim)):
@@ -248,18 +341,41 @@ def _square_root(information: Tensor | None, dim: int, like: Tensor, edges: int)
     full = information.double() if information.dim() == 3 else torch.diag_embed(information.double())
     if not bool(torch.isfinite(full).all()):
         raise DvoError("not finite", field="information", remedy="give finite numbers")
+    return full
+
+
+def _square_root(full: Tensor, like: Tensor, diagonal: bool) -> Tensor:
+    """``(E, D, D)`` with ``root^T root = information``."""
+    lower, info = torch.linalg.cholesky_ex(full)
+    if not diagonal and not bool(info.any()):
+        return lower.mT.to(like)
     values, vectors = torch.linalg.eigh(full)
     if bool((values < -1e-9 * values.abs().amax(-1, keepdim=True)).any()):
         raise DvoError("has a negative eigenvalue", field="information", remedy="give positive semi-definite matrices")
     return (values.clamp(min=0).sqrt()[..., None] * vectors.mT).to(like)
 
 
-def _check(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, chart: str) -> int:
+def _in_plane(poses_cw: Tensor, measurements: Tensor, full: Tensor | None) -> bool:
+    """Whether all motions lie in the plane ``z = 0``, and no information ties the other coordinates to them."""
+    if poses_cw.shape[-1] != 7 or any(bool((x[:, 2:5] != 0).any()) for x in (poses_cw, measurements)):
+        return False
+    return full is None or not bool((full[:, PLANE][:, :, (2, 3, 4)] != 0).any())
+
+
+def _flattened(poses: Tensor) -> Tensor:
+    """Poses in the plane without what rounding left outside it."""
+    keep = poses.new_tensor([1, 1, 0, 0, 0, 1, 1])
+    return se3.normalise(poses * keep)
+
+
+def _check(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, options: PoseGraphOptions) -> int:
     """Dimension of the tangent."""
     if poses_cw.dim() != 2 or poses_cw.shape[-1] not in (7, 8):
         raise DvoError(f"has shape {tuple(poses_cw.shape)}", field="poses_cw", remedy="give (N, 7) or (N, 8)")
-    if chart not in ("log", "split", "quaternion"):
-        raise DvoError(f"unknown chart {chart!r}", field="chart", remedy="use log, split or quaternion")
+    if options.chart not in get_args(Chart):
+        raise DvoError(f"unknown chart {options.chart!r}", field="chart", remedy="use log, split or quaternion")
+    if options.start not in ("best", "given"):
+        raise DvoError(f"unknown start {options.start!r}", field="start", remedy="use best or given")
     if poses_cw.dtype not in (torch.float32, torch.float64):
         raise DvoError(f"has dtype {poses_cw.dtype}", field="poses_cw", remedy="use float32 or float64")
     wanted = (len(ii), poses_cw.shape[1])

@@ -2,7 +2,8 @@
 
 Only the blocks of the lower triangle that can be non-zero are stored; which these are (the pattern) is found once and
 their values change with each linearisation. A system is solved either directly, by the sparse Cholesky factorisation
-of :mod:`dvo.ba.sparse.cholesky`, or by conjugate gradients with a block-Jacobi preconditioner.
+of :mod:`dvo.ba.sparse.cholesky` or the faster one of :mod:`dvo.ba.sparse.multifrontal` that needs SciPy, or by
+conjugate gradients with a block-Jacobi preconditioner.
 """
 
 from __future__ import annotations
@@ -10,15 +11,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 from dvo.ba.sparse.cholesky import TilePlan, best_plan, solve_cholesky
+from dvo.ba.sparse.multifrontal import (
+    Columns,
+    FrontPlan,
+    order_columns,
+    plan_fronts,
+    scipy_is_installed,
+    solve_fronts,
+)
 from dvo.core.errors import DvoError
 
-LinearSolver = Literal["auto", "direct", "cg"]
+LinearSolver = Literal["auto", "tiles", "fronts", "direct", "cg"]
+"""Cholesky by tiles or by fronts, each with conjugate gradients where the factor would be too large; "direct" is by
+tiles or an error; "cg" is without a factor. "auto" leaves the choice to the problem."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +93,21 @@ class BlockPattern:
         if dim not in self._plans:
             self._plans[dim] = best_plan(self.size, self.rows, self.columns, dim)
         return self._plans[dim]
+
+    @cached_property
+    def _fronts(self) -> dict[int, FrontPlan | None]:
+        return {}
+
+    @cached_property
+    def _columns(self) -> Columns | None:
+        return order_columns(self.size, self.rows.cpu().numpy(), self.columns.cpu().numpy())
+
+    def front_plan(self, dim: int) -> FrontPlan | None:
+        """The same for the factorisation by fronts, which needs SciPy."""
+        if dim not in self._fronts:
+            rows, columns = self.rows.cpu().numpy(), self.columns.cpu().numpy()
+            self._fronts[dim] = plan_fronts(self._columns, rows, columns, dim) if self._columns else None
+        return self._fronts[dim]
 
     def find(self, rows: Tensor, columns: Tensor) -> Tensor:
         """Positions of blocks that are stored, ``rows >= columns``."""
@@ -233,23 +259,39 @@ def solve_blocks(
 
     Args:
         matrix: symmetric positive definite.
-        rhs: ``(n, D)``.
-        solver: "direct" (Cholesky), "cg", or "auto": direct unless the factor would be too large.
+        rhs: ``(n, D)``, or ``(n, D, R)`` for several.
+        solver: see :data:`LinearSolver`; "auto" is "tiles" here.
         options: of conjugate gradients.
 
     Returns:
-        ``(n, D)``; NaN where a direct solution finds that the matrix is not positive definite.
+        Of the shape of ``rhs``; NaN where a direct solution finds that the matrix is not positive definite.
 
     Raises:
-        DvoError: an unknown solver, or "direct" where the factor would be too large.
+        DvoError: an unknown solver, "direct" where the factor would be too large, or "fronts" without SciPy.
     """
-    if solver not in ("auto", "direct", "cg"):
-        raise DvoError(f"unknown linear solver {solver!r}", field="solver", remedy="use auto, direct or cg")
+    if solver not in get_args(LinearSolver):
+        raise DvoError(
+            f"unknown linear solver {solver!r}", field="solver", remedy=f"use {', '.join(get_args(LinearSolver))}"
+        )
     if matrix.pattern.size == 0:
         return rhs
+    if solver == "fronts":
+        return _solve_by_fronts(matrix, rhs, options)
+    if rhs.dim() == 3:
+        return torch.stack([solve_blocks(matrix, each, solver, options) for each in rhs.unbind(-1)], -1)
     plan = None if solver == "cg" else matrix.pattern.cholesky_plan(matrix.blocks.shape[-1])
     if plan is not None:
         return solve_cholesky(plan, matrix.blocks, rhs)
     if solver == "direct":
         raise DvoError("the matrix is too dense to factorise", field="solver", remedy="use solver='cg'")
     return conjugate_gradients(matrix.operator(), rhs, block_jacobi(matrix, options.cluster), options)[0]
+
+
+def _solve_by_fronts(matrix: BlockMatrix, rhs: Tensor, options: CGOptions) -> Tensor:
+    if not scipy_is_installed():
+        raise DvoError("SciPy is not installed", field="solver", remedy="pip install dvo[sparse], or use tiles")
+    plan = matrix.pattern.front_plan(matrix.blocks.shape[-1])
+    if plan is None:
+        return solve_blocks(matrix, rhs, "cg", options)
+    found = solve_fronts(plan, matrix.blocks.double().cpu().numpy(), rhs.double().cpu().numpy())
+    return torch.full_like(rhs, torch.nan) if found is None else torch.from_numpy(found).to(rhs)

@@ -23,13 +23,15 @@ class LMOptions:
         max_iterations: steps tried at most.
         tolerance: relative decrease of the cost by an accepted step below which it has converged.
         damping: at the start, a fraction of the Hessian's diagonal.
-        solver: of the linear system: "auto", "direct" (sparse Cholesky) or "cg".
+        decrease: the damping falls to no less than this fraction of itself after a step.
+        solver: of the linear system, see :data:`dvo.ba.sparse.block_matrix.LinearSolver`.
         cg: options of conjugate gradients.
     """
 
     max_iterations: int = 50
     tolerance: float = 1e-6
     damping: float = 1e-4
+    decrease: float = 1 / 3
     solver: LinearSolver = "auto"
     cg: CGOptions = field(default_factory=CGOptions)
 
@@ -94,7 +96,7 @@ def levenberg_marquardt(
         if new < now:  # False for NaN
             decrease, gain = now - new, (now - new) / predicted if predicted > 0 else 0.0
             state, now = moved, new
-            damping, growth = damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 2.0
+            damping, growth = damping * max(options.decrease, 1 - (2 * gain - 1) ** 3), 2.0
             if decrease <= options.tolerance * now:
                 converged = True
                 break

@@ -7,13 +7,13 @@ meanwhile, and the window, are moved along with the last keyframe before them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.ba.pose_graph import PoseGraphOptions, optimise_pose_graph
+from dvo.ba.pose_graph import LOOP_OPTIONS, optimise_pose_graph
 from dvo.geometry import se3, sim3
 from dvo.map.correction import apply_similarities, move_window, similarity_between, window_carrier
 from dvo.map.keyframe_graph import KeyframeGraph
@@ -50,7 +50,7 @@ class Correction:
 
     def solve(self) -> Tensor:
         """Similarities ``(N, 8)`` world to camera at the minimum; their scales are the new units of the keyframes."""
-        options = PoseGraphOptions(fixed=torch.from_numpy(self.held)) if self.held.any() else PoseGraphOptions()
+        options = replace(LOOP_OPTIONS, fixed=torch.from_numpy(self.held)) if self.held.any() else LOOP_OPTIONS
         result = optimise_pose_graph(self.start, self.ii, self.jj, self.measured, self.weight, options)
         return sim3.normalise(result.poses_cw)
 

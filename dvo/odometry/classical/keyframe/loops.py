@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dvo.ba.pose_graph import optimise_pose_graph
+from dvo.ba.pose_graph import LOOP_OPTIONS, optimise_pose_graph
 from dvo.geometry import se3, sim3, so3
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
 from dvo.map.keyframe_log import KeyframeLog
@@ -157,7 +157,7 @@ class LoopCloser:
         deviation[:, :3] *= depth[ends, None]
         measured = torch.cat([steps, *(loop.measurement[None] for loop in self._edges)])
         solved = optimise_pose_graph(
-            before, torch.cat([ii, old]), ends, measured, deviation.square().reciprocal()
+            before, torch.cat([ii, old]), ends, measured, deviation.square().reciprocal(), LOOP_OPTIONS
         ).poses_cw
         after = sim3.normalise(solved)
         move(world, log, after)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from dvo.ba.edges import free_slots
 from dvo.ba.kernels import Kernel
+from dvo.ba.planar_edges import PLANE, cotangent_terms, flattened, in_plane, planar_edges
 from dvo.ba.pose_graph_start import relaxation, spanning_tree
 from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.levenberg import LMOptions, levenberg_marquardt
@@ -36,8 +37,6 @@ Chart = Literal["log", "split", "quaternion"]
 that of 2-D graphs; "quaternion" is ``[t, q_xyz]`` with ``q_w >= 0``, that of 3-D graphs in g2o files. In Sim(3)
 ``log s`` comes last."""
 Start = Literal["given", "tree", "relaxation"]
-PLANE = (0, 1, 5)
-"""Coordinates of a motion in the plane."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def optimise_pose_graph(
     with torch.no_grad(), full_precision(poses_cw.device):
         measurements = measurements.to(poses_cw)
         full = _full_information(information, dim, len(ii))
-        plane = _in_plane(poses_cw, measurements, full)
+        plane = in_plane(poses_cw, measurements, full)
         axes = list(PLANE) if plane else list(range(dim))
         root = None
         if full is not None:
@@ -138,8 +137,10 @@ def optimise_pose_graph(
             solver = replace(solver, solver="fronts" if fronts else "tiles")
 
         def whitened(poses: Tensor) -> Tensor:
-            e = residuals(poses, ii, jj, measurements, options.chart)
-            e = e[:, axes] if plane else e
+            if plane:
+                e, _, _ = planar_edges(poses, ii, jj, measurements, options.chart, False)
+            else:
+                e = residuals(poses, ii, jj, measurements, options.chart)
             return e if root is None else (root @ e[..., None])[..., 0]
 
         def cost(poses: Tensor) -> float:
@@ -147,7 +148,11 @@ def optimise_pose_graph(
             return 0.5 * float(options.kernel.cost(s).sum(dtype=torch.float64))
 
         def linearise(poses: Tensor) -> SparseSystem:
-            e, j_i, j_j = _linear(poses, ii, jj, measurements, options.chart, axes if plane else slice(None))
+            if plane:
+                e, j_i, j_j = planar_edges(poses, ii, jj, measurements, options.chart, True)
+                assert j_i is not None and j_j is not None
+            else:
+                e, j_i, j_j = residuals_and_jacobians(poses, ii, jj, measurements, options.chart)
             if root is not None:
                 e, j_i, j_j = (root @ e[..., None])[..., 0], root @ j_i, root @ j_j
             weight = options.kernel.slope(e.square().sum(-1, keepdim=True)).expand_as(e)
@@ -166,15 +171,17 @@ def optimise_pose_graph(
             moved = group.retract(poses, torch.nn.functional.pad(change, (0, 0, 0, 1))[slot])
             return torch.where((slot == free)[:, None], poses, moved)
 
-        begin, start, initial = poses_cw, "given", None
+        begin, initial = poses_cw, None
+        start: Start = "given"
         if options.start == "best" and free and solver.max_iterations > 0:
             initial = cost(poses_cw)
             least = initial
             tree = spanning_tree(poses_cw, ii, jj, measurements, full, slot == free)
             same = bool((tree.roots == (slot == free)).all())
             loose = relaxation(tree, ii, jj, measurements, full, solver.solver, pattern.h_pp if same else None)
-            for name, poses in (("tree", tree.poses), ("relaxation", loose)):
-                poses = _flattened(poses) if plane else poses
+            candidates: tuple[tuple[Start, Tensor], ...] = (("tree", tree.poses), ("relaxation", loose))
+            for name, poses in candidates:
+                poses = flattened(poses) if plane else poses
                 found = cost(poses)
                 if found < least:  # False for NaN
                     begin, start, least = poses, name, found
@@ -207,53 +214,25 @@ def residuals_and_jacobians(
     Returns:
         ``e (E, D)``, ``J_i (E, D, D)`` and ``J_j (E, D, D)``.
     """
-    return _linear(poses_cw, ii, jj, measurements, chart, slice(None))
-
-
-def _linear(
-    poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, chart: Chart, axes: list[int] | slice
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The same for some of the coordinates, which must not depend on the others."""
     error, motion = _errors(poses_cw, ii, jj, measurements)
     e = _coordinates(error, chart)
+    by_right = _chart_jacobian(error, e, chart)
     adjoint = se3.adjoint(motion) if e.shape[-1] == 6 else sim3.adjoint(motion)
-    if chart == "log" and e.shape[-1] == 6:
-        by_right = _inverse_right_jacobian(e, axes)
-    else:
-        by_right = _chart_jacobian(error, e, chart)[:, axes][..., axes]
-    return e[:, axes], by_right @ adjoint[:, axes][..., axes], -by_right
+    return e, by_right @ adjoint, -by_right
 
 
-def _inverse_right_jacobian(xi: Tensor, axes: list[int] | slice) -> Tensor:
+def _inverse_right_jacobian(xi: Tensor) -> Tensor:
     """Of SE(3): ``x / (1 - e^-x)`` at ``x = ad(xi)``, in closed form.
 
-    The even part is ``1 + a x^2 + b x^4``, as ``x (x^2 + theta^2)^2 = 0``; with ``f = (1 - theta/2 cot(theta/2)) /
-    theta^2`` it takes the value ``1 - f theta^2`` at ``x^2 = -theta^2``, and its derivative there.
+    The even part is ``1 + a x^2 + b x^4``, as ``x (x^2 + theta^2)^2 = 0``; at ``x^2 = -theta^2`` it takes the value
+    ``1 - f theta^2`` of :func:`dvo.ba.planar_edges.cotangent_terms`, and its derivative.
     """
-    x = _small_adjoint(xi)[:, axes][..., axes]
+    x = _small_adjoint(xi)
     square = xi[..., 3:6].square().sum(-1)[..., None, None]
-    small = square < 0.04
-    safe = torch.where(small, 1.0, square)
-    theta = safe.sqrt()
-    half = theta / 2
-    cot = half.cos() / half.sin()
-    f = torch.where(
-        small, _even(square, 1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160), (1 - half * cot) / safe
-    )
-    # f' / theta, of 1 - half cot(half) and its derivative half / 2 (1 + cot^2) - cot / 2
-    slope = ((half * (1 + cot * cot) - cot) / (2 * theta) - 2 * f) / safe
-    slope = torch.where(small, _even(square, 1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520), slope)
+    f, slope = cotangent_terms(square)
     xx = x @ x
     eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
     return eye + 0.5 * x + (f - 0.5 * slope * square) * xx - 0.5 * slope * (xx @ xx)
-
-
-def _even(square: Tensor, *coefficients: float) -> Tensor:
-    """``sum c_k square^k``."""
-    out = torch.zeros_like(square)
-    for c in reversed(coefficients):
-        out = out * square + c
-    return out
 
 
 def right_jacobian(xi: Tensor) -> Tensor:
@@ -313,7 +292,7 @@ def _coordinates(error: Tensor, chart: Chart) -> Tensor:
 def _chart_jacobian(error: Tensor, e: Tensor, chart: Chart) -> Tensor:
     """Derivative ``(E, D, D)`` of the coordinates ``e`` of an error by a right perturbation of it."""
     if chart == "log":
-        return torch.linalg.inv(right_jacobian(e))
+        return _inverse_right_jacobian(e) if e.shape[-1] == 6 else torch.linalg.inv(right_jacobian(e))
     q = error[..., 3:7]
     q = torch.where(q[..., 3:] < 0, -q, q)
     dim = error.shape[-1] - 1
@@ -353,19 +332,6 @@ def _square_root(full: Tensor, like: Tensor, diagonal: bool) -> Tensor:
     if bool((values < -1e-9 * values.abs().amax(-1, keepdim=True)).any()):
         raise DvoError("has a negative eigenvalue", field="information", remedy="give positive semi-definite matrices")
     return (values.clamp(min=0).sqrt()[..., None] * vectors.mT).to(like)
-
-
-def _in_plane(poses_cw: Tensor, measurements: Tensor, full: Tensor | None) -> bool:
-    """Whether all motions lie in the plane ``z = 0``, and no information ties the other coordinates to them."""
-    if poses_cw.shape[-1] != 7 or any(bool((x[:, 2:5] != 0).any()) for x in (poses_cw, measurements)):
-        return False
-    return full is None or not bool((full[:, PLANE][:, :, (2, 3, 4)] != 0).any())
-
-
-def _flattened(poses: Tensor) -> Tensor:
-    """Poses in the plane without what rounding left outside it."""
-    keep = poses.new_tensor([1, 1, 0, 0, 0, 1, 1])
-    return se3.normalise(poses * keep)
 
 
 def _check(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, options: PoseGraphOptions) -> int:

@@ -2,9 +2,9 @@
 
 Prints for each g2o file, and for a synthetic graph of laps of a circle in Sim(3) with drifting scale: poses, edges,
 chi2 of the poses given (as defined by g2o), which start was chosen and its chi2, chi2 after, steps and seconds (median
-of ``--repeat``). With ``--chart log`` the error of a file is the logarithm, as GTSAM has it: chi2 is then twice the error
-that GTSAM tells. ``--gtsam`` prints that too, of GTSAM's own Levenberg-Marquardt with its default settings and the same
-tolerance (``pip install gtsam``), its seconds, and the ratio of ours to those; runs of the two take turns.
+of ``--repeat``). With ``--chart log`` the error of a file is the logarithm, as GTSAM has it: chi2 is then twice the
+error that GTSAM tells. ``--gtsam`` prints that too, of GTSAM's own Levenberg-Marquardt with its default settings and
+the same tolerance (``pip install gtsam``), its seconds, and the ratio of ours to those; runs of the two take turns.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SECONDS_PER_FRONT, SECONDS_PER_NUMBER, SECONDS_PER_PRODUCT = 6e-5, 4e-9, 2.5e-10
+SECONDS_PER_FRONT, SECONDS_PER_NUMBER, SECONDS_PER_PRODUCT = 1e-4, 8e-9, 1.5e-10
 """Rough costs of the calls for a front, of each number in it, and of a multiplication; they decide what is merged."""
 MAX_NUMBERS, MAX_BLOCKS, MAX_DEGREE = 1.5e8, 1.5e7, 100
 """Numbers and blocks of a factor, and neighbours of a block row in the mean, that are still worth a factorisation."""
@@ -88,10 +88,12 @@ class Columns:
     Attributes:
         rank: ``(n,)`` place of each block row in the order of elimination.
         under: block rows below each column, as places in that order.
+        parent: the first of these, -1 for none.
     """
 
     rank: np.ndarray
     under: list[set[int]]
+    parent: list[int]
 
 
 def order_columns(size: int, rows: np.ndarray, columns: np.ndarray) -> Columns | None:
@@ -112,16 +114,16 @@ def order_columns(size: int, rows: np.ndarray, columns: np.ndarray) -> Columns |
     for a, b in zip(rank[rows].tolist(), rank[columns].tolist(), strict=True):
         if a != b:
             under[min(a, b)].add(max(a, b))
-    stored = 0
-    for found in under:  # what is below a column of the factor is also below its parent
+    parent, stored = [-1] * size, 0
+    for column, found in enumerate(under):  # what is below a column of the factor is also below its parent
         stored += len(found) + 1
         if stored > MAX_BLOCKS:
             return None
         if found:
-            up = min(found)
+            parent[column] = up = min(found)
             under[up] |= found
             under[up].discard(up)
-    return Columns(rank, under)
+    return Columns(rank, under, parent)
 
 
 def plan_fronts(structure: Columns, rows: np.ndarray, columns: np.ndarray, dim: int) -> FrontPlan | None:
@@ -135,11 +137,10 @@ def plan_fronts(structure: Columns, rows: np.ndarray, columns: np.ndarray, dim: 
     Returns:
         The plan, or None where the factor would have more numbers than :data:`MAX_NUMBERS`.
     """
-    parent = [min(found) if found else -1 for found in structure.under]
-    members, parent_of = _merge(structure.under, parent, dim)
+    members, parent = _merge(structure, dim)
     if sum(len(x) * (len(x) + len(structure.under[top])) for top, x in members.items()) * dim * dim > MAX_NUMBERS:
         return None
-    return _place(structure, members, parent_of, rows, columns, dim)
+    return _place(structure, members, parent, rows, columns, dim)
 
 
 def _minimum_degree(size: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -163,18 +164,18 @@ def _seconds(pivots: int, below: int, dim: int) -> float:
     return SECONDS_PER_FRONT + (k + 2 * b) * (k + b) * SECONDS_PER_NUMBER + products * SECONDS_PER_PRODUCT
 
 
-def _merge(under: list[set[int]], parent: list[int], dim: int) -> tuple[dict[int, list[int]], dict[int, int]]:
+def _merge(structure: Columns, dim: int) -> tuple[dict[int, list[int]], dict[int, int]]:
     """Columns of each supernode, by its last column, and the supernode above it."""
+    under, parent = structure.under, structure.parent
     members = [[column] for column in range(len(under))]
     head = list(range(len(under)))
+    cost = [_seconds(1, len(found), dim) for found in under]
     for column, up in enumerate(parent):
-        if up < 0:
-            continue
-        own, above, count = len(members[column]), len(members[up]), len(under[up])
-        apart = _seconds(own, len(under[column]), dim) + _seconds(above, count, dim)
-        if _seconds(own + above, count, dim) <= apart:
-            members[up] += members[column]
-            head[column] = up
+        if up >= 0:
+            together = _seconds(len(members[column]) + len(members[up]), len(under[up]), dim)
+            if together <= cost[column] + cost[up]:
+                members[up] += members[column]
+                head[column], cost[up] = up, together
     for column in reversed(range(len(under))):  # the column above is further on, and done
         head[column] = head[head[column]]
     tops = [column for column in range(len(under)) if head[column] == column]
@@ -263,24 +264,23 @@ def solve_fronts(plan: FrontPlan, blocks: np.ndarray, rhs: np.ndarray) -> np.nda
     from scipy.linalg.lapack import dpotrf
 
     values = blocks.reshape(-1)[plan.source]
-    remainders: list[np.ndarray | None] = [None] * len(plan.fronts)
+    remainders: dict[int, np.ndarray] = {}
     factors = []
     for at, front in enumerate(plan.fronts):
         k, b = front.end - front.begin, len(front.below)
         flat = np.zeros((k + b) * k)
         flat[plan.target[front.entries]] = values[front.entries]
         panel = flat.reshape(k + b, k, order="F")
-        rest = np.zeros((b, b), order="F") if front.children else None
+        rest = np.zeros((b, b) if front.children else (0, 0), order="F")
         for child in front.children:
-            _add(panel, rest, remainders[child.front], child, k)
-            remainders[child.front] = None
+            _add(panel, rest, remainders.pop(child.front), child, k)
         top, info = dpotrf(panel[:k], lower=1, clean=0)
         if info:
             return None
         bottom = panel[k:]
         if b:
             bottom = dtrsm(1.0, top, panel[k:], side=1, lower=1, trans_a=1)
-            if rest is None:
+            if not front.children:
                 remainders[at] = dsyrk(-1.0, bottom, lower=1)
             else:
                 remainders[at] = dsyrk(-1.0, bottom, beta=1.0, c=rest, lower=1, overwrite_c=1)

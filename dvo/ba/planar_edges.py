@@ -1,7 +1,8 @@
 """Edges of a pose graph whose motions all lie in the plane ``z = 0``: three coordinates instead of six.
 
 What :func:`dvo.ba.pose_graph.residuals_and_jacobians` has in the coordinates :data:`PLANE`, from angles and a few
-products. The other coordinates are zero and stay so; they are no unknowns, whether their information is zero or not.
+products. The other coordinates are no unknowns: they and their gradient are zero, and so they stay, even where so
+little information holds the poses in the plane that chi2 would be lower outside it.
 """
 
 from __future__ import annotations

@@ -14,7 +14,9 @@ from torch import Tensor
 
 from dvo.ba.factors import RelativePose
 from dvo.ba.kernels import Kernel
+from dvo.ba.planar_edges import PLANE, in_plane, planar_edges
 from dvo.ba.pose_graph import (
+    LOOP_OPTIONS,
     Chart,
     PoseGraphOptions,
     optimise_pose_graph,
@@ -25,7 +27,7 @@ from dvo.ba.pose_graph import (
 from dvo.ba.sparse.levenberg import LMOptions
 from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3
-from eval.benchmarks.pose_graph import PoseGraph, read_g2o
+from eval.benchmarks.pose_graph import PoseGraph, make_laps, read_g2o
 
 GROUPS = {6: se3, 7: sim3}
 CHARTS: tuple[Chart, ...] = ("log", "split", "quaternion")
@@ -167,6 +169,163 @@ def test_a_kernel_limits_a_false_loop():
     assert error[0] > 1 and error[1] < 0.1 * error[0]
 
 
+def drifted(dim: int = 6, laps: int = 2, lap: int = 30, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Laps in three dimensions with much drift: poses by chaining the motions, edges, and a full information."""
+    poses, ii, jj, measured, weight = make_laps(laps * lap, lap=lap, every=2, seed=seed)
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.tensor([0.05] * 3 + [0.03] * 3 + [0.02], dtype=torch.float64)
+    measured = sim3.normalise(
+        sim3.compose(sim3.exp(noise * torch.randn(len(ii), 7, dtype=torch.float64, generator=generator)), measured)
+    )
+    chain = [poses[0]]
+    for motion in measured[: len(poses) - 1]:
+        chain.append(sim3.compose(motion, chain[-1]))
+    poses = torch.stack(chain)
+    mix = torch.randn(len(ii), dim, dim, dtype=torch.float64, generator=generator) * 0.3
+    information = mix @ mix.mT + torch.eye(dim, dtype=torch.float64)
+    if dim == 6:
+        poses, measured = poses[:, :7], measured[:, :7]
+    return poses, ii, jj, measured, 100 * information
+
+
+def with_solver(solver: str, **changes: object) -> PoseGraphOptions:
+    return PoseGraphOptions(solver=LMOptions(max_iterations=200, tolerance=1e-12, solver=solver), **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kernel", [Kernel("none"), Kernel("huber", 1.0), Kernel("cauchy", 2.0)])
+@pytest.mark.parametrize("dim", [6, 7])
+def test_both_factorisations_end_at_the_same_chi2(dim: int, kernel: Kernel):
+    pytest.importorskip("scipy")
+    found = [optimise_pose_graph(*drifted(dim), with_solver(s, kernel=kernel)) for s in ("fronts", "tiles")]
+    assert found[0].chi2 == pytest.approx(found[1].chi2, rel=1e-8) and found[0].start == found[1].start
+    torch.testing.assert_close(found[0].poses_cw, found[1].poses_cw, rtol=1e-4, atol=1e-4)
+
+
+def test_without_the_extra_the_tiles_are_used(monkeypatch: pytest.MonkeyPatch):
+    def never(*_: object) -> None:
+        raise AssertionError("fronts without SciPy")
+
+    graph = drifted()
+    expected = optimise_pose_graph(*graph, with_solver("tiles"))
+    monkeypatch.setattr("dvo.ba.pose_graph.scipy_is_installed", lambda: False)
+    monkeypatch.setattr("dvo.ba.sparse.block_matrix.solve_fronts", never)
+    found = optimise_pose_graph(*graph, with_solver("auto"))
+    assert torch.equal(found.poses_cw, expected.poses_cw)
+    monkeypatch.setattr("dvo.ba.pose_graph.scipy_is_installed", lambda: True)
+    with pytest.raises((AssertionError, DvoError)):
+        optimise_pose_graph(*graph, with_solver("auto"))
+
+
+def test_the_start_of_least_chi2_is_taken_and_told():
+    poses, ii, jj, measured, information = drifted()
+    best = optimise_pose_graph(poses, ii, jj, measured, information)
+    assert best.start != "given" and best.chi2 <= best.start_chi2 < best.initial_chi2
+    given_chi2 = optimise_pose_graph(poses, ii, jj, measured, information, PoseGraphOptions(solver=LMOptions(0)))
+    assert best.initial_chi2 == pytest.approx(given_chi2.chi2, rel=1e-12) and given_chi2.start == "given"
+    again = optimise_pose_graph(best.poses_cw, ii, jj, measured, information)
+    assert again.start == "given" and again.start_chi2 == again.initial_chi2 == pytest.approx(best.chi2, rel=1e-9)
+
+
+def test_a_trajectory_tracked_with_loops_keeps_its_start_and_its_solver(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("dvo.ba.sparse.block_matrix.solve_fronts", None)
+    result = optimise_pose_graph(*drifted(7), LOOP_OPTIONS)
+    assert result.start == "given" and result.start_chi2 == result.initial_chi2 and result.chi2 < result.initial_chi2
+
+
+@pytest.mark.parametrize("dim", [6, 7])
+def test_any_start_is_far_enough_for_consistent_measurements(dim: int):
+    """Each pose is turned at random; the relative poses have no error, some edges are against the way or double."""
+    poses, ii, jj, _, information = drifted(dim)
+    group = GROUPS[dim]
+    flip = torch.arange(len(ii)) % 3 == 0
+    ii, jj = torch.where(flip, jj, ii), torch.where(flip, ii, jj)
+    ii, jj, information = (torch.cat((x, x[:7])) for x in (ii, jj, information))
+    measured = group.compose(poses[jj], group.inverse(poses[ii]))
+    generator = torch.Generator().manual_seed(1)
+    lost = group.retract(poses, 2 * torch.randn(len(poses), dim, dtype=torch.float64, generator=generator))
+    lost[0] = poses[0]
+    result = optimise_pose_graph(lost, ii, jj, measured, information)
+    assert result.start != "given" and result.start_chi2 < 1e-8 * result.initial_chi2
+    torch.testing.assert_close(centres_of(result.poses_cw), centres_of(poses), rtol=1e-6, atol=1e-6)
+
+
+def centres_of(poses_cw: Tensor) -> Tensor:
+    return GROUPS[poses_cw.shape[-1] - 1].inverse(poses_cw)[:, :3]
+
+
+@pytest.mark.parametrize("solver", ["fronts", "tiles"])
+def test_parts_that_no_edge_joins(solver: str):
+    """Two parts, of which only the first has a pose that stays, a pose alone, and an edge of a pose with itself."""
+    poses, ii, jj, measured, information = drifted()
+    count = len(poses)
+    both = torch.cat((poses, poses.roll(1, 0), poses[:1]))
+    loop = torch.tensor([3])
+    ends = [torch.cat((x, x + count, loop)) for x in (ii, jj)]
+    motion = torch.cat((measured, measured, se3.identity(1, dtype=torch.float64)))
+    weight = torch.cat((information, information, information[:1]))
+    one = optimise_pose_graph(poses, ii, jj, measured, information, with_solver(solver))
+    two = optimise_pose_graph(both, *ends, motion, weight, with_solver(solver))
+    assert two.converged and two.chi2 == pytest.approx(2 * one.chi2, rel=1e-6)
+    torch.testing.assert_close(two.poses_cw[:count], one.poses_cw, rtol=1e-4, atol=1e-4)
+    assert torch.equal(two.poses_cw[-1], both[-1])
+    free = optimise_pose_graph(poses, ii, jj, measured, information, with_solver(solver, fixed=0))
+    assert free.chi2 == pytest.approx(one.chi2, rel=1e-6)
+
+
+@pytest.mark.parametrize("solver", ["fronts", "tiles"])
+def test_information_that_is_singular_or_unequal(solver: str):
+    """Edges without any information, of directions only, and a million times that of the others."""
+    poses, ii, jj, measured, information = drifted()
+    true = optimise_pose_graph(poses, ii, jj, measured, information).poses_cw
+    measured = se3.compose(true[jj], se3.inverse(true[ii]))
+    information = information.clone()
+    loops = torch.arange(len(poses), len(ii))
+    information[loops[::4]] = 0
+    measured[loops[::4]] = se3.identity(1, dtype=torch.float64)
+    information[loops[1::4]] = torch.diag(torch.tensor([1.0, 0, 0, 0, 0, 0], dtype=torch.float64))
+    information[loops[2::4]] *= 1e6
+    result = optimise_pose_graph(poses, ii, jj, measured, information, with_solver(solver))
+    assert result.chi2 < 1e-9 * result.initial_chi2
+    torch.testing.assert_close(result.poses_cw, true, rtol=1e-4, atol=1e-4)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.sampled_from(CHARTS), st.integers(0, 10_000), st.sampled_from([1e-6, 0.05, 1.0, 3.0]))
+def test_edges_in_the_plane_are_those_in_space(chart: Chart, seed: int, size: float):
+    xi = torch.zeros(40, 6, dtype=torch.float64)
+    xi[:, PLANE] = size * torch.randn(40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    poses, measured = se3.exp(xi).split((10, 30))
+    ii, jj = torch.randint(0, 10, (2, 30), generator=torch.Generator().manual_seed(seed))
+    found = planar_edges(poses, ii, jj, measured, chart, True)
+    e, j_i, j_j = residuals_and_jacobians(poses, ii, jj, measured, chart)
+    axes = list(PLANE)
+    assert in_plane(poses, measured, None)
+    keep = found[0][:, 2].abs() < (0.999 if chart == "quaternion" else 3.13)  # pi may be told as -pi
+    for own, full in zip(found, (e[:, axes], j_i[:, axes][..., axes], j_j[:, axes][..., axes]), strict=True):
+        assert own is not None
+        torch.testing.assert_close(own[keep], full[keep], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("outside", [0.0, 1.0, 1e12])
+def test_a_graph_in_the_plane_does_not_depend_on_information_outside_it(outside: float):
+    poses, ii, jj, measured, information = drifted()
+    keep = poses.new_tensor([1, 1, 0, 0, 0, 1, 1])
+    poses, measured = (se3.normalise(x * keep + x.new_tensor([0, 0, 0, 0, 0, 0, 1e-3])) for x in (poses, measured))
+    rest = [2, 3, 4]
+    information[:, rest] = information[:, :, rest] = 0
+    information[:, rest, rest] = outside
+    assert in_plane(poses, measured, information)
+    result = optimise_pose_graph(poses, ii, jj, measured, information, with_solver("auto"))
+    assert (result.poses_cw[:, 2:5] == 0).all()
+    # The same graph in another plane has six coordinates, and a lower minimum outside it where nothing holds it there.
+    tilt = se3.exp(torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6], dtype=torch.float64))
+    information[:, rest, rest] = 1e12
+    world = se3.compose(poses, tilt.expand_as(poses))
+    assert not in_plane(world, measured, information)
+    full = optimise_pose_graph(world, ii, jj, measured, information, with_solver("auto"))
+    assert full.chi2 == pytest.approx(result.chi2, rel=1e-5)
+
+
 def write(path: Path, text: str) -> Path:
     path.write_text(text, encoding="utf-8")
     return path
@@ -261,3 +420,18 @@ def test_the_final_chi2_of_a_rendered_loop_is_that_of_gtsam():
     result = optimise_pose_graph(*arguments(graph), PoseGraphOptions(chart="log"))
     assert result.initial_chi2 == pytest.approx(35.675317653438256, rel=1e-6)
     assert result.converged and result.chi2 == pytest.approx(5.800920988659587, rel=1e-6)
+
+
+# Global minima; from the poses of the files Levenberg-Marquardt ends at 770.2, 59900 and 10492.
+@pytest.mark.parametrize(
+    ("name", "chi2"),
+    [
+        ("mit.g2o", 41.206947),
+        pytest.param("intel.g2o", 215.8393, marks=pytest.mark.slow),
+        pytest.param("torus3D.g2o", 24235.27378, marks=pytest.mark.slow),
+    ],
+)
+def test_the_start_avoids_a_local_minimum(folder: Path, name: str, chi2: float):
+    pytest.importorskip("scipy")  # for its time
+    result = optimise_pose_graph(*arguments(read_g2o(folder / name)), PoseGraphOptions(chart="log"))
+    assert result.converged and result.start != "given" and result.chi2 == pytest.approx(chi2, rel=1e-5)

@@ -47,8 +47,9 @@ class PoseGraphOptions:
         fixed: how many leading poses stay, or which: bool ``(N,)``.
         chart: coordinates of the residual.
         kernel: robust kernel on ``e^T Omega e``.
-        solver: of Levenberg-Marquardt and its linear systems. "auto" is "fronts" on the CPU where SciPy is installed,
-            else "tiles".
+        solver: of Levenberg-Marquardt and its linear systems. The damping is close to none at first, as the best start
+            is near the minimum as a rule, and directions of little curvature matter. "auto" is "fronts" on the CPU
+            where SciPy is installed, else "tiles".
         start: "best" is that of least chi2 of the poses given, a spanning tree and a linear relaxation; "given" keeps
             to the poses given.
     """
@@ -56,7 +57,7 @@ class PoseGraphOptions:
     fixed: int | Tensor | Sequence[bool] = 1
     chart: Chart = "log"
     kernel: Kernel = field(default_factory=Kernel)
-    solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=100, damping=1e-8, decrease=0.1))
+    solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=100, damping=1e-12, decrease=0.1))
     start: Literal["best", "given"] = "best"
 
 

@@ -374,6 +374,24 @@ def test_bad_input_is_named(field: str, change: object):
     assert error.value.field == field
 
 
+def test_the_benchmark_prints_the_start_and_the_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from eval.benchmarks import pose_graph as benchmark
+
+    file = str(Path(__file__).parent / "rendered_loop.g2o")
+    monkeypatch.setattr("sys.argv", ["pose_graph", "--chart", "log", "--gtsam", "--repeat", "2", file])
+    monkeypatch.setattr(benchmark, "gtsam_minimum", lambda _: (5.75, 0.5))
+    benchmark.main()
+    header, row = capsys.readouterr().out.splitlines()
+    for words, word in (("chi2 given", "given"), ("chi2 of it", "of_it"), ("cpu s", "cpu")):
+        header = header.replace(words, word)
+    told = dict(zip(header.split(), row.split(), strict=True))
+    assert told["start"] in ("given", "tree", "relaxation") and told["GTSAM"] == "5.750000"
+    assert float(told["of_it"]) <= float(told["given"]) and float(told["after"]) == pytest.approx(5.800921, abs=1e-5)
+    assert float(told["ratio"]) >= 0
+
+
 @pytest.fixture(scope="module")
 def folder(data_root: Path) -> Path:
     path = data_root / "posegraph"

@@ -99,7 +99,11 @@ def tables(facts: dict[str, Any], start: float) -> str:
     if calibrated:
         value = f"{calibrated['focal']:.1f} ± {calibrated['deviation']:.1f} px ({calibrated['source']})"
         settings.append(("focal length", value))
-    settings += [(f"seconds of {name}", f"{value:.1f}") for name, value in (facts.get("seconds") or {}).items()]
+    settings += [
+        (f"seconds of {name}", f"{value:.1f}")
+        for name, value in (facts.get("seconds") or {}).items()
+        if value is not None
+    ]
     if start:
         settings.append(("time of the first frame", f"{start:.6f} s; times of this page count from it"))
     parts.append(_section("Run", _pairs(settings)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -253,8 +254,10 @@ def _row(cells: dict[str, str]) -> FrameRow:
     values["keyframe"] = cells["keyframe"] == "1" if cells["keyframe"] else None
     for name in (*_DIGITS, *_SIGMAS):
         values[name] = float(cells[name]) if cells.get(name) else None
-        if values[name] is not None and not abs(values[name]) <= MAX_NUMBER:  # false for nan too
-            raise ValueError(f"{name} is not a number within ±{MAX_NUMBER:g}")
+        if values[name] is not None and not math.isfinite(values[name]):
+            raise ValueError(f"{name} is not finite")
+        if values[name] is not None and abs(values[name]) > MAX_NUMBER:
+            raise ValueError(f"{name} is beyond {MAX_NUMBER:g}")
     if values["timestamp"] is None:
         raise ValueError("no timestamp")
     return FrameRow(**values)

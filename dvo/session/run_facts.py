@@ -44,7 +44,7 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= _MAX_FRAMES
 
 
-def _table(required: tuple[str, ...] = (), **parts: _Kind) -> _Kind:
+def _table(parts: dict[str, _Kind], required: tuple[str, ...] = ()) -> _Kind:
     return _Kind("a table", lambda value: isinstance(value, dict), parts, required)
 
 
@@ -71,27 +71,36 @@ _BREAK = {"from": _NUMBER, "to": _NUMBER, "frames": _COUNT, "reason": _TEXT, "ne
 _LOOP = {
     "from": _NUMBER, "to": _NUMBER, "kind": _TEXT, "inliers": _NUMBER, "in_map": _FLAG, "joins_segments": _FLAG,
 }  # fmt: skip
-_SCALE = _table(segments=_listed(_table(("segment", "source"), segment=_COUNT, source=_TEXT)))
+_QUALITY = {"verdict": _TEXT, "reason": _TEXT, "remedy": _TEXT}
+_FRAMES = {"read": _COUNT, "fed": _COUNT, "tracked": _COUNT, "lost": _COUNT}
+_FOCAL = {"focal": _NUMBER, "deviation": _NUMBER, "source": _TEXT}
+_METRIC_SEGMENT = _table({"segment": _COUNT, "source": _TEXT}, ("segment", "source"))
+_INFO = {
+    "loops": _listed(_table(_LOOP, ("from", "to"))),
+    "scale": _table({"segments": _listed(_METRIC_SEGMENT)}),
+}
 _RUN = _table(
+    {
+        "source": _TEXT,
+        "odometry": _TEXT,
+        "weights": _TEXT,
+        "quality": _table(_QUALITY, ("verdict",)),
+        "frames": _table(_FRAMES, ("read", "lost")),
+        "segments": _listed(_table(_SEGMENT, ("number", "start", "end", "frames", "file"))),
+        "breaks": _listed(_table(_BREAK, ("frames", "reason", "new_segment"))),
+        "info": _table(_INFO),
+        "metrics": _table({"alignment": _TEXT, **_METRICS}),
+        "self_calibration": _table(_FOCAL, ("focal", "deviation", "source")),
+        "seconds": _named(_NUMBER),
+        "fps": _NUMBER,
+        "peak_memory_mb": _NUMBER,
+        "map_points": _COUNT,
+        "interrupted": _FLAG,
+        "warnings": _listed(_TEXT),
+        "config": _named(_ANY),
+        "versions": _named(_ANY),
+    },
     ("frames", "segments", "breaks", "info"),
-    source=_TEXT,
-    odometry=_TEXT,
-    weights=_TEXT,
-    quality=_table(("verdict",), verdict=_TEXT, reason=_TEXT, remedy=_TEXT),
-    frames=_table(("read", "lost"), read=_COUNT, fed=_COUNT, tracked=_COUNT, lost=_COUNT),
-    segments=_listed(_table(("number", "start", "end", "frames", "file"), **_SEGMENT)),
-    breaks=_listed(_table(("frames", "reason", "new_segment"), **_BREAK)),
-    info=_table(loops=_listed(_table(("from", "to"), **_LOOP)), scale=_SCALE),
-    metrics=_table(alignment=_TEXT, **_METRICS),
-    self_calibration=_table(("focal", "deviation", "source"), focal=_NUMBER, deviation=_NUMBER, source=_TEXT),
-    seconds=_named(_NUMBER),
-    fps=_NUMBER,
-    peak_memory_mb=_NUMBER,
-    map_points=_COUNT,
-    interrupted=_FLAG,
-    warnings=_listed(_TEXT),
-    config=_named(_ANY),
-    versions=_named(_ANY),
 )
 
 
@@ -145,15 +154,17 @@ def _plain(value: Any, file: Path, place: str, depth: int = 0) -> Any:
 
 def _check(value: Any, kind: _Kind, file: Path, place: str) -> None:
     if not kind.holds(value):
-        raise DvoError(f"not {kind.name}", file=file, field=_shown(place), remedy=REMEDY)
+        raise DvoError(f"has no valid value: expected {kind.name}", file=file, field=_shown(place), remedy=REMEDY)
     if kind.parts is None:
         return
     for name in kind.required:
         if value.get(name) is None:
-            raise DvoError("is missing", file=file, field=_shown(_below(place, name)), remedy=REMEDY)
+            raise DvoError(
+                "has no valid value: it is missing", file=file, field=_shown(_below(place, name)), remedy=REMEDY
+            )
     items = enumerate(value) if isinstance(value, list) else value.items()
     for key, item in items:
-        part = kind.parts.get("*") or kind.parts.get(key)
+        part = kind.parts.get("*") or kind.parts.get(str(key))
         # A list holds no null; an entry of a table that is null is as one that is missing.
         if part is not None and (item is not None or isinstance(value, list)):
             _check(item, part, file, _below(place, str(key)))

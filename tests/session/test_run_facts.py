@@ -108,19 +108,23 @@ def test_every_entry(folder, capsys):
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
-        (("frames",), MISSING, "frames: is missing"), (("info",), [], "info: not a table"),
-        (("fps",), "fast", "fps: not a number"), (("metrics",), 3, "metrics: not a table"),
-        (("warnings",), {}, "warnings: not a list"), (("quality", "reason"), [], "quality: reason: not a text"),
-        (("segments", 0, "start"), "x", "segments: 0: start: not a number"),
+        (("frames",), MISSING, "frames: has no valid value: it is"),
+        (("info",), [], "info: has no valid value"),
+        (("fps",), "fast", "fps: has no valid value"),
+        (("metrics",), 3, "metrics: has no valid value"),
+        (("warnings",), {}, "warnings: has no valid value"),
+        (("quality", "reason"), [], "quality: reason: has no valid value"),
+        (("segments", 0, "start"), "x", "segments: 0: start: has no valid value"),
         (("segments", 1, "joined_to"), 7, "segments: 1: joined_to: no such segment"),
-        (("breaks", 0, "frames"), 10**12, "breaks: 0: frames: not a whole number"),
-        (("info", "loops", 0, "to"), None, "info: loops: 0: to: is missing"),
-        (("seconds", "reading"), True, "seconds: reading: not a number"),
+        (("breaks", 0, "frames"), 10**12, "breaks: 0: frames: has no valid value"),
+        (("info", "loops", 0, "to"), None, "info: loops: 0: to: has no valid value: it is"),
+        (("seconds", "reading"), True, "seconds: reading: has no valid value"),
         (("seed",), float("nan"), "seed: not a finite"),
-        (("config",), NESTED, "nested too deeply"), (("peak_memory_mb",), {}, "peak_memory_mb: not a number"),
-        (("self_calibration",), {"focal": 3}, "self_calibration: deviation: is missing"),
+        (("config",), NESTED, "nested too deeply"),
+        (("peak_memory_mb",), {}, "peak_memory_mb: has no valid value"),
+        (("self_calibration",), {"focal": 3}, "self_calibration: deviation: has no valid value: it is"),
     ],
-)  # fmt: skip
+)
 def test_the_error_names_the_entry(folder, capsys, place, value, said):
     values = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps(changed(values, place, value)))

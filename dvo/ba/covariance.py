@@ -125,7 +125,7 @@ def _marginal(solver: SchurFactor, rows: Tensor, constraint: Tensor | None) -> T
         last = covariance[:, :-1, -1:]
         covariance = covariance[:, :-1, :-1] - last @ last.mT / covariance[:, -1:, -1:]
     good = (solver.ok & torch.isfinite(covariance).all(-1).all(-1))[:, None, None]
-    infinite = torch.diag_embed(torch.full_like(covariance[..., 0], torch.inf))
+    infinite = torch.diag_embed(torch.full_like(covariance.diagonal(dim1=-2, dim2=-1), torch.inf))
     return torch.where(good, covariance, infinite)
 
 

@@ -141,7 +141,7 @@ class State:
     def is_short(self, reduced: Tensor) -> Tensor:
         """``(B, 1)`` bool, elements of the batch with a step ``(B, size)`` within :attr:`StateBlock.longest`."""
         size = reduced.abs()
-        short = torch.ones_like(size[:, :1], dtype=torch.bool)
+        short = torch.ones(len(size), 1, dtype=torch.bool, device=size.device)
         for name in self.offsets:
             short = short & (self.part(name, size) <= self.blocks[name].longest).flatten(1).all(1, keepdim=True)
         return short

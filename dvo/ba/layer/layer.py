@@ -183,10 +183,10 @@ def _transformed(given: PatchProblem, options: BAOptions) -> BAResult:
         return *plain, *result.blocks.values()
 
     found = composed(run, *(value(*name) for name in named))
-    extra = dict(zip(asked, found[3:], strict=False))
+    extra: dict[str, Any] = dict(zip(asked, found[3:], strict=False))
     further = dict(zip(given.blocks, found[3 + len(asked) :], strict=True))
     poses_cw, patches, intrinsics = found[:3]
-    return replace(BAResult(poses_cw, patches, intrinsics, blocks=further), **extra)  # type: ignore[arg-type]
+    return replace(BAResult(poses_cw, patches, intrinsics, blocks=further), **extra)
 
 
 def _asked(options: BAOptions, name: str) -> bool:
@@ -209,7 +209,7 @@ def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped:
     if dtype in (torch.float16, torch.bfloat16):
         dtype = torch.float32
     names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
-    given = given.with_values(**{name: getattr(given, name).to(dtype) for name in names})
+    given = given.with_values(**{name: _cast(getattr(given, name), dtype) for name in names})
     poses = pose_block(given.poses_cw, options.fixed, held=options.structure_only)
     depths = inverse_depth_block(given.inverse_depths, options.depth_range, held=options.motion_only)
     further = {name: block.with_value(block.value.to(dtype)) for name, block in given.blocks.items()}
@@ -231,6 +231,15 @@ def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped:
         reprojection = given.reprojection(options.max_residual, options.bounds, options.kernel, focal_only)
     more = (factor.with_tensors([x.to(dtype) for x in factor.tensors()]) for factor in given.factors)
     return Problem(State({**further, **own}), (reprojection, *more))
+
+
+def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """Another type; of the gradient, what is too large for the type of the argument is left out."""
+    there = x.to(dtype)
+    if there is not x and there.requires_grad:
+        largest = torch.finfo(x.dtype).max
+        there.register_hook(lambda gradient: torch.where(gradient.abs() > largest, 0.0, gradient))
+    return there
 
 
 @torch.no_grad()

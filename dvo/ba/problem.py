@@ -14,7 +14,7 @@ Shapes: ``B`` batch, ``N`` elements of a block, ``F`` rows of a factor (edges, p
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -23,8 +23,11 @@ from torch import Tensor
 
 from dvo.ba.layer.linearisation import AdjointConstants, Linearisation, NormalEquations, adjoint_term, assemble
 from dvo.ba.state import State, StateBlock
+from dvo.core.errors import DvoError
 
-__all__ = ["AdjointConstants", "Factor", "Linearisation", "NormalEquations", "Problem", "State", "StateBlock"]
+__all__ = [
+    "AdjointConstants", "Factor", "Linearisation", "NormalEquations", "Problem", "State", "StateBlock", "check_further",
+]  # fmt: skip
 
 
 class Factor(ABC):
@@ -96,6 +99,22 @@ class Factor(ABC):
             Scalars whose sum is phi; each is differentiated before the next one is made, which bounds memory.
         """
         yield adjoint_term(self.linearise(state.values()), state, constants)
+
+
+def check_further(factors: Iterable[object], blocks: Mapping[str, object]) -> None:
+    """Check the types of further measurements and unknowns of a problem.
+
+    Args:
+        factors, blocks: of the problem.
+
+    Raises:
+        DvoError: one that is no :class:`Factor` or no :class:`StateBlock`.
+    """
+    for field, values, kind in (("factors", factors, Factor), ("blocks", blocks.values(), StateBlock)):
+        for value in values:
+            if not isinstance(value, kind):
+                message = f"must each be a {kind.__name__}, one is of type {type(value).__name__}"
+                raise DvoError(message, field=field, remedy="see dvo.ba.factors and dvo.ba.blocks")
 
 
 @dataclass(frozen=True)

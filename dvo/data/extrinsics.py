@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import read_yaml
 from dvo.data.files.files import MAX_NUMBER, parse_number, read_rows
@@ -95,6 +96,7 @@ def pose_of_numbers(values: Any, file: object | None = None) -> np.ndarray:
     return poses_from_matrices(matrix)
 
 
+@checked_arguments
 def base_trajectory(trajectory: Trajectory, T_base_camera: np.ndarray) -> Trajectory:
     """Poses of the base frame in the base frame of the first row.
 

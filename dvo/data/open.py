@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration
 from dvo.data.calibration.focal_guess import guess_focal
@@ -25,6 +26,7 @@ from dvo.data.streams.capture import is_stream
 from dvo.data.streams.live_source import open_stream
 
 
+@checked_arguments
 def open_source(
     source: Path | str,
     *,

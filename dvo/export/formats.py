@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
 from dvo.data.files.output import new_folder
@@ -44,6 +45,7 @@ WITHOUT_TIMES = ("kitti",)
 """Trajectory formats whose rows are frames, so that a frame without a pose cannot be told from the next one."""
 
 
+@checked_arguments
 def export_map(
     source: Odometry | KeyframeGraph, folder: Path | str, format: str = "colmap", segment: int | None = None
 ) -> Reconstruction:
@@ -101,6 +103,7 @@ def export_graph(graph: KeyframeGraph, segment: int, format: str, folder: Path |
     return reconstruction
 
 
+@checked_arguments
 def export_trajectory(trajectory: Trajectory, folder: Path | str, format: str = "tum") -> None:
     """Write a trajectory for another program.
 

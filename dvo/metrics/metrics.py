@@ -12,6 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import pose_matrices, poses_from_matrices
@@ -185,6 +186,7 @@ def relative_rotation_errors(
     return estimate.timestamps[i][gap:], errors
 
 
+@checked_arguments
 def evaluate(
     estimate: Trajectory,
     reference: Trajectory,

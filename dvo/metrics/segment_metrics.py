@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, Metrics, associate, evaluate, fit_alignment, relative_errors, stands_still, transform
 from dvo.odometry.protocol import Segment
@@ -156,6 +157,7 @@ def most_worlds(frames: int, gaps: int = 0) -> int:
     return 1 + gaps + frames // FRAMES_PER_WORLD
 
 
+@checked_arguments
 def evaluate_segments(
     segments: Sequence[Segment],
     reference: Trajectory,

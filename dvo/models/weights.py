@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.limits import limit_error
 from dvo.core.threads import use_threads
@@ -107,6 +108,7 @@ def tensor_digest(model: nn.Module) -> str:
     return digest.hexdigest()
 
 
+@checked_arguments
 def find_weights(name_or_file: str | Path) -> Path:
     """The file of shipped weights by name, or a file by path.
 
@@ -182,6 +184,7 @@ def _table(path: Path, metadata: dict[str, str], name: str) -> dict[str, Any]:
     return value
 
 
+@checked_arguments
 def weights_info(name_or_file: str | Path) -> WeightsInfo:
     """Contents of a weights file, without its tensors.
 
@@ -197,6 +200,7 @@ def list_weights() -> list[WeightsInfo]:
     return [weights_info(path) for path in sorted(FOLDER.glob("*.safetensors"))]
 
 
+@checked_arguments
 def load_weights(name_or_file: str | Path, device: torch.device | str = "cpu") -> LoadedWeights:
     """Read a network of any architecture.
 
@@ -220,6 +224,7 @@ def load_weights(name_or_file: str | Path, device: torch.device | str = "cpu") -
     return LoadedWeights.of(model.to(device).eval(), info.name, info)
 
 
+@checked_arguments
 def load_model(name_or_file: str | Path = "small", device: torch.device | str = "cpu") -> nn.Module:
     """The bare network of a weights file, in evaluation mode.
 
@@ -269,6 +274,7 @@ def _fill(model: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:
     model.load_state_dict({k: t.float() if t.is_floating_point() else t for k, t in tensors.items()})
 
 
+@checked_arguments
 def save_weights(path: str | Path, model: nn.Module, card: dict[str, Any], half: bool = True) -> None:
     """Write a network as safetensors, with its architecture and sizes in the metadata.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import check_seed
 from dvo.core.threads import settle_threads
 from dvo.models.weights import FOLDER, LoadedWeights, load_weights
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from dvo.odometry.patch.tracker import PatchOdometry
 
 
+@partial(checked_arguments, skip=("seed",))
 def load(
     weights: str = "small",
     *,
@@ -62,6 +65,7 @@ def load(
     return build_odometry(load_weights(weights, device), device=device, seed=seed, config=config, **overrides)
 
 
+@partial(checked_arguments, skip=("seed",))
 def build_odometry(
     weights: LoadedWeights,
     *,
@@ -90,6 +94,7 @@ def build_odometry(
     return builder(weights, device=device, seed=seed, config=config, **overrides)
 
 
+@partial(checked_arguments, skip=("preset",))
 def patch_odometry(
     weights: LoadedWeights,
     *,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_seed
 from dvo.core.threads import settle_threads
@@ -27,6 +29,7 @@ from dvo.odometry.patch.old_maps import OLD_VERSION, OldLoops, OldTracker, close
 from dvo.odometry.patch.tracker import PatchOdometry
 
 
+@partial(checked_arguments, skip=("seed", "preset"))
 def load_map(
     file: str | Path,
     *,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.map.merging import append_graph
 from dvo.models.weights import LoadedWeights, tensor_digest
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from dvo.odometry.patch.tracker import PatchOdometry
 
 
+@checked_arguments
 def merge_maps(
     first: str | Path,
     second: str | Path,

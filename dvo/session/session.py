@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
@@ -50,6 +51,7 @@ class Run:
         return self.frames_fed / max(own, 1e-9)
 
 
+@checked_arguments
 def run(
     odometry: Odometry,
     source: Iterable[Frame],

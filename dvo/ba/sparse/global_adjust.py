@@ -16,7 +16,7 @@ from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, i
 from dvo.ba.edges import check_index, plan_edges
 from dvo.ba.kernels import Kernel
 from dvo.ba.patch_problem import PatchProblem
-from dvo.ba.problem import Factor, State, StateBlock
+from dvo.ba.problem import Factor, State, StateBlock, check_further
 from dvo.ba.sparse.block_parts import PART, BlockParts
 from dvo.ba.sparse.equations import SparseSystem
 from dvo.ba.sparse.global_edges import ReprojectionEdges
@@ -262,6 +262,7 @@ def _fast_edges(
 
 
 def _check(problem: PatchProblem) -> None:
+    check_further(problem.factors, problem.blocks)
     n, e, k = problem.poses_cw.shape[0], len(problem.ii), problem.patches.shape[0]
     side, sensors = problem.patches.shape[-1], problem.sensors
     cameras = n if sensors is None else sensors.from_body.shape[-2]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from types import GeneratorType
 from typing import Generic, TypeVar
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
 
@@ -18,6 +19,8 @@ T = TypeVar("T")
 
 JOIN_TIMEOUT = 2.0
 """Seconds to wait for the thread at the end; one that hangs in a driver dies with the process."""
+LONGEST = 1_000_000
+"""Longest queue, frames."""
 _CHECK = 1.0  # seconds after which a waiting consumer looks again, see LiveFrames._wait
 
 
@@ -152,6 +155,7 @@ class LiveFrames(Generic[T]):
     kind = "stream"
     frame_count: int | None = None
 
+    @checked_arguments
     def __init__(
         self,
         frames: Iterable[T],
@@ -162,8 +166,9 @@ class LiveFrames(Generic[T]):
         groundtruth: Trajectory | None = None,
         interrupt: Callable[[], object] | None = None,
     ) -> None:
-        if queue < 1:
-            raise DvoError(f"must be 1 or more, got {queue}", field="queue", remedy="give a whole number of frames")
+        if not 1 <= queue <= LONGEST:
+            message = f"must be 1 or more, and {LONGEST} at most, got {queue}"
+            raise DvoError(message, field="queue", remedy="give a whole number of frames")
         self.name, self.groundtruth = name, groundtruth
         self._frames, self._queue = frames, _Queue[T](queue, drop, interrupt)
         self._thread: threading.Thread | None = None

@@ -15,6 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.focal_guess import guess_from_angle
@@ -29,7 +30,7 @@ from dvo.data.recording import EVERYTHING, Log, RawFrame, Selection
 from dvo.data.source import Reading, Source
 from dvo.data.streams.capture import STANDARD_INPUT, Capture, StreamClock, is_stream, shown
 from dvo.data.streams.image_pipe import pipe_reader, split_images
-from dvo.data.streams.live import LiveFrames, StreamCounts
+from dvo.data.streams.live import LONGEST, LiveFrames, StreamCounts
 from dvo.data.trajectory import Trajectory
 
 
@@ -167,6 +168,7 @@ class LiveSource(Source):
         self.close()
 
 
+@checked_arguments
 def open_stream(
     source: Any,
     *,
@@ -213,11 +215,14 @@ def open_stream(
                 for frame in source:
                     print(odometry.track(frame).pose_wc)
     """
+    if source is None:
+        raise DvoError("must be a camera, an address or a pipe, got None", field="source", remedy="give webcam:0 or -")
     fps = checked_rate(fps)
     check_stride(stride)
     check_invert(mask, mask_invert)
-    if queue is not None and queue < 0:
-        raise DvoError(f"must be 0 or more, got {queue}", field="queue", remedy="give a whole number of frames")
+    if queue is not None and not 0 <= queue <= LONGEST:
+        message = f"must be 0 or more, and {LONGEST} at most, got {queue}"
+        raise DvoError(message, field="queue", remedy="give a whole number of frames")
     if calib is not None and not isinstance(calib, Calibration):
         calib = read_calibration(calib)
     interval = Interval.of(None, end)

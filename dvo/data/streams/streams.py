@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.data.files.stamps import checked_rate
 from dvo.data.frame import Frame
@@ -118,6 +119,7 @@ def _changed(frame: Frame, seconds: float, reason: str) -> Frame:
     return changed
 
 
+@checked_arguments
 def stream(
     images: Iterable[Item],
     camera: Camera | None = None,

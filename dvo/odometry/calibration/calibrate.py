@@ -13,12 +13,14 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sized
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice, tee
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
@@ -88,6 +90,7 @@ class CalibrationOptions:
         check_settings(self, _RANGES)
 
 
+@partial(checked_arguments, skip=("seed",))
 def calibrate(
     frames: Iterable[Frame],
     guess: FocalGuess | None = None,

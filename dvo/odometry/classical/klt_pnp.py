@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import changed
 from dvo.data.frame import Frame
 from dvo.odometry.classical import two_view
@@ -62,6 +63,7 @@ class KltPnp:
 
     name = "klt-pnp"
 
+    @checked_arguments
     def __init__(self, config: KltPnpConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = changed(config or KltPnpConfig(), settings)
         self.seed = seed

@@ -8,12 +8,14 @@ adjustment of its pose alone, and moves with them.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import check_seed
 from dvo.data.frame import Frame
 from dvo.geometry import se3
@@ -35,6 +37,7 @@ _WITH_FEATURES = 32  # frames without a pose whose features are kept until the i
 _NOT_INITIALISED = "not initialised"  # reason of a loss: the segment ended before its keyframes agreed with each other
 
 
+@partial(checked_arguments, skip=("preset",))
 def droid_odometry(
     weights: LoadedWeights,
     *,

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.threads import core_left
 from dvo.data.frame import Frame
@@ -198,6 +199,7 @@ class PatchOdometry:
         known = {frame.identifier: pose for frame, pose in zip(self.window.frames, poses, strict=True)}
         return self._result(known if self.state.initialised else {})
 
+    @checked_arguments
     def save(self, file: str | Path) -> None:
         """Write the map to a file, for other recordings of the place (:func:`dvo.load_map`) or other programs.
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import check_settings
 from dvo.data.frame import Frame
 from dvo.geometry import se3
@@ -226,6 +228,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 that its weights fix, so that they differ little."""
 
 
+@partial(checked_arguments, skip=("preset",))
 def deepvo_odometry(
     weights: LoadedWeights,
     *,

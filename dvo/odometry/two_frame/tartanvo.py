@@ -10,12 +10,14 @@ frames together, so a scene whose depth changes along the way changes the scale 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import check_settings
 from dvo.data.frame import Frame
 from dvo.geometry import se3
@@ -98,6 +100,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 """Settings that trade accuracy for speed; ``dvo.load("tartanvo.safetensors", preset="fast")``."""
 
 
+@partial(checked_arguments, skip=("preset",))
 def tartan_odometry(
     weights: LoadedWeights,
     *,

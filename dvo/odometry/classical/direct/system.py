@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import changed
 from dvo.data.frame import Frame
 from dvo.odometry.classical.direct.align import Alignment, Reference, align
@@ -93,6 +94,7 @@ class DirectOdometry:
 
     name = "direct"
 
+    @checked_arguments
     def __init__(self, config: DirectConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = changed(config or DirectConfig(), settings)
         self._seed = seed

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import changed
 from dvo.data.frame import Frame
 from dvo.odometry.classical import two_view
@@ -36,6 +37,7 @@ class KeyframeOdometry:
 
     name = "keyframe"
 
+    @checked_arguments
     def __init__(self, config: KeyframeConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = changed(config or KeyframeConfig(), settings)
         self._seed = seed

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dvo.core.arguments import checked_arguments
 from dvo.core.settings import changed
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
@@ -91,6 +92,7 @@ class MonoSlam:
 
     name = "monoslam"
 
+    @checked_arguments
     def __init__(self, config: MonoSlamConfig | None = None, seed: int = 0, **settings: Any) -> None:
         self.config = changed(config or MonoSlamConfig(), settings)
         self._rng = np.random.default_rng([seed, 7501])

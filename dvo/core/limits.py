@@ -116,7 +116,7 @@ def limit_error(error: BaseException, file: object | None = None) -> DvoError | 
         return None
     text = first_line(error)
     if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
-        if "cuda" in str(error).lower():
+        if type(error).__name__ == "OutOfMemoryError":  # torch's, of an accelerator
             return DvoError("the memory of the device does not suffice", remedy="give --device cpu, or smaller images")
         remedy = "raise the limit of memory (ulimit -v), end other programs, or give a smaller file or smaller images"
         return DvoError("the memory does not suffice", file=file, remedy=remedy)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 from eval.suites.rendered import RECORD, place_of, rendered_folder
 from eval.suites.suite import Suite
 
@@ -40,11 +40,10 @@ def prepare(suites: list[Suite]) -> list[Path]:
             print_line(
                 f"{sequence.name:32} {facts['frames']} frames, {facts['path_m']:.2f} m, {facts['scene']}: {took}"
             )
-            sys.stdout.flush()
             folders.append(folder)
     size = sum(file.stat().st_size for folder in folders for file in folder.rglob("*") if file.is_file())
     where = folders[0].parent if folders else "nowhere"
-    print(
+    print_line(
         f"{len(folders)} sequences, {made} rendered now, {size / 1e6:.0f} MB in {where}; "
         f"{time.perf_counter() - begin:.0f} s"
     )

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -89,3 +90,37 @@ def test_it_predicts_the_spread_of_the_estimate_at_fixed_size(problem: Maker) ->
     whitened = torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), errors[..., None], upper=False)
     assert 0.8 < whitened.square().mean().item() < 1.25
     assert (size[0] / size[1]).mean().item() > 1.25
+
+
+@pytest.mark.parametrize("weight", [1e10, 1e14, 1e20])
+@pytest.mark.parametrize("dtype", [torch.float32, F64], ids=str)
+def test_one_weight_among_small_ones_leaves_the_other_directions(
+    problem: Maker, weight: float, dtype: torch.dtype
+) -> None:
+    """From a weight on that holds its edge, more of it changes nothing; a Hessian has no digits for both."""
+    p = problem(noise=0.3)
+    p = replace(p, **{name: getattr(p, name).to(torch.float32).to(dtype) for name in
+                      ("poses", "patches", "intrinsics", "targets", "weights")})  # fmt: skip
+
+    def covariance(weight: float) -> Tensor:
+        weights = p.weights.clone()
+        weights[:, 5] = weight
+        given = PatchProblem(*replace(p, weights=weights).arguments())
+        return pose_covariance(make_problem(given), (1, 3))
+
+    expected, found = covariance(1e6), covariance(weight)
+    assert torch.isfinite(found).all()
+    scale = expected.diagonal(dim1=1, dim2=2).sqrt()
+    scale = scale[:, :, None] * scale[:, None]
+    assert ((found - expected) / scale).abs().max() < 0.01
+
+
+def test_the_rows_give_the_covariance_of_the_equations(problem: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+    p = problem(noise=0.3)
+    made = make_problem(PatchProblem(*p.arguments()))
+    prior = size_gradient(p.poses, 0, (1, 2, 3))
+    expected = [pose_covariance(made, (1, 2), WEAK, constraint=prior), pose_covariance(made, (1, 2))]
+    monkeypatch.setattr("dvo.ba.covariance._keeps_digits", lambda *a: torch.zeros(2, dtype=torch.bool))
+    found = [pose_covariance(made, (1, 2), WEAK, constraint=prior), pose_covariance(made, (1, 2))]
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-9)

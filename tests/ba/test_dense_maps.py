@@ -8,6 +8,7 @@ from dvo.ba.factors import DepthDamping
 from dvo.ba.layer.dense import dense_bundle_adjust, dense_patches, dense_plan, pixel_grid
 from dvo.ba.layer.layer import bundle_adjust
 from dvo.ba.options import BADamping, BAOptions
+from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.losses.pose import pose_errors
@@ -123,3 +124,15 @@ def test_true_flow_gives_depth_and_motion(index):
 
 def test_one_step_damping_of_the_published_code_is_used():
     assert damping_of(0) == BADamping(0.1, 0.1, 1e-7) and damping_of(9) == BADamping(0.1, 1e-4, 1e-7)
+
+
+@pytest.mark.parametrize("name", ["inverse_depth", "targets", "weights", "ii", "jj", "damping"])
+def test_maps_that_do_not_fit_are_named(name):
+    poses, depth, intrinsics, targets, weights, damping = problem()
+    ii, jj = PAIRS.unbind(1)
+    given = {"poses_cw": poses, "inverse_depth": depth, "intrinsics": intrinsics, "targets": targets,
+             "weights": weights, "ii": ii, "jj": jj, "damping": damping.exp()}  # fmt: skip
+    for wrong in (given[name][None], given[name].tolist()):
+        with pytest.raises(DvoError) as error:
+            dense_bundle_adjust(**(given | {name: wrong}))
+        assert error.value.field == name

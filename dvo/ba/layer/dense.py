@@ -15,8 +15,10 @@ from dvo.ba.factors import DepthDamping
 from dvo.ba.options import BAOptions
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.solve import solve
+from dvo.core.errors import DvoError
 
 _DEFAULT = BAOptions()
+_HELP = "see the help of dense_bundle_adjust"
 
 
 def dense_plan(ii: Int[Tensor, " E"], jj: Int[Tensor, " E"], frames: int, pixels: int) -> EdgePlan:
@@ -106,7 +108,7 @@ def dense_bundle_adjust(
         >>> poses_cw, inverse_depth = dense_bundle_adjust(
         ...     poses_cw, inverse_depth, intrinsics, targets, weights, ii, jj, damping=eta)
     """
-    b, n, h, w = inverse_depth.shape
+    b, n, h, w = _checked(inverse_depth, targets, weights, ii, jj, damping)
     if plan is None:
         plan = dense_plan(ii, jj, n, h * w)
     patches = dense_patches(inverse_depth).permute(0, 1, 3, 4, 2).reshape(b, n * h * w, 3, 1, 1)
@@ -115,3 +117,24 @@ def dense_bundle_adjust(
     measured = targets.reshape(b, -1, 2), weights.reshape(b, -1, 2), source, target, plan.kk
     solved = solve(PatchProblem(poses_cw, patches, intrinsics, *measured, factors=factors, plan=plan), options)
     return solved.poses_cw, solved.patches[:, :, 2, 0, 0].view(b, n, h, w)
+
+
+def _checked(
+    inverse_depth: Tensor, targets: Tensor, weights: Tensor, ii: Tensor, jj: Tensor, damping: Tensor | None
+) -> tuple[int, int, int, int]:
+    """Shape of the maps, once those of the others belong to it; the layer checks the rest."""
+    given = {"inverse_depth": inverse_depth, "targets": targets, "weights": weights, "ii": ii, "jj": jj}
+    for name, x in (given if damping is None else given | {"damping": damping}).items():
+        if not isinstance(x, Tensor):
+            raise DvoError(f"is {type(x).__name__}, not a tensor", field=name, remedy="give a torch.Tensor")
+    if inverse_depth.dim() != 4 or ii.dim() != 1:
+        name, x = ("ii", ii) if inverse_depth.dim() == 4 else ("inverse_depth", inverse_depth)
+        raise DvoError(f"has shape {tuple(x.shape)}", field=name, remedy=_HELP)
+    b, n, h, w = inverse_depth.shape
+    rows = (b, len(ii), h, w, 2)
+    wanted = {"targets": rows, "weights": rows, "jj": (len(ii),), "damping": (b, n, h, w)}
+    for name, shape in wanted.items():
+        x = damping if name == "damping" else given[name]
+        if x is not None and x.shape != shape:
+            raise DvoError(f"has shape {tuple(x.shape)}, not {shape}", field=name, remedy=_HELP)
+    return b, n, h, w

@@ -240,7 +240,7 @@ def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:
     there = x.to(dtype)
     if there is not x and there.requires_grad:
         largest = torch.finfo(x.dtype).max
-        there.register_hook(lambda gradient: torch.where(gradient.abs() > largest, 0.0, gradient))
+        there.register_hook(lambda g: None if g is None else torch.where(g.abs() > largest, 0.0, g))
     return there
 
 

@@ -171,6 +171,7 @@ TAILS = ["", "/", "/live", "/a@b", "/live?token={}", "?access_token={}", "/x?a=1
 def _odd_address(folder: Path, random: np.random.Generator) -> str:
     scheme, user, tail = (str(part[int(random.integers(len(part)))]) for part in (SCHEMES, USERS, TAILS))
     separator = ["://", "://", "://", ":/", "//"][int(random.integers(5))]
+    separator = "://" if scheme in ("", "file") else separator  # else a path, in which everything is a name
     text = f"{scheme}{separator}{user.format(SECRET)}127.0.0.1:1{tail.format(SECRET)}"
     (folder / "empty.txt").write_text(text)
     return text.replace(SECRET, "...")
@@ -179,7 +180,7 @@ def _odd_address(folder: Path, random: np.random.Generator) -> str:
 def _address(folder: Path, random: np.random.Generator | None) -> None:
     """Open an address at which nobody answers: no message holds its secret."""
     address = (folder / "empty.txt").read_text()
-    if not address:
+    if not address.strip():
         return
     try:
         open_source(address)

@@ -13,8 +13,8 @@ from urllib.parse import unquote
 HIDDEN = "***"
 """What stands in the place of a secret value."""
 
-# A path joins the slashes of "rtsp://", and a scheme may be mistyped; one letter before a colon is a drive. A colon or a
-# scheme may have been forgotten.
+# A path joins the slashes of "rtsp://", and a scheme may be mistyped; one letter before a colon is a drive. A colon or
+# a scheme may have been forgotten.
 _KNOWN = r"(?:rtsps?|rtmp[a-z]{0,2}|https?|s?ftps?|udp|tcp|srt|mms|h264\+rtsp|rstp|htpp?s?)"
 _SCHEME = re.compile(rf"[a-z][a-z0-9+-]+:[/\\]+|(?<![\w./\\]){_KNOWN}[/\\]+|(?<!\S):[/\\]+", re.IGNORECASE)
 _PORT = re.compile(r"[^\s/@:]*:\d{1,5}(?![^\s/?#,.;:'\")\]])")

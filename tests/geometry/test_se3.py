@@ -1,4 +1,7 @@
-"""SE(3): values against the matrix exponential, gradients where others have returned NaN."""
+"""SE(3): values against the matrix exponential, gradients where others have returned NaN.
+
+Against other packages: ``tests/conformity/test_groups.py``.
+"""
 
 from __future__ import annotations
 
@@ -173,15 +176,6 @@ def test_rotations_are_not_computed_in_the_precision_of_autocast() -> None:
     outside = se3.matrix(se3.compose(pose, pose)), se3.act(pose, pose[:, :3])
     for a, b in zip(inside, outside, strict=True):
         torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("angle", [1e-3, 0.1, 1.0, 3.0])
-def test_agrees_with_pypose(angle: float) -> None:
-    pypose = pytest.importorskip("pypose")
-    xi = tangents(angle)
-    theirs = pypose.se3(xi).Exp()
-    torch.testing.assert_close(se3.matrix(se3.exp(xi)), theirs.matrix(), atol=1e-8, rtol=0)
-    torch.testing.assert_close(se3.log(theirs.tensor()), theirs.Log().tensor(), atol=1e-7, rtol=0)
 
 
 @settings(max_examples=10, deadline=None)

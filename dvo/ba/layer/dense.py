@@ -134,7 +134,7 @@ def _checked(
     rows = (b, len(ii), h, w, 2)
     wanted = {"targets": rows, "weights": rows, "jj": (len(ii),), "damping": (b, n, h, w)}
     for name, shape in wanted.items():
-        x = damping if name == "damping" else given[name]
-        if x is not None and x.shape != shape:
-            raise DvoError(f"has shape {tuple(x.shape)}, not {shape}", field=name, remedy=_HELP)
+        found = damping if name == "damping" else given[name]
+        if found is not None and found.shape != shape:
+            raise DvoError(f"has shape {tuple(found.shape)}, not {shape}", field=name, remedy=_HELP)
     return b, n, h, w

@@ -146,9 +146,6 @@ def _mask(fixed: object, frames: int) -> Tensor:
         fixed = torch.from_numpy(fixed)
     if isinstance(fixed, Tensor) and fixed.dtype == torch.bool and fixed.shape == (frames,):
         return fixed
-    is_tensor = isinstance(fixed, Tensor)
     found = f"{fixed.dtype} of shape {tuple(fixed.shape)}" if isinstance(fixed, Tensor) else shown(fixed)
-    raise DvoError(
-        f"is {'a tensor of ' if is_tensor else ''}{found}, neither a number of frames nor a mask of {frames}",
-        field="fixed", remedy=f"give a whole number, or bool ({frames},)",
-    )  # fmt: skip
+    what = f"is {found}, neither a number of frames nor a mask of {frames}"
+    raise DvoError(what, field="fixed", remedy=f"give a whole number, or bool ({frames},)")

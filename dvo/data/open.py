@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from dvo.data.streams.capture import is_stream
 from dvo.data.streams.live_source import open_stream
 
 
-@checked_arguments
+@partial(checked_arguments, skip=("fps", "stride"))
 def open_source(
     source: Path | str,
     *,

@@ -168,7 +168,7 @@ class LiveSource(Source):
         self.close()
 
 
-@checked_arguments
+@partial(checked_arguments, skip=("fps", "stride"))
 def open_stream(
     source: Any,
     *,

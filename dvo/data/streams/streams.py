@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections import deque
 from collections.abc import Iterable, Iterator
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -119,7 +120,7 @@ def _changed(frame: Frame, seconds: float, reason: str) -> Frame:
     return changed
 
 
-@checked_arguments
+@partial(checked_arguments, skip=("images", "timestamps", "fps"))
 def stream(
     images: Iterable[Item],
     camera: Camera | None = None,
@@ -164,6 +165,8 @@ def stream(
     fps = checked_rate(fps)
     undistorter = Undistorter(camera) if camera is not None and undistort and needs_undistortion(camera) else None
     times = _iterator(timestamps, name, "timestamps") if timestamps is not None else None
+    if not hasattr(images, "__iter__") and not hasattr(images, "__getitem__"):
+        raise _not_iterable(images, name, "images")
 
     def frames() -> Iterator[Frame]:
         for index, item in enumerate(_iterator(images, name, "images")):
@@ -191,7 +194,11 @@ def _iterator(values: Any, name: str, field: str) -> Iterator[Any]:
     try:
         return iter(values)
     except TypeError:
-        raise DvoError(f"not {field}: {type(values).__name__}", file=name, field=field, remedy="give a list") from None
+        raise _not_iterable(values, name, field) from None
+
+
+def _not_iterable(values: object, name: str, field: str) -> DvoError:
+    return DvoError(f"not {field}: {type(values).__name__}", file=name, field=field, remedy="give a list")
 
 
 def _seconds(time: Any, index: int, name: str) -> float:

@@ -27,7 +27,6 @@ from dvo.ba.layer.transforms import composed, is_transformed
 from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
-from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
 from dvo.core.threads import use_threads
@@ -38,7 +37,6 @@ __all__ = ["BADamping", "BAOptions", "BAResult", "Sensors", "bundle_adjust", "ma
 _DEFAULT = BAOptions()
 
 
-@checked_arguments
 def bundle_adjust(
     poses_cw: Tensor,
     patches: Tensor,

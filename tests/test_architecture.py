@@ -126,7 +126,8 @@ def test_no_file_stands_in_a_circle() -> None:
 
 @pytest.mark.parametrize("file", TESTS, ids=name)
 def test_tests_share_only_what_lies_in_support(file: Path) -> None:
-    own = "tests.fuzz" if (ROOT / "tests" / "fuzz") in file.parents else "tests.support"
+    programs = (room for room in ("fuzz", "faults") if (ROOT / "tests" / room) in file.parents)
+    own = f"tests.{next(programs, 'support')}"
     for line, module in imports(file):
         if module.split(".")[0] == "tests":
             assert any(f"{module}.".startswith(f"{room}.") for room in ("tests.support", own)), (

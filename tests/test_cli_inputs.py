@@ -70,7 +70,7 @@ def test_extrinsics(given, images, tmp_path, capsys, monkeypatch, scale):
     assert ("scale of the trajectory is not known" in (out / "trajectory_base.txt").read_text()) == (scale is None)
     assert sum("lever arm of 1.5 m" in warning for warning in summary(out)["warnings"]) == (scale is None)
     assert summary(out)["extrinsics"] == str(tmp_path / "rig.txt") and summary(out)["finished"]
-    assert main(arguments(images, out)) == 0
+    assert main(arguments(images, out, "--overwrite")) == 0
     assert not (out / "trajectory_base.txt").exists()
 
 

@@ -120,7 +120,7 @@ def test_a_run_with_a_distance_is_in_metres_and_one_that_is_not_covered_is_told(
     assert np.linalg.norm(rows[12, 1:4] - rows[2, 1:4]) == pytest.approx(0.5, rel=1e-4)
     assert not (out / "cloud.ply").exists()
     capsys.readouterr()
-    assert main(["run", str(clip), "--out", str(out), *SETTINGS, "--distance", "5", "6", "1"]) == 0
+    assert main(["run", str(clip), "--out", str(out), "--overwrite", *SETTINGS, "--distance", "5", "6", "1"]) == 0
     printed = capsys.readouterr().out
     assert "no metric scale from known distances" in printed and "after Sim(3) alignment" in printed
 

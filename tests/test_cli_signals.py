@@ -116,6 +116,15 @@ def test_kill_at_ten_moments_of_a_real_clip(data_root, tmp_path, repository):
         assert len(lines) - 1 >= recorded[:, 1].sum(), "every row is written at once"
 
 
+@pytest.fixture(autouse=True)
+def default_signals():
+    """Signals as a shell leaves them; under ``nohup`` one of them is ignored."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGHUP, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 ENDING = pytest.mark.parametrize(
     ("number", "code", "said"), [(signal.SIGTERM, 143, "terminated"), (signal.SIGHUP, 129, "hung up")]
 )

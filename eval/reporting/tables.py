@@ -174,7 +174,7 @@ def one_line(text: str) -> str:
 
 
 def escape(text: str) -> str:
-    """The text as Markdown shows it: on one line, without markup, HTML, links or the end of a cell.
+    """The text as Markdown shows it: on one line, without markup, HTML, named links or the end of a cell.
 
     Args:
         text: name of a system, a sequence or a suite, message of a program: anything.
@@ -184,12 +184,11 @@ def escape(text: str) -> str:
 
     Example:
         >>> escape("a|b [c](http://d) <e>")
-        'a\\|b \\[c\\](http\\://d) &lt;e&gt;'
+        'a\\|b \\[c\\](http://d) &lt;e&gt;'
     """
     plain = "".join(letter if letter.isprintable() else " " for letter in one_line(text)).replace("&", "&amp;")
     marked = re.sub(r"[\\`*\[\]|~#]|(?<!\w)_|_(?!\w)|@(?=\w)", r"\\\g<0>", plain)
-    unlinked = re.sub(r"(?i)\b(https?|ftp)(:)(?=//)|\b(www)(\.)", r"\1\3\\\2\4", marked)
-    return re.sub(r"^(\d*)([-+.)])(?=\s)", r"\1\\\2", unlinked.replace("<", "&lt;").replace(">", "&gt;"))
+    return re.sub(r"^(\d*)([-+.)])(?=\s)", r"\1\\\2", marked.replace("<", "&lt;").replace(">", "&gt;"))
 
 
 def _csv(value: object) -> str:

@@ -249,6 +249,7 @@ def test_work_of_several_threads_is_noted_at_its_entries(monkeypatch):
     """As :data:`FORK` does in processes of their own; a fork is only told here."""
     forks = {"work": False, "after work": False}
     monkeypatch.setattr(threads, "_forks", forks)
+    torch.set_num_threads(1)
     dvo.load_model("small")
     threads._after_fork()
     assert not any(forks.values()), "one thread"

@@ -77,6 +77,8 @@ def _run(clip: Path, folder: Path, number: signal.Signals | None, after: float) 
         log = os.open(f"{folder}.log", os.O_WRONLY | os.O_CREAT)
         os.dup2(log, 1)
         os.dup2(log, 2)
+        for handled in (signal.SIGHUP, signal.SIGTERM):  # also under nohup
+            signal.signal(handled, signal.SIG_DFL)
         os._exit(main(line))
     if number is not None:
         time.sleep(after)

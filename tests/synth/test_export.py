@@ -101,7 +101,7 @@ def test_mesh_sequence_reads_back_with_the_background_as_no_depth(tmp_path: Path
 def test_export_refuses_what_it_cannot_do(sequence: SyntheticSequence, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("precious")
-    with pytest.raises(DvoError, match="holds something"):
+    with pytest.raises(DvoError, match="not an empty folder"):
         export_sequence(sequence, tmp_path / "full", "tum")
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
     with pytest.raises(DvoError, match="layout"):
@@ -114,7 +114,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["synth", "export", "--out", out, "--layout", "tartanair", "--family", "planes", *size]) == 0
     assert len(list((tmp_path / "P001" / "image_left").iterdir())) == 2
     for wrong, said in (
-        (["export", "--out", out, *size], "holds something"),
+        (["export", "--out", out, *size], "not an empty folder"),
         (["export", "--out", out + "x", "--family", "castle", *size], "family"),
         (["export", "--out", out + "x", "--size", "8x8"], "WIDTHxHEIGHT"),
         (["preview", "--out", str(tmp_path / "none" / "x.png")], "cannot be written"),

@@ -56,7 +56,7 @@ def test_judged_by_rotation(plan, rows):
 
 WILD = "a|b `c` *d* <b>e</b> [f](http://g) ![h](i) &amp; www.j.k\nl_m _n_ \\\\ #o ~~p~~ q@r.s"
 ESCAPED = (
-    r"a\|b \`c\` \*d\* &lt;b&gt;e&lt;/b&gt; \[f\](http\://g) !\[h\](i) &amp;amp; www\.j.k "
+    r"a\|b \`c\` \*d\* &lt;b&gt;e&lt;/b&gt; \[f\](http://g) !\[h\](i) &amp;amp; www.j.k "
     r"l_m \_n\_ \\\\ \#o \~\~p\~\~ q\@r.s"
 )
 

@@ -96,6 +96,7 @@ def test_a_core_is_left_to_a_busy_thread(monkeypatch, cores, count, busy, expect
         torch.set_num_threads(before)
 
 
+@pytest.mark.slow
 def test_dvo_chooses_where_nothing_is_set():
     code = LOAD + (
         "t = now(); print(t.count, t.chosen_by, t.wait_policy, t.waits_by, torch.get_num_threads());"
@@ -106,6 +107,7 @@ def test_dvo_chooses_where_nothing_is_set():
     assert first in {f"{count} dvo passive dvo {count}" for count in counts} and later == "3"
 
 
+@pytest.mark.slow
 def test_what_the_user_has_set_is_kept():
     code = "import dvo.core.threads as threads; threads.thread_rule = lambda cores: 2; " + LOAD
     code += "t = now(); print(t.count, t.chosen_by, t.wait_policy, t.waits_by, 'OMP_WAIT_POLICY' in os.environ)"
@@ -114,6 +116,7 @@ def test_what_the_user_has_set_is_kept():
     ]
 
 
+@pytest.mark.slow
 def test_torch_imported_first():
     """The number can still be set; spinning is told once, and only if several threads are left."""
     start = (

@@ -83,6 +83,7 @@ def hlg_as_sdr(levels):
     return 255 * np.clip(1000 / 203 * scene**1.2, 0, 1) ** (1 / 2.4)
 
 
+@pytest.mark.slow
 def test_hdr_of_phones(tmp_path):
     """HEVC of 10 bits, BT.2020, HLG: newer FFmpeg takes reference white for white, older leaves the levels."""
     ramp = np.repeat(np.linspace(0, 255, WIDTH // 8).round(), 8)

@@ -34,6 +34,7 @@ def test_a_map_with_measured_depths(tmp_path):
     assert found.finish().metric and found.finish().info["scale"]["source"] == "depth"
 
 
+@pytest.mark.slow
 def test_a_map_with_depths_from_right_images(tmp_path):
     """Before the initialisation, and after keyframes with depths from right images have left the window."""
 

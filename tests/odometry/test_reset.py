@@ -14,6 +14,7 @@ def test_every_member_is_here():
     assert {name for name in ARCHITECTURES if name != "distance_vo"} == set(MEMBERS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MEMBERS)
 @pytest.mark.parametrize("finished", [False, True])
 def test_the_next_sequence_has_the_bytes_of_a_new_odometry(name, finished):

@@ -222,6 +222,7 @@ def induced_between(clip: Clip, intrinsics: torch.Tensor) -> tuple[torch.Tensor,
     return torch.stack([u - x, v - y], -1), inside
 
 
+@pytest.mark.slow
 def test_what_would_cover_everything_is_left_out() -> None:
     clips = [make_clip(SEED, index, surroundings=1.0, **SMALL) for index in range(30)]
     shown = [clip.moving for clip in clips if clip.moving is not None]

@@ -93,6 +93,7 @@ def test_flow_there_and_back_agree(scene: Scene, case: str) -> None:
     assert np.median(np.linalg.norm(returned + there.flow[y, x], axis=-1)) < 0.1
 
 
+@pytest.mark.slow
 def test_warped_frame_is_the_same_picture() -> None:
     """Median photometric error of the warp outside occlusions below one grey level, bodies and rolling shutter too."""
     errors, unmoved = [], []

@@ -57,6 +57,7 @@ def test_tiles_of_a_round_are_no_neighbours_and_each_is_eliminated_once(size, pa
             assert sorted(int(k) for part in parts for k in part) == list(range(flat.numel()))
 
 
+@pytest.mark.slow
 def test_many_rows_below_a_tile_and_long_chains():
     """An arrow, whose last rows are below all others, and a chain with a few loops."""
     arrow = [(i, j) for i in range(100, 112) for j in range(112)]

@@ -102,6 +102,7 @@ def test_frames_bring_what_the_scale_comes_from(monkeypatch):
     assert 0.4 < np.isnan(next(frames_of(sequence, "depth")).depth).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_a_sequence_in_metres_is_measured():
     for scale in ("depth", "stereo"):
         errors = measure(walk(16), "small", 0, scale)

@@ -135,6 +135,7 @@ def test_lists_that_are_not_understood_are_refused(tmp_path, text, field):
         read_expected(file)
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_and_page_and_goes_on(tmp_path, capsys):
     out, rng = tmp_path / "out", np.random.default_rng(0)
     writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))

@@ -207,6 +207,7 @@ def trajectories(data_root) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [

@@ -78,6 +78,7 @@ def test_a_known_warp_is_found(dx, dy, turn, zoom, gain, offset):
     assert found.correlation > 0.99 and found.last_step < 0.01
 
 
+@pytest.mark.slow
 def test_it_is_differentiable():
     x, y = grid(24, 24)
     images = torch.stack([texture(x, y), texture(x - 0.4, y + 0.3)])

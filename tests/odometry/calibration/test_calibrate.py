@@ -72,6 +72,7 @@ def test_without_its_deviation_the_principal_point_is_the_middle(leaning):
     assert found.aside == (0.0, 0.0) and len(str(found).splitlines()) == 1 and len(tracked) == 1
 
 
+@pytest.mark.slow
 def test_the_same_seed_and_an_iterator_give_the_same_bytes(clip):
     options = CalibrationOptions(frames=20, rounds=1)
     assert calibrate(iter(clip), options=options) == calibrate(clip, options=options)

@@ -133,6 +133,7 @@ def test_true_flow_gives_the_true_trajectory_and_depth(clip, knowing):
     assert len(done.map.points) == sum(int(found.reliable.sum()) for found in done.depth) == len(done.map.colors)
 
 
+@pytest.mark.slow
 def test_a_moving_body_does_not_pull_the_camera(clip, monkeypatch):
     volume = true_volume(clip)
 

@@ -35,6 +35,7 @@ def test_the_focal_length_is_found_from_the_measurements(factor):
     assert found.minimum.deviation < 0.06 and found.contrast > 0.02
 
 
+@pytest.mark.slow
 def test_a_rolling_shutter_has_to_be_corrected():
     graph = walk_with(1.0, noise=0.02, readout=0.06)
     adjust_segment(graph, 0, shutter=Shutter(0.06, ROWS))

@@ -96,6 +96,7 @@ def test_a_place_is_recognised_from_a_wrong_start(closed):
         assert all_steps(finder.verify(predicted)) is None
 
 
+@pytest.mark.slow
 def test_a_match_ends_once_further_updates_change_nothing(closed, monkeypatch):
     """Asked of several pairs: how far a single one goes on moving depends on its view."""
     finder, errors = closed[0].loops.finder, []
@@ -226,6 +227,7 @@ def released(graph, identifiers):
         graph.archive.add(replace(graph.archive[identifier], centres=centres, inverse_depth=depth, colors=colors))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_keyframes_without_patches_are_corrected_with_the_others(correcting):
     """The oldest patches were released while a search ran: the pose graph takes the depth of the nearest patches."""
@@ -244,6 +246,7 @@ def test_keyframes_without_patches_are_corrected_with_the_others(correcting):
     assert torch.isfinite(loop_correction.prepare(graph, kept, loops, loops[-1]).solve()).all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_a_loop_of_a_keyframe_whose_patches_were_released_counts_for_nothing(correcting):
     loops, loop = correcting.loops, correcting.loops.loops[-1]
@@ -252,6 +255,7 @@ def test_a_loop_of_a_keyframe_whose_patches_were_released_counts_for_nothing(cor
     assert not loops.finder.agree(loop, loop) and not loops.is_within(loop, (1e6, 4.0, 1e6))
 
 
+@pytest.mark.slow
 def test_an_interruption_while_a_frame_waits_leaves_the_work(correcting, monkeypatch):
     loops, work = correcting.loops, correcting.loops.maintenance.job
 
@@ -304,6 +308,7 @@ def test_a_search_that_fails_ends_the_frame_that_takes_its_result(film, monkeypa
             odometry.track(frame)
 
 
+@pytest.mark.slow
 def test_without_loops_nothing_is_searched_or_kept(film, closed):
     odometry, estimates, result = track(film[0], loops=False)
     assert "loops" not in result.info and not odometry.loops.finder.kept

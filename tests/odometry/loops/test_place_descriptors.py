@@ -98,6 +98,7 @@ def test_the_shipped_descriptor_is_fitted_to_the_shipped_weights():
     assert facts["sha256"] == weights_info("small").sha256, "run python -m train places"
 
 
+@pytest.mark.slow
 def test_the_shipped_descriptor_recognises_a_view_in_another_light_among_other_scenes():
     model, descriptor = load_model("small"), load_descriptor()
     assert descriptor.dimensions * 2 <= 1024  # bytes of a keyframe

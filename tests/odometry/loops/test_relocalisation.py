@@ -58,6 +58,7 @@ def runs():
     return truth, [track(frames, seed=seed) for seed in (0, 1, 2)]
 
 
+@pytest.mark.slow
 def test_the_first_frames_that_show_a_known_place_are_located_in_it(runs):
     truth, found = runs
     for _, estimates, result in found:
@@ -71,6 +72,7 @@ def test_the_first_frames_that_show_a_known_place_are_located_in_it(runs):
     assert np.median([evaluate(result.trajectory, truth).ate_percent for _, _, result in found]) < 0.3
 
 
+@pytest.mark.slow
 def test_while_it_sees_the_map_the_window_has_keyframes_of_it_that_stay(runs):
     frames, _ = interrupted(63, BACK)
     odometry = dvo.load("small", **SHORT, **ALONE)

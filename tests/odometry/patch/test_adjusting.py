@@ -62,6 +62,7 @@ def test_a_world_is_adjusted_after_a_loop(film, tmp_path):
     assert dvo.load_map(tmp_path / "adjusting.dvo").finish().info["adjustments"] == []
 
 
+@pytest.mark.slow
 def test_an_adjustment_on_request(film):
     """It waits, and lowers cost and error; in real time it is done beside tracking, and no frame waits for it."""
     loaded, count = adjusting(film, lambda loops: loops.corrections > 0 and loops.maintenance.job is None)

@@ -126,6 +126,7 @@ def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch
     assert (tmp_path / "tried.dvo").read_bytes() == (tmp_path / "not.dvo").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_pose_that_would_cost_the_newest_frame_its_own_is_refused(dark, monkeypatch):
     refuse(monkeypatch, dark[BACK].timestamp)
     try_insert, support = PatchWindow.try_insert, patch_window.support_of
@@ -158,6 +159,7 @@ def test_later_frames_do_not_count(dark):
         window.confidence = kept
 
 
+@pytest.mark.slow
 def test_a_repetition_of_a_view_that_was_joined_late_shares_its_pose(dark, monkeypatch):
     frames = with_images(dark, [dark[BACK].image], BACK + 1)
     refuse(monkeypatch, frames[BACK].timestamp)

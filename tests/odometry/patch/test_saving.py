@@ -21,6 +21,7 @@ from tests.support.saved_maps import FAST, check_saved_run, rewritten
 from tests.support.tiny_tracker import SMALL, frames, network, run, tracker
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("operator", "settings"),
     [
@@ -62,6 +63,7 @@ def test_saving_changes_nothing_while_lost_and_after_a_change_of_segment(interru
     assert estimates[23].segment == 1 and len(result.segments) == 3
 
 
+@pytest.mark.slow
 def test_a_sequence_that_was_not_initialised_is_closed_in_the_file_as_by_finish(tmp_path):
     still = replace(SMALL, initial_parallax=1e9)
     for config, count in ((SMALL, 3), (still, 8), (still, 30)):

@@ -48,6 +48,7 @@ def test_same_seed_same_bytes_and_another_seed_another_trajectory():
     assert first.tobytes() != other.tobytes()
 
 
+@pytest.mark.slow
 def test_the_state_space_operator_tracks_and_its_states_stay_bounded():
     odometry = tracker(operator="mamba")
     estimates = [odometry.track(frame) for frame in frames(30)]

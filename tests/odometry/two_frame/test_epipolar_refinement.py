@@ -88,6 +88,7 @@ def test_the_cost_is_least_where_a_plain_search_finds_it():
     assert motion_cost(rays, found[3:], found[:3], options) <= plain.fun * (1 + 1e-4)
 
 
+@pytest.mark.slow
 def test_steps_use_the_derivatives_of_the_cost():
     """Without damping and weights (a wide scale), the gradient is that of half the sum of squares."""
     flow, true = views(6)

@@ -245,6 +245,7 @@ def test_an_odometry_without_one_leaves_it_out():
     assert estimate.covariance is None and estimate.reference is None and estimate.rotation_sigma is None
 
 
+@pytest.mark.slow
 def test_a_window_may_have_a_second_solution_until_the_tracker_has_tried(monkeypatch):
     solved, solve = [], uncertainty.window_solutions
     monkeypatch.setattr(uncertainty, "window_solutions", lambda window: solved.append(1) or solve(window))

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from dvo.synth.clip import make_clip
@@ -25,6 +26,7 @@ def start(path, batch, processes, rank, port, clips):
     return subprocess.Popen(command, cwd=ROOT, env=environment, **pipes)
 
 
+@pytest.mark.slow
 def test_two_processes_equal_one_with_twice_the_batch(tmp_path, runs):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -54,6 +54,7 @@ def test_a_study_runs_resumes_and_reports(tmp_path, monkeypatch):
     assert json.loads((run / "result.json").read_text())["arm"] == names[1]
 
 
+@pytest.mark.slow
 def test_arms_start_from_a_state_with_settings_and_clips_of_their_own(tmp_path):
     arms = {"all": {}, "random": {}, "still": {}}
     changes = {

@@ -205,6 +205,7 @@ def test_bad_weights_of_the_loss_are_refused(change):
         LossConfig(**change)
 
 
+@pytest.mark.slow
 def test_the_shipped_configuration_trains_and_resumes(tmp_path, runs, command):
     """With sizes for a test; the network is exported and loaded."""
     pytest.importorskip("kornia")

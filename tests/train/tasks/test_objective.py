@@ -173,6 +173,7 @@ def test_exact_targets_from_identity_find_the_rotation(clips):
     assert good >= 0.9 * clips
 
 
+@pytest.mark.slow
 def test_the_better_of_two_beginnings_finds_the_rotation():
     """Chosen by the residual alone, at least 19 of 20 rendered clips end within 2 % of the motion."""
     graph = full_graph(8, PATCHES, self_edges=False)

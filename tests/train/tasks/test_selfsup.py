@@ -168,6 +168,7 @@ def recording(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_the_shipped_configuration_trains_resumes_and_exports(tmp_path, runs, recording, command):
     """With sizes for a test, from a state of ``patch_vo``, on a folder of images without poses."""
     pytest.importorskip("kornia")

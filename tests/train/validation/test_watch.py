@@ -4,6 +4,7 @@ import random
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
@@ -12,6 +13,7 @@ from train.validation.watch import TrackWhileTraining, undisturbed
 QUICK = {"rendered": 1, "frames": 10, "size": (48, 64)}
 
 
+@pytest.mark.slow
 def test_training_is_the_same_with_and_without_it(tmp_path, runs):
     watch = TrackWhileTraining(str(tmp_path), every=2, **QUICK)
     plain, losses = runs.fit(tmp_path, 3)

@@ -58,6 +58,7 @@ def measure(name: str, seed: int, frames: int, fps: float) -> list[float]:
     return [float(value) for value in lines[0].split()[1:]]
 
 
+@pytest.mark.slow
 def test_gpl_packages_are_imported_only_when_a_system_is_built():
     for file in sorted((ROOT / "eval").rglob("*.py")) + sorted((ROOT / "dvo").rglob("*.py")):
         tree = ast.parse(file.read_text(encoding="utf-8"))

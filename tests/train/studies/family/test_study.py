@@ -29,6 +29,7 @@ def file(family, tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_study_runs_once_and_reports_again(file, monkeypatch, capsys):
     monkeypatch.setattr(study, "apart", lambda function, *arguments: function(*arguments))
     with pytest.raises(DvoError, match=r"family.yaml: members: second: task: no task 'absent'"):

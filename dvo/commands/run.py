@@ -272,42 +272,45 @@ def track(
             observer.update(frame, estimate)
         progress.update(frame, estimate)
 
-    with InterruptSwitch(getattr(clip, "stop", None)) as switch, TrackingProgress(clip.frame_count) as progress:
-        try:
-            done = session.run(
-                odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None,
-                again=again,
-            )  # fmt: skip
-        except KeyboardInterrupt:
-            recorder.stop(interrupted=True, reason=_ABORTED)
-            raise
-        except Exception as error:
-            recorder.stop(interrupted=False, reason=f"ended by {type(error).__name__}: {error}")
-            raise
-        new_warnings = [warning for warning in done.warnings if warning not in printed]
-        done = replace(
-            done, warnings=(*done.warnings, *recorder.warnings), seconds={**facts.get("seconds", {}), **done.seconds}
-        )
-        scores = score(done, clip.groundtruth)
-        writer = None if save_map is None else partial(_save, odometry, save_map)
-        pages = Pages(clip.name, done, table, odometry, clip.groundtruth)
-        _write(folder, done, scores, clip, facts, writer, pages)
+    with InterruptSwitch(getattr(clip, "stop", None)) as switch:
+        with TrackingProgress(clip.frame_count) as progress:
+            try:
+                done = session.run(
+                    odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None,
+                    again=again,
+                )  # fmt: skip
+            except KeyboardInterrupt:
+                recorder.stop(interrupted=True, reason=_ABORTED)
+                raise
+            except Exception as error:
+                recorder.stop(interrupted=False, reason=f"ended by {type(error).__name__}: {error}")
+                raise
+            new_warnings = [warning for warning in done.warnings if warning not in printed]
+            done = replace(
+                done,
+                warnings=(*done.warnings, *recorder.warnings),
+                seconds={**facts.get("seconds", {}), **done.seconds},
+            )
+            scores = score(done, clip.groundtruth)
+            writer = None if save_map is None else partial(_save, odometry, save_map)
+            pages = Pages(clip.name, done, table, odometry, clip.groundtruth)
+            _write(folder, done, scores, clip, facts, writer, pages)
+            for observer in observers:
+                observer.finish(done)
+            pages.add_warnings(folder, [text for observer in observers for text in getattr(observer, "warnings", ())])
+            progress.finish(done.result)
+        for warning in new_warnings:
+            warn(warning)
+        print_report(folder, done, scores, [CALIBRATION] * (facts.get("calibration_file") is not None))
         for observer in observers:
-            observer.finish(done)
-        pages.add_warnings(folder, [text for observer in observers for text in getattr(observer, "warnings", ())])
-        progress.finish(done.result)
-    for warning in new_warnings:
-        warn(warning)
-    print_report(folder, done, scores, [CALIBRATION] * (facts.get("calibration_file") is not None))
-    for observer in observers:
-        file = getattr(observer, "file", None)
-        # Files in the folder are listed already; a video without a frame is removed.
-        if file is not None and file.exists() and file.resolve().parent != folder.resolve():
-            say(f"{getattr(observer, 'option', '').removeprefix('--')} in {file}")
-    if save_map is not None:
-        say(f"map in {save_map}")
-    if export:
-        _export(odometry, done, folder / results.EXPORT, export)
+            file = getattr(observer, "file", None)
+            # Files in the folder are listed already; a video without a frame is removed.
+            if file is not None and file.exists() and file.resolve().parent != folder.resolve():
+                say(f"{getattr(observer, 'option', '').removeprefix('--')} in {file}")
+        if save_map is not None:
+            say(f"map in {save_map}")
+        if export:
+            _export(odometry, done, folder / results.EXPORT, export)
     if done.interrupted:
         return 128 + (switch.pressed or signal.SIGINT)
     return OK if done.result.frames_tracked else NOTHING_TRACKED

@@ -17,7 +17,7 @@ import pytest
 
 import dvo
 from dvo.cli import main
-from dvo.commands import run
+from dvo.commands import run as command
 from dvo.data.trajectory import read_tum
 from tests.support.command_line import arguments, errors, names, summary
 
@@ -31,7 +31,7 @@ spec = importlib.util.spec_from_file_location("fakes", sys.argv[4])
 fakes = importlib.util.module_from_spec(spec); spec.loader.exec_module(fakes)
 import dvo, dvo.commands.run
 from dvo.cli import main
-from dvo.commands import run
+from dvo.commands import run as command
 
 class Logged(fakes.FakeOdometry):
     def track(self, frame):
@@ -223,13 +223,13 @@ def test_second_ctrl_c_while_the_results_are_written(given, image_folder, tmp_pa
 
 def test_a_signal_while_exports_are_written_lets_them_end(given, image_folder, tmp_path, monkeypatch):
     """Tracking is over then, and the results are there; the second signal would end the program."""
-    export = run.export_run
+    export = command.export_run
 
     def signalled(*args):
         os.kill(os.getpid(), signal.SIGTERM)
         return export(*args)
 
     given()
-    monkeypatch.setattr(run, "export_run", signalled)
+    monkeypatch.setattr(command, "export_run", signalled)
     assert main(arguments(image_folder, tmp_path / "out", "--export", "tum")) == 0
     assert summary(tmp_path / "out")["finished"] and (tmp_path / "out/export/tum/trajectory.txt").is_file()

@@ -265,12 +265,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Exit code, see :mod:`dvo.commands`.
     """
-    with _terminable():
-        code = _run(argv)
+    with _terminable() as received:
+        code = _run(argv, received)
     return _flush(code)
 
 
-def _run(argv: Sequence[str] | None) -> int:
+def _run(argv: Sequence[str] | None, received: Sequence[KeyboardInterrupt]) -> int:
     try:
         arguments = build_parser().parse_args(argv)
         check_limits(TRACKING if arguments.command in _TRACKING else LOADING)
@@ -279,40 +279,52 @@ def _run(argv: Sequence[str] | None) -> int:
         return command(arguments)
     except SystemExit as exit_:  # argparse: --help, --version, or a wrong option
         return exit_.code if isinstance(exit_.code, int) else BAD_INPUT
-    except DvoError as error:
-        return _complain(error, BAD_INPUT)
-    except Terminated as end:
-        return _complain("hung up" if end.code == HUNG_UP else "terminated", end.code)
-    except KeyboardInterrupt:
+    except (Exception, KeyboardInterrupt) as error:
+        # A library may turn the exception of a signal into one of its own.
+        return _failed(received[-1] if received else error)
+
+
+def _failed(error: Exception | KeyboardInterrupt) -> int:
+    """Print a line for what has ended a command, and return the exit code; errors of this program are raised."""
+    if isinstance(error, Terminated):
+        return _complain("hung up" if error.code == HUNG_UP else "terminated", error.code)
+    if isinstance(error, KeyboardInterrupt):
         return _complain("interrupted", INTERRUPTED)
-    except BrokenPipeError:  # the reader of stdout has seen enough
+    if isinstance(error, BrokenPipeError):  # the reader of stdout has seen enough
         return OK
-    except OSError as error:
-        return _complain(_as_input_error(error), BAD_INPUT)
-    except Exception as error:
-        limited = limit_error(error)
-        if limited is not None:
-            return _complain(limited, BAD_INPUT)
-        sys.excepthook = print_traceback  # of an error of this program: it may quote names and addresses too
-        raise
+    if isinstance(error, OSError):
+        error = _as_input_error(error)
+    known = error if isinstance(error, DvoError) else limit_error(error)
+    if known is not None:
+        return _complain(known, BAD_INPUT)
+    sys.excepthook = print_traceback  # it may quote names and addresses too
+    raise error
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Raise :class:`Terminated` at SIGTERM and SIGHUP, so that a command can clean up; unless they are handled."""
+def _terminable() -> Iterator[list[KeyboardInterrupt]]:
+    """Raise :class:`Terminated` at SIGTERM and SIGHUP, so that a command can clean up; unless they are handled.
 
-    def terminate(number: int, frame: FrameType | None) -> NoReturn:
-        raise Terminated(number)
+    Yields:
+        What was raised so far, also at Ctrl-C.
+    """
+    received: list[KeyboardInterrupt] = []
+
+    def end(number: int, frame: FrameType | None) -> NoReturn:
+        received.append(KeyboardInterrupt() if number == signal.SIGINT else Terminated(number))
+        raise received[-1]
 
     is_main = threading.current_thread() is threading.main_thread()
-    ours = [number for number in ending_signals() if is_main and signal.getsignal(number) is signal.SIG_DFL]
-    for number in ours:
-        signal.signal(number, terminate)
+    usual = (signal.SIG_DFL, signal.default_int_handler)
+    numbers = (signal.SIGINT, *ending_signals()) if is_main else ()
+    before = {number: handler for number in numbers if (handler := signal.getsignal(number)) in usual}
+    for number in before:
+        signal.signal(number, end)
     try:
-        yield
+        yield received
     finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _as_input_error(error: OSError) -> DvoError:

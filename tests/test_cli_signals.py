@@ -18,6 +18,7 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.commands import run as command
+from dvo.core.errors import DvoError
 from dvo.data.trajectory import read_tum
 from tests.support.command_line import arguments, errors, names, summary
 
@@ -233,3 +234,24 @@ def test_a_signal_while_exports_are_written_lets_them_end(given, image_folder, t
     monkeypatch.setattr(command, "export_run", signalled)
     assert main(arguments(image_folder, tmp_path / "out", "--export", "tum")) == 0
     assert summary(tmp_path / "out")["finished"] and (tmp_path / "out/export/tum/trajectory.txt").is_file()
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [(signal.SIGTERM, 143, "terminated"), (signal.SIGHUP, 129, "hung up"), (signal.SIGINT, 130, "interrupted")],
+)
+@pytest.mark.parametrize("error", [DvoError("not a safetensors file"), ValueError("shape"), OSError("cannot read")])
+def test_a_signal_that_a_library_turns_into_another_error(
+    number, code, said, error, image_folder, tmp_path, monkeypatch, capsys
+):
+    """As in a reader of weights, whose own code calls Python."""
+
+    def load(*args, **options):
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+            time.sleep(1)
+        raise error
+
+    monkeypatch.setitem(vars(dvo), "load", load)
+    assert main(arguments(image_folder, tmp_path / "out")) == code
+    assert errors(capsys.readouterr().err)[-1] == f"dvo: {said}" and not (tmp_path / "out").exists()

@@ -6,7 +6,7 @@ import re
 import sys
 import traceback
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from types import TracebackType
 from urllib.parse import unquote
 
@@ -16,12 +16,12 @@ HIDDEN = "***"
 # A path joins the slashes of "rtsp://", and a scheme may be mistyped; one letter before a colon is a drive. A colon or
 # a scheme may have been forgotten.
 _KNOWN = r"(?:rtsps?|rtmp[a-z]{0,2}|https?|s?ftps?|udp|tcp|srt|mms|h264\+rtsp|rstp|htpp?s?)"
-_SCHEME = re.compile(rf"[a-z][a-z0-9+-]+:[/\\]+|(?<![\w./\\]){_KNOWN}[/\\]+|(?<!\S):[/\\]+", re.IGNORECASE)
+_SCHEME = re.compile(rf"[a-z][a-z0-9+-]{{1,30}}:[/\\]+|(?<![\w./\\]){_KNOWN}[/\\]+|(?<!\S):[/\\]+", re.IGNORECASE)
 _PORT = re.compile(r"[^\s/@:]*:\d{1,5}(?![^\s/?#,.;:'\")\]])")
 _USER = re.compile(r"[^\s/@:\[]+:")
 # user:password@host without a scheme, or behind one without its colon
 _BARE = re.compile(
-    r"(?:(?<![^\s'\"(=])|(?<=//)|(?<=\\\\))(?![a-z]:[/\\])[\w+%-][\w.+%-]*:\S*@(?=[\w\[-])", re.IGNORECASE
+    r"(?:(?<![^\s'\"(=])|(?<=//)|(?<=\\\\))(?![a-z]:[/\\])[\w+%-][\w.+%-]{0,200}:\S{0,1000}@(?=[\w\[-])", re.IGNORECASE
 )
 _HEADER = re.compile(r"\b(authorization|cookie)(\s*[:=]\s*)\S+(?: \S+)?", re.IGNORECASE)
 _SECRET_PARTS = (
@@ -29,6 +29,7 @@ _SECRET_PARTS = (
     "ticket", "user", "login", "account", "nonce", "policy", "bearer",
 )  # fmt: skip
 _SECRET_NAMES = ("code", "pin", "otp", "sid", "k", "p", "pw", "s", "st", "u", "hdnts", "hdnea")
+_PIECE = 5000  # characters of a line that are looked at together
 _LONG = 20  # characters of a value that is taken for a secret whatever its name
 
 
@@ -56,6 +57,8 @@ def redacted(text: str, whole: bool = False) -> str:
 
 
 def _redacted_line(line: str, whole: bool) -> str:
+    if len(line) > _PIECE:  # the time of what follows grows with the square
+        return "".join(_redacted_line(piece, whole) for piece in _pieces(line))
     found = _SCHEME.search(line)
     while found:
         start = found.end()
@@ -64,6 +67,17 @@ def _redacted_line(line: str, whole: bool) -> str:
     if not _SCHEME.search(line):
         line = _BARE.sub("", line)
     return _HEADER.sub(rf"\1\2{HIDDEN}", _without_values(line, whole))
+
+
+def _pieces(line: str) -> Iterator[str]:
+    """Parts of a long line, cut behind a blank where there is one."""
+    start = 0
+    while start < len(line):
+        end = start + _PIECE
+        blank = line.rfind(" ", start + _PIECE // 2, end) + 1
+        end = blank if blank and end < len(line) else end
+        yield line[start:end]
+        start = end
 
 
 def _userinfo(rest: str, whole: bool) -> int:

@@ -128,3 +128,11 @@ def test_the_traceback_of_an_unknown_error_holds_no_secret(repository):
     done = subprocess.run([sys.executable, "-c", program], cwd=repository, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1 and "RuntimeError: \\x1b[2J rtsp://host" in done.stderr
     assert "rtsp://admin:Xq9@host'\n" not in done.stderr and "\x1b" not in done.stderr
+
+
+@pytest.mark.parametrize("start", ["x" * 10**6, "x " * 10**5, "a=" * 10**5, "aa:/" * 10**5, "'a:" * 10**5])
+def test_long_texts_come_to_an_end(start):
+    """Names and files may be of any length."""
+    found = redacted(f"{start} rtsp://admin:Xq9@camera/live")
+    assert "Xq9" not in found and found.endswith("camera/live")
+    assert "Xq9" not in str(DvoError(f"{start} rtsp://admin:Xq9@camera/live"))

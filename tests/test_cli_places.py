@@ -103,6 +103,10 @@ def test_results_that_are_inputs_of_the_next_run_stay(given, image_folder, tmp_p
     shutil.copytree(image_folder, images)
     assert main(["run", str(images), "--out", str(out), "--overwrite", "--device", "cpu"]) == 2
     assert len(names(images)) == 20
+    (out / "export" / "colmap" / "calib.txt").write_text("50 50 31.5 23.5\n")
+    more = ["--calib", str(out / "export" / "colmap" / "calib.txt"), "--overwrite"]
+    assert main(["run", str(image_folder), *more, "--out", str(out), "--device", "cpu"]) == 2
+    assert "the file of --calib" in capsys.readouterr().err
 
 
 def test_the_page_of_a_run_is_not_written_over_its_other_files(given, image_folder, tmp_path, capsys):

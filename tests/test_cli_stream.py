@@ -15,6 +15,7 @@ import pytest
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
 from tests.support.command_line import errors, summary
+from tests.support.stand_in_camera import StandInCamera
 
 COMMON = ["--device", "cpu"]
 
@@ -47,32 +48,20 @@ def test_a_pipe(given, piped, calib, tmp_path, capsys):
     assert "received 20 frames, dropped 0 of them" in said.out and errors(said.err) == []
 
 
-class HangingCamera:
+class HangingCamera(StandInCamera):
     """Sends an image, 499 more when ``go`` is set, and then nothing until ``wake`` is set."""
 
     def __init__(self, *_):
-        self.pictures, self.index = images(4), -1
-
-    def isOpened(self):
-        return True
-
-    def set(self, key, value):
-        return False
-
-    def get(self, key):
-        return 0.0
+        self.pictures = images(4)
 
     def grab(self):
-        self.index += 1
+        super().grab()
         if self.index in (1, 500):
             (self.go if self.index == 1 else self.wake).wait(20)
         return True
 
     def retrieve(self):
         return True, self.pictures[self.index % 4].copy()
-
-    def release(self):
-        pass
 
 
 def test_ctrl_c_ends_a_camera_that_sends_nothing_more(given, monkeypatch, calib, tmp_path, capsys):

@@ -15,6 +15,7 @@ from safetensors.torch import save_file
 import dvo
 from dvo.cli import main
 from tests.support.command_line import arguments, summary
+from tests.support.stand_in_camera import StandInCamera
 
 ADDRESSES = [
     "rtmp://admin:Xq9@ss/w0rd@host/live", "ftp://admin:Xq9@host/clip.mp4", "rtps://admin:Xq9/@host",
@@ -25,30 +26,14 @@ HOSTILE = "a\x1b]0;owned\x07\u202e\u200b\x9bb"
 ESCAPED = r"a\x1b]0;owned\x07\u202e\u200b\x9bb"
 
 
-class Camera:
-    """Stand-in for ``cv2.VideoCapture`` that sends twelve images."""
-
-    def __init__(self, *_):
-        self.index = -1
-
-    def isOpened(self):
-        return True
-
-    def set(self, key, value):
-        return False
-
-    def get(self, key):
-        return 0.0
+class Camera(StandInCamera):
+    """Sends twelve images."""
 
     def grab(self):
-        self.index += 1
-        return self.index < 12
+        return super().grab() and self.index < 12
 
     def retrieve(self):
         return True, np.full((48, 64, 3), 20 * self.index, np.uint8)
-
-    def release(self):
-        pass
 
 
 def is_clean(text: str) -> bool:

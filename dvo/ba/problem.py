@@ -101,15 +101,17 @@ class Factor(ABC):
         yield adjoint_term(self.linearise(state.values()), state, constants)
 
 
-def check_further(factors: Iterable[object], blocks: Mapping[str, object]) -> None:
+def check_further(factors: Iterable[object], blocks: object) -> None:
     """Check the types of further measurements and unknowns of a problem.
 
     Args:
         factors, blocks: of the problem.
 
     Raises:
-        DvoError: one that is no :class:`Factor` or no :class:`StateBlock`.
+        DvoError: one that is no :class:`Factor` or no :class:`StateBlock`, or blocks without names.
     """
+    if not isinstance(blocks, Mapping):
+        raise DvoError(f"is of type {type(blocks).__name__}", field="blocks", remedy="give state blocks by name")
     for field, values, kind in (("factors", factors, Factor), ("blocks", blocks.values(), StateBlock)):
         for value in values:
             if not isinstance(value, kind):

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,25 +58,14 @@ def calibrate(arguments: argparse.Namespace) -> int:
         warn(warning, "note")
     file = FISHEYE if options.fisheye else CALIBRATION
     with results.locked_folder(arguments.out, source.name) as folder:
-        _check_free(folder, (file,) if board is None else (file, FACTS, PICTURE), arguments.overwrite)
+        names = (file,) if board is None else (file, FACTS, PICTURE)
+        taken = [name for name in names if os.path.lexists(folder / name)]
+        results.check_free(folder, taken, names if _is_ours(folder / file) else (), arguments.overwrite)
         inputs = {"--weights": arguments.weights} if board is None else {}
         check_outputs({"--out": folder / file}, inputs, arguments.source)
         if board is None:
             return _without_board(source, folder, arguments)
         return _with_board(source, board, options, folder)
-
-
-def _check_free(folder: Path, names: Sequence[str], overwrite: bool) -> None:
-    """Refuse a folder with files that would be replaced, unless a calibration has written them and they may be."""
-    taken = [name for name in names if os.path.lexists(folder / name)]
-    mine = _is_ours(folder / names[0])
-    for name in taken:
-        if not mine:
-            message = "is not a file of dvo calibrate, whose result would take its place"
-            raise DvoError(message, file=folder / name, field="--out", remedy="give a new folder")
-    if taken and not overwrite:
-        remedy = "give a new folder, or --overwrite to replace it"
-        raise DvoError("holds a calibration", file=folder, field="--out", remedy=remedy)
 
 
 def _is_ours(file: Path) -> bool:

@@ -20,6 +20,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from dvo.commands import Terminated, ending_signals
+from dvo.core.arguments import checked_device
 from dvo.core.errors import DvoError
 from dvo.core.text import print_line, printable
 from dvo.data.frame import Frame
@@ -50,13 +51,8 @@ def device_of(name: str) -> torch.device:
         except (RuntimeError, TypeError):
             name = "cpu"
         return torch.device(name)
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise DvoError(f"cannot be used ({reason})", field=f"device '{name}'", remedy="give --device cpu") from error
-    return device
+    found: torch.device = checked_device(name, "--device")
+    return found
 
 
 def seed_everything(seed: int) -> None:

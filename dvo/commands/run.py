@@ -146,9 +146,6 @@ def _check_outputs(arguments: argparse.Namespace, folder: Path) -> None:
     options = ("calib", "times", "groundtruth", "extrinsics", "mask", "depth", "right", "depth_calib", "config", "map",
                "weights")  # fmt: skip
     inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in options}
-    if arguments.calib is not None and arguments.out is not None:
-        del inputs["--calib"]  # the calibration of an earlier run in the folder stays there
-        check_outputs(outputs, {"--calib": arguments.calib}, arguments.source)
     check_outputs(outputs, inputs, arguments.source, folder)
     if arguments.save_map is not None:
         check_place(Path(arguments.save_map), "--save-map")

@@ -30,6 +30,7 @@ from dvo.core.text import redacted
 from dvo.data.files.output import check_writable, only_writer, replaced, sweep_parts, write_text
 from dvo.data.trajectory import Trajectory, tum_text
 from dvo.session.files import write_error, write_ply
+from dvo.session.run_facts import read_json
 from dvo.session.session import Run
 
 TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png", "run.json"
@@ -43,7 +44,6 @@ SEGMENT_FILE = re.compile(r"trajectory-\d+\.txt")
 EXPORT = "export"
 """Folder of the exports in the results folder."""
 _EXPORTED = re.compile(EXPORT + r"/[A-Za-z0-9_-]+")
-_LARGEST = 64 * 2**20  # bytes of a run.json
 
 
 @contextlib.contextmanager
@@ -68,7 +68,12 @@ def results_folder(
             ``overwrite`` is not set, or a file of the name of a result that no run of dvo has written.
     """
     with locked_folder(out, name) as folder:
-        _check_free(folder, overwrite, exports)
+        try:
+            taken = [child.name for child in sorted(folder.iterdir()) if is_result(child.name)]
+        except OSError as error:
+            raise DvoError(error.strerror or str(error), file=folder, field="--out", remedy="give another") from error
+        taken += [name for name in (f"{EXPORT}/{one}" for one in exports) if os.path.lexists(folder / name)]
+        check_free(folder, taken, files_of_run(folder) if taken else (), overwrite)
         yield folder
 
 
@@ -173,14 +178,11 @@ def files_of_run(folder: Path) -> frozenset[str]:
         Names, of exports ``export/NAME``; none without a ``run.json`` of dvo. Of a run that has not ended, and of one
         that does not list its files, all names of results.
     """
-    file = folder / SUMMARY
     try:
-        if file.stat().st_size > _LARGEST:
-            return frozenset()
-        facts = json.loads(file.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        facts = read_json(folder / SUMMARY)
+    except DvoError:
         return frozenset()
-    found = facts.get("versions") if isinstance(facts, dict) else None
+    found = facts.get("versions")
     if not isinstance(found, dict) or "dvo" not in found or "odometry" not in facts:
         return frozenset()
     listed = facts.get("files")
@@ -191,21 +193,25 @@ def files_of_run(folder: Path) -> frozenset[str]:
     return frozenset(names | {SUMMARY})
 
 
-def _check_free(folder: Path, overwrite: bool, exports: Sequence[str]) -> None:
-    """Refuse a folder with files that a run would replace, unless they are results that may be."""
-    try:
-        taken = [child.name for child in sorted(folder.iterdir()) if is_result(child.name)]
-    except OSError as error:
-        raise DvoError(error.strerror or str(error), file=folder, field="--out", remedy="give another") from error
-    taken += [name for name in (f"{EXPORT}/{one}" for one in exports) if os.path.lexists(folder / name)]
-    mine = files_of_run(folder) if taken else frozenset()
+def check_free(folder: Path, taken: Sequence[str], mine: Collection[str], overwrite: bool) -> None:
+    """Refuse a folder with files that would be replaced, unless they are results that may be.
+
+    Args:
+        folder: of results.
+        taken: names of the files that would be replaced.
+        mine: names of the files that an earlier run of the command has written.
+        overwrite: these may be replaced.
+
+    Raises:
+        DvoError: a file of another origin, or results that may not be replaced.
+    """
     for name in taken:
         if name not in mine:
-            message = "is not a file of a run of dvo, whose results would take its place"
+            message = "is not a file that dvo has written there, and would be replaced"
             raise DvoError(message, file=folder / name, field="--out", remedy="give a new folder")
     if taken and not overwrite:
         remedy = "give a new folder, or --overwrite to replace them"
-        raise DvoError("holds the results of a run", file=folder, field="--out", remedy=remedy)
+        raise DvoError("holds results", file=folder, field="--out", remedy=remedy)
 
 
 def remove_results(folder: Path) -> None:

@@ -116,6 +116,27 @@ def read_facts(file: Path) -> dict[str, Any]:
     Raises:
         DvoError: it cannot be read, or an entry is missing or of another kind, with its name.
     """
+    facts = _plain(read_json(file), file, "")
+    _check(facts, _RUN, file, "")
+    facts["info"] = {name: value for name, value in facts["info"].items() if value is not None}
+    for number, segment in enumerate(facts["segments"]):
+        joined = segment.get("joined_to")
+        if joined is not None and joined >= len(facts["segments"]):
+            raise DvoError("no such segment", file=file, field=f"segments: {number}: joined_to", remedy=REMEDY)
+    if sum(found["frames"] for found in facts["breaks"]) > _MAX_FRAMES:
+        raise DvoError(f"more than {_MAX_FRAMES} frames", file=file, field="breaks", remedy=REMEDY)
+    return facts
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """Read run.json without a look at its entries.
+
+    Args:
+        file: the file.
+
+    Raises:
+        DvoError: it cannot be read, or is no table in JSON.
+    """
     try:
         if file.stat().st_size > _LIMIT:
             raise DvoError("too large", file=file, remedy=REMEDY)
@@ -126,15 +147,6 @@ def read_facts(file: Path) -> dict[str, Any]:
         raise DvoError("not JSON", file=file, remedy=REMEDY) from None
     if not isinstance(facts, dict):
         raise DvoError("not the description of a run", file=file, remedy=REMEDY)
-    facts = _plain(facts, file, "")
-    _check(facts, _RUN, file, "")
-    facts["info"] = {name: value for name, value in facts["info"].items() if value is not None}
-    for number, segment in enumerate(facts["segments"]):
-        joined = segment.get("joined_to")
-        if joined is not None and joined >= len(facts["segments"]):
-            raise DvoError("no such segment", file=file, field=f"segments: {number}: joined_to", remedy=REMEDY)
-    if sum(found["frames"] for found in facts["breaks"]) > _MAX_FRAMES:
-        raise DvoError(f"more than {_MAX_FRAMES} frames", file=file, field="breaks", remedy=REMEDY)
     return facts
 
 

@@ -1,5 +1,6 @@
 """Short forms of the trials."""
 
+import re
 import sys
 
 import pytest
@@ -10,7 +11,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reas
 
 
 def test_writers(tmp_path):
-    text, failed = writers.trial(tmp_path, 15.0)
+    text, failed = writers.trial(tmp_path, 5.0)
     assert not failed, text
 
 
@@ -20,6 +21,6 @@ def test_signals(tmp_path):
 
 
 def test_soak(tmp_path):
-    text, failed = soak.trial(tmp_path, 0.0)
-    assert "different trajectories: 1" in text and "files left: 0" in text, text
-    assert not failed, text
+    text, _ = soak.trial(tmp_path, 0.0)  # too short for a verdict on the memory
+    assert "different trajectories: 1\n" in text and text.endswith("files left: 0"), text
+    assert re.search(r"descriptors: (\d+), \1\n", text) and re.search(r"threads: (\d+), \1\n", text), text

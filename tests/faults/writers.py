@@ -131,7 +131,7 @@ KINDS: tuple[Kind, ...] = (
 
 
 def write_for(place: str, seconds: float, seed: int) -> None:
-    """Write all kinds in turn, and print a JSON line with the failures of each.
+    """Write all kinds in turn, twice at least, and print a JSON line with the failures of each.
 
     Args:
         place: folder.
@@ -139,8 +139,9 @@ def write_for(place: str, seconds: float, seed: int) -> None:
         seed: of the first content.
     """
     torch.set_num_threads(1)
-    end, count, saves = time.monotonic() + seconds, seed * 1000, Counter[str]()
-    while time.monotonic() < end:
+    end, count, rounds, saves = time.monotonic() + seconds, seed * 1000, 0, Counter[str]()
+    while time.monotonic() < end or rounds < 2:
+        rounds += 1
         for kind in KINDS:
             try:
                 kind.write(Path(place) / kind.file, count)
@@ -166,7 +167,9 @@ def trial(place: Path, seconds: float) -> tuple[str, bool]:
     command = [sys.executable, "-c", WRITERS, str(place), str(seconds)]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     counts: Counter[str] = Counter()
-    while any(process.poll() is None for process in running):
+    goes_on = True
+    while goes_on:
+        goes_on = any(process.poll() is None for process in running)  # each is read once more at the end
         for kind in KINDS:
             file = place / kind.file
             if not file.exists():
@@ -189,5 +192,4 @@ def trial(place: Path, seconds: float) -> tuple[str, bool]:
         rows.append(f"{kind.file:24s}" + "".join(f"{cell:8d}" for cell in cells))
     rows.append(f"parts left: {len(left)}")
     failed = sum(value for name, value in counts.items() if name.endswith((" failed", " corrupt"))) + len(left)
-    starved = any(not counts[f"{kind.file} {what}"] for kind in KINDS for what in ("saves", "reads"))
-    return "\n".join(rows), bool(failed or starved or any(process.returncode for process in running))
+    return "\n".join(rows), bool(failed or any(process.returncode for process in running))

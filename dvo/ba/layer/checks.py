@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +14,7 @@ from dvo.ba.edges import EdgePlan, edge_numbers
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.limits import LARGEST, SHORTEST_FOCAL
 from dvo.ba.patch_problem import PatchProblem
-from dvo.ba.problem import Factor, StateBlock
+from dvo.ba.problem import check_further
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
 
@@ -91,15 +91,9 @@ def _written(shape: tuple[int, ...]) -> str:
 def _check_further(given: PatchProblem) -> None:
     """Factors, further blocks and the layout of the edges."""
     device, b = given.poses_cw.device, len(given.poses_cw)
-    for factor in given.factors:
-        if not isinstance(factor, Factor):
-            raise DvoError(f"holds {shown(factor)}", field="factors", remedy="give objects of dvo.ba.problem.Factor")
-    if not isinstance(given.blocks, Mapping):
-        raise DvoError(f"is {shown(given.blocks)}", field="blocks", remedy="give state blocks by name")
+    check_further(given.factors, given.blocks)
     for name, block in given.blocks.items():
         field = f"blocks[{name!r}]"
-        if not isinstance(block, StateBlock):
-            raise DvoError(f"is {shown(block)}", field=field, remedy="give a StateBlock")
         if name in (POSES, INVERSE_DEPTHS, INTRINSICS) or block.eliminated:
             raise DvoError("stands for a block of its own", field=field, remedy="give another name and no elimination")
         if block.value.dtype not in REAL or block.value.device != device:

@@ -121,25 +121,33 @@ def drop_part(part: Path) -> None:
 def new_folder(folder: Path | str) -> Iterator[Path]:
     """Write files into a part of a folder, which takes its name at the end of the block.
 
+    A link is followed. A place at which a file system is mounted keeps its name: there the files appear one by one.
+
     Args:
         folder: missing or empty.
 
     Yields:
-        Folder beside it to write into.
+        Folder beside it, or in a mounted one, to write into.
 
     Raises:
         DvoError: it is not an empty folder, also because another writer was first.
         OSError: it cannot be written.
     """
-    folder = Path(folder).absolute()
+    folder = Path(os.path.realpath(folder))
+    is_mounted = os.path.ismount(folder)
+    place = folder if is_mounted else folder.parent
+    place.mkdir(parents=True, exist_ok=True)
+    sweep_parts(place)
     _check_empty(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    sweep_parts(folder.parent)
-    part = folder.with_name(_part_name(folder))
+    part = place / _part_name(folder)
     part.mkdir()
     try:
         yield part
-        _check_empty(folder)
+        _check_empty(folder, part)
+        if is_mounted:
+            for child in list(part.iterdir()):
+                os.rename(child, folder / child.name)
+            return
         with contextlib.suppress(OSError):
             folder.rmdir()
         try:
@@ -293,8 +301,8 @@ def _is_abandoned(part: Path) -> bool:
         return False
 
 
-def _check_empty(folder: Path) -> None:
-    if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
+def _check_empty(folder: Path, but: Path | None = None) -> None:
+    if os.path.lexists(folder) and (not folder.is_dir() or any(child != but for child in folder.iterdir())):
         raise DvoError("is not an empty folder", file=folder, remedy="give a new folder")
 
 

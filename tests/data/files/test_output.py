@@ -169,6 +169,29 @@ def test_a_new_folder_appears_whole(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
+def test_a_link_to_an_empty_folder_is_followed(tmp_path):
+    (tmp_path / "disk" / "empty").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("disk/empty")
+    with output.new_folder(tmp_path / "link") as part:
+        (part / "c.txt").write_text("")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "disk" / "empty" / "c.txt").exists()
+
+
+def test_a_mounted_folder_keeps_its_place(tmp_path, monkeypatch):
+    """As that of a container, which can neither be removed nor renamed."""
+    (tmp_path / "out").mkdir()
+    number = (tmp_path / "out").stat().st_ino
+    monkeypatch.setattr(os.path, "ismount", lambda path: True)
+    with output.new_folder(tmp_path / "out") as part:
+        assert part.parent == tmp_path / "out"
+        (part / "a").mkdir()
+        (part / "a" / "c.txt").write_text("")
+    assert [file.name for file in (tmp_path / "out").iterdir()] == ["a"] and (tmp_path / "out" / "a" / "c.txt").exists()
+    assert (tmp_path / "out").stat().st_ino == number
+    with pytest.raises(DvoError, match="not an empty folder"), output.new_folder(tmp_path / "out"):
+        pytest.fail("must not begin")
+
+
 def test_of_two_writers_of_a_folder_the_second_gets_an_error(tmp_path):
     with pytest.raises(DvoError, match="not an empty folder"), output.new_folder(tmp_path / "a") as slow:
         (slow / "slow").write_text("")

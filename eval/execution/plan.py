@@ -119,17 +119,21 @@ def write_manifest(plan: Plan, runs: list[Run], facts: dict[str, SystemFacts]) -
     return manifest
 
 
-def check_folder(out: Path) -> None:
-    """Check that a folder is free for an evaluation, or holds one, which goes on.
+def claim_folder(out: Path) -> None:
+    """Check that a folder is free for an evaluation, or holds one, which goes on; a free one is marked as one.
+
+    An evaluation that is killed before its manifest is written goes on, too.
 
     Args:
         out: the folder.
 
     Raises:
         DvoError: it holds a file or folder of the name of a result that no evaluation has written.
+        OSError: it cannot be written.
     """
     taken = [name for name in WRITTEN if os.path.lexists(out / name)]
     if not taken:
+        write_text(out / MANIFEST, json.dumps({"suites": [], "systems": [], "runs": []}) + "\n")
         return
     try:
         found = json.loads((out / MANIFEST).read_text(encoding="utf-8"))

@@ -29,7 +29,7 @@ from eval.execution.plan import (
     PREDICTIONS,
     Plan,
     Run,
-    check_folder,
+    claim_folder,
     groundtruth_file,
     prediction_folder,
     write_manifest,
@@ -86,7 +86,7 @@ def predict_all(plan: Plan, say: Callable[[str], None], run: Callable[[Job], Pre
         if labels.count(label) > 1:
             raise DvoError(f"two systems of the name '{label}'", field="--systems", remedy="rename one of the files")
     with only_writer(plan.out, "--out"):
-        check_folder(plan.out)
+        claim_folder(plan.out)
         sweep(plan.out / PREDICTIONS)
         opened = {(suite.name, seq.name): open_once(plan, suite, seq, say) for suite, seq in plan.sequences()}
         tasks, runs = [], []

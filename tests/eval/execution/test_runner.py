@@ -142,6 +142,20 @@ def test_two_evaluations_do_not_share_a_folder(plan, image_folder):
         predict_all(replace(plan, systems=("null",)), lambda text: None, predict_here)
 
 
+def test_an_evaluation_that_was_killed_before_its_manifest_goes_on(plan, image_folder, monkeypatch):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("eval.execution.runner.open_once", killed)
+        predict_all(replace(plan, systems=("null",)), lambda text: None, predict_here)
+    (plan.out / "groundtruth" / "clip").mkdir(parents=True, exist_ok=True)
+    with pytest.raises(DvoError, match="not written by this version"):
+        read_manifest(plan.out)
+    predict_all(replace(plan, systems=("null",)), lambda text: None, predict_here)
+    assert read_manifest(plan.out).systems == ("null",)
+
+
 @pytest.mark.parametrize("name", ["results.csv", "run.json", "predictions", "report.html"])
 def test_files_that_no_evaluation_has_written_stay(plan, image_folder, name):
     """Also run.json of a results folder of dvo."""

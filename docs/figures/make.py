@@ -21,6 +21,7 @@ import dvo
 from dvo.ba.layer.schur import invert_blocks
 from dvo.ba.layer.window_equations import window_equations
 from dvo.ba.options import BAOptions
+from dvo.core.command_line import OneLineParser
 from dvo.nets.correlation.correlation import correlate_reference
 from dvo.odometry.frames.front_end import encode_image
 from dvo.odometry.patch.tracker import PatchOdometry
@@ -303,7 +304,7 @@ def write(figure: Any, path: Path) -> None:
 
 def main() -> None:
     """Track the walk and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = OneLineParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=FRAMES, help="of the walk (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder (default: that of this file)")
     arguments = parser.parse_args()

@@ -6,7 +6,6 @@ printed table has the frames with a pose, the segments and the errors against th
 
 from __future__ import annotations
 
-import argparse
 from itertools import islice
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 
 import dvo
+from dvo.core.command_line import OneLineParser
 from dvo.metrics import evaluate
 from dvo.synth import make_sequence
 from dvo.synth.sequence import SyntheticSequence
@@ -98,7 +98,7 @@ def measure(name: str, frames: list[dvo.Frame], truth: dvo.Trajectory) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OneLineParser(description=__doc__)
     parser.add_argument("--only", choices=list(CLIPS), help="one clip")
     parser.add_argument("--pictures", action="store_true", help="render the pictures alone, track nothing")
     parser.add_argument("--out", type=Path, default=FOLDER, help="folder of the pictures")

@@ -23,7 +23,7 @@ from dvo.data.readers.registry import find_reader
 from dvo.data.readers.rosbag import split_topic
 from dvo.data.recording import Recording, Request, Selection
 from dvo.data.source import Reading, Source
-from dvo.data.streams.capture import is_stream
+from dvo.data.streams.capture import is_stream, not_found_remedy
 from dvo.data.streams.live_source import open_stream
 
 
@@ -107,7 +107,7 @@ def open_source(
     with lookups(path):
         is_there = path.exists()
     if not is_there:
-        raise DvoError("no such file or folder", file=path, remedy="give a video, a folder of images or a sequence")
+        raise DvoError("no such file or folder", file=path, remedy=not_found_remedy(source))
     check_stride(stride)
     check_invert(mask, mask_invert)
     interval = Interval.of(start, end)

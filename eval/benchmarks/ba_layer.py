@@ -6,7 +6,6 @@ fastest of several runs, and the ratio to the dense reference implementation in 
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 
@@ -16,6 +15,7 @@ from torch import Tensor
 from dvo.ba.edges import plan_edges
 from dvo.ba.layer.layer import bundle_adjust
 from dvo.ba.layer.reference import bundle_adjust_reference
+from dvo.core.command_line import OneLineParser
 from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 
@@ -73,7 +73,7 @@ def fastest(run: Callable[[], None], device: torch.device, repeats: int) -> floa
 
 def main() -> None:
     """Run the benchmark and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OneLineParser(description=__doc__)
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 4])
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--patches", type=int, default=24, help="per frame")

@@ -23,6 +23,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.data.files.root import data_root
 from eval.suites.suite import ROOT
@@ -250,7 +251,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         Exit code: 0, or 2 for invalid input.
     """
-    line = argparse.ArgumentParser(prog="python -m eval.benchmarks.compare_commits", description=__doc__,
+    line = OneLineParser(prog="python -m eval.benchmarks.compare_commits", description=__doc__,
                                    formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     line.add_argument("--base", required=True, metavar="REV", help="commit to compare with")
     line.add_argument("--pairs", type=int, default=5, metavar="N", help="number of pairs of each measurement (5)")

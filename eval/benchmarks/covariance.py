@@ -30,6 +30,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.core.threads import settle_threads
 from dvo.data.frame import Frame, StereoView
@@ -235,7 +236,7 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: of the command line; None: those of the process.
     """
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m eval.benchmarks.covariance", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

@@ -9,12 +9,11 @@ The error that is left with true measurements is the tracker's own.
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 import torch
 from torch import Tensor
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.threads import settle_threads
 from dvo.map.window import Window
 from dvo.metrics import Metrics, evaluate
@@ -90,7 +89,7 @@ def measure(sequence: SyntheticSequence, depth: Tensor, case: str, weights: str,
 
 def main() -> None:
     """Run the comparison and print a line for each sequence and case."""
-    parser = argparse.ArgumentParser(prog="python -m eval.benchmarks.error_budget", description=__doc__)
+    parser = OneLineParser(prog="python -m eval.benchmarks.error_budget", description=__doc__)
     parser.add_argument("--suites", default="plain", help="rendered suites with commas between (%(default)s)")
     parser.add_argument("--weights", default="small", help="name or file (%(default)s)")
     parser.add_argument("--seed", type=int, default=0)

@@ -7,7 +7,6 @@ seconds, peak memory, and cost and position error before and after.
 
 from __future__ import annotations
 
-import argparse
 import math
 import resource
 import time
@@ -19,6 +18,7 @@ from torch import Tensor
 from dvo.ba.kernels import Kernel
 from dvo.ba.sparse.global_adjust import GlobalBAOptions, global_bundle_adjust
 from dvo.ba.sparse.levenberg import LMOptions
+from dvo.core.command_line import OneLineParser
 from dvo.geometry import se3, so3
 from dvo.geometry.projection import reproject
 
@@ -154,7 +154,7 @@ def position_error(poses_cw: Tensor, true_poses_cw: Tensor) -> float:
 
 def main() -> None:
     """Run the benchmark and print its results."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OneLineParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--patches", type=int, default=48, help="per frame")
     parser.add_argument("--threads", type=int, default=2)

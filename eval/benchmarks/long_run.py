@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.core.threads import settle_threads
 from dvo.data.frame import Frame
@@ -188,7 +189,7 @@ def draw(file: Path, rows: list[Row]) -> None:
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(prog="python -m eval.benchmarks.long_run", description=__doc__,
+    parser = OneLineParser(prog="python -m eval.benchmarks.long_run", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("--frames", type=int, default=20_000, metavar="N", help="of the video (%(default)s)")
     parser.add_argument("--walk", type=int, default=600, metavar="N", help="frames of the walk (%(default)s)")

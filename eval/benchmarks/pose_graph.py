@@ -10,7 +10,6 @@ take turns.
 
 from __future__ import annotations
 
-import argparse
 import math
 import statistics
 import time
@@ -25,6 +24,7 @@ from torch import Tensor
 from dvo.ba.pose_graph import Chart, PoseGraphOptions, optimise_pose_graph
 from dvo.ba.sparse.block_matrix import LinearSolver
 from dvo.ba.sparse.levenberg import LMOptions
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3, so3
 
@@ -174,7 +174,7 @@ def gtsam_minimum(file: Path) -> tuple[float, float]:
 
 def main() -> None:
     """Run the benchmark and print a row for each graph."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OneLineParser(description=__doc__)
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--poses", type=int, default=0, help="of the generated graph")
     parser.add_argument("--chart", default="g2o", choices=("g2o", "log"), help="coordinates of the error of the files")

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 import dvo
+from dvo.core.command_line import OneLineParser
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
@@ -141,7 +142,7 @@ def dark() -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = OneLineParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("mode", nargs="?", choices=("maps", "dark"), default="maps")
     parser.add_argument("--suites", type=lambda text: text.split(","), default=["revisit", "revisit/test"])
     parser.add_argument("--sequences", type=lambda text: text.split(","), help="names with commas between")

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from dvo.core.allocator import reuse_freed_memory
+from dvo.core.command_line import OneLineParser
 from dvo.core.yaml_files import read_yaml
 from dvo.synth import random_path, random_scene, render
 from dvo.synth.clip import make_clip
@@ -114,7 +115,7 @@ def step_seconds(count: int, recipe: dict[str, Any], batches: list[dict[str, tor
 
 def main() -> None:
     """Run the benchmark and print its tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = OneLineParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=8, help="frames rendered together")
     parser.add_argument("--clips", type=int, default=5)
     parser.add_argument("--steps", type=int, default=3)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.threads import settle_threads
 from dvo.odometry.calibration.calibrate import CalibrationOptions, calibrate
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
@@ -59,7 +60,7 @@ def row(name: str, found: SelfCalibration, focal: float, cx: float, cy: float) -
 
 def main() -> None:
     """Run the benchmark and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = OneLineParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clips", type=int, default=4)
     parser.add_argument("--frames", type=int, default=60)
     arguments = parser.parse_args()

@@ -23,6 +23,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.core.threads import available_cores
 from dvo.data.files.root import data_root
@@ -166,7 +167,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         Exit code: 0, or 2 for invalid input.
     """
-    line = argparse.ArgumentParser(prog="python -m eval.benchmarks.threads", description=__doc__,
+    line = OneLineParser(prog="python -m eval.benchmarks.threads", description=__doc__,
                                    formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     line.add_argument("--clip", default="kitti00_120", help="name under the data folder, or a path (kitti00_120)")
     line.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings ($DVO_DATA, ../shared/data)")

@@ -15,6 +15,7 @@ from types import FrameType
 from typing import Any
 
 import dvo
+from dvo.core.command_line import OneLineParser
 from dvo.data.files.root import data_root
 
 LIBRARY = Path(dvo.__file__).resolve().parent
@@ -45,7 +46,7 @@ class Traced:
 
 def main(given: list[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m eval.benchmarks.traced_frame", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import cProfile
 import math
 import pstats
@@ -15,6 +14,7 @@ import time
 import torch
 
 from dvo.core.allocator import reuse_freed_memory
+from dvo.core.command_line import OneLineParser
 from dvo.core.threads import settle_threads
 from dvo.odometry.load import load
 from dvo.odometry.patch.tracker import PatchOdometry
@@ -39,7 +39,7 @@ def _cumulative(stats: pstats.Stats, file: str, function: str) -> float:
 
 def main() -> None:
     """Run the benchmark and print its results."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = OneLineParser(description=__doc__)
     parser.add_argument("--weights", default="small")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--frames", type=int, default=150)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.core.threads import settle_threads
 from dvo.odometry.load import load
@@ -203,7 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: of the command line; None: those of the process.
     """
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m eval.benchmarks.weight_calibration", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

@@ -18,6 +18,16 @@ def test_missing_source(tmp_path):
         open_source(tmp_path / "nowhere.mp4")
 
 
+@pytest.mark.parametrize("source, address", [
+    ("rtmp://host/live", True), (" rtsp://host", True), ("rtsp:/host/a", True), ("webcam", True), ("webcam0", True),
+    ("webcam.mp4", False), ("C:/clip.mp4", False), ("clip", False),
+])  # fmt: skip
+def test_an_address_of_another_scheme_says_which_are_read(source, address):
+    with pytest.raises(DvoError, match="no such file or folder") as caught:
+        open_source(source)
+    assert ("rtsp://" in caught.value.remedy) is address
+
+
 def test_no_images(tmp_path):
     with pytest.raises(DvoError, match="no images"):
         open_source(tmp_path, calib=Calibration(50, 50, 31, 23))

@@ -13,6 +13,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
+from dvo.core.command_line import OneLineParser
 from tests.faults import signals, soak, writers
 
 
@@ -25,7 +26,7 @@ def main(given: list[str] | None = None) -> int:
     Returns:
         Exit code.
     """
-    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__,
+    parser = OneLineParser(prog="python -m tests.faults", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("trial", choices=("writers", "signals", "soak"))
     parser.add_argument("--seconds", type=float, default=30.0)

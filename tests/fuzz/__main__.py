@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import gc
 import importlib
 import os
@@ -16,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from tests.fuzz.target import Target
 from tests.fuzz.worker import Outcome, run_cases, warm
@@ -103,7 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns:
         Exit code: 0, or 1 if a case failed.
     """
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser = OneLineParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=1000, help="number of mutated inputs (1000)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first mutation of each reader (0)")
     parser.add_argument("--readers", nargs="*", default=[], metavar="NAME", help="only readers that begin so (all)")

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 STANDARD_INPUT = "-"
 WEBCAM = re.compile(r"webcam:(\d{1,3})")
 NETWORK = re.compile(r"(rtsp|rtsps|http|https)://", re.IGNORECASE)
+_ADDRESS = re.compile(r"\s*[a-z][a-z0-9+.-]+:/|\s*webcam:?\s*\d*\s*$", re.IGNORECASE)
 
 _SECONDS = 10  # to open a stream, and to wait for its next image
 _JUMP = 5.0  # seconds that the clock of a stream may run away from that of this machine
@@ -34,6 +35,17 @@ def is_stream(source: object) -> bool:
     """
     text = source if isinstance(source, str) else ""
     return text == STANDARD_INPUT or bool(WEBCAM.fullmatch(text) or NETWORK.match(text))
+
+
+def not_found_remedy(source: object) -> str:
+    """What to give in place of a source that does not exist: another address if it looks like one.
+
+    Args:
+        source: as given by the user.
+    """
+    if isinstance(source, str) and _ADDRESS.match(source):
+        return "addresses begin with rtsp://, rtsps://, http:// or https://, a camera is webcam:0"
+    return "give a video, a folder of images or a sequence"
 
 
 def shown(address: str) -> str:

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 import dvo
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.data.files.root import data_root
 from dvo.data.trajectory import Trajectory
@@ -190,7 +191,7 @@ def is_told(found: Score) -> bool:
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(prog="python -m eval.benchmarks.interruptions", description=__doc__)
+    parser = OneLineParser(prog="python -m eval.benchmarks.interruptions", description=__doc__)
     parser.add_argument("--weights", default="small", metavar="NAME|FILE")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--split", choices=("calibration", "test"), default="test", help="rendered scenes")

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields
 from pathlib import Path
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.session.results import jsonable
 from eval.benchmarks.loops.processes import Alternating, alone
@@ -168,7 +169,7 @@ def line(run: Run) -> str:
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(prog="python -m eval.benchmarks.loops", description=__doc__,
+    parser = OneLineParser(prog="python -m eval.benchmarks.loops", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)  # fmt: skip
     parser.add_argument("mode", nargs="?", choices=("revisit", "blackout"), default="revisit")
     parser.add_argument("--systems", nargs="+", default=["dvo-small"], metavar="NAME", help="with a setting `loops`")

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 import dvo
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.core.threads import settle_threads
 from dvo.models.patch_vo import PatchVO
@@ -191,7 +192,7 @@ def choose_methods(model: PatchVO, names: list[str], scenes: int) -> Iterator[Me
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m eval.benchmarks.place_recognition", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

@@ -21,6 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.threads import settle_threads
 from eval.benchmarks.verdict.trials import KINDS, Outcome, Trial, carry_out
 
@@ -60,7 +61,7 @@ def table(outcomes: Sequence[Outcome]) -> str:
 
 def main(given: list[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m eval.benchmarks.verdict", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
 from dvo.core.threads import settle_threads
 from dvo.data.calibration.calibration import Calibration
@@ -221,7 +222,7 @@ def make_runs(tasks: Sequence[Task], out: Path, jobs: int = 1) -> dict[str, Run]
 
 def main(given: list[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog="python -m eval.benchmarks.wild", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, metavar="DIR", help="with videos")

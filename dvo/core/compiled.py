@@ -1,0 +1,50 @@
+"""Decorator of kernels, see :mod:`dvo.core.kernels`. Imports numba."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+from numba.core import event
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# The order of sums may be changed when a kernel is compiled, so that they use vector instructions; it is then fixed.
+# Infinite numbers and NaN keep their meaning.
+_OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+
+
+class _Notice(event.Listener):
+    """Prints a line when the first kernel of this process is compiled; those on the disk are not."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        if not self.said:
+            _Notice.said = True
+            print("dvo: compiling kernels, once on this machine", file=sys.stderr, flush=True)
+
+    def on_end(self, event: Any) -> None: ...
+
+
+event.register("numba:compile", _Notice())
+
+
+def compiled(function: F) -> F:
+    """Compile a function of arrays and numbers when it is first called; it runs without the lock of the interpreter.
+
+    Compiled code is kept beside the file or, where that cannot be written, in the cache of the user or in
+    ``$NUMBA_CACHE_DIR``; where none can, every process compiles its own.
+
+    Args:
+        function: of a file whose name ends in ``_kernels.py``.
+
+    Returns:
+        The same, compiled.
+    """
+    try:
+        return numba.njit(cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # no place for the cache
+        return numba.njit(**_OPTIONS)(function)

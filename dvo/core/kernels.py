@@ -1,0 +1,63 @@
+"""Choice between compiled kernels and their plain PyTorch twins.
+
+A kernel is a loop over numbers, compiled by numba when it is first called and then kept on the disk. The twin is its
+specification: it serves where gradients or an accelerator are asked for, where numba cannot be imported, and everywhere
+with ``DVO_KERNELS=torch``. Kernels stand in files named ``*_kernels.py``, which import numba and are imported where
+:func:`use_kernels` says so, since that takes half a second.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from dvo.core.errors import DvoError
+
+VARIABLE = "DVO_KERNELS"
+CHOICES = ("numba", "torch")
+
+
+def use_kernels(*tensors: Tensor) -> bool:
+    """Tell if a computation on these tensors is one for kernels.
+
+    Args:
+        tensors: the floating-point arguments.
+
+    Returns:
+        True for float32 tensors on the CPU of which no gradient is recorded, if kernels are there and wanted.
+
+    Raises:
+        DvoError: ``DVO_KERNELS`` has another value than ``numba`` or ``torch``.
+    """
+    if not available():
+        return False
+    plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    return plain and not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
+
+
+def available() -> bool:
+    """Tell if kernels are wanted, and numba can be imported; if it cannot, one line says so.
+
+    Raises:
+        DvoError: see :func:`use_kernels`.
+    """
+    chosen = os.environ.get(VARIABLE) or CHOICES[0]
+    if chosen not in CHOICES:
+        raise DvoError(f"is {chosen!r}", field=VARIABLE, remedy=f"set it to {' or '.join(CHOICES)}, or unset it")
+    return chosen == "numba" and _imported()
+
+
+@cache
+def _imported() -> bool:
+    try:
+        importlib.import_module("numba")
+    except ImportError as error:  # also a numba that does not know this numpy
+        reason = " ".join(str(error).split())[:200]
+        print(f"dvo: note: numba cannot be imported ({reason}): computing without kernels, slower", file=sys.stderr)
+        return False
+    return True

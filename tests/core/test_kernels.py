@@ -1,0 +1,70 @@
+"""Tests of the choice between kernels and twins."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from dvo.core.errors import DvoError
+from dvo.core.kernels import VARIABLE, available, use_kernels
+
+ROOT = Path(__file__).resolve().parents[2]
+HIDDEN = (
+    "import sys; sys.modules['numba'] = None; from dvo.core.kernels import available; print(available(), available())"
+)
+KERNEL = """
+import numpy as np
+from dvo.core.compiled import compiled
+
+@compiled
+def total(x):
+    s = 0.0
+    for i in range(len(x)):
+        s += x[i]
+    return s
+
+print(total(np.ones(1000)), total(np.array([1.0, np.nan])))
+"""
+
+
+def test_of_the_cpu_without_gradients(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    plain, recorded = torch.zeros(3), torch.zeros(3, requires_grad=True)
+    assert available() and use_kernels(plain)
+    assert not use_kernels(plain, recorded)
+    assert not use_kernels(plain.double()) and not use_kernels(torch.zeros(3, device="meta"))
+    with torch.inference_mode():
+        assert use_kernels(plain, recorded)
+
+
+def test_twins_on_request(monkeypatch):
+    monkeypatch.setenv(VARIABLE, "torch")
+    assert not use_kernels(torch.zeros(3))
+    monkeypatch.setenv(VARIABLE, "cuda-graph")
+    with pytest.raises(DvoError, match="DVO_KERNELS: is 'cuda-graph'. Set it to numba or torch"):
+        use_kernels(torch.zeros(3))
+
+
+def test_without_numba_one_line_says_so():
+    found = subprocess.run([sys.executable, "-c", HIDDEN], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False False"
+    assert found.stderr.count("numba cannot be imported") == 1
+
+
+def test_compiled_once_with_a_line(tmp_path):
+    file = tmp_path / "some_kernels.py"
+    file.write_text(KERNEL)
+    for said in (1, 0):
+        found = subprocess.run([sys.executable, file], env={"PYTHONPATH": str(ROOT), "PATH": ""}, capture_output=True,
+                               text=True, check=True)  # fmt: skip
+        assert found.stdout.strip() == "1000.0 nan"
+        assert found.stderr.count("compiling kernels") == said
+
+
+def test_importing_dvo_does_not_import_numba():
+    script = "import sys, dvo, dvo.cli; assert 'numba' not in sys.modules"
+    subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True)

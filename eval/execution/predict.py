@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.processes import run_limited
 from dvo.core.threads import process_environment
 from dvo.data.files.output import write_text
 from dvo.data.frame import Frame
@@ -28,7 +29,6 @@ from dvo.metrics.segment_metrics import worlds_of
 from dvo.odometry.protocol import Estimate, Odometry, Segment
 from dvo.session.results import jsonable, peak_memory_mb
 from dvo.session.session import run
-from eval.execution.process import run_limited
 from eval.scoring.blackout import dark_spans, is_dark, without_view
 from eval.suites.suite import ROOT, open_sequence
 from eval.suites.suite import Sequence as Recording

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dvo.core import processes
 from dvo.core.errors import DvoError
 from dvo.data.files.output import only_writer
 from dvo.data.trajectory import write_tum
 from dvo.session.results import jsonable
-from eval.execution import process
 from eval.execution.cache import (
     SystemFacts,
     commit,
@@ -183,7 +183,7 @@ def _done(plan: Plan, tasks: list[Task], run: Callable[[Job], Prediction]) -> It
         for number, prediction in run_on_ray(jobs, plan.ray):
             yield waiting[number], prediction, False
         return
-    process.begin()
+    processes.begin()
     with ThreadPoolExecutor(plan.workers) as pool:
         futures = {pool.submit(obtain, task.job, task.key, run=run, retry=plan.retry): task for task in waiting}
         try:
@@ -192,7 +192,7 @@ def _done(plan: Plan, tasks: list[Task], run: Callable[[Job], Prediction]) -> It
         except BaseException:  # Ctrl-C too: nothing that was started may go on
             for future in futures:
                 future.cancel()
-            process.end_all()
+            processes.end_all()
             raise
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import cv2
 
+from dvo.core.processes import die_with_parent
 from eval.execution.predict import Job, predict_here
-from eval.execution.process import die_with_parent
 from eval.suites.selection import sequence_from
 
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 from multiprocessing.synchronize import Semaphore
 
 from dvo.core.errors import DvoError
+from dvo.core.processes import die_with_parent
 from eval.benchmarks.loops.runs import Run, Task, Turns, carry_out
-from eval.execution.process import die_with_parent
 
 
 def alone(task: Task) -> Run:

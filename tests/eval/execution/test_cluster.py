@@ -24,7 +24,7 @@ def test_ray_missing_and_packed_runs(job, tmp_path, image_folder, monkeypatch, p
     assert np.isfinite(np.loadtxt(tmp_path / "p/seed0-abc/trajectory.txt")).all()
 
     asked: list[str] = []
-    monkeypatch.setattr(cluster.importlib, "import_module", lambda name: PretendedRay(asked))
+    monkeypatch.setattr(cluster.cluster.importlib, "import_module", lambda name: PretendedRay(asked))
     said: list[str] = []
     predict_all(replace(plan, systems=("null",), ray="ray://head:1"), said.append)
     assert asked == ["init ray://head:1", "cpus 1", "run 0", "run 1", "shutdown"]
@@ -33,7 +33,7 @@ def test_ray_missing_and_packed_runs(job, tmp_path, image_folder, monkeypatch, p
     def absent(name: str):
         raise ImportError(name)
 
-    monkeypatch.setattr(cluster.importlib, "import_module", absent)
+    monkeypatch.setattr(cluster.cluster.importlib, "import_module", absent)
     with pytest.raises(DvoError, match="Ray is not installed"):
         predict_all(replace(plan, systems=("null",), seeds=(7,), ray="auto"), lambda text: None)
 
@@ -64,7 +64,10 @@ class PretendedRay:
 
         return wrap
 
-    def wait(self, waiting: list, num_returns: int) -> tuple[list, list]:
+    def nodes(self) -> list[dict]:
+        return [{"Alive": True, "Resources": {"CPU": 2.0}}]
+
+    def wait(self, waiting: list, num_returns: int, timeout: float) -> tuple[list, list]:
         return waiting[-num_returns:], waiting[:-num_returns]
 
     def get(self, reference: tuple) -> bytes:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dvo.core.errors import DvoError
+from dvo.core.processes import Ending
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.odometry.protocol import Break, Segment
 from eval.execution.predict import (
@@ -22,7 +23,6 @@ from eval.execution.predict import (
     read_segments,
     without_empty,
 )
-from eval.execution.process import Ending
 
 
 def test_a_run_in_its_own_process(job):

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _running: set[subprocess.Popen[bytes]] = set()
-_lock = threading.Lock()
-_stopped = threading.Event()
+_lock = threading.RLock()  # a handler of a signal may take it while its thread has it
+_closed = threading.Event()
+_ended = threading.Event()
 
 
 class StoppedError(Exception):
-    """The program was ended together with the whole evaluation, for no fault of its own."""
+    """The program was not started, or was ended, together with all others, for no fault of its own."""
 
 
 @dataclass(frozen=True)
@@ -39,26 +40,27 @@ class Ending:
         return f"{how} {self.last_line}".strip()
 
 
-def run_limited(command: list[str], environment: dict[str, str], seconds: float, log: Path) -> Ending:
+def run_limited(command: list[str], environment: dict[str, str], seconds: float | None, log: Path) -> Ending:
     """Run a program; what it writes goes to ``log``. When the time is out it ends with all that it has started.
 
     Args:
         command: program and arguments.
         environment: variables of the program.
-        seconds: time limit.
-        log: file for its output.
+        seconds: time limit; None for none.
+        log: file for its output, to which it is appended.
 
     Returns:
         Exit code and last line of output.
 
     Raises:
-        StoppedError: :func:`end_all` was called.
+        StoppedError: :func:`end_all` or, before it was started, :func:`close` was called.
     """
-    if _stopped.is_set():
-        raise StoppedError
-    with open(log, "wb") as file:
-        process = subprocess.Popen(command, env=environment, stdout=file, stderr=file, start_new_session=True)
-    with _lock:
+    with _lock, open(log, "ab") as file:
+        if _closed.is_set():
+            raise StoppedError
+        process = subprocess.Popen(
+            command, env=environment, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
+        )
         _running.add(process)
     try:
         code: int | None = process.wait(seconds)
@@ -68,15 +70,28 @@ def run_limited(command: list[str], environment: dict[str, str], seconds: float,
         _end(process)
         with _lock:
             _running.discard(process)
-    if _stopped.is_set():
+    if _ended.is_set():
         raise StoppedError
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return Ending(code, lines[-1] if lines else "")
 
 
+def close(number: int) -> None:
+    """Send a signal to every program that :func:`run_limited` waits for, and start no more until :func:`begin`.
+
+    Args:
+        number: of a signal that the programs handle; those that they have started are not told.
+    """
+    _closed.set()
+    with _lock:
+        for process in _running:
+            process.send_signal(number)
+
+
 def end_all() -> None:
     """End every program that :func:`run_limited` waits for, and start no more until :func:`begin`."""
-    _stopped.set()
+    _closed.set()
+    _ended.set()
     with _lock:
         for process in _running:
             _end(process)
@@ -84,13 +99,18 @@ def end_all() -> None:
 
 def begin() -> None:
     """Programs may run (again)."""
-    _stopped.clear()
+    _closed.clear()
+    _ended.clear()
 
 
-def die_with_parent() -> None:
-    """Ask the kernel to end this process when its parent dies (Linux; nothing elsewhere)."""
+def die_with_parent(number: int = signal.SIGKILL) -> None:
+    """Ask the kernel to send a signal to this process when its parent dies (Linux; nothing elsewhere).
+
+    Args:
+        number: of the signal.
+    """
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
+        ctypes.CDLL(None).prctl(1, number, 0, 0, 0)  # PR_SET_PDEATHSIG
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from eval.execution.process import begin, run_limited
+from dvo.core.processes import begin, run_limited
 
 
 def test_time_limit_ends_the_children_too(tmp_path):

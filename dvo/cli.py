@@ -19,11 +19,9 @@ from typing import NoReturn
 from dvo import __version__
 from dvo.commands import BAD_INPUT, HUNG_UP, INTERRUPTED, OK, Terminated, ending_signals
 from dvo.commands.calibrate_options import add_calibrate
-from dvo.commands.input_options import add_input_options
-from dvo.commands.scale_options import add_scale_options
+from dvo.commands.run_options import add_batch_options, add_folder_options, add_run_options, add_tracking_options
 from dvo.commands.stream_options import add_stream_options
-from dvo.commands.view_options import add_view_options
-from dvo.core.command_line import OneLineParser
+from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed
 from dvo.core.errors import DvoError
 from dvo.core.limits import LOADING, TRACKING, check_limits, limit_error
 from dvo.core.text import print_line, print_traceback
@@ -34,6 +32,10 @@ EXIT_CODES = (
 )
 
 _TRACKING = ("demo", "run", "calibrate")  # commands
+_BATCH_CODES = (
+    "exit codes: 0 all videos are tracked, 1 one of them failed or has no tracked frame, 2 bad usage, 129 hung up, "
+    "130 interrupted, 143 terminated (the same command goes on)"
+)
 _MERGE_CODES = "exit codes: 0 done, 1 the second map was not recognised in the first (nothing is written), 2 bad input"
 
 
@@ -48,8 +50,9 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     demo = commands.add_parser("demo", help="render a clip, track it and compare with the ground truth")
-    _tracking_options(demo)
-    demo.add_argument("--frames", type=_positive_int, default=180, help="length of the clip (default: %(default)s)")
+    add_folder_options(demo)
+    add_tracking_options(demo)
+    demo.add_argument("--frames", type=positive_int, default=180, help="length of the clip (default: %(default)s)")
     demo.set_defaults(run="dvo.demo:demo")
 
     run = commands.add_parser("run", help="track a video, a folder of images or a dataset sequence", epilog=EXIT_CODES)
@@ -58,36 +61,16 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="SOURCE",
         help="video, images, dataset sequence, webcam:0, rtsp://..., http://... or -",
     )
-    run.add_argument(
-        "--calib",
-        metavar="FILE",
-        help="'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, a YAML file, or COLMAP's cameras.txt[:ID] (default: that of "
-        "a data set, else the focal length is found in the images)",
-    )
-    _tracking_options(run)
-    run.add_argument("--stride", type=_positive_int, default=1, metavar="N", help="track every N-th frame")
-    times = run.add_mutually_exclusive_group()
-    times.add_argument(
-        "--times", metavar="FILE", help="file with the time of each image in seconds in the first column"
-    )
-    times.add_argument(
-        "--fps", type=_positive_float, metavar="F", help="frames per second, if the source does not define it"
-    )
-    run.add_argument("--groundtruth", metavar="FILE", help="TUM trajectory (camera to world) to compare with")
-    run.add_argument(
-        "--export",
-        type=_names,
-        default=[],
-        metavar="NAMES",
-        help="write the results for other programs too: colmap, colmap-text, nerfstudio, tum, kitti, euroc; by commas",
-    )
-    run.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for a later --map")
-    run.add_argument("--map", metavar="FILE", help="map file (.dvo) of an earlier recording, to be localised in")
-    add_input_options(run)
+    add_folder_options(run)
+    add_run_options(run)
     add_stream_options(run)
-    add_view_options(run)
-    add_scale_options(run)
     run.set_defaults(run="dvo.commands.run:run")
+
+    batch = commands.add_parser(
+        "batch", help="track many videos, a results folder for each, and a table of all", epilog=_BATCH_CODES
+    )
+    add_batch_options(batch)
+    batch.set_defaults(run="dvo.commands.batch:batch")
 
     add_calibrate(commands)
 
@@ -151,8 +134,8 @@ def build_parser() -> argparse.ArgumentParser:
     content = export.add_mutually_exclusive_group()
     content.add_argument("--family", metavar="F", help="family of scenes (default: random)")
     content.add_argument("--mesh", metavar="FILE", help="glTF, OBJ or PLY file to render, from inside or outside")
-    export.add_argument("--frames", type=_positive_int, default=150, metavar="N", help="default: %(default)s")
-    export.add_argument("--fps", type=_positive_float, default=30.0, metavar="F", help="default: %(default)g")
+    export.add_argument("--frames", type=positive_int, default=150, metavar="N", help="default: %(default)s")
+    export.add_argument("--fps", type=positive_float, default=30.0, metavar="F", help="default: %(default)g")
     export.add_argument("--path", metavar="KIND", help="kind of path: handheld, forward, orbit, rotation, drone, ...")
     export.add_argument("--sensor", action="store_true", help="simulate noise, vignetting and other sensor effects")
     export.add_argument(
@@ -170,7 +153,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
     parser.add_argument("--size", type=_size, default=_size(size), metavar="WxH", help=f"pixels (default: {size})")
-    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="default: %(default)s")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="default: %(default)s")
     parser.add_argument("--textures", metavar="DIR", help="folder of photographs for the textures of the scenes")
     parser.add_argument("--up", choices=("y", "z"), help="axis of the mesh that points up (default: y; z for PLY)")
     parser.add_argument(
@@ -184,47 +167,11 @@ def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
     )
 
 
-def _tracking_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
-    parser.add_argument("--overwrite", action="store_true", help="replace the results of an earlier run in --out")
-    system = parser.add_mutually_exclusive_group()
-    system.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
-    system.add_argument(
-        "--system", metavar="NAME", help="an odometry without weights: keyframe, klt-pnp, direct or monoslam"
-    )
-    parser.add_argument(
-        "--device", metavar="D", default="auto", help="torch device (default: accelerator if available)"
-    )
-    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="default: %(default)s")
-    parser.add_argument(
-        "--preset", metavar="NAME", help="settings of the odometry: default, fast or accurate (default: default)"
-    )
-    parser.add_argument("--config", metavar="FILE", help="YAML file with settings of the odometry")
-    parser.add_argument(
-        "--set", metavar="NAME=VALUE", action="append", default=[], help="one setting, such as patches=48; repeatable"
-    )
-    parser.add_argument("--no-loops", action="store_true", help="pure odometry: do not close loops (--set loops=false)")
-
-
-def _positive_int(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"must be 1 or more, got {text}")
-    return value
-
-
 def _count(text: str) -> int:
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be 0 or more, got {text[:60]}")
     return value
-
-
-def _names(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
-    if not all(names):
-        raise argparse.ArgumentTypeError(f"expected names separated by commas, got {text[:60]!r}")
-    return list(dict.fromkeys(names))
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -236,23 +183,9 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _rows(text: str) -> int:
-    value = _positive_int(text)
+    value = positive_int(text)
     if value > 1000:
         raise argparse.ArgumentTypeError(f"must be 1000 or less, got {text[:60]}")
-    return value
-
-
-def _seed(text: str) -> int:
-    value = int(text)
-    if not 0 <= value < 2**63:
-        raise argparse.ArgumentTypeError(f"must be 0 or more and below 2^63, got {text[:60]}")
-    return value
-
-
-def _positive_float(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be more than 0, got {text}")
     return value
 
 

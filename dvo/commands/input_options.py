@@ -33,6 +33,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
     )
+    parser.add_argument("--topic", metavar="NAME", help="topic of the images in a bag of ROS 1 or 2, or an MCAP file")
 
 
 def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -33,7 +33,7 @@ def check_outputs(
     written = {option: Path(path) for option, path in outputs.items() if path}
     for option, output in written.items():
         for name, path in inputs.items():
-            if path and any(os.path.lexists(place) and _is_same(output, place) for place in _places(path, source)):
+            if path and any(os.path.lexists(place) and _is_same(output, place) for place in places(path, source)):
                 raise _error(output, option, name)
         if source and _is_same(output, Path(source)):
             raise _error(output, option, "the source")
@@ -47,7 +47,7 @@ def check_outputs(
     if folder is None:
         return
     for name, path in {**inputs, "the source": source}.items():
-        for place in _places(path, source) if path else ():
+        for place in places(path, source) if path else ():
             within = is_result(place.name) and _is_same(place.parent, folder)
             if os.path.lexists(place) and (within or _is_in(place, folder / EXPORT)):
                 raise _error(place, "--out", name)
@@ -58,8 +58,13 @@ def _error(file: Path, option: str, name: str) -> DvoError:
     return DvoError(f"is {what}, which it would replace", file=file, field=option, remedy="give another place")
 
 
-def _places(path: Path | str, source: Path | str | None) -> Iterator[Path]:
-    """Files that a path may name."""
+def places(path: Path | str, source: Path | str | None) -> Iterator[Path]:
+    """Files that the value of an option may name, in the order in which they are looked up.
+
+    Args:
+        path: the value; a suffix ``:ID`` of a calibration is left out too.
+        source: in whose folder a relative path is looked up after the working directory.
+    """
     spellings = [str(path)]
     head, colon, _ = str(path).rpartition(":")
     if colon and head:

@@ -24,6 +24,8 @@ from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
 from dvo.commands.places import check_outputs
 from dvo.commands.report import Scores, headline, print_report, score
+from dvo.commands.request import request_facts
+from dvo.commands.run_options import INPUTS
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
 from dvo.commands.streams import print_counts, stream_facts, stream_settings
 from dvo.commands.summary import Pages
@@ -107,6 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
         "seed": arguments.seed,
         "stride": arguments.stride,
         **input_facts(arguments),
+        **request_facts(arguments),
     }
     seed_everything(arguments.seed)
     folders = results.results_folder(
@@ -143,9 +146,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _check_outputs(arguments: argparse.Namespace, folder: Path) -> None:
     """Refuse outputs that are inputs, and places that cannot be written."""
     outputs = {"--save-map": arguments.save_map, "--overlay": arguments.overlay, "--rerun": arguments.rerun}
-    options = ("calib", "times", "groundtruth", "extrinsics", "mask", "depth", "right", "depth_calib", "config", "map",
-               "weights")  # fmt: skip
-    inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in options}
+    inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in INPUTS}
     check_outputs(outputs, inputs, arguments.source, folder)
     if arguments.save_map is not None:
         check_place(Path(arguments.save_map), "--save-map")

@@ -1,4 +1,4 @@
-"""Options of ``dvo run`` for streams and bags of ROS, in a module that imports nothing heavy."""
+"""Options of ``dvo run`` for streams, in a module that imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="of a stream, frames that may wait, older ones are dropped; 0: none is dropped (default: 2 if live)",
     )
-    parser.add_argument("--topic", metavar="NAME", help="topic of the images in a bag of ROS 1 or 2, or an MCAP file")
 
 
 def _length(text: str) -> int:

@@ -1,4 +1,4 @@
-"""Parser of command lines whose errors are one line."""
+"""Parser of command lines whose errors are one line, and types of arguments that several commands have."""
 
 from __future__ import annotations
 
@@ -16,3 +16,51 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the message and exit."""
         self.exit(BAD_ARGUMENT, printable(f"{self.prog}: error: {message} (see {self.prog} --help)") + "\n")
+
+
+def positive_int(text: str) -> int:
+    """Whole number of at least 1; a type of arguments.
+
+    Args:
+        text: of the command line.
+    """
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be 1 or more, got {text}")
+    return value
+
+
+def positive_float(text: str) -> float:
+    """Finite number above 0; a type of arguments.
+
+    Args:
+        text: of the command line.
+    """
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be more than 0, got {text}")
+    return value
+
+
+def seed(text: str) -> int:
+    """Whole number from 0 to 2^63 - 1; a type of arguments.
+
+    Args:
+        text: of the command line.
+    """
+    value = int(text)
+    if not 0 <= value < 2**63:
+        raise argparse.ArgumentTypeError(f"must be 0 or more and below 2^63, got {text[:60]}")
+    return value
+
+
+def names(text: str) -> list[str]:
+    """Names separated by commas, each once; a type of arguments.
+
+    Args:
+        text: of the command line.
+    """
+    found = [name.strip() for name in text.split(",")]
+    if not all(found):
+        raise argparse.ArgumentTypeError(f"expected names separated by commas, got {text[:60]!r}")
+    return list(dict.fromkeys(found))

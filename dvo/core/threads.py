@@ -74,6 +74,23 @@ def thread_rule(cores: int) -> int:
     return min(cores, 4)
 
 
+def share_cores(jobs: int | None) -> tuple[int, int]:
+    """Number of processes at a time, and threads of each, in which they share the cores of this process.
+
+    A number in the environment (``OMP_NUM_THREADS``, ``MKL_NUM_THREADS``) is that of each process.
+
+    Args:
+        jobs: processes at a time; None for as many as leave each the threads that it would have alone.
+
+    Returns:
+        Processes, and threads of each; both 1 or more, and independent of the load.
+    """
+    cores = available_cores()
+    given = next((int(text) for name in NUMBERS if (text := os.environ.get(name, "")).isdecimal() and int(text)), None)
+    threads = given or thread_rule(cores if jobs is None else max(1, cores // jobs))
+    return jobs or max(1, cores // threads), threads
+
+
 def wait_passively() -> bool:
     """Choose passive waiting after a short spin, unless the environment says otherwise; before torch is imported.
 

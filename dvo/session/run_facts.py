@@ -98,6 +98,8 @@ _RUN = _table(
         "interrupted": _FLAG,
         "warnings": _listed(_TEXT),
         "config": _named(_ANY),
+        "options": _named(_ANY),
+        "inputs": _named(_table({"path": _TEXT, "bytes": _NUMBER, "sha256": _TEXT})),
         "versions": _named(_ANY),
     },
     ("frames", "segments", "breaks", "info"),

@@ -39,12 +39,12 @@ def folder_names(sources: Sequence[str], out: Path) -> list[str]:
     """
     owners = _owners(out)
     paths = [split_topic(source, None)[0] for source in sources]
-    beside = Counter(_key(str(path.with_suffix(""))) for path in paths)
+    beside = Counter(_key(str(path.parent / path.stem)) for path in paths)
     bags = Counter(map(str, paths))
     candidates = []
     for source, path in zip(sources, paths, strict=True):
         # Of walk.mp4 and walk.avi in one folder, and of topics of one bag, the stem says too little.
-        last = path.name if beside[_key(str(path.with_suffix("")))] > 1 else stem_of(path)
+        last = path.name if beside[_key(str(path.parent / path.stem))] > 1 else stem_of(path)
         last += source[len(str(path)) :] if bags[str(path)] > 1 else ""
         candidates.append(list(_candidates(last, path)))
     names: dict[int, str] = {}

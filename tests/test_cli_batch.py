@@ -424,7 +424,7 @@ def test_over_ray(tracked, videos, tmp_path, monkeypatch, capsys):
 def import_or(ray: PretendedRay) -> Callable[[str], object]:
     """``importlib.import_module`` with a stand-in for Ray."""
     real = cluster.importlib.import_module
-    return lambda name: ray if name == "ray" else real(name)
+    return lambda name, *more: ray if name == "ray" else real(name, *more)
 
 
 def test_calls_that_are_not_done_are_cancelled():

@@ -317,7 +317,8 @@ def run_one(job: Job, folder: Path, log: Path) -> Ending:
     environment = process_environment(job.threads, {**os.environ, "PYTHONPATH": path})
     begin = f"{LOG_BEGIN}{job.threads} dvo {shlex.join(line)}\n"
     log.write_text(begin, encoding="utf-8", errors="replace")
-    return run_limited([sys.executable, "-m", "dvo.commands.batch_worker", *line], environment, None, log)
+    program = [sys.executable, "-m", "dvo.commands.batch_worker", str(os.getpid())]
+    return run_limited([*program, *line], environment, None, log)
 
 
 def _error_line(log: Path, ending: Ending) -> str:

@@ -55,7 +55,7 @@ class Row:
         if self.state == FAILED:
             return f"failed: {self.error}"
         if self.state == WAITING:
-            return "not begun, or not done"
+            return "not done"
         told = ": ".join(part for part in (self.verdict, self.reason) if part)
         told = told or ("tracked" if self.tracked else "nothing tracked")
         return f"interrupted ({told})" if self.state == INTERRUPTED else told

@@ -20,6 +20,7 @@ from dvo.core.errors import DvoError
 from dvo.core.text import first_line
 
 _POLL = 1.0  # seconds between two looks at should_stop
+_CLEANING = 10.0  # seconds that calls which are cancelled have to remove what they have begun
 
 
 @contextlib.contextmanager
@@ -104,9 +105,11 @@ def run_on(
             for reference in done:
                 yield waiting.pop(reference), partial(ray.get, reference)
     finally:
-        for reference in waiting:
-            with contextlib.suppress(Exception):  # of a cluster that is gone
+        with contextlib.suppress(Exception):  # of a cluster that is gone
+            for reference in waiting:
                 ray.cancel(reference)
+            if waiting:
+                ray.wait(list(waiting), num_returns=len(waiting), timeout=_CLEANING)
 
 
 def packed(folder: Path) -> bytes:

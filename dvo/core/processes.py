@@ -8,9 +8,11 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
+_FOREVER = 1e9  # seconds
 _running: set[subprocess.Popen[bytes]] = set()
 _lock = threading.RLock()  # a handler of a signal may take it while its thread has it
 _closed = threading.Event()
@@ -63,7 +65,8 @@ def run_limited(command: list[str], environment: dict[str, str], seconds: float 
         )
         _running.add(process)
     try:
-        code: int | None = process.wait(seconds)
+        # With a limit Python looks every 50 ms, so that an exception from another thread, as Ray's, arrives.
+        code: int | None = process.wait(_FOREVER if seconds is None else seconds)
     except subprocess.TimeoutExpired:
         code = None
     finally:
@@ -103,14 +106,27 @@ def begin() -> None:
     _ended.clear()
 
 
-def die_with_parent(number: int = signal.SIGKILL) -> None:
-    """Ask the kernel to send a signal to this process when its parent dies (Linux; nothing elsewhere).
+def die_with_parent() -> None:
+    """Ask the kernel to end this process when its parent dies (Linux; nothing elsewhere)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
+
+
+def stop_with_parent(parent: int) -> None:
+    """Send SIGTERM to this process within a second after its parent has died, from a thread that watches.
+
+    That of the kernel comes several times, once for each thread of the parent, and a second one aborts a run.
 
     Args:
-        number: of the signal.
+        parent: process number.
     """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, number, 0, 0, 0)  # PR_SET_PDEATHSIG
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -222,8 +222,11 @@ def _check_places(jobs: Sequence[Job], out: Path) -> None:
 def _announce(count: int, left: int, workers: int, threads: int, arguments: argparse.Namespace) -> None:
     many = f"{threads} {'thread' if threads == 1 else 'threads'}{' each' if workers > 1 else ''}"
     where = f"on {arguments.ray}, with" if arguments.ray else f"{min(workers, max(left, 1))} at a time, with"
+    begin = f"{count} {'video' if count == 1 else 'videos'}"
+    if not left:
+        return _tell(f"{begin}, done already")
     done = f", {count - left} of them done already" if count > left else ""
-    _tell(f"{count} {'video' if count == 1 else 'videos'}{done}; {where} {many}")
+    return _tell(f"{begin}{done}; {where} {many}")
 
 
 def _tell(text: str) -> None:

@@ -20,7 +20,7 @@ from dvo.core.errors import DvoError
 from dvo.core.text import first_line
 
 _POLL = 1.0  # seconds between two looks at should_stop
-_CLEANING = 10.0  # seconds that calls which are cancelled have to remove what they have begun
+_CLEANING = 5.0  # seconds that calls which are cancelled have to remove what they have begun
 
 
 @contextlib.contextmanager

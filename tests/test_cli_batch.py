@@ -189,6 +189,19 @@ def test_results_of_other_options_are_kept(tracked, videos, tmp_path, capsys, ch
     assert main(line(videos, out, *change, "--overwrite")) == 0 and tracked == [], "they are the same now"
 
 
+def test_a_damaged_run_is_not_replaced_unasked(tracked, videos, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(line(videos[:1], out)) == 0
+    file = out / "one" / "run.json"
+    for damage in ({"frames": "many"}, {"inputs": {"source": 3}}, {"inputs": None}):
+        file.write_text(json.dumps(json.loads(file.read_text()) | damage))
+        before = file.read_bytes()
+        assert main(line(videos, out)) == 2 and file.read_bytes() == before
+        assert str(out / "one") in errors(capsys.readouterr().err)[-1] and tracked == ["one"]
+        assert main(line(videos[:1], out, "--overwrite")) == 0 and summary(out / "one")["finished"]
+        tracked.pop()
+
+
 def test_a_failed_video_is_a_row(tracked, videos, tmp_path, capsys, monkeypatch):
     out = tmp_path / "out"
     videos[1].with_suffix(".calib.txt").unlink()

@@ -180,6 +180,8 @@ def _found(job: Job, folder: Path, overwrite: bool) -> tuple[Row, Job | None]:
     try:
         facts = read_facts(folder / results.SUMMARY)
     except DvoError:
+        if not overwrite:
+            raise
         return waiting, Job(job.name, job.source, job.options, True, job.threads)
     other = list(differences(request_of(job.source, job.options), facts))
     if other and not overwrite:
@@ -359,7 +361,7 @@ def _one_line(error: DvoError) -> str:
 def _on_ray(
     ray: Any, jobs: Sequence[Job], out: Path, arguments: argparse.Namespace, should_stop: Callable[[], bool]
 ) -> Generator[tuple[Job, Row], None, None]:
-    """Track on the nodes of a cluster; what runs when it is stopped is cancelled and leaves nothing."""
+    """Track on the nodes of a cluster; what runs when it is stopped is cancelled, and has no results."""
     accelerators = 0 if arguments.device in ("auto", "cpu") else 1
     found = cluster.run_on(
         ray, track_packed, jobs, threads=jobs[0].threads, accelerators=accelerators, at_most=arguments.jobs,

@@ -15,6 +15,7 @@ from functools import cache
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from dvo.core.errors import DvoError
 
@@ -29,12 +30,13 @@ def use_kernels(*tensors: Tensor) -> bool:
         tensors: the floating-point arguments.
 
     Returns:
-        True for float32 tensors on the CPU of which no gradient is recorded, if kernels are there and wanted.
+        True for float32 tensors on the CPU of which no derivative is recorded, by autograd, as dual numbers or within
+        ``torch.func``, if kernels are there and wanted.
 
     Raises:
         DvoError: ``DVO_KERNELS`` has another value than ``numba`` or ``torch``.
     """
-    if not available():
+    if not available() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return False
     plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
     return plain and not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))

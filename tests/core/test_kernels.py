@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from dvo.core.errors import DvoError
 from dvo.core.kernels import VARIABLE, available, use_kernels
@@ -39,6 +40,21 @@ def test_of_the_cpu_without_gradients(monkeypatch):
     assert not use_kernels(plain.double()) and not use_kernels(torch.zeros(3, device="meta"))
     with torch.inference_mode():
         assert use_kernels(plain, recorded)
+
+
+def test_twins_where_derivatives_are_taken_forward(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    seen = []
+
+    def look(x):
+        seen.append(use_kernels(x))
+        return x * 2
+
+    torch.func.vmap(look)(torch.zeros(3))
+    torch.func.grad(lambda x: look(x).sum())(torch.zeros(3))
+    with forward_ad.dual_level():
+        look(forward_ad.make_dual(torch.zeros(3), torch.ones(3)))
+    assert seen == [False] * 3 and use_kernels(torch.zeros(3))
 
 
 def test_twins_on_request(monkeypatch):

@@ -20,7 +20,9 @@ from torch import Tensor
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, inverse_depth_block, pose_block
 from dvo.ba.covariance import pose_covariance
 from dvo.ba.edges import EdgePlan, plan_edges
+from dvo.ba.layer import edgewise
 from dvo.ba.layer.checks import FLOATS, INDICES, check_structure, check_values
+from dvo.ba.layer.edgewise import EdgewiseReprojection, measured_edges
 from dvo.ba.layer.grouped import group_measurements
 from dvo.ba.layer.step import gauss_newton
 from dvo.ba.layer.transforms import composed, is_transformed
@@ -28,6 +30,7 @@ from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
 from dvo.core.errors import DvoError
+from dvo.core.kernels import use_kernels
 from dvo.core.settings import shown
 from dvo.core.threads import use_threads
 from dvo.geometry.precision import full_precision
@@ -119,7 +122,7 @@ def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
     if options.check is not False:
         check_values(given)
     with full_precision(given.poses_cw.device):
-        problem = gauss_newton(make_problem(given, options), options.iterations, options.damping)
+        problem = _solved(make_problem(given, options), options)
         state, patches = problem.state, given.patches
         poses_cw, inverse_depths = state[POSES].value, state[INVERSE_DEPTHS].value
         patches = patches.to(poses_cw.dtype)
@@ -136,6 +139,12 @@ def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
             cost, inliers = _report(make_problem(now, options, grouped=False))
         further = {name: state[name].value for name in given.blocks}
         return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance, further)
+
+
+def _solved(problem: Problem, options: BAOptions) -> Problem:
+    if isinstance(problem.factors[0], EdgewiseReprojection):
+        return edgewise.gauss_newton(problem, options.iterations, options.damping, options.depth_range)
+    return gauss_newton(problem, options.iterations, options.damping)
 
 
 def _with_whole_indices(given: PatchProblem) -> PatchProblem:
@@ -215,21 +224,26 @@ def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped:
     further = {name: block.with_value(block.value.to(dtype)) for name, block in given.blocks.items()}
     own = {POSES: poses, INVERSE_DEPTHS: depths}
     refine = options.refine_intrinsics
-    reprojection: Factor
-    if grouped and given.sensors is None and refine == "none":
+    more = [factor.with_tensors([x.to(dtype) for x in factor.tensors()]) for factor in given.factors]
+    measured = given.centres, given.intrinsics, given.targets, given.weights
+    gate: dict[str, Any] = dict(max_residual=options.max_residual, bounds=options.bounds, kernel=options.kernel)
+    reprojection: Factor | None = None
+    fast = grouped and given.sensors is None and refine == "none"
+    others = (*(block.value for block in further.values()), *(x for factor in more for x in factor.tensors()))
+    if fast and use_kernels(poses.value, depths.value, *measured, *others):
+        reprojection = measured_edges(*measured, given.ii, given.jj, given.kk, **gate)
+    if reprojection is not None:
+        pass
+    elif fast:
         plan = given.plan
         if plan is None:
             frames, count = given.poses_cw.shape[1], given.patches.shape[1]
             plan = plan_edges(given.ii, given.jj, given.kk, frames, count)
-        reprojection = group_measurements(
-            given.centres, given.intrinsics, given.targets, given.weights, plan, poses,
-            max_residual=options.max_residual, bounds=options.bounds, kernel=options.kernel,
-        )  # fmt: skip
+        reprojection = group_measurements(*measured, plan, poses, **gate)
     else:
         own = {INTRINSICS: intrinsics_block(given.intrinsics, refine, shared=given.sensors is None), **own}
         focal_only = refine == "focal"
         reprojection = given.reprojection(options.max_residual, options.bounds, options.kernel, focal_only)
-    more = (factor.with_tensors([x.to(dtype) for x in factor.tensors()]) for factor in given.factors)
     return Problem(State({**further, **own}), (reprojection, *more))
 
 

@@ -9,10 +9,12 @@ which stays finite for points at infinity (Teed et al., "Deep Patch Visual Odome
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from dvo.core.kernels import use_kernels
 from dvo.geometry import se3, so3
 from dvo.geometry.precision import full_precision
 
@@ -145,6 +147,10 @@ def reproject(
         >>> flow = seen.coords - patches[:, kk, :2].permute(0, 1, 3, 4, 2)
         >>> flow[~seen.valid] = 0
     """
+    if not jacobians and use_kernels(poses_cw, patches, intrinsics):
+        found = by_kernel(poses_cw, patches, intrinsics, ii, jj, kk)
+        if found is not None:
+            return found
     with full_precision(poses_cw.device):
         b, k, _, p, q = patches.shape
         matrices = motion_matrices(poses_cw, intrinsics, ii, jj)
@@ -165,3 +171,32 @@ def reproject(
         g_ij = se3.relative(poses_cw.index_select(1, ii), poses_cw.index_select(1, jj))
         jac_i = -jac_j @ se3.adjoint(g_ij)
         return Reprojection(coords, depth, valid, jac_i, jac_j, jac_d)
+
+
+def by_kernel(
+    poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor, kk: Tensor
+) -> Reprojection | None:
+    """:func:`reproject` without Jacobians by a compiled loop.
+
+    Args:
+        poses_cw, patches, intrinsics, ii, jj, kk: see :func:`reproject`; what is not an index is float32, on the CPU.
+
+    Returns:
+        The projections; None for shapes or indices that do not belong together.
+    """
+    if (poses_cw.dim(), patches.dim(), ii.dim()) != (3, 5, 1):
+        return None
+    (b, n, _), (_, k, _, p, q), edges = poses_cw.shape, patches.shape, len(ii)
+    shapes = (poses_cw.shape, (b, n, 7)), (patches.shape, (b, k, 3, p, q)), (intrinsics.shape, (b, n, 4))
+    indices = [x for x in (ii, jj, kk) if x.dtype == torch.int64 and x.device == poses_cw.device]
+    if any(found != wanted for found, wanted in shapes) or [tuple(x.shape) for x in indices] != [(edges,)] * 3:
+        return None
+    from dvo.geometry.projection_kernels import project_patches
+
+    coords, depth = poses_cw.new_empty(b, edges, p, q, 2), poses_cw.new_empty(b, edges, p, q)
+    valid = torch.empty(b, edges, p, q, dtype=torch.bool)
+    floats = [x.detach().contiguous() for x in (poses_cw, patches.flatten(3), intrinsics)]
+    out = coords.flatten(2, 3), depth.flatten(2), valid.flatten(2)
+    given = [x.numpy() for x in (*floats, *(x.contiguous() for x in indices))]
+    arguments: tuple[Any, ...] = (*given, MIN_Z_DIVISION, MIN_Z_VALID, *(x.numpy() for x in out))
+    return Reprojection(coords, depth, valid) if project_patches(*arguments) else None

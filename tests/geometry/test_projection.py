@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
+from dvo.core.kernels import VARIABLE
 from dvo.geometry import se3
-from dvo.geometry.projection import Reprojection, reproject
+from dvo.geometry.projection import Reprojection, by_kernel, reproject
 
 F64 = torch.float64
 B, N, M, P = 2, 4, 5, 3
@@ -168,3 +173,45 @@ def test_autocast_does_not_reach_in() -> None:
     with torch.autocast("cpu", dtype=torch.bfloat16):
         found = reproject(poses, patches, intrinsics, *edges()).coords
     assert torch.equal(found, expected)
+
+
+BAD = (math.nan, 1e8, -1e8, 0.0)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.integers(0, 10_000), st.integers(1, 2), st.sampled_from([0, 1, 7, 60]),
+    st.sampled_from([(1, 1), (3, 3), (4, 5)]), st.sampled_from(BAD),
+)  # fmt: skip
+def test_the_kernel_projects_as_its_twin(
+    monkeypatch: pytest.MonkeyPatch, seed: int, batch: int, count: int, size: tuple[int, int], bad: float
+) -> None:
+    """The twin in double precision; some points are behind the camera or have a coordinate that is none."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    generator = torch.Generator().manual_seed(seed)
+    poses = se3.exp(torch.randn(batch, 4, 6, generator=generator))
+    patches = 40 * torch.rand(batch, 5, 3, *size, generator=generator)
+    patches[:, :, 2] /= 20
+    patches[:, 0, seed % 3, 0, 0] = bad
+    intrinsics = torch.tensor([30.0, 32, 20, 15]) + torch.rand(batch, 4, 4, generator=generator)
+    indices = [torch.randint(high, (count,), generator=generator) for high in (4, 4, 5)]
+    found = reproject(poses, patches, intrinsics, *indices)
+    expected = reproject(se3.normalise(poses.double()), patches.double(), intrinsics.double(), *indices)
+    torch.testing.assert_close(found.depth.double(), expected.depth, rtol=1e-5, atol=1e-5, equal_nan=True)
+    scale = float(expected.coords.nan_to_num(0, 0, 0).abs().max()) if count else 1.0
+    torch.testing.assert_close(found.coords.double(), expected.coords, rtol=1e-5, atol=1e-6 * scale, equal_nan=True)
+    assert torch.equal(found.valid, expected.valid)
+    assert found.coords.dtype == torch.float32
+
+
+@pytest.mark.parametrize("name", ["ii", "jj", "kk"])
+@pytest.mark.parametrize("value", [-1, 100])
+def test_an_index_out_of_range_is_not_read(name: str, value: int) -> None:
+    floats = [x.float() for x in scene()]
+    indices = dict(zip(("ii", "jj", "kk"), edges(), strict=True))
+    wrong = indices[name].clone()
+    wrong[1] = value
+    assert by_kernel(*floats, **indices) is not None
+    assert by_kernel(*floats, **(indices | {name: wrong})) is None
+    assert by_kernel(*floats, **(indices | {name: wrong[:1]})) is None
+    assert by_kernel(*floats, **(indices | {name: wrong.int()})) is None

@@ -5,9 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dvo.core.kernels import use_kernels
 from dvo.geometry import se3
-from dvo.geometry.projection import reproject
+from dvo.geometry.projection import MIN_Z_DIVISION, reproject
 from dvo.map.window import Window
+
+LONGEST = 1e3
+"""Flow of a patch at most, in the mean flow of a frame pair, feature pixels."""
 
 
 def predict_pose(poses_cw: Tensor, times: list[float], time: float, damping: float) -> Tensor:
@@ -87,9 +91,16 @@ def flow_magnitude(window: Window, i: int, j: int) -> float:
     Returns:
         Feature pixels.
     """
-    whole, only = _displacement(window, i, j, rotation=False)
     m = window.per_frame
+    patches, of_i, of_j = window.patches[i * m : (i + 1) * m], window.frames[i].intrinsics, window.frames[j].intrinsics
+    floats = window.poses_cw[i], window.poses_cw[j], of_i, of_j, patches
+    if use_kernels(*floats) and len(patches):
+        from dvo.odometry.window.window_kernels import mean_flow
+
+        first, second, of_first, of_second, seen = (x.detach().contiguous().numpy() for x in floats)
+        return mean_flow(first, second, of_first, of_second, seen, MIN_Z_DIVISION, LONGEST)
+    whole, only = _displacement(window, i, j, rotation=False)
     c = window.patches.shape[-1] // 2
-    start = window.patches[i * m : (i + 1) * m, :2, c, c]
+    start = patches[:, :2, c, c]
     moved = 0.5 * (whole - start).norm(dim=-1) + 0.5 * (only - start).norm(dim=-1)
-    return float(moved.clamp(max=1e3).mean())
+    return float(moved.clamp(max=LONGEST).mean())

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from dvo.geometry.projection import reproject
+from dvo.core.kernels import use_kernels
+from dvo.geometry.projection import MIN_Z_DIVISION, reproject
 from dvo.map.window import Window
 from dvo.odometry.frames.content import MATCHED, matched_share
 
@@ -64,6 +65,9 @@ def support_of(window: Window, position: int) -> PoseSupport:
     Returns:
         Support; without inliers for the first frame.
     """
+    found = _by_kernel(window, position)
+    if found is not None:
+        return found
     into = (window.jj == position) & (window.ii <= position)
     if not bool(into.any()):
         return PoseSupport(0.0, 0.0)
@@ -75,6 +79,22 @@ def support_of(window: Window, position: int) -> PoseSupport:
     if not bool(earlier.any()):
         return PoseSupport(confidence, 0.0)
     return PoseSupport(confidence, _inliers(window, earlier))
+
+
+def _by_kernel(w: Window, position: int) -> PoseSupport | None:
+    """The same by a compiled loop; None where it is not one for kernels."""
+    floats = w.poses_cw, w.patches, w.intrinsics, w.targets, w.confidence
+    if not use_kernels(*floats):
+        return None
+    from dvo.odometry.window.window_kernels import support
+
+    poses, patches, intrinsics, targets, confidence = (x.detach().contiguous().numpy() for x in floats)
+    jj, kk = w.jj.contiguous().numpy(), w.kk.contiguous().numpy()
+    good, *values = support(
+        position, w.visible is not None, jj, kk, w.per_frame, poses, patches, intrinsics, targets, confidence,
+        CONFIDENT, AGREEMENT, MIN_Z_DIVISION,
+    )  # fmt: skip
+    return PoseSupport(*values) if good else None
 
 
 def measured(window: Window, confidence: Tensor, among: Tensor) -> Tensor:

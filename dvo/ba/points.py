@@ -7,13 +7,18 @@ Intrinsics and distortion are constant. Not differentiable; for maps and for pro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dvo.ba.bal import PointProblem
-from dvo.ba.layer.schur import eliminate
+from dvo.ba.layer.schur import eliminate, factorise, solve_with
+from dvo.core.kernels import available
 from dvo.geometry import se3, so3
+
+Array = np.ndarray[Any, Any]
 
 MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32
 """Bounds of the diagonal that damping is a fraction of, as in Ceres: unobserved directions are damped too."""
@@ -78,6 +83,80 @@ def _normal_equations(problem: PointProblem, fixed: int) -> tuple[Tensor, ...]:
     return tuple(x[None] for x in (h_pp, h_pl, h_ll, g_p[fixed:].flatten(), g_l))
 
 
+class _Plain:
+    """Steps and costs by PyTorch; the equations are kept until the problem is another."""
+
+    def __init__(self, problem: PointProblem, fixed: int) -> None:
+        self._fixed, self._at = fixed, problem
+        self._equations = _normal_equations(problem, fixed)
+
+    def cost(self, problem: PointProblem) -> float:
+        """Half the sum of squared residuals."""
+        return 0.5 * float(residuals(problem).square().sum())
+
+    def step(self, problem: PointProblem, damping: float) -> tuple[Tensor, Tensor, float]:
+        """Steps ``(P,)`` of the cameras and ``(K, 3)`` of the points, and the decrease of the cost expected of them."""
+        if problem is not self._at:
+            self._at, self._equations = problem, _normal_equations(problem, self._fixed)
+        h_pp, h_pl, h_ll, g_p, g_l = self._equations
+        d_p = damping * h_pp.diagonal(dim1=1, dim2=2).clamp(MIN_DIAGONAL, MAX_DIAGONAL)
+        d_l = damping * h_ll.diagonal(dim1=2, dim2=3).clamp(MIN_DIAGONAL, MAX_DIAGONAL)
+        solver = eliminate(h_pp + torch.diag_embed(d_p), h_pl, h_ll + torch.diag_embed(d_l))
+        dp, dl = solver.solve(g_p, g_l)
+        predicted = 0.5 * float((dp * (d_p * dp + g_p)).sum() + (dl * (d_l * dl + g_l)).sum())
+        return dp[0], dl[0], predicted
+
+
+class _Compiled:
+    """The same by compiled loops over the points, which take no place for pairs of a camera and a point unseen."""
+
+    def __init__(self, order: Array, start: Array, fixed: int) -> None:
+        self._order, self._start, self._fixed = order, start, fixed
+
+    def cost(self, problem: PointProblem) -> float:
+        from dvo.ba.point_kernels import half_squares
+
+        arguments = *_arrays(problem), problem.point.contiguous().numpy(), problem.pixels.contiguous().numpy()
+        return float(half_squares(*arguments))
+
+    def step(self, problem: PointProblem, damping: float) -> tuple[Tensor, Tensor, float]:
+        from dvo.ba.point_kernels import point_steps, reduced_points
+
+        size, points = 6 * max(0, len(problem.poses_cw) - self._fixed), len(problem.points)
+        s, x, g_p, d_p = np.zeros((size, size)), np.zeros(size), np.zeros(size), np.zeros(size)
+        mixed, q = np.zeros((len(self._order), 3, 6)), np.zeros((points, 3, 3))
+        g_l, d_l, dl = np.zeros((points, 3)), np.zeros((points, 3)), np.zeros((points, 3))
+        place = self._order, self._start, self._fixed
+        numbers = float(damping), MIN_DIAGONAL, MAX_DIAGONAL
+        given = *_arrays(problem), problem.pixels.contiguous().numpy(), *place, *numbers
+        arguments: tuple[Any, ...] = (*given, s, x, g_p, d_p, mixed, q, g_l, d_l)
+        reduced_points(*arguments)
+        step = solve_with(*factorise(torch.from_numpy(s)[None]), torch.from_numpy(x)[None])[0]
+        dp = step.numpy()
+        twice = point_steps(problem.camera.contiguous().numpy(), *place, mixed, q, g_l, d_l, dp, dl)
+        return step, torch.from_numpy(dl), 0.5 * float((dp * (d_p * dp + g_p)).sum() + twice)
+
+
+def _arrays(problem: PointProblem) -> tuple[Any, ...]:
+    """Rotations, poses, intrinsics, distortion, points, and the camera of each observation."""
+    p = problem
+    tensors = so3.matrix(p.poses_cw[:, 3:]), p.poses_cw, p.intrinsics, p.radial, p.points, p.camera
+    return tuple(x.contiguous().numpy() for x in tensors)
+
+
+def _compiled(problem: PointProblem, fixed: int) -> _Compiled | None:
+    """Kernels for a problem, None where they do not serve."""
+    p = problem
+    floats = p.poses_cw, p.intrinsics, p.radial, p.points, p.pixels
+    if not available() or any(x.device.type != "cpu" or x.dtype != torch.float64 or x.requires_grad for x in floats):
+        return None
+    from dvo.ba.point_kernels import by_point
+
+    camera, point = p.camera.contiguous().numpy(), p.point.contiguous().numpy()
+    good, order, start = by_point(camera, point, len(p.poses_cw), len(p.points))
+    return _Compiled(order, start, int(fixed)) if good else None
+
+
 def solve_points(
     problem: PointProblem,
     *,
@@ -104,20 +183,15 @@ def solve_points(
         >>> solution = solve_points(read_bal("problem-21-11315-pre.txt"), fixed=1)
         >>> solution.cost / solution.initial_cost
     """
-    cost = initial = _cost(problem)
+    system = _compiled(problem, fixed) or _Plain(problem, fixed)
+    cost = initial = system.cost(problem)
     growth, converged = 2.0, False
     tried = 0
-    system = _normal_equations(problem, fixed)
     while tried < max_iterations:
         tried += 1
-        h_pp, h_pl, h_ll, g_p, g_l = system
-        d_p = damping * h_pp.diagonal(dim1=1, dim2=2).clamp(MIN_DIAGONAL, MAX_DIAGONAL)
-        d_l = damping * h_ll.diagonal(dim1=2, dim2=3).clamp(MIN_DIAGONAL, MAX_DIAGONAL)
-        solver = eliminate(h_pp + torch.diag_embed(d_p), h_pl, h_ll + torch.diag_embed(d_l))
-        dp, dl = solver.solve(g_p, g_l)
-        moved = _moved(problem, dp[0], dl[0], fixed)
-        new_cost = _cost(moved)
-        predicted = 0.5 * float((dp * (d_p * dp + g_p)).sum() + (dl * (d_l * dl + g_l)).sum())
+        dp, dl, predicted = system.step(problem, damping)
+        moved = _moved(problem, dp, dl, fixed)
+        new_cost = system.cost(moved)
         gain = (cost - new_cost) / predicted if predicted > 0 else -1.0
         if new_cost < cost:  # False for NaN
             decrease, problem, cost = cost - new_cost, moved, new_cost
@@ -125,17 +199,12 @@ def solve_points(
             if decrease <= tolerance * cost:
                 converged = True
                 break
-            system = _normal_equations(problem, fixed)
         else:
             damping, growth = damping * growth, growth * 2
             if damping > 1e16 or predicted <= 1e-15 * cost:
                 converged = predicted <= tolerance * cost
                 break
     return PointSolution(problem, initial, cost, tried, converged)
-
-
-def _cost(problem: PointProblem) -> float:
-    return 0.5 * float(residuals(problem).square().sum())
 
 
 def _moved(problem: PointProblem, dp: Tensor, dl: Tensor, fixed: int) -> PointProblem:

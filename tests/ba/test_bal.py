@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import bz2
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from dvo.ba.bal import PointProblem, read_bal
 from dvo.ba.points import residuals, solve_points
 from dvo.core.errors import DvoError
+from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.geometry import se3
 
 FILES = ["dubrovnik-3-7-pre.txt", "problem-21-11315-pre.txt", "problem-49-7776-pre.txt"]
@@ -167,6 +171,30 @@ def test_degenerate_problems_end() -> None:
     assert np.isfinite(solve_points(behind, max_iterations=20).cost)
     unseen = start.moved(start.poses_cw, torch.cat((start.points, torch.ones(1, 3, dtype=torch.float64))))
     torch.testing.assert_close(solve_points(unseen).problem.points[-1], torch.ones(3, dtype=torch.float64))
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 10_000), st.integers(0, 5), st.integers(0, 150), st.integers(1, 4))
+def test_the_kernels_take_the_steps_of_the_twin(
+    monkeypatch: pytest.MonkeyPatch, seed: int, fixed: int, count: int, iterations: int
+) -> None:
+    """Of some observations, some of them twice, in any order."""
+    _, start = synthetic(noise=1.0)
+    some = torch.randint(150, (count,), generator=torch.Generator().manual_seed(seed))
+    start = replace(start, camera=start.camera[some], point=start.point[some], pixels=start.pixels[some])
+    found = []
+    for choice in CHOICES:
+        monkeypatch.setenv(VARIABLE, choice)
+        found.append(solve_points(start, fixed=fixed, max_iterations=iterations))
+    ours, twin = found
+    assert (ours.iterations, ours.converged) == (twin.iterations, twin.converged)
+    assert ours.initial_cost == pytest.approx(twin.initial_cost, rel=1e-9)
+    if count >= 100 and fixed >= 2:  # else what the measurements leave open is open to rounding, too
+        assert ours.cost == pytest.approx(twin.cost, rel=1e-6)
+        torch.testing.assert_close(ours.problem.poses_cw, twin.problem.poses_cw, atol=1e-6, rtol=0)
+        torch.testing.assert_close(ours.problem.points, twin.problem.points, atol=1e-4, rtol=1e-4)
+    else:
+        assert ours.cost == pytest.approx(twin.cost, rel=1e-2, abs=1e-3)
 
 
 TINY = "1 1 1\n0 0 10.0 20.0\n" + " ".join(["0"] * 6 + ["100", "0", "0"]) + "\n0 0 -2\n"

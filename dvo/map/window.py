@@ -89,7 +89,7 @@ class Window:
         weights: ``(E, 2)`` of the targets in bundle adjustment; 0 for an edge before its first update.
         confidence: ``(E, 2)`` of the network in its measurements, in (0, 1); 0 before the first update.
         jj, kk: ``(E,)`` target frame and patch of each edge.
-        edge_slots: ``(E,)`` index of each edge in the correlation caches.
+        edge_slots: ``(E,)`` index of each edge in results that are kept from step to step.
         frames: the keyframes, oldest first.
         unfixed: ``(h, w)`` bool, pixels of the feature maps that are not fixed to the images; None: all. It counts for
             all frames but guests, beside their own masks.

@@ -25,7 +25,6 @@ STAGES = {
     "graph index": ("edges.py", "build_graph"),
     "reprojection": ("projection.py", "reproject"),
     "correlation": ("edge_correlation.py", "lookup"),
-    "  refresh of cached windows": ("edge_correlation.py", "_refresh"),
     "update operator": ("update.py", "forward"),
     "bundle adjustment": ("layer.py", "bundle_adjust"),
     "keyframes": ("tracker.py", "_reduce"),

@@ -29,12 +29,6 @@ class TrueFlow:
     def keep_maps(self, map_slot, maps):
         pass
 
-    def forget(self, edge_slots):
-        pass
-
-    def origins(self):
-        return torch.zeros(0)
-
     def __call__(self, coords, graph):
         window = self.odometry.window
         edges = (graph.ii, graph.jj, graph.kk)

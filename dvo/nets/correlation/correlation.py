@@ -7,8 +7,8 @@ Three implementations give the same values:
 
 - :func:`correlate_reference`, the specification: bilinear sampling of the features, then dot products.
 - :class:`CorrelationVolume`: all products of a clip as one matrix product, then cheap look-ups. For training.
-- :class:`dvo.nets.correlation.edge_correlation.EdgeCorrelation`: products with one window of features an edge, kept
-  between updates. For tracking, where the volume would not fit.
+- :class:`dvo.nets.correlation.edge_correlation.EdgeCorrelation`: products with one window of features an edge. For
+  tracking, where the volume would not fit.
 
 An update operator receives them as :class:`Correlation`, which states the order of the channels. Positions receive no
 gradient, as in RAFT.

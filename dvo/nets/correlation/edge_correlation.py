@@ -1,12 +1,10 @@
-"""Correlation of the edges of a sliding window, cached between updates.
+"""Correlation of the edges of a sliding window.
 
-Between two updates an edge moves by about a pixel, while most of the cost of its correlation is reading features. The
-products of a patch with a window larger than needed are therefore cached in a slot of the edge; they are computed again
-only when the edge moves out of the window. Values equal :func:`dvo.nets.correlation.correlation.correlate_reference`,
-up to the order of the channels.
+For tracking, where few edges of many frames are looked up once: no product is kept from one update to the next. Values
+equal :func:`dvo.nets.correlation.correlation.correlate_reference`, up to the order of the channels.
 
-Memory is read contiguously: the maps are padded with zeros by the width of a window, so that a row of a window is one
-contiguous range at every position, and products are stored with x fastest, so that a row of a look-up is one too.
+Memory is read contiguously: the maps are stored with their channels last and padded with zeros by the width of a
+window, so that a row of a window is one contiguous range at every position.
 """
 
 from __future__ import annotations
@@ -15,114 +13,57 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-_NOWHERE = -(10**6)
+from dvo.core.kernels import use_kernels
+
 FIRST_MAPS = 8  # map slots that memory is reserved for at first
-PIECE = 256  # edges processed at once, so that the working set fits in the processor's cache
+_PIECE = 32  # edges processed at once, so that the working set fits in the processor's cache
+_SPREAD = 4  # pixels between those of a patch, up to which they share one window of the map
 
 
 class EdgeCorrelation:
-    """Cached correlation of edges at one pyramid level.
-
-    Frames have map slots and edges have edge slots; both are assigned by the caller
-    (:class:`dvo.odometry.window.correlation.WindowCorrelation`).
+    """Correlation of edges at one pyramid level.
 
     Args:
         scale: down-sampling of the level relative to the features.
-        pixels: patch pixels ``p * p``.
         radius: correlation radius in pixels of the level.
-        side: side of the cached window, pixels of the level; at least ``2 * radius + 2``.
-        device: of the caches.
+        device: of the maps.
+
+    Attributes:
+        maps: ``(N, H, W, C)`` features by map slot, each in a border of ``2 radius + 2`` zeros.
 
     Example:
-        >>> cache = EdgeCorrelation(scale=1, pixels=9, radius=3, side=14, device="cpu")
-        >>> cache.keep_map(0, torch.randn(32, 30, 40))
-        >>> slots = torch.arange(2)
-        >>> cache.forget(slots)
+        >>> level = EdgeCorrelation(scale=1, radius=3, device="cpu")
+        >>> level.keep_map(0, torch.randn(32, 30, 40))
         >>> coords = torch.full((2, 3, 3, 2), 12.0)
         >>> kk, frames = torch.tensor([0, 1]), torch.tensor([0, 0])
-        >>> cache.lookup(coords, slots, torch.randn(2, 32, 9), kk, frames).shape
+        >>> level.lookup(coords, torch.randn(2, 9, 32), kk, frames).shape
         torch.Size([2, 441])
     """
 
-    def __init__(self, scale: float, pixels: int, radius: int, side: int, device: torch.device | str) -> None:
-        self.scale, self.pixels, self.radius, self.side = scale, pixels, radius, side
-        self._maps = torch.zeros(0, 0, 0, 0, device=device)
-        self._products = torch.zeros(0, pixels, side, side, device=device)
-        self._origin = torch.zeros(0, 2, dtype=torch.long, device=device)
-
-    def __len__(self) -> int:
-        """Number of edge slots that memory is reserved for."""
-        return len(self._origin)
+    def __init__(self, scale: float, radius: int, device: torch.device | str) -> None:
+        self.scale, self.radius = scale, radius
+        self.maps = torch.zeros(0, 0, 0, 0, device=device)
 
     def keep_map(self, slot: int, level: Float[Tensor, "C h w"]) -> None:
         """Store the features of a frame; the storage grows with the largest slot, by doubling.
 
         Args:
-            slot: map slot of the frame; its content is overwritten.
+            slot: map slot of the frame, assigned by the caller; its content is overwritten.
             level: features of the frame at this level.
         """
         c, h, w = level.shape
-        have, s = len(self._maps), self.side
+        have, border = len(self.maps), 2 * self.radius + 2
         if slot >= have:
-            grown = level.new_zeros(max(slot + 1, 2 * have, FIRST_MAPS), h + 2 * s, w + 2 * s, c)
+            grown = level.new_zeros(max(slot + 1, 2 * have, FIRST_MAPS), h + 2 * border, w + 2 * border, c)
             if have:
-                grown[:have] = self._maps
-            self._maps = grown
-        self._maps[slot, s : s + h, s : s + w] = level.permute(1, 2, 0)
-
-    def forget(self, slots: Int[Tensor, " n"]) -> None:
-        """Invalidate the cached windows of edge slots that are assigned to new edges.
-
-        Args:
-            slots: edge slots; storage is reserved for new ones.
-        """
-        if len(slots):
-            self._reserve(int(slots.max()) + 1)
-            self._origin[slots] = _NOWHERE
-
-    def _reserve(self, count: int) -> None:
-        have = len(self._origin)
-        if count > have:
-            extra = max(count - have, have // 2, 256)
-            self._products = torch.cat([self._products, self._products.new_zeros(extra, *self._products.shape[1:])])
-            self._origin = torch.cat([self._origin, self._origin.new_full((extra, 2), _NOWHERE)])
-
-    def origins(self, slots: Int[Tensor, " n"]) -> Int[Tensor, "n 2"]:
-        """Upper left corners of the cached windows, from which :meth:`restore` computes the same products again.
-
-        Args:
-            slots: edge slots.
-
-        Returns:
-            ``x, y`` in pixels of the level; far outside of the map for a window that has not been computed.
-        """
-        return self._origin[slots]
-
-    def restore(
-        self,
-        origins: Int[Tensor, "n 2"],
-        slots: Int[Tensor, " n"],
-        features: Float[Tensor, "K C q"],
-        kk: Int[Tensor, " n"],
-        frames: Int[Tensor, " n"],
-    ) -> None:
-        """Compute the cached windows of edges at given positions.
-
-        Args:
-            origins: see :meth:`origins`.
-            slots: edge slots; storage is reserved for new ones.
-            features, kk, frames: see :meth:`lookup`.
-        """
-        self.forget(slots)
-        known = (origins != _NOWHERE).any(-1).nonzero()[:, 0]
-        if len(known):
-            self._fill(origins[known], slots[known], features, kk[known], frames[known])
+                grown[:have] = self.maps
+            self.maps = grown
+        self.maps[slot, border : border + h, border : border + w] = level.permute(1, 2, 0)
 
     def lookup(
         self,
         coords: Float[Tensor, "E p p 2"],
-        slots: Int[Tensor, " E"],
-        features: Float[Tensor, "K C q"],
+        features: Float[Tensor, "K q C"],
         kk: Int[Tensor, " E"],
         frames: Int[Tensor, " E"],
     ) -> Float[Tensor, "E c"]:
@@ -130,60 +71,84 @@ class EdgeCorrelation:
 
         Args:
             coords: reprojected patch pixels ``x, y`` in feature pixels (of scale 1).
-            slots: edge slot of each edge.
-            features: patch features, pixels last.
+            features: of the ``q = p^2`` pixels of each patch, channels last.
             kk: patch of each edge.
             frames: map slot of the target frame of each edge.
 
         Returns:
-            ``c = p^2 * (2r+1)^2`` channels, ordered ``pixels_first``: patch row, patch column, y offset, x offset.
+            ``c = p^2 * (2r+1)^2`` channels, ordered ``pixels_first``: patch row, patch column, y offset, x offset. NaN
+            for a pixel whose position is not a number.
         """
-        e, s, r = len(slots), self.side, self.radius
-        taps = 2 * r + 2
-        at = coords.reshape(e, self.pixels, 2) / self.scale
-        self._refresh(at, slots, features, kk, frames)
-        local = (at - self._origin[slots][:, None] - r).clamp(0, s - taps + 1 - 1e-4)
-        base = local.floor()
-        fx, fy = (local - base)[..., None, None, :].unbind(-1)
-        x, y = base.long().unbind(-1)
-        pixel = torch.arange(self.pixels, device=kk.device)
-        start = ((slots[:, None] * self.pixels + pixel) * s + y) * s + x
-        index = start[..., None] + torch.arange(taps, device=kk.device) * s
-        runs = self._products.as_strided((self._products.numel() - taps + 1, taps), (1, 1))
-        out = local.new_empty(e, self.pixels, taps - 1, taps - 1)
-        for a in range(0, e, PIECE):
-            part = slice(a, a + PIECE)
-            values = runs.index_select(0, index[part].flatten()).view(-1, self.pixels, taps, taps)
-            rows = torch.lerp(values[..., :-1, :], values[..., 1:, :], fy[part])
-            torch.lerp(rows[..., :-1], rows[..., 1:], fx[part], out=out[part])
-        return out.view(e, -1)
+        at = (coords.flatten(1, 2) / self.scale).contiguous()
+        if use_kernels(self.maps, features, at):
+            from dvo.nets.correlation.edge_correlation_kernels import correlate
 
-    def _refresh(self, at: Tensor, slots: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> None:
-        """Compute the products again for edges that have moved out of their cached window."""
-        s, r = self.side, self.radius
-        _, height, width, _ = self._maps.shape
-        # A window beyond the border contains only zeros, at any position.
-        limit = torch.tensor([width - 2 * s, height - 2 * s], device=at.device)
-        at = at.clamp(-1e5, 1e5)  # far-away projections would overflow the integers
-        centre, low, high = (x.floor().long() for x in (at[:, self.pixels // 2], at.amin(1), at.amax(1)))
-        wanted = (centre - (s // 2 - 1)).clamp(min=-s).minimum(limit)
-        origin = self._origin[slots]
-        # A patch whose projection is larger than a window stays clamped; its centre alone decides on a refresh then.
-        outside = ((low - r < origin) | (high + r + 1 >= origin + s)).any(-1)
-        stale = (outside & (origin != wanted).any(-1)).nonzero()[:, 0]
-        if len(stale):
-            self._fill(wanted[stale], slots[stale], features, kk[stale], frames[stale])
+            side = 2 * self.radius + 1
+            out = at.new_empty(*at.shape[:2], side, side)
+            correlate(
+                self.maps.numpy(), features.contiguous().numpy(), at.numpy(), kk.numpy(), frames.numpy(), self.radius,
+                out.numpy(),
+            )  # fmt: skip
+        else:
+            out = correlate_edges(self.maps, features, at, kk, frames, self.radius)
+        return out.flatten(1)
 
-    def _fill(self, origins: Tensor, slots: Tensor, features: Tensor, kk: Tensor, frames: Tensor) -> None:
-        """Compute the windows of edges at positions ``(n, 2)``."""
-        s = self.side
-        _, height, width, c = self._maps.shape
-        runs = self._maps.as_strided((self._maps.numel() // c - s + 1, s * c), (c, 1))
-        x, y = (origins + s).unbind(-1)
-        first = (frames * height + y) * width + x
-        steps = torch.arange(s, device=origins.device) * width
-        for edges in torch.arange(len(slots), device=origins.device).split(PIECE // 4):
-            window = runs.index_select(0, (first[edges, None] + steps).flatten()).view(len(edges), s * s, c)
-            products = torch.bmm(features[kk[edges]].mT, window.mT)
-            self._products[slots[edges]] = products.view(len(edges), self.pixels, s, s)
-        self._origin[slots] = origins
+
+def correlate_edges(
+    maps: Float[Tensor, "N H W C"],
+    features: Float[Tensor, "K q C"],
+    at: Float[Tensor, "E q 2"],
+    kk: Int[Tensor, " E"],
+    frames: Int[Tensor, " E"],
+    radius: int,
+) -> Float[Tensor, "E q s s"]:
+    """Twin of the kernel: look up edges at one level.
+
+    Args:
+        maps: padded, see :class:`EdgeCorrelation`.
+        features, kk, frames: see :meth:`EdgeCorrelation.lookup`.
+        at: ``x, y`` in pixels of the level.
+        radius: ``r``, pixels of the level.
+
+    Returns:
+        Correlation over ``s = 2r + 1`` y offsets and x offsets.
+    """
+    taps = 2 * radius + 2
+    (_, height, width, c), (e, q) = maps.shape, at.shape[:2]
+    out = at.new_empty(e, q, taps - 1, taps - 1)
+    if not e:
+        return out
+    # A window beyond the border contains only zeros, at any position.
+    limit = torch.tensor([width - 2 * taps, height - 2 * taps], dtype=at.dtype, device=at.device)
+    position = (at - radius).clamp(min=-taps).minimum(limit)
+    base = position.floor()
+    fx, fy = (position - base)[..., None, None, :].unbind(-1)
+    corner = base.nan_to_num(-taps).long() + taps
+    low = corner.amin(1)
+    spread = (corner - low[:, None]).flatten(1).amax(1)
+    side = taps + min(int(spread.max()), _SPREAD)
+    # The pixels of a patch share the products with one window of the map, which is moved inwards at the far border.
+    origin = low.minimum(torch.tensor([width - side, height - side], device=at.device))
+    inner = (corner - origin[:, None]).clamp(max=side - taps)
+    first = (frames * height + origin[:, 1]) * width + origin[:, 0]
+    rows = torch.arange(side, device=at.device)
+    pixels, steps = torch.arange(q, device=at.device), rows[:taps] * side
+    runs = maps.as_strided((maps.numel() // c - side + 1, side * c), (c, 1))
+    for edges in torch.arange(e, device=at.device).split(_PIECE):
+        window = runs.index_select(0, (first[edges, None] + rows * width).flatten()).view(-1, side * side, c)
+        products = torch.bmm(features[kk[edges]], window.mT)
+        row = torch.arange(len(edges), device=at.device)[:, None] * q + pixels
+        start = (row * side + inner[edges, :, 1]) * side + inner[edges, :, 0]
+        lines = products.as_strided((products.numel() - taps + 1, taps), (1, 1))
+        values = lines.index_select(0, (start[..., None] + steps).flatten()).view(-1, q, taps, taps)
+        blended = torch.lerp(values[..., :-1, :], values[..., 1:, :], fy[edges])
+        out[edges] = torch.lerp(blended[..., :-1], blended[..., 1:], fx[edges])
+    wide = (spread > _SPREAD).nonzero()[:, 0]
+    if q > 1 and len(wide):  # pixels too far from each other are looked up one by one
+        single = (kk[wide, None] * q + pixels).flatten()
+        alone = at[wide].view(-1, 1, 2)
+        found = correlate_edges(
+            maps, features.reshape(-1, 1, c), alone, single, frames[wide].repeat_interleave(q), radius
+        )
+        out[wide] = found.view(-1, q, taps - 1, taps - 1)
+    return out

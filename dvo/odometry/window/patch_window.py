@@ -94,13 +94,11 @@ class Snapshot:
 
     Attributes:
         window: poses, patches and edge states.
-        origins: of the correlations; a value that is interpolated in a cached window depends on them in its last bit.
         alignment: the image that one more frame replaces and, of an alignment in every step, its results; None
             without one.
     """
 
     window: WindowSnapshot
-    origins: Tensor
     alignment: AlignmentSnapshot | None
 
 
@@ -263,7 +261,7 @@ class PatchWindow:
         """Record everything that steps and one new frame change, for :meth:`restore`."""
         always = self.settings.align == "always"
         alignment = None if self.alignment is None else self.alignment.snapshot(results=always)
-        return Snapshot(self.window.snapshot(), self.correlation.origins(), alignment)
+        return Snapshot(self.window.snapshot(), alignment)
 
     def restore(self, before: Snapshot) -> None:
         """Undo what has changed since a snapshot; the window has the same frames and edges again.
@@ -272,14 +270,11 @@ class PatchWindow:
             before: the snapshot.
         """
         self.window.restore(before.window)
-        if not torch.equal(self.correlation.origins(), before.origins):
-            self.correlation.restore(before.origins)
         if self.alignment is not None and before.alignment is not None:
             self.alignment.restore(before.alignment)
 
     def _forget(self, edge_slots: Tensor) -> None:
-        """Invalidate the cached results of new edges."""
-        self.correlation.forget(edge_slots)
+        """Invalidate the alignments of new edges."""
         if self.alignment is not None and self.settings.align == "always":
             self.alignment.forget(edge_slots)
 

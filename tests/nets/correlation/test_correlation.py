@@ -1,8 +1,13 @@
 """Each fast correlation equals the plain one, in value and gradient."""
 
+import math
+
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.nets.correlation.correlation import CorrelationVolume, correlate_reference
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
 from dvo.nets.patch.patchifier import pool_levels
@@ -77,29 +82,56 @@ def as_dpvo(channels):
     return channels.view(-1, 9, 7, 7).permute(0, 3, 2, 1).flatten(1)
 
 
+def looked_up(patches, maps, coords, kk, jj, radius):
+    """Channels of both levels as the tracker looks them up."""
+    found = []
+    for scale, level in zip((1, 4), pool_levels(maps, (1, 4)), strict=True):
+        of_level = EdgeCorrelation(scale, radius, "cpu")
+        of_level.maps = of_level.maps.to(maps)
+        for frame in range(maps.shape[1]):
+            of_level.keep_map(frame, level[0, frame])
+        found.append(of_level.lookup(coords[0], patches[0].flatten(2).mT, kk, jj))
+    return found
+
+
+@pytest.mark.parametrize("spread", [2.0, 30.0])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_cached_windows_equal_reference(seed):
-    patches, maps, coords, kk, jj = problem(batch=1, seed=seed)
-    features = patches.detach()[0].flatten(2)
-    torch.set_default_dtype(torch.float64)
-    try:
-        caches = [EdgeCorrelation(1, 9, 3, 14, "cpu"), EdgeCorrelation(4, 9, 3, 12, "cpu")]
-    finally:
-        torch.set_default_dtype(torch.float32)
-    for cache, level in zip(caches, pool_levels(maps.detach(), (1, 4)), strict=True):
-        for frame in range(3):
-            cache.keep_map(frame, level[0, frame])
-    for cache in caches:
-        cache.forget(torch.arange(20))
-    slots = torch.randperm(20, generator=torch.Generator().manual_seed(seed))[: len(kk)]
-    generator = torch.Generator().manual_seed(seed)
-    for step in range(6):  # small steps stay inside the cached windows, the large one leaves them
-        size = 12.0 if step == 3 else 0.5
-        coords = coords + size * torch.randn(1, len(kk), 1, 1, 2, generator=generator, dtype=coords.dtype)
-        slow = [c[0] for c in correlate_reference(patches, maps, coords, kk, jj)]
-        kept = [as_dpvo(cache.lookup(coords[0], slots, features, kk, jj)) for cache in caches]
-        for a, b in zip(slow, kept, strict=True):
-            torch.testing.assert_close(b, a)
+def test_windows_of_edges_equal_reference(seed, spread):
+    patches, maps, coords, kk, jj = problem(batch=1, seed=seed, spread=spread)
+    slow = [c[0] for c in correlate_reference(patches, maps, coords, kk, jj)]
+    for a, b in zip(slow, looked_up(patches.detach(), maps.detach(), coords, kk, jj, 3), strict=True):
+        torch.testing.assert_close(as_dpvo(b), a)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    edges=st.integers(0, 12),
+    channels=st.sampled_from([1, 3, 8, 64]),
+    side=st.sampled_from([1, 3]),
+    radius=st.integers(1, 7),
+    spread=st.sampled_from([0.0, 2.0, 30.0]),
+    special=st.sampled_from([None, math.nan, math.inf, -math.inf, 1e30, -3.5e9]),
+)
+def test_kernel_equals_twin(seed, edges, channels, side, radius, spread, special):
+    g = torch.Generator().manual_seed(seed)
+    patches, maps = (
+        torch.randn(1, 6, channels, side, side, generator=g),
+        torch.randn(1, 3, channels, 12, 14, generator=g),
+    )
+    kk, jj = torch.randint(6, (edges,), generator=g), torch.randint(3, (edges,), generator=g)
+    coords = torch.rand(1, edges, 1, 1, 2, generator=g) * 34 - 10
+    coords = coords + spread * torch.rand(1, edges, side, side, 2, generator=g)
+    if special is not None and edges:
+        coords[0, edges // 2, 0, side - 1, seed % 2] = special
+    found = []
+    for choice in CHOICES:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(VARIABLE, choice)
+            found.append(looked_up(patches, maps, coords, kk, jj, radius))
+    for kernel, twin in zip(*found, strict=True):
+        torch.testing.assert_close(kernel, twin, rtol=1e-5, atol=1e-5 * channels**0.5, equal_nan=True)
+        assert kernel.isnan().any() == (special is not None and math.isnan(special) and edges > 0)
 
 
 def test_far_away_positions_are_zero_not_an_overflow():

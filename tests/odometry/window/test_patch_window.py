@@ -32,7 +32,7 @@ def content(window):
     data = window.window
     found = {field.name: getattr(data, field.name) for field in fields(data) if field.name not in ("frames", "_edges")}
     shot = window.snapshot()
-    found |= {"origins": shot.origins, "identifiers": [frame.identifier for frame in data.frames]}
+    found |= {"identifiers": [frame.identifier for frame in data.frames]}
     if shot.alignment is not None:
         found["images"] = window.alignment.images
         found |= {f"result {k}": part for k, part in enumerate(shot.alignment.results or ())}

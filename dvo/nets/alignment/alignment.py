@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.core.kernels import use_kernels
 from dvo.core.settings import check_settings
 
 _LONGEST = 2.0  # pixels that one iteration may move
@@ -194,6 +195,8 @@ def align_patches(
         >>> found.positions.shape
         torch.Size([1, 2])
     """
+    if use_kernels(images, centres, start, warps) and min(images.shape[1:]) > 1:
+        return _align_compiled(images, source, target, centres, start, warps, options)
     offsets, *window = grey_windows(images, source, centres, options.window)
     template, gx, gy = map(_centred, window)
     floor = _NOISE * options.window
@@ -215,6 +218,22 @@ def align_patches(
     seen = _centred(sample_images(images, target, positions[:, None] + warped))
     correlation = (seen * template).sum(1) / (energy * (seen.square().sum(1) + floor)).sqrt()
     return Alignment(positions, correlation, length)
+
+
+def _align_compiled(
+    images: Tensor, source: Tensor, target: Tensor, centres: Tensor, start: Tensor, warps: Tensor,
+    options: AlignmentOptions,
+) -> Alignment:  # fmt: skip
+    """:func:`align_patches` by its kernel, which samples as :func:`sample_images_plain` does."""
+    from dvo.nets.alignment.alignment_kernels import align
+
+    grey, middle, begin, warp = (x.detach().contiguous().numpy() for x in (images, centres, start, warps))
+    positions, quality = start.new_empty(len(begin), 2), start.new_empty(2, len(begin))
+    align(
+        grey, source.numpy(), target.numpy(), middle, begin, warp, options.window, options.iterations,
+        _NOISE * options.window, _LONGEST, positions.numpy(), quality.numpy(),
+    )  # fmt: skip
+    return Alignment(positions, *quality)
 
 
 def accept(

@@ -1,5 +1,7 @@
 """Sub-pixel alignment: its twin, its gradients, known shifts, and rendered motion."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -90,6 +92,37 @@ def test_it_is_differentiable():
     start = torch.tensor([[11.23, 11.64]], dtype=torch.float64, requires_grad=True)
     warps = torch.tensor([[[1.03, 0.02], [-0.03, 0.97]]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(positions, (images.requires_grad_(), start, warps), eps=1e-5, atol=1e-4)
+
+
+@given(
+    seed=st.integers(0, 1000), edges=st.integers(0, 6), window=st.sampled_from([5, 7, 13]), reach=st.floats(-30, 60),
+    iterations=st.integers(1, 4), special=st.sampled_from([None, math.nan, math.inf, -1e30]), flat=st.booleans(),
+)  # fmt: skip
+@settings(max_examples=60, deadline=None)
+def test_the_kernel_finds_what_the_twin_finds(seed, edges, window, reach, iterations, special, flat):
+    """Windows inside, across the border and outside; positions without a value stay without one and harm no other."""
+    g = torch.Generator().manual_seed(seed)
+    x, y = grid(30, 40)
+    images = torch.stack([texture(x, y), texture(x * 1.02 + 0.4, y - 0.3), 90 + 20 * (not flat) * texture(y, x) / 127])
+    source, target = torch.randint(3, (2, edges), generator=g)
+    centres = torch.rand(edges, 2, generator=g) * 40 - 5 + reach * (seed % 3 == 0)
+    start = centres + torch.rand(edges, 2, generator=g) - 0.5
+    warps = torch.eye(2) + 0.2 * (torch.rand(edges, 2, 2, generator=g) - 0.5)
+    if special is not None and edges:
+        start[0, seed % 2] = special
+    options = AlignmentOptions(window=window, iterations=iterations)
+    with torch.inference_mode():
+        ours = align_patches(images.float(), source, target, centres, start, warps, options)
+        floats = (x.double() for x in (centres, start, warps))
+        theirs = align_patches(images, source, target, *floats, options)
+    known = theirs.positions.isfinite().all(1)
+    assert torch.equal(ours.positions.isfinite().all(1), known)
+    for name in ("positions", "correlation", "last_step"):
+        one, other = getattr(ours, name)[known], getattr(theirs, name)[known].float()
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=2e-3)
+    size = (40, 30)
+    taken = [accept(found, at, size, 4.0, options) for found, at in ((ours, start), (theirs, start.double()))]
+    assert not any(of[~known].any() for of in taken)
 
 
 def test_without_texture_nothing_moves_and_nothing_is_accepted():

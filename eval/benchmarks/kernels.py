@@ -1,0 +1,110 @@
+"""Benchmark of compiled kernels and their twins: ``python -m eval.benchmarks.kernels [--only correlation]``.
+
+Prints for each kernel a line: size, milliseconds of the kernel and of its PyTorch twin on one thread (medians of
+``--repeats`` runs that take turns, so that a busy machine slows both), the ratio, and the largest difference of the
+results.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+from dvo.core.command_line import OneLineParser
+from dvo.core.kernels import CHOICES, VARIABLE
+from dvo.nets.alignment.alignment import align_patches
+from dvo.nets.correlation.edge_correlation import EdgeCorrelation
+
+Call = Callable[[], Tensor]
+
+
+def edge_correlation(generator: torch.Generator, scale: int) -> tuple[str, Call]:
+    """Look-up of the edges of a window at one level of 320x240 video.
+
+    Args:
+        generator: of the input.
+        scale: of the level.
+    """
+    edges, patches, frames, channels, height, width = 720, 192, 9, 64, 60, 80
+    level = EdgeCorrelation(scale, radius=3, device="cpu")
+    for slot in range(frames):
+        level.keep_map(slot, torch.randn(channels, height // scale, width // scale, generator=generator))
+    features = torch.randn(patches, 9, channels, generator=generator)
+    kk = torch.randint(patches, (edges,), generator=generator)
+    slots = torch.randint(frames, (edges,), generator=generator)
+    ticks = torch.arange(3.0)
+    patch = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
+    coords = torch.rand(edges, 1, 1, 2, generator=generator) * torch.tensor([width, height]) + 1.05 * patch
+    return f"{edges} edges, {channels} channels", lambda: level.lookup(coords, features, kk, slots)
+
+
+def alignment(generator: torch.Generator) -> tuple[str, Call]:
+    """Alignment of the edges that leave a window."""
+    edges, frames, height, width = 240, 8, 240, 320
+    noise = torch.rand(frames, 1, height // 4, width // 4, generator=generator) * 255
+    images = torch.nn.functional.interpolate(noise, (height, width), mode="bicubic")[:, 0].contiguous()
+    source = torch.randint(frames, (edges,), generator=generator)
+    centres = torch.rand(edges, 2, generator=generator) * torch.tensor([width, height])
+    start = centres + torch.rand(edges, 2, generator=generator)
+    warps = torch.eye(2) + 0.1 * torch.rand(edges, 2, 2, generator=generator)
+    return f"{edges} edges", lambda: align_patches(images, source, source, centres, start, warps).positions
+
+
+KERNELS: dict[str, Callable[[torch.Generator], tuple[str, Call]]] = {
+    "correlation, level 1": lambda generator: edge_correlation(generator, 1),
+    "correlation, level 4": lambda generator: edge_correlation(generator, 4),
+    "alignment": alignment,
+}
+"""By name: a function of a random generator that returns a description of the size and a call to time, which asks
+:func:`dvo.core.kernels.use_kernels`."""
+
+
+def compare(call: Call, repeats: int) -> tuple[float, float, float]:
+    """Run a kernel and its twin in turns.
+
+    Args:
+        call: computes with either.
+        repeats: number of runs of each, after one that is not timed.
+
+    Returns:
+        Median seconds of the kernel and of the twin, and the largest absolute difference of the results.
+    """
+    seconds: dict[str, list[float]] = {choice: [] for choice in CHOICES}
+    found = {}
+    for repeat in range(repeats + 1):
+        for choice in CHOICES:
+            with mock.patch.dict(os.environ, {VARIABLE: choice}):
+                start = time.perf_counter()
+                found[choice] = call()
+                seconds[choice] += [time.perf_counter() - start] if repeat else []
+    kernel, twin = CHOICES
+    largest = (found[kernel] - found[twin]).abs().max().item()
+    return statistics.median(seconds[kernel]), statistics.median(seconds[twin]), largest
+
+
+def main() -> None:
+    """Run the benchmark and print a line for each kernel."""
+    parser = OneLineParser(prog="python -m eval.benchmarks.kernels", description=__doc__)
+    parser.add_argument("--only", default="", help="kernels whose names contain this")
+    parser.add_argument("--repeats", type=int, default=20, help="(%(default)s)")
+    options = parser.parse_args()
+    chosen = [name for name in KERNELS if options.only in name]
+    if not chosen or options.repeats < 1:
+        parser.error(f"no run: --only is part of {', '.join(KERNELS)}, --repeats at least 1")
+    torch.set_num_threads(1)
+    print(f"{'kernel':24} {'size':28} {'ms':>8} {'twin ms':>8} {'ratio':>6} {'difference':>11}")
+    with torch.inference_mode():
+        for name in chosen:
+            size, call = KERNELS[name](torch.Generator().manual_seed(0))
+            kernel, twin, largest = compare(call, options.repeats)
+            print(f"{name:24} {size:28} {1e3 * kernel:8.2f} {1e3 * twin:8.2f} {twin / kernel:6.1f} {largest:11.1e}")
+
+
+if __name__ == "__main__":
+    main()

@@ -23,22 +23,24 @@ VARIABLE = "DVO_KERNELS"
 CHOICES = ("numba", "torch")
 
 
-def use_kernels(*tensors: Tensor) -> bool:
+def use_kernels(*tensors: Tensor, double: bool = False) -> bool:
     """Tell if a computation on these tensors is one for kernels.
 
     Args:
         tensors: the floating-point arguments.
+        double: the kernels take float64 as well.
 
     Returns:
-        True for float32 tensors on the CPU of which no derivative is recorded, by autograd, as dual numbers or within
-        ``torch.func``, if kernels are there and wanted.
+        True for float32 tensors (or float64, where these are taken) on the CPU of which no derivative is recorded, by
+        autograd, as dual numbers or within ``torch.func``, if kernels are there and wanted.
 
     Raises:
         DvoError: ``DVO_KERNELS`` has another value than ``numba`` or ``torch``.
     """
     if not available() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         return False
-    plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+    dtype = torch.float64 if double and any(x.dtype == torch.float64 for x in tensors) else torch.float32
+    plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == dtype for x in tensors)
     return plain and not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
 
 

@@ -2,8 +2,8 @@
 
 Only the blocks of the lower triangle that can be non-zero are stored; which these are (the pattern) is found once and
 their values change with each linearisation. A system is solved either directly, by the sparse Cholesky factorisation
-of :mod:`dvo.ba.sparse.cholesky` or the faster one of :mod:`dvo.ba.sparse.multifrontal` that needs SciPy, or by
-conjugate gradients with a block-Jacobi preconditioner.
+of :mod:`dvo.ba.sparse.cholesky`, its compiled twin :mod:`dvo.ba.sparse.column_cholesky`, or the one of
+:mod:`dvo.ba.sparse.multifrontal` that needs SciPy, or by conjugate gradients with a block-Jacobi preconditioner.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from dvo.ba.sparse.cholesky import TilePlan, best_plan, solve_cholesky
+from dvo.ba.sparse.column_cholesky import DIM, ColumnPlan, plan_columns, solve_columns
 from dvo.ba.sparse.multifrontal import (
     Columns,
     FrontPlan,
@@ -26,6 +27,7 @@ from dvo.ba.sparse.multifrontal import (
     solve_fronts,
 )
 from dvo.core.errors import DvoError
+from dvo.core.kernels import use_kernels
 
 LinearSolver = Literal["auto", "tiles", "fronts", "direct", "cg"]
 """Cholesky by tiles or by fronts, each with conjugate gradients where the factor would be too large; "direct" is by
@@ -83,6 +85,17 @@ class BlockPattern:
     def off_diagonal(self) -> Tensor:
         """Positions of the blocks below the diagonal."""
         return torch.nonzero(self.rows != self.columns)[:, 0]
+
+    @cached_property
+    def first(self) -> Tensor:
+        """``(n + 1,)`` first block of each block row."""
+        counts = torch.bincount(self.rows, minlength=self.size)
+        return torch.cat((counts.new_zeros(1), counts.cumsum(0)))
+
+    @cached_property
+    def column_plan(self) -> ColumnPlan | None:
+        """Plan of the compiled Cholesky factorisation, whose blocks are those of poses; None if it would be too large."""
+        return plan_columns(self.size, self.rows, self.columns)
 
     @cached_property
     def _plans(self) -> dict[int, TilePlan | None]:
@@ -260,7 +273,8 @@ def solve_blocks(
     Args:
         matrix: symmetric positive definite.
         rhs: ``(n, D)``, or ``(n, D, R)`` for several.
-        solver: see :data:`LinearSolver`; "auto" is "tiles" here.
+        solver: see :data:`LinearSolver`; "auto" is the factorisation of :mod:`dvo.ba.sparse.column_cholesky` where it
+            can be used, and "tiles" elsewhere.
         options: of conjugate gradients.
 
     Returns:
@@ -279,6 +293,10 @@ def solve_blocks(
         return _solve_by_fronts(matrix, rhs, options)
     if rhs.dim() == 3:
         return torch.stack([solve_blocks(matrix, each, solver, options) for each in rhs.unbind(-1)], -1)
+    if solver == "auto" and rhs.shape[-1] == DIM and use_kernels(matrix.blocks, rhs, double=True):
+        columns = matrix.pattern.column_plan
+        if columns is not None:
+            return solve_columns(columns, matrix.blocks, rhs)
     plan = None if solver == "cg" else matrix.pattern.cholesky_plan(matrix.blocks.shape[-1])
     if plan is not None:
         return solve_cholesky(plan, matrix.blocks, rhs)

@@ -15,14 +15,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dvo.ba.sparse.block_matrix import BlockMatrix, block_jacobi, conjugate_gradients, make_pattern, solve_blocks
+from dvo.ba.sparse.block_parts import PART
 from dvo.ba.sparse.levenberg import MAX_DIAGONAL, MIN_DIAGONAL, LMOptions
 from dvo.ba.sparse.schur_pattern import SCRATCH, SchurPattern
 from dvo.core.errors import DvoError
+from dvo.core.kernels import use_kernels
 
 
 @dataclass(frozen=True)
@@ -129,13 +132,33 @@ class SparseSystem:
 
     def _to_depths(self, x: Tensor) -> Tensor:
         """``H_pl^T x`` for ``x (n, D)``."""
+        if self._compiled(x):
+            from dvo.ba.sparse import schur_kernels
+
+            out = torch.empty_like(self.h_ll)
+            schur_kernels.to_depths(*self._rows(), x.contiguous().numpy(), out.numpy())
+            return out
         each = (self.h_pl * x.index_select(0, self.pattern.frame)).sum(-1)
         return torch.zeros_like(self.h_ll).index_add_(0, self.pattern.patch, each)
 
     def _to_poses(self, y: Tensor) -> Tensor:
         """``H_pl y`` for ``y (K,)``."""
+        if self._compiled(y):
+            from dvo.ba.sparse import schur_kernels
+
+            out = torch.zeros(self.g_p.shape, dtype=y.dtype)
+            schur_kernels.to_poses(*self._rows(), y.contiguous().numpy(), out.numpy())
+            return out
         each = self.h_pl * y.index_select(0, self.pattern.patch)[:, None]
         return torch.zeros_like(self.g_p).index_add_(0, self.pattern.frame, each)
+
+    def _compiled(self, x: Tensor) -> bool:
+        return self.h_pl.shape[-1] == PART and use_kernels(self.h_pl, x, double=True)
+
+    def _rows(self) -> tuple[Any, ...]:
+        """Arguments of kernels: observations, their keys, the first of each patch, number of free frames."""
+        pattern = self.pattern
+        return self.h_pl.contiguous().numpy(), pattern.keys.numpy(), pattern.first.numpy(), pattern.free
 
     def _diagonal(self, poses: BlockMatrix, q: Tensor) -> Tensor:
         """Diagonal blocks ``(n, D, D)`` of ``S``."""
@@ -158,6 +181,14 @@ class SparseSystem:
         pattern, dim = self.pattern, self.h_pl.shape[-1]
         blocks = self.h_pl.new_zeros(pattern.reduced.count, dim, dim)
         blocks[torch.searchsorted(pattern.reduced.keys, poses.pattern.keys)] = poses.blocks
+        if self._compiled(q):
+            from dvo.ba.sparse import schur_kernels
+
+            h_pl, keys, first, free = self._rows()
+            reduced = pattern.reduced
+            arrays = reduced.keys.numpy(), reduced.first.numpy(), blocks.numpy()
+            schur_kernels.reduce(h_pl, keys, first, q.contiguous().numpy(), free, *arrays)
+            return BlockMatrix(reduced, blocks)
         for part in pattern.products:
             count, patches, m = part.shape
             w = self.h_pl.new_zeros(count * patches * m, dim)

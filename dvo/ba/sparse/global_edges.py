@@ -9,14 +9,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from dvo.ba.edges import EdgePlan
-from dvo.ba.kernels import Kernel
+from dvo.ba.kernels import Kernel, KernelName
 from dvo.ba.layer.normal_equations import Gate, View, counts, pose_jacobian, relative_motion, view
 from dvo.ba.sparse.schur_pattern import SchurPattern
+from dvo.core.kernels import use_kernels
 from dvo.geometry import so3
 
 
@@ -74,8 +76,37 @@ class ReprojectionEdges:
         longest = pixel_weight.amax(-2, keepdim=True) * self.max_residual**2
         return v, residual, weight, torch.where(use, s, longest)
 
+    def _compiled(self, poses_cw: Tensor, inverse_depth: Tensor) -> bool:
+        return use_kernels(poses_cw, inverse_depth, *self._floats, double=True)
+
+    @property
+    def _floats(self) -> tuple[Tensor, ...]:
+        return self.source, self.target, self.weight, self.focal
+
+    @cached_property
+    def _arrays(self) -> dict[str, Any]:
+        """Arguments of kernels that do not change."""
+        plan = self.plan
+        source, target, weight, focal = (x.contiguous().numpy() for x in self._floats)
+        layout = {name: getattr(plan, name).numpy() for name in ("group_pair", "pair_j", "order", "filled", "kk")}
+        return dict(source=source, target=target, weight=weight, focal=focal, **layout)
+
+    def _motion(self, poses_cw: Tensor, inverse_depth: Tensor) -> dict[str, Any]:
+        """Arguments of kernels that are the values of the unknowns."""
+        rotation, t = relative_motion(poses_cw[None], self.plan)
+        depth = inverse_depth.contiguous().numpy()
+        return dict(rotation=rotation[0].contiguous().numpy(), t=t[0, ..., 0].contiguous().numpy(), depth=depth)
+
+    def _robust(self) -> dict[str, Any]:
+        return dict(name=get_args(KernelName).index(self.kernel.name), width=float(self.kernel.width))
+
     def cost(self, poses_cw: Tensor, inverse_depth: Tensor) -> float:
         """Half the sum of robust squared residuals, pixels squared, at ``(N, 7)`` and ``(K,)``."""
+        if self._compiled(poses_cw, inverse_depth):
+            from dvo.ba.sparse import edge_kernels
+
+            values = self._motion(poses_cw, inverse_depth) | self._arrays | self._robust()
+            return float(edge_kernels.cost(**values, max_residual=float(self.max_residual)))
         rotation, t = relative_motion(poses_cw[None], self.plan)
         total = 0.0
         for part in self.plan.chunks():
@@ -85,6 +116,11 @@ class ReprojectionEdges:
 
     def inliers(self, poses_cw: Tensor, inverse_depth: Tensor) -> Tensor:
         """``(E,)`` bool: the edge counts and its weight is positive."""
+        if self._compiled(poses_cw, inverse_depth):
+            from dvo.ba.sparse import edge_kernels
+
+            values = self._motion(poses_cw, inverse_depth) | self._arrays
+            return torch.from_numpy(edge_kernels.inliers(**values, max_residual=float(self.max_residual)))
         rotation, t = relative_motion(poses_cw[None], self.plan)
         out = torch.zeros(len(self.target), dtype=torch.bool, device=self.target.device)
         for part in self.plan.chunks():
@@ -118,6 +154,8 @@ class ReprojectionEdges:
             ``h_pp (N_blocks, 6, 6)``, ``h_pl (O, 6)``, ``h_ll (K,)``, ``g_p (n, 6)``, ``g_l (K,)``; see
             :class:`dvo.ba.sparse.equations.SparseSystem`.
         """
+        if self._compiled(poses_cw, inverse_depth):
+            return self._accumulate_compiled(poses_cw, inverse_depth, pattern, at)
         plan, n = self.plan, self.free
         zeros = poses_cw.new_zeros
         rotation, t = relative_motion(poses_cw[None], plan)
@@ -160,3 +198,22 @@ class ReprojectionEdges:
         g_p = zeros(n + 1, 6).index_add_(0, slot_j, gradient[..., 0])
         g_p = g_p.index_add_(0, slot_i, (minus_adjoint.mT @ gradient)[..., 0])[:n]
         return h_pp, h_pl[:-1], by_depth[:, 1], g_p, by_depth[:, 0]
+
+    def _accumulate_compiled(
+        self, poses_cw: Tensor, inverse_depth: Tensor, pattern: SchurPattern, at: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        from dvo.ba.sparse import edge_kernels
+
+        n, zeros = self.free, poses_cw.new_zeros
+        h_pp, h_pl = zeros(pattern.h_pp.count, 6, 6), zeros(len(pattern.keys) + 1, 6)
+        h_ll, g_p, g_l = zeros(self.plan.patches), zeros(n + 1, 6), zeros(self.plan.patches)
+        ends = self.slot[self.plan.pair_j], self.slot[self.plan.pair_i]
+        block = pattern.h_pp.find(torch.maximum(*ends), torch.minimum(*ends))  # not looked at for fixed frames
+        edge_kernels.accumulate(
+            **self._motion(poses_cw, inverse_depth), **self._arrays, **self._robust(),
+            max_residual=float(self.max_residual), pair_i=self.plan.pair_i.numpy(), slot=self.slot.numpy(),
+            at_target=at[0].numpy(), at_source=at[1].numpy(), diagonal=pattern.h_pp.diagonal.numpy(),
+            off_diagonal=block.numpy(), h_pp=h_pp.numpy(), h_pl=h_pl.numpy(), h_ll=h_ll.numpy(), g_p=g_p.numpy(),
+            g_l=g_l.numpy(),
+        )  # fmt: skip
+        return h_pp, h_pl[:-1], h_ll, g_p[:n], g_l

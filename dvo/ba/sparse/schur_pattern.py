@@ -9,11 +9,14 @@ import torch
 from torch import Tensor
 
 from dvo.ba.sparse.block_matrix import BlockPattern, make_pattern
+from dvo.core.kernels import available
 
 EXPLICIT_WORK = 400
 """``S`` is formed if that takes at most this many block products for each observation."""
 SCRATCH = 1 << 20
 """Numbers of temporary storage in a product of source frames."""
+MARKS = 1 << 24
+"""Pairs of frames, or of source frames and frames, up to which a kernel marks those that are coupled in a table."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,24 @@ class SchurPattern:
 
     def find(self, frame: Tensor, patch: Tensor) -> Tensor:
         """Position of observations; one past the last for frames that are not free (``frame == n``)."""
+        if self.compiled:
+            from dvo.ba.sparse import schur_kernels
+
+            arrays = (x.contiguous().numpy() for x in (self.keys, self.first, frame, patch))
+            return torch.from_numpy(schur_kernels.find(*arrays, self.free))
         at = torch.searchsorted(self.keys, patch * self.free + frame)
         return torch.where(frame < self.free, at, len(self.keys))
+
+    @property
+    def compiled(self) -> bool:
+        """Positions are for kernels."""
+        return self.keys.device.type == "cpu" and available()
+
+    @cached_property
+    def first(self) -> Tensor:
+        """``(K + 1,)`` first observation of each patch."""
+        counts = torch.bincount(self.patch, minlength=self.patches)
+        return torch.cat((counts.new_zeros(1), counts.cumsum(0)))
 
     @cached_property
     def sizes(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -153,6 +172,12 @@ class SchurPattern:
     def reduced(self) -> BlockPattern:
         """Pattern of ``S``."""
         keys = self.h_pp.keys
+        sources = int(self.source.max()) + 1 if len(self.source) else 0
+        if self.compiled and self.free * max(self.free, sources) <= MARKS:
+            from dvo.ba.sparse import schur_kernels
+
+            arrays = self.keys.numpy(), self.source.numpy(), self.free, sources, keys.numpy()
+            return BlockPattern(self.free, torch.from_numpy(schur_kernels.coupled(*arrays)))
         for begin, end, _, _, m, _ in self.groups.chunks if len(self.keys) else ():
             rows, columns, _ = _lower_pairs(self.groups.members[begin:end, :m])
             keys = torch.cat((keys, rows * self.free + columns)).unique()
@@ -185,8 +210,13 @@ def make_schur_pattern(
         frame, patch: ``(M,)`` observations, in any order, repeated or not; ``frame == n`` for a fixed one.
         pair_a, pair_b: ``(M,)`` pairs of poses that share a measurement, ``n`` for a fixed one.
     """
-    seen = frame < free
-    keys = (patch[seen] * free + frame[seen]).unique()
+    if patch.device.type == "cpu" and available():
+        from dvo.ba.sparse import schur_kernels
+
+        keys = torch.from_numpy(schur_kernels.observations(patch.numpy(), frame.numpy(), len(source), free))
+    else:
+        seen = frame < free
+        keys = (patch[seen] * free + frame[seen]).unique()
     return SchurPattern(free, len(source), source, keys, make_pattern(free, pair_a, pair_b))
 
 

@@ -126,15 +126,19 @@ def solve(rank, start, under, rows, columns, place, blocks, rhs, x):
                     run += 1
                 source, goes, width = 6 * (a - begin), 6 * (at - first), 6 * run
                 own = 6 * (s - begin)
-                for c in range(6):
-                    f0, f1, f2 = column[0, own + c], column[1, own + c], column[2, own + c]
-                    f3, f4, f5 = column[3, own + c], column[4, own + c], column[5, own + c]
-                    out = target[c, goes : goes + width]
-                    p0, p1 = column[0, source : source + width], column[1, source : source + width]
-                    p2, p3 = column[2, source : source + width], column[3, source : source + width]
-                    p4, p5 = column[4, source : source + width], column[5, source : source + width]
+                p0, p1 = column[0, source : source + width], column[1, source : source + width]
+                p2, p3 = column[2, source : source + width], column[3, source : source + width]
+                p4, p5 = column[4, source : source + width], column[5, source : source + width]
+                for c in range(0, 6, 2):
+                    e0, e1, e2 = column[0, own + c], column[1, own + c], column[2, own + c]
+                    e3, e4, e5 = column[3, own + c], column[4, own + c], column[5, own + c]
+                    f0, f1, f2 = column[0, own + c + 1], column[1, own + c + 1], column[2, own + c + 1]
+                    f3, f4, f5 = column[3, own + c + 1], column[4, own + c + 1], column[5, own + c + 1]
+                    out, next_out = target[c, goes : goes + width], target[c + 1, goes : goes + width]
                     for r in range(width):
-                        out[r] -= f0 * p0[r] + f1 * p1[r] + f2 * p2[r] + f3 * p3[r] + f4 * p4[r] + f5 * p5[r]
+                        q0, q1, q2, q3, q4, q5 = p0[r], p1[r], p2[r], p3[r], p4[r], p5[r]
+                        out[r] -= e0 * q0 + e1 * q1 + e2 * q2 + e3 * q3 + e4 * q4 + e5 * q5
+                        next_out[r] -= f0 * q0 + f1 * q1 + f2 * q2 + f3 * q3 + f4 * q4 + f5 * q5
                 a, at = a + run, at + run
     y = np.empty((size, 6), blocks.dtype)
     for i in range(size):

@@ -34,15 +34,33 @@ def _slope(s, name, width):
 
 
 @compiled
+def _relative(rotation, translation, i, j, r, move):
+    """Rotation and translation of ``T_j T_i^-1``, into the last two arguments."""
+    for a in range(3):
+        for b in range(3):
+            r[a, b] = (
+                rotation[j, a, 0] * rotation[i, b, 0]
+                + rotation[j, a, 1] * rotation[i, b, 1]
+                + rotation[j, a, 2] * rotation[i, b, 2]
+            )
+    for a in range(3):
+        turned = r[a, 0] * translation[i, 0] + r[a, 1] * translation[i, 1] + r[a, 2] * translation[i, 2]
+        move[a] = translation[j, a] - turned
+
+
+@compiled
 def cost(
-    rotation, t, depth, source, target, weight, focal, group_pair, pair_j, order, filled, kk, name, width, max_residual
-):
+    rotation, translation, depth, source, target, weight, focal, group_pair, pair_i, pair_j, order, filled, kk,
+    name, width, max_residual,
+):  # fmt: skip
     """Half the sum of robust squared residuals, see :meth:`ReprojectionEdges.cost`, in double precision."""
     groups, size = filled.shape
+    r, move = np.empty((3, 3), rotation.dtype), np.empty(3, rotation.dtype)
     limit, total = max_residual * max_residual, 0.0
     for g in range(groups):
         pair = group_pair[g]
-        r, move, fx, fy = rotation[pair], t[pair], focal[pair_j[pair], 0], focal[pair_j[pair], 1]
+        fx, fy = focal[pair_j[pair], 0], focal[pair_j[pair], 1]
+        _relative(rotation, translation, pair_i[pair], pair_j[pair], r, move)
         for m in range(size):
             if not filled[g, m]:
                 continue
@@ -62,13 +80,18 @@ def cost(
 
 
 @compiled
-def inliers(rotation, t, depth, source, target, weight, focal, group_pair, pair_j, order, filled, kk, max_residual):
+def inliers(
+    rotation, translation, depth, source, target, weight, focal, group_pair, pair_i, pair_j, order, filled, kk,
+    max_residual,
+):  # fmt: skip
     """``(E,)`` bool, see :meth:`ReprojectionEdges.inliers`."""
     groups, size = filled.shape
+    r, move = np.empty((3, 3), rotation.dtype), np.empty(3, rotation.dtype)
     limit, out = max_residual * max_residual, np.zeros(len(target), np.bool_)
     for g in range(groups):
         pair = group_pair[g]
-        r, move, fx, fy = rotation[pair], t[pair], focal[pair_j[pair], 0], focal[pair_j[pair], 1]
+        fx, fy = focal[pair_j[pair], 0], focal[pair_j[pair], 1]
+        _relative(rotation, translation, pair_i[pair], pair_j[pair], r, move)
         for m in range(size):
             if not filled[g, m]:
                 continue
@@ -86,7 +109,7 @@ def inliers(rotation, t, depth, source, target, weight, focal, group_pair, pair_
 
 @compiled
 def accumulate(
-    rotation, t, depth, source, target, weight, focal, group_pair, pair_i, pair_j, order, filled, kk,
+    rotation, translation, depth, source, target, weight, focal, group_pair, pair_i, pair_j, order, filled, kk,
     name, width, max_residual, slot, at_target, at_source, diagonal, off_diagonal, h_pp, h_pl, h_ll, g_p, g_l,
 ):  # fmt: skip
     """Sums over the edges, see :meth:`ReprojectionEdges.accumulate`, added to the last five arguments.
@@ -95,6 +118,7 @@ def accumulate(
     fixed frames.
     """
     groups, size = filled.shape
+    r, move = np.empty((3, 3), rotation.dtype), np.empty(3, rotation.dtype)
     free = len(g_p) - 1
     limit, real = max_residual * max_residual, h_pp.dtype.type
     h, sums = np.zeros((6, 6), h_pp.dtype), np.zeros(6, h_pp.dtype)
@@ -102,7 +126,8 @@ def accumulate(
     ji, adjoint = np.zeros((6, 6), h_pp.dtype), np.zeros((6, 6), h_pp.dtype)
     for g in range(groups):
         pair = group_pair[g]
-        r, move, fx, fy = rotation[pair], t[pair], focal[pair_j[pair], 0], focal[pair_j[pair], 1]
+        fx, fy = focal[pair_j[pair], 0], focal[pair_j[pair], 1]
+        _relative(rotation, translation, pair_i[pair], pair_j[pair], r, move)
         if g == 0 or group_pair[g - 1] != pair:
             h[:], sums[:] = 0, 0
             # -Ad(G_ij); J_i = -J_j Ad(G_ij)
@@ -141,7 +166,7 @@ def accumulate(
                 lx, ly = wx * jx[i], wy * jy[i]
                 sums[i] += jx[i] * wex + jy[i] * wey
                 row[i] = jx[i] * wdx + jy[i] * wdy
-                for c in range(6):
+                for c in range(i + 1):
                     h[i, c] += lx * jx[c] + ly * jy[c]
             o, p = at_target[place], at_source[place]
             for c in range(6):
@@ -154,6 +179,9 @@ def accumulate(
                 )  # fmt: skip
         if g + 1 < groups and group_pair[g + 1] == pair:
             continue
+        for i in range(6):
+            for c in range(i):
+                h[c, i] = h[i, c]
         sj, si = slot[pair_j[pair]], slot[pair_i[pair]]
         for c in range(6):
             g_p[sj, c] += sums[c]

@@ -186,7 +186,8 @@ class SparseSystem:
 
             h_pl, keys, first, free = self._rows()
             reduced = pattern.reduced
-            arrays = reduced.keys.numpy(), reduced.first.numpy(), blocks.numpy()
+            by_source, first_of_source = (x.numpy() for x in pattern.by_source)
+            arrays = by_source, first_of_source, reduced.keys.numpy(), reduced.first.numpy(), blocks.numpy()
             schur_kernels.reduce(h_pl, keys, first, q.contiguous().numpy(), free, *arrays)
             return BlockMatrix(reduced, blocks)
         for part in pattern.products:

@@ -22,6 +22,9 @@ from dvo.core.kernels import use_kernels
 from dvo.geometry import so3
 
 
+_LAYOUT = "group_pair", "pair_i", "pair_j", "order", "filled", "kk"  # of a plan, for kernels
+
+
 @dataclass(frozen=True)
 class ReprojectionEdges:
     """Measurements of a graph in the order of an edge plan (one graph, no batch).
@@ -88,14 +91,14 @@ class ReprojectionEdges:
         """Arguments of kernels that do not change."""
         plan = self.plan
         source, target, weight, focal = (x.contiguous().numpy() for x in self._floats)
-        layout = {name: getattr(plan, name).numpy() for name in ("group_pair", "pair_j", "order", "filled", "kk")}
+        layout = {name: getattr(plan, name).numpy() for name in _LAYOUT}
         return dict(source=source, target=target, weight=weight, focal=focal, **layout)
 
     def _motion(self, poses_cw: Tensor, inverse_depth: Tensor) -> dict[str, Any]:
         """Arguments of kernels that are the values of the unknowns."""
-        rotation, t = relative_motion(poses_cw[None], self.plan)
-        depth = inverse_depth.contiguous().numpy()
-        return dict(rotation=rotation[0].contiguous().numpy(), t=t[0, ..., 0].contiguous().numpy(), depth=depth)
+        values = so3.matrix(poses_cw[:, 3:]), poses_cw[:, :3], inverse_depth
+        rotation, translation, depth = (x.contiguous().numpy() for x in values)
+        return dict(rotation=rotation, translation=translation, depth=depth)
 
     def _robust(self) -> dict[str, Any]:
         return dict(name=get_args(KernelName).index(self.kernel.name), width=float(self.kernel.width))
@@ -211,7 +214,7 @@ class ReprojectionEdges:
         block = pattern.h_pp.find(torch.maximum(*ends), torch.minimum(*ends))  # not looked at for fixed frames
         edge_kernels.accumulate(
             **self._motion(poses_cw, inverse_depth), **self._arrays, **self._robust(),
-            max_residual=float(self.max_residual), pair_i=self.plan.pair_i.numpy(), slot=self.slot.numpy(),
+            max_residual=float(self.max_residual), slot=self.slot.numpy(),
             at_target=at[0].numpy(), at_source=at[1].numpy(), diagonal=pattern.h_pp.diagonal.numpy(),
             off_diagonal=block.numpy(), h_pp=h_pp.numpy(), h_pl=h_pl.numpy(), h_ll=h_ll.numpy(), g_p=g_p.numpy(),
             g_l=g_l.numpy(),

@@ -88,42 +88,74 @@ def coupled(keys, source, free, sources, others):
 
 
 @compiled
-def reduce(h_pl, keys, start, q, free, pattern, row_start, blocks):
-    """Subtract ``H_pl diag(q) H_pl^T`` from the blocks of a pattern with sorted keys; ``row_start (n + 1,)``."""
-    most = 1
-    for k in range(len(q)):
-        most = max(most, start[k + 1] - start[k])
-    place, known = np.empty((most, most), np.int64), np.full(most, -1)
-    scaled, other = np.empty(6, h_pl.dtype), np.empty(6, h_pl.dtype)
-    length = -1
-    for k in range(len(q)):
-        begin, count = start[k], start[k + 1] - start[k]
-        if count == 0 or q[k] == 0:
+def reduce(h_pl, keys, start, q, free, by_source, first, pattern, row_start, blocks):
+    """Subtract ``H_pl diag(q) H_pl^T`` from the blocks of a pattern with sorted keys.
+
+    ``by_source`` are the patches by source frames, of which ``first`` has the first of each: those of one source are
+    seen from much the same frames, so that their sum is a dense product. ``row_start (n + 1,)`` is of the pattern.
+    """
+    most, place = 1, np.full(free, -1)
+    members = np.empty(free, np.int64)
+    for s in range(len(first) - 1):
+        most = max(most, first[s + 1] - first[s])
+    w = np.empty((most + 7) * 6 * free, h_pl.dtype)
+    total = np.empty(6 * free, h_pl.dtype)
+    at = np.empty(free, np.int64)
+    for s in range(len(first) - 1):
+        count = 0
+        for p in range(first[s], first[s + 1]):
+            k = by_source[p]
+            for o in range(start[k], start[k + 1]):
+                f = keys[o] - k * free
+                if place[f] < 0:
+                    place[f] = 0
+                    members[count] = f
+                    count += 1
+        if count == 0:
             continue
-        same = count == length
+        members[:count].sort()
         for a in range(count):
-            f = keys[begin + a] - k * free
-            same = same and known[a] == f
-            known[a] = f
-        if not same:  # most patches are seen from the frames of the one before
-            length = count
-            for a in range(count):
-                at = row_start[known[a]]
-                for b in range(a + 1):
-                    key = known[a] * free + known[b]
-                    while pattern[at] < key:
-                        at += 1
-                    place[a, b] = at
-        for a in range(count):
-            for i in range(6):
-                scaled[i] = h_pl[begin + a, i] * q[k]
-            for b in range(a + 1):
-                here = blocks[place[a, b]]
-                for c in range(6):
-                    other[c] = h_pl[begin + b, c]
+            place[members[a]] = a
+        used, width = 0, 6 * count
+        for p in range(first[s], first[s + 1]):
+            k = by_source[p]
+            if start[k] == start[k + 1]:
+                continue
+            root, row = np.sqrt(q[k]), w[used * width : (used + 1) * width]
+            row[:] = 0
+            for o in range(start[k], start[k + 1]):
+                to = 6 * place[keys[o] - k * free]
                 for i in range(6):
+                    row[to + i] = h_pl[o, i] * root
+            used += 1
+        w[used * width : (used + 7) * width] = 0  # patches are taken by eight
+        for a in range(count):
+            place[members[a]] = -1
+            search = row_start[members[a]]
+            for b in range(a + 1):
+                key = members[a] * free + members[b]
+                while pattern[search] < key:
+                    search += 1
+                at[b] = search
+            for i in range(6):
+                length, own = 6 * (a + 1), 6 * a + i
+                total[:length] = 0
+                for p in range(0, used, 8):
+                    w0, w1 = w[p * width : (p + 1) * width], w[(p + 1) * width : (p + 2) * width]
+                    w2, w3 = w[(p + 2) * width : (p + 3) * width], w[(p + 3) * width : (p + 4) * width]
+                    w4, w5 = w[(p + 4) * width : (p + 5) * width], w[(p + 5) * width : (p + 6) * width]
+                    w6, w7 = w[(p + 6) * width : (p + 7) * width], w[(p + 7) * width : (p + 8) * width]
+                    c0, c1, c2, c3 = w0[own], w1[own], w2[own], w3[own]
+                    c4, c5, c6, c7 = w4[own], w5[own], w6[own], w7[own]
+                    for c in range(length):
+                        total[c] += (
+                            c0 * w0[c] + c1 * w1[c] + c2 * w2[c] + c3 * w3[c]
+                            + c4 * w4[c] + c5 * w5[c] + c6 * w6[c] + c7 * w7[c]
+                        )  # fmt: skip
+                for b in range(a + 1):
+                    here = blocks[at[b], i]
                     for c in range(6):
-                        here[i, c] -= scaled[i] * other[c]
+                        here[c] -= total[6 * b + c]
 
 
 @compiled

@@ -114,6 +114,12 @@ class SchurPattern:
         return torch.cat((counts.new_zeros(1), counts.cumsum(0)))
 
     @cached_property
+    def by_source(self) -> tuple[Tensor, Tensor]:
+        """``(K,)`` patches by source frames, and the first of each source frame, ``K`` after the last."""
+        counts = torch.bincount(self.source)
+        return self.source.argsort(stable=True), torch.cat((counts.new_zeros(1), counts.cumsum(0)))
+
+    @cached_property
     def sizes(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Sorted keys ``(source, frame)``, sources, number of frames and number of patches of each source."""
         pairs = (self.source[self.patch] * max(self.free, 1) + self.frame).unique()

@@ -88,16 +88,16 @@ def multistart(
     """
     problem = problem.exact()
 
-    def solved(now: PatchProblem, iterations: int) -> PatchProblem:
+    def solved(name: str, now: PatchProblem, iterations: int) -> Solution:
         if iterations == 0:
-            return now
+            return rated(name, now, float(now.robust_cost(options.kernel, options.max_residual)))
         steps = replace(options.solver, max_iterations=iterations)
         result = solve(now, replace(options, solver=steps))
         blocks = {name: block.with_value(result.blocks[name]) for name, block in now.blocks.items()}
-        return now.with_values(poses_cw=se3.normalise(result.poses_cw), patches=result.patches, blocks=blocks)
+        now = now.with_values(poses_cw=se3.normalise(result.poses_cw), patches=result.patches, blocks=blocks)
+        return rated(name, now, result.cost / now.total_weight)  # which is its robust cost
 
-    def rated(name: str, now: PatchProblem) -> Solution:
-        cost = float(now.robust_cost(options.kernel, options.max_residual))
+    def rated(name: str, now: PatchProblem, cost: float) -> Solution:
         return Solution(name, now, cost if cost == cost else float("inf"))
 
     count, found = options.solver.max_iterations, []
@@ -106,10 +106,11 @@ def multistart(
         for name in sorted(starts, key=lambda name: name != PRESENT):
             now, half = starts[name](problem, options), count // 2
             if name != PRESENT:
-                now = solved(now, half)
-                if rated(name, now).cost > limit:
+                first = solved(name, now, half)
+                if first.cost > limit:
                     continue
-            found.append(rated(name, solved(now, count if name == PRESENT else count - half)))
+                now = first.problem
+            found.append(solved(name, now, count if name == PRESENT else count - half))
             limit = abandon * found[0].cost if found[0].start == PRESENT else limit
     return sorted(found, key=lambda solution: solution.cost)
 

@@ -99,6 +99,13 @@ class PatchProblem:
             values.setdefault("plan", None)
         return replace(self, **values)
 
+    def planned(self) -> PatchProblem:
+        """The problem with the layout of its edges, which several solutions then share."""
+        if self.plan is not None:
+            return self
+        frames, patches = self.poses_cw.shape[-2], self.patches.shape[-4]
+        return replace(self, plan=plan_edges(self.ii, self.jj, self.kk, frames, patches))
+
     def edges(self, which: Tensor) -> PatchProblem:
         """The same problem with some of its edges.
 
@@ -204,6 +211,15 @@ class PatchProblem:
         names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
         return replace(self, **{name: getattr(self, name)[None] for name in names})
 
+    @property
+    def total_weight(self) -> float:
+        """Sum of the weights of one graph: its cost, half the sum of the robust squared residuals, over this is the mean
+        of :meth:`robust_cost`."""
+        return float(self.batched()._total_weights()[0])
+
+    def _total_weights(self) -> Tensor:
+        return self.weights.sum((1, 2)).clamp(min=torch.finfo(self.weights.dtype).tiny)
+
     def robust_cost(
         self,
         kernel: Kernel = KERNEL,
@@ -226,6 +242,5 @@ class PatchProblem:
         values = {POSES: p.poses_cw, INVERSE_DEPTHS: p.inverse_depths, INTRINSICS: p.intrinsics}
         values |= {name: block.value for name, block in p.blocks.items()}
         factors = p.reprojection(max_residual, None, kernel), *p.factors
-        total = p.weights.sum((1, 2)).clamp(min=torch.finfo(p.weights.dtype).tiny)
-        cost = 0.5 * torch.stack([factor.cost(values) for factor in factors]).sum(0) / total
+        cost = 0.5 * torch.stack([factor.cost(values) for factor in factors]).sum(0) / p._total_weights()
         return cost if self.poses_cw.dim() == 3 else cost[0]

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 
 from dvo.odometry.checks.check_pairs import CheckPair
@@ -26,6 +25,7 @@ MAX_PAIRS = 32
 _SCALE = 0.5  # of the robust kernel, pixels
 _ITERATIONS = 12
 _STEP = 1e-5  # of the numeric derivatives, radians
+_TOLERANCE = 1e-3  # relative decrease of the cost below which a fit has converged
 _STRONGEST = 1e8  # damping beyond which no step helps
 
 
@@ -71,33 +71,53 @@ def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:
     towards = motion[:3, 3] / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
     aside = np.linalg.svd(towards[None])[2][1:]
 
+    moving = np.arange(7) < (7 if with_shift else 5)
+    units = _STEP * np.eye(7)[moving]
+
     def residuals(x: np.ndarray) -> np.ndarray:
-        turn = np.asarray(cv2.Rodrigues(x[:3])[0]) @ motion[:3, :3]
-        tx, ty, tz = (direction := towards + x[3:5] @ aside) / np.linalg.norm(direction)
-        essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ turn
-        moved = second - np.append(x[5:7], 0.0) if with_shift else second
-        lines, back = first @ essential.T, moved @ essential
-        gradient = (lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
-        return np.asarray((moved * lines).sum(1) / np.sqrt(np.maximum(gradient, 1e-18)))
+        """``(X, N)`` for ``(X, 7)``: turn, direction, shift."""
+        turn = _turns(x[:, :3]) @ motion[:3, :3]
+        direction = towards + x[:, 3:5] @ aside
+        tx, ty, tz = (direction / np.linalg.norm(direction, axis=1, keepdims=True)).T
+        zero = np.zeros_like(tx)
+        across = np.stack([zero, -tz, ty, tz, zero, -tx, -ty, tx, zero], 1).reshape(-1, 3, 3)
+        essential = across @ turn
+        moved = second - np.pad(x[:, None, 5:7], ((0, 0), (0, 0), (0, 1)))
+        lines, back = first @ essential.swapaxes(1, 2), moved @ essential
+        gradient = lines[..., 0] ** 2 + lines[..., 1] ** 2 + back[..., 0] ** 2 + back[..., 1] ** 2
+        return np.asarray((moved * lines).sum(-1) / np.sqrt(np.maximum(gradient, 1e-18)))
 
     def cost_of(distances: np.ndarray) -> float:
         return float(_SCALE**2 * np.log1p((distances / scale) ** 2).sum())
 
-    x, damping = np.zeros(7 if with_shift else 5), 1e-3
-    now = residuals(x)
+    x, damping = np.zeros(7), 1e-3
+    now = residuals(x[None])[0]
     cost = cost_of(now)
     for _ in range(_ITERATIONS):
-        jacobian = np.stack([(residuals(x + _STEP * unit) - now) / _STEP for unit in np.eye(len(x))], 1)
+        jacobian = (residuals(x + units) - now).T / _STEP
         weighted = jacobian / (1 + (now / scale) ** 2)[:, None]
         normal, gradient = weighted.T @ jacobian, weighted.T @ now
         while damping < _STRONGEST:
             lifted = normal + damping * np.diag(np.diag(normal) + 1e-12)
-            step = x - np.linalg.solve(lifted, gradient)
-            after = residuals(step)
-            if cost_of(after) < cost:
-                x, now, cost, damping = step, after, cost_of(after), damping / 5
+            step = x.copy()
+            step[moving] -= np.linalg.solve(lifted, gradient)
+            after = residuals(step[None])[0]
+            before, found = cost, cost_of(after)
+            if found < cost:
+                x, now, cost, damping = step, after, found, damping / 5
                 break
             damping *= 8
         else:
             break
+        if before - cost <= _TOLERANCE * cost:
+            break
     return cost
+
+
+def _turns(vectors: np.ndarray) -> np.ndarray:
+    """Rotation matrices ``(X, 3, 3)`` of rotation vectors ``(X, 3)`` (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    across = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+    return np.eye(3) + np.sinc(angle / np.pi) * across + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (across @ across)

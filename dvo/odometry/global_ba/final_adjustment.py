@@ -80,6 +80,8 @@ class AdjustmentOptions:
             raise DvoError("no kernel", field="kernels", remedy="give one or more; Kernel() has no influence")
 
 
+_MOTION_ITERATIONS = 5  # of a solution that the motion during the readout is taken from, at most
+_MOST = 1.5  # change of an inverse depth that is extrapolated
 _RESTART_ITERATIONS = 20  # of the first frames from each start, at most
 
 
@@ -157,7 +159,7 @@ def adjust_segment(
         end = min(max(start + block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
         whole = start == held and not (map_size or later)
-        part = graph.problem(True, segment, 0 if whole else int(identifiers[start]), int(identifiers[end - 1]))
+        part = graph.problem(True, segment, 0 if whole else int(identifiers[start]), int(identifiers[end - 1])).planned()
         rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
         fixed, new = rows < start, rows >= solved
         now[solved:end] = change(old[solved:end])
@@ -168,12 +170,15 @@ def adjust_segment(
             poses, found, _ = solve_part(part, poses, found, fixed, replace(options, kernels=first))
         if start == 1 and not map_size and measured_share(measured_depths(part)) < MEASURED_SHARE:
             poses, found = _leave_minimum(part, poses, found, fixed, options)
-        for _ in range(options.shutter_rounds if rolling is not None else 0):
+        rounds = options.shutter_rounds if rolling is not None else 0
+        for number in range(rounds):
             assert rolling is not None
+            # All but the last find the motion only.
+            few = last if number == rounds - 1 else replace(last, iterations=min(_MOTION_ITERATIONS, last.iterations))
             now[rows] = poses
             track = PoseTrack.through(times[:end], now[:end])
             corrected = as_global_shutter(part, poses, found, rows, track, rolling)
-            poses, found, _ = solve_part(corrected, poses, found, fixed, last)
+            poses, found, _ = solve_part(corrected, poses, found, fixed, few)
         now[rows] = poses
         change = _Change(old[end - 1], now[end - 1], change.scale * float((depths[new] / found[new]).median()))
         for row in (~fixed).nonzero()[:, 0].tolist():
@@ -244,6 +249,24 @@ def extend_solution(poses_cw: Tensor, depths: Tensor, first_cw: Tensor, solved: 
     depths[:n] = solved.median(1, keepdim=True).values
     depths[:n, ::2] = solved
     return torch.cat([first_cw, change(poses_cw[n:])]), depths
+
+
+def extrapolated(
+    poses_cw: Tensor, depths: Tensor, earlier_cw: Tensor, earlier_depths: Tensor, ratio: float
+) -> tuple[Tensor, Tensor]:
+    """Start of a solution from two that belong to other values of a parameter, along which they lie on a line.
+
+    Args:
+        poses_cw, depths: ``(N, 7)`` and ``(N, M)`` inverse depths of the nearer one.
+        earlier_cw, earlier_depths: of the other one.
+        ratio: way from the nearer one to the wanted value over that from the other one to the nearer one.
+
+    Returns:
+        Poses ``(N, 7)`` and inverse depths ``(N, M)``.
+    """
+    step = ratio * se3.log(se3.relative(earlier_cw, poses_cw))
+    factor = (depths / earlier_depths).clamp(1 / _MOST, _MOST) ** ratio
+    return se3.normalise(se3.compose(se3.exp(step), poses_cw)), depths * factor
 
 
 def solve_part(

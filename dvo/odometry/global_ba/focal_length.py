@@ -20,7 +20,8 @@ from torch import Tensor
 from dvo.ba.patch_problem import PatchProblem
 from dvo.geometry import se3
 from dvo.map.map import Map
-from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, solve_part
+from dvo.map.recordings import increasing_times
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, extrapolated, solve_part
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.global_ba.self_calibration import Minimum, profile_minimum
 
@@ -34,9 +35,13 @@ ASIDE = 0.08
 MIN_CONTRAST = 0.005
 """Contrast of the coarse minimum below which no finer one is looked for."""
 
+QUICK_FRAMES = 60
+"""Frames of a quick look, if there are fewer keyframes."""
+
 _STEPS = 0.08, 0.02  # distance of the values that are tried, in logarithms: coarse, then fine
 _ASIDE_STEP = 0.01  # distance of the principal points that are tried, focal lengths
 _ITERATIONS = 6
+_FAR = 4.0  # extrapolation, times the distance that is known
 _SHUTTER_ROUNDS = 2  # solutions with corrected measurements, each from the motion of the last
 
 
@@ -66,7 +71,7 @@ def find_focal(
     shutter: Shutter,
     options: AdjustmentOptions = AdjustmentOptions(),  # noqa: B008 (frozen)
     *,
-    principal_point: bool = True,
+    beyond: float | None = None,
 ) -> FocalProfile:
     """Estimate the focal length, one factor of fx and fy, and if wanted the principal point.
 
@@ -75,23 +80,30 @@ def find_focal(
         segment: its number.
         shutter: timing of the rows; a rolling shutter that is not corrected is taken for another focal length.
         options: of the adjustment; its last kernel counts.
-        principal_point: False leaves it where it is.
+        beyond: logarithm of a factor; a profile whose minimum is nearer to the first value is of no interest. This is a
+            quick look, without the principal point: at the keyframes, with dropped ones up to :data:`QUICK_FRAMES`, and
+            with measurements that are corrected for a rolling shutter once.
 
     Returns:
-        The profile; that of the coarse steps alone where it is flat (:data:`MIN_CONTRAST`). An infinite deviation if
+        The profile; that of the coarse steps alone where it is flat (:data:`MIN_CONTRAST`), or of no interest, then
+        with a contrast of 0. An infinite deviation if
         the cost still falls at the end of the range, or for fewer than :data:`MIN_KEYFRAMES` frames.
     """
     frames = graph.members(segment)
     if len(frames) < MIN_KEYFRAMES:
         return FocalProfile(_UNKNOWN, 0.0)
-    part = graph.problem(True, segment)
+    part, times = graph.problem(True, segment), increasing_times(graph, frames)
+    if beyond is not None:
+        part, shutter = _corrected(part, times, shutter), replace(shutter, readout=0.0)
+        part = _thinned(part, torch.tensor([frame.anchor is None for frame in frames]))
     solve = _Solver(
-        part, torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64), shutter,
+        part.planned(), times, shutter,
         replace(options, kernels=options.kernels[-1:], iterations=_ITERATIONS),
     )  # fmt: skip
     freedom = len(part.patches)
     coarse = profile_minimum(solve, 0.0, _STEPS[0], -FARTHEST, FARTHEST, freedom)
-    if not np.isfinite(coarse.deviation):
+    # The minimum of a single valley is less than a step away from the lowest point that was tried.
+    if not np.isfinite(coarse.deviation) or beyond is not None and abs(coarse.value) <= min(_STEPS[0] / 2, beyond - _STEPS[0]):
         return FocalProfile(coarse, 0.0)
 
     def contrast_at(value: float) -> float:
@@ -103,7 +115,7 @@ def find_focal(
         return FocalProfile(coarse, flat)
     fine = profile_minimum(solve, coarse.value, _STEPS[1], -FARTHEST, FARTHEST, freedom)
     found = FocalProfile(replace(fine, gain=coarse.gain), contrast_at(fine.value))
-    if not principal_point:
+    if beyond is not None:
         return found
 
     def aside(cost: Callable[[float], float]) -> Minimum:
@@ -113,6 +125,34 @@ def find_focal(
     at = right.value if np.isfinite(right.deviation) else 0.0
     down = aside(lambda y: solve(fine.value, at, y))
     return replace(found, aside=(right, down))
+
+
+def _corrected(part: PatchProblem, times: Tensor, shutter: Shutter) -> PatchProblem:
+    """Measurements as a global shutter would have made them, by the present poses."""
+    if shutter.readout <= 0:
+        return part
+    index, track = torch.arange(len(part.poses_cw)), PoseTrack.through(times, part.poses_cw)
+    depths = part.inverse_depths.reshape(len(index), -1)
+    return as_global_shutter(part, part.poses_cw, depths, index, track, shutter)
+
+
+def _thinned(part: PatchProblem, kept: Tensor) -> PatchProblem:
+    """The frames that are kept ``(N,)``, and others, evenly, up to :data:`QUICK_FRAMES`."""
+    others = (~kept).nonzero()[:, 0]
+    missing = min(QUICK_FRAMES - int(kept.sum()), len(others))
+    if part.factors or missing == len(others):
+        return part
+    chosen = kept.clone()
+    if missing > 0:
+        chosen[others[torch.linspace(0, len(others) - 1, missing).round().long()]] = True
+    return part.select(chosen)
+
+
+def _along(first: tuple[float, ...], second: tuple[float, ...], third: tuple[float, ...]) -> float | None:
+    """Way from the second value to the third over that from the first to the second; None if they are on no line."""
+    a, b = np.subtract(second, first), np.subtract(third, second)
+    ratio = float(a @ b / (a @ a))
+    return ratio if abs(ratio) <= _FAR and np.linalg.norm(b - ratio * a) < 1e-9 else None
 
 
 class _Solver:
@@ -129,8 +169,10 @@ class _Solver:
         wanted = log_factor, right, down
         moved = centre + focal * torch.tensor([[right, down]], dtype=focal.dtype)
         part = self.part.with_values(intrinsics=torch.cat([focal * float(np.exp(log_factor)), moved], 1))
-        nearest = min(self.known, key=lambda known: (math.dist(known, wanted), known))
-        poses, depths = self.known[nearest]
+        nearest = sorted(self.known, key=lambda known: (math.dist(known, wanted), known))
+        poses, depths = self.known[nearest[0]]
+        if len(nearest) > 1 and (ratio := _along(nearest[1], nearest[0], wanted)) is not None:
+            poses, depths = extrapolated(poses, depths, *self.known[nearest[1]], ratio)
         cost, fixed = 0.0, self.index < 1
         for _ in range(_SHUTTER_ROUNDS if self.shutter.readout > 0 else 1):
             seen = part

@@ -17,10 +17,10 @@ from torch import Tensor
 from dvo.geometry import se3
 from dvo.map.map import Map
 from dvo.map.recordings import count_earlier, increasing_times
-from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment, solve_part
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment, extrapolated, solve_part
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
-_FRAMES = 150  # of a segment that are looked at, those with most motion
+_FRAMES = 80  # of a segment that are looked at, those with most motion
 _MIN_FRAMES = 20  # frames below which nothing is concluded
 _GAIN = 0.02  # relative decrease of the cost below which a readout time is not believed
 _STEP = 0.2  # distance of the values that are tried, frame intervals
@@ -105,19 +105,30 @@ def find_readout(
     own = [np.median(frame.inverse_depth) for frame in frames[earlier:]]
     first = earlier + _busiest(now[earlier:], float(np.median(own)))
     last = min(first + _FRAMES, len(frames)) - 1
-    part = graph.problem(True, segment, int(identifiers[first]) if first else 0, int(identifiers[last]))
+    part = graph.problem(True, segment, int(identifiers[first]) if first else 0, int(identifiers[last])).planned()
     index = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
     fixed = index <= first
     depths = part.patches[:, 2, 0, 0].reshape(len(index), -1)
     settings = replace(options, kernels=options.kernels[-1:], iterations=_ITERATIONS)
 
+    known: dict[float, tuple[Tensor, Tensor]] = {}
+
     def cost(readout: float) -> float:
-        nonlocal depths
+        poses, now_depths = now[index], depths
+        near = sorted(known, key=lambda value: (abs(value - readout), value))[:2]
+        if near:
+            poses, now_depths = known[near[0]]
+        if len(near) == 2:
+            ratio = (readout - near[0]) / (near[0] - near[1])
+            poses, now_depths = extrapolated(poses, now_depths, *known[near[1]], ratio)
         found = 0.0
-        for _ in range(2 if readout > 0 else 1):  # the second round with the motion that the first has found
+        # Without a trend to follow, a second round with the motion that the first has found.
+        for _ in range(2 if readout > 0 and len(near) < 2 else 1):
+            now[index] = poses
             track = PoseTrack.through(times, now)
-            seen = as_global_shutter(part, now[index], depths, index, track, Shutter(readout, rows))
-            now[index], depths, found = solve_part(seen, now[index], depths, fixed, settings)
+            seen = as_global_shutter(part, poses, now_depths, index, track, Shutter(readout, rows))
+            poses, now_depths, found = solve_part(seen, poses, now_depths, fixed, settings)
+        known[readout] = poses, now_depths
         return found
 
     interval = float((times[1:] - times[:-1])[earlier:].median())

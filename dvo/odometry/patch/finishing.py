@@ -67,7 +67,7 @@ def judge_result(
     if not (own and leaves_doubt(quality, CHECK_FOCAL)):
         return quality
     longest = max(own, key=lambda segment: len(graph.members(segment)))
-    profile = find_focal(graph, longest, shutter, config.adjustment, principal_point=False)
+    profile = find_focal(graph, longest, shutter, config.adjustment, beyond=WRONG_FOCAL)
     step, sure = profile.minimum.value, profile.contrast >= SURE_CONTRAST
     if not (sure and abs(step) > WRONG_FOCAL):
         return quality

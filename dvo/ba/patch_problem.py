@@ -213,8 +213,8 @@ class PatchProblem:
 
     @property
     def total_weight(self) -> float:
-        """Sum of the weights of one graph: its cost, half the sum of the robust squared residuals, over this is the mean
-        of :meth:`robust_cost`."""
+        """Sum of the weights of one graph: half the sum of its robust squared residuals over this is the mean of
+        :meth:`robust_cost`."""
         return float(self.batched()._total_weights()[0])
 
     def _total_weights(self) -> Tensor:

@@ -94,7 +94,7 @@ class BlockPattern:
 
     @cached_property
     def column_plan(self) -> ColumnPlan | None:
-        """Plan of the compiled Cholesky factorisation, whose blocks are those of poses; None if it would be too large."""
+        """The same for the compiled factorisation, whose blocks are those of poses."""
         return plan_columns(self.size, self.rows, self.columns)
 
     @cached_property

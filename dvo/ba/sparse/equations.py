@@ -136,7 +136,8 @@ class SparseSystem:
             from dvo.ba.sparse import schur_kernels
 
             out = torch.empty_like(self.h_ll)
-            schur_kernels.to_depths(*self._rows(), x.contiguous().numpy(), out.numpy())
+            h_pl, keys, first, free = self._rows()
+            schur_kernels.to_depths(h_pl, keys, first, free, x.contiguous().numpy(), out.numpy())
             return out
         each = (self.h_pl * x.index_select(0, self.pattern.frame)).sum(-1)
         return torch.zeros_like(self.h_ll).index_add_(0, self.pattern.patch, each)
@@ -147,7 +148,8 @@ class SparseSystem:
             from dvo.ba.sparse import schur_kernels
 
             out = torch.zeros(self.g_p.shape, dtype=y.dtype)
-            schur_kernels.to_poses(*self._rows(), y.contiguous().numpy(), out.numpy())
+            h_pl, keys, first, free = self._rows()
+            schur_kernels.to_poses(h_pl, keys, first, free, y.contiguous().numpy(), out.numpy())
             return out
         each = self.h_pl * y.index_select(0, self.pattern.patch)[:, None]
         return torch.zeros_like(self.g_p).index_add_(0, self.pattern.frame, each)
@@ -155,7 +157,7 @@ class SparseSystem:
     def _compiled(self, x: Tensor) -> bool:
         return self.h_pl.shape[-1] == PART and use_kernels(self.h_pl, x, double=True)
 
-    def _rows(self) -> tuple[Any, ...]:
+    def _rows(self) -> tuple[Any, Any, Any, int]:
         """Arguments of kernels: observations, their keys, the first of each patch, number of free frames."""
         pattern = self.pattern
         return self.h_pl.contiguous().numpy(), pattern.keys.numpy(), pattern.first.numpy(), pattern.free

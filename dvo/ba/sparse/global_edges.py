@@ -21,7 +21,6 @@ from dvo.ba.sparse.schur_pattern import SchurPattern
 from dvo.core.kernels import use_kernels
 from dvo.geometry import so3
 
-
 _LAYOUT = "group_pair", "pair_i", "pair_j", "order", "filled", "kk"  # of a plan, for kernels
 
 

@@ -97,8 +97,8 @@ class SchurPattern:
         if self.compiled:
             from dvo.ba.sparse import schur_kernels
 
-            arrays = (x.contiguous().numpy() for x in (self.keys, self.first, frame, patch))
-            return torch.from_numpy(schur_kernels.find(*arrays, self.free))
+            end = frame.contiguous().numpy(), patch.contiguous().numpy()
+            return torch.from_numpy(schur_kernels.find(self.keys.numpy(), self.first.numpy(), *end, self.free))
         at = torch.searchsorted(self.keys, patch * self.free + frame)
         return torch.where(frame < self.free, at, len(self.keys))
 
@@ -134,7 +134,15 @@ class SchurPattern:
         """True if forming ``S`` is cheaper than many products with it."""
         if len(self.keys) == 0:
             return True
-        _, _, frames, patches = self.sizes
+        sources = int(self.source.max()) + 1
+        if sources * self.free <= MARKS:  # a table is faster than sorting
+            source = self.source[self.patch]
+            marked = torch.zeros(sources, self.free, dtype=torch.bool, device=self.keys.device)
+            marked[source, self.frame] = True
+            frames = marked.sum(1)
+            patches = torch.bincount(self.source[self.patch.unique_consecutive()], minlength=sources)
+        else:
+            _, _, frames, patches = self.sizes
         return int((frames * frames * patches).sum()) <= EXPLICIT_WORK * len(self.keys)
 
     @cached_property

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dvo.core.kernels import available
 from dvo.odometry.checks.check_pairs import CheckPair
 
 MIN_CORNERS = 30
@@ -39,15 +40,26 @@ def shift_gain(pairs: Sequence[CheckPair], motions: Sequence[np.ndarray]) -> flo
     Returns:
         In [0, 1]; NaN for too few pairs.
     """
-    known = [at for at, pair in enumerate(pairs) if len(pair.points) >= MIN_CORNERS]
-    if len(known) < MIN_PAIRS:
-        return math.nan
-    chosen = [known[at] for at in np.unique(np.linspace(0, len(known) - 1, MAX_PAIRS).astype(int))]
     gains = []
-    for at in chosen:
+    for at in looked_at(pairs):
         plain, shifted = (fitted_cost(pairs[at], motions[at], with_shift) for with_shift in (False, True))
         gains.append(max(1 - shifted / plain, 0.0) if plain > 0 else 0.0)
-    return float(np.median(gains))
+    return float(np.median(gains)) if gains else math.nan
+
+
+def looked_at(pairs: Sequence[CheckPair]) -> list[int]:
+    """Pairs that :func:`shift_gain` looks at.
+
+    Args:
+        pairs: all of them.
+
+    Returns:
+        Their indices; empty if there are too few.
+    """
+    known = [at for at, pair in enumerate(pairs) if len(pair.points) >= MIN_CORNERS]
+    if len(known) < MIN_PAIRS:
+        return []
+    return [known[at] for at in np.unique(np.linspace(0, len(known) - 1, MAX_PAIRS).astype(int))]
 
 
 def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:
@@ -71,6 +83,12 @@ def fitted_cost(pair: CheckPair, motion: np.ndarray, with_shift: bool) -> float:
     towards = motion[:3, 3] / length if length > 1e-12 else np.array([1.0, 0.0, 0.0])
     aside = np.linalg.svd(towards[None])[2][1:]
 
+    if available():
+        from dvo.odometry.checks import fit_kernels
+
+        values = first[:, :2].copy(), second[:, :2].copy(), motion[:3, :3].copy(), towards.copy(), aside.copy()
+        limits = scale, _SCALE, _ITERATIONS, _STEP, _TOLERANCE, _STRONGEST
+        return float(fit_kernels.fit(*values, 7 if with_shift else 5, *limits))
     moving = np.arange(7) < (7 if with_shift else 5)
     units = _STEP * np.eye(7)[moving]
 

@@ -14,7 +14,7 @@ from dvo.geometry.projection import reproject
 from dvo.map.map import Map
 from dvo.map.recordings import increasing_times
 from dvo.odometry.checks.check_pairs import CheckPair, CheckPairs, epipolar_distances, median_displacement
-from dvo.odometry.checks.floating_crop import shift_gain
+from dvo.odometry.checks.floating_crop import looked_at, shift_gain
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.protocol import Result
 from dvo.odometry.quality import Quality, judge
@@ -128,7 +128,9 @@ def _placed(graph: Map, checks: CheckPairs) -> Iterator[tuple[CheckPair, np.ndar
 def _shift_gain(graph: Map, checks: CheckPairs, shutter: Shutter, stride: int) -> float:
     """What shifts of the images explain of the corners, see :func:`dvo.odometry.checks.floating_crop.shift_gain`."""
     pairs, motions = [], []
-    for pair, *poses in _placed(graph, checks):
+    placed = list(_placed(graph, checks))
+    for at in looked_at([pair for pair, *_ in placed]):
+        pair, *poses = placed[at]
         first, second = (torch.as_tensor(pose, dtype=torch.float64) for pose in poses)
         motion = se3.relative(first, second)
         motions.append(se3.matrix(motion).numpy())

@@ -82,6 +82,7 @@ class AdjustmentOptions:
 
 _MOTION_ITERATIONS = 5  # of a solution that the motion during the readout is taken from, at most
 _MOST = 1.5  # change of an inverse depth that is extrapolated
+_ABANDON = 1.25  # see :data:`dvo.ba.multistart.ABANDON`: many frames tell sooner than a window
 _RESTART_ITERATIONS = 20  # of the first frames from each start, at most
 
 
@@ -159,7 +160,9 @@ def adjust_segment(
         end = min(max(start + block, solved + 1), len(identifiers))
         # Held frames that share no edge with the block are left out, but not those that hold the first one.
         whole = start == held and not (map_size or later)
-        part = graph.problem(True, segment, 0 if whole else int(identifiers[start]), int(identifiers[end - 1])).planned()
+        part = graph.problem(
+            True, segment, 0 if whole else int(identifiers[start]), int(identifiers[end - 1])
+        ).planned()
         rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
         fixed, new = rows < start, rows >= solved
         now[solved:end] = change(old[solved:end])
@@ -208,7 +211,7 @@ def _leave_minimum(
         return poses_cw, depths
     solver = LMOptions(max_iterations=_RESTART_ITERATIONS, tolerance=options.tolerance)
     settings = GlobalBAOptions(fixed[:n], options.kernels[-1], options.max_residual, solver=solver)
-    better = preferred(multistart(early, RESTARTS, settings))
+    better = preferred(multistart(early, RESTARTS, settings, _ABANDON))
     if better.start == PRESENT:
         return poses_cw, depths
 

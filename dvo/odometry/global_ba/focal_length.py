@@ -103,7 +103,11 @@ def find_focal(
     freedom = len(part.patches)
     coarse = profile_minimum(solve, 0.0, _STEPS[0], -FARTHEST, FARTHEST, freedom)
     # The minimum of a single valley is less than a step away from the lowest point that was tried.
-    if not np.isfinite(coarse.deviation) or beyond is not None and abs(coarse.value) <= min(_STEPS[0] / 2, beyond - _STEPS[0]):
+    if (
+        not np.isfinite(coarse.deviation)
+        or beyond is not None
+        and abs(coarse.value) <= min(_STEPS[0] / 2, beyond - _STEPS[0])
+    ):
         return FocalProfile(coarse, 0.0)
 
     def contrast_at(value: float) -> float:

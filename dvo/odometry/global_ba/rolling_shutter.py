@@ -9,12 +9,14 @@ Adjustment", CVPR 2012, used to correct the measurements instead of extending th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dvo.ba.patch_problem import PatchProblem
-from dvo.geometry import se3
+from dvo.core.kernels import use_kernels
+from dvo.geometry import se3, so3
 
 _STENCIL = 5  # poses that a polynomial goes through
 _NEAREST = 0.05  # least depth of a point in front of a camera, in the unit of the poses
@@ -113,6 +115,8 @@ def as_global_shutter(
     Returns:
         The problem with the positions at which a global shutter would have seen the points.
     """
+    if use_kernels(poses_cw, depths, part.patches, part.targets, part.intrinsics, track.twists, double=True):
+        return _compiled(part, poses_cw, depths, frames, track, shutter)
     focal, centre = part.intrinsics.split(2, -1)
 
     def undo(xy: Tensor, depth: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -131,3 +135,20 @@ def as_global_shutter(
     targets, _ = undo(part.targets, seen[:, 2].clamp(min=_NEAREST), jj)
     patches = torch.cat([xy[:, :, None, None], part.patches[:, 2:]], 1)
     return part.with_values(patches=patches, targets=targets)
+
+
+def _compiled(
+    part: PatchProblem, poses_cw: Tensor, depths: Tensor, frames: Tensor, track: PoseTrack, shutter: Shutter
+) -> PatchProblem:
+    """:func:`as_global_shutter` by a kernel."""
+    from dvo.odometry.global_ba import shutter_kernels
+
+    given = (
+        so3.matrix(poses_cw[:, 3:]), poses_cw[:, :3], part.intrinsics, part.patches[:, :2, 0, 0], depths.reshape(-1),
+        part.targets, part.ii, part.jj, part.kk, frames, track.times, track.twists,
+    )  # fmt: skip
+    arrays: list[Any] = [x.contiguous().numpy() for x in given]
+    arrays += [float(shutter.readout), float(shutter.rows), _NEAREST]
+    xy, targets = shutter_kernels.global_shutter(*arrays)
+    patches = torch.cat([torch.from_numpy(xy).to(part.patches)[:, :, None, None], part.patches[:, 2:]], 1)
+    return part.with_values(patches=patches, targets=torch.from_numpy(targets).to(part.targets))

@@ -3,7 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from dvo.core.kernels import VARIABLE
 from dvo.odometry.checks.check_pairs import CheckPair
 from dvo.odometry.checks.floating_crop import MIN_PAIRS, fitted_cost, shift_gain
 
@@ -54,3 +57,18 @@ def test_the_cost_is_that_of_the_true_motion_wherever_the_fit_begins():
 def test_too_few_pairs_or_corners_say_nothing():
     assert np.isnan(gain((8.0, 0.0), seeds=range(MIN_PAIRS - 1)))
     assert np.isnan(gain((8.0, 0.0), count=20))
+
+
+@pytest.mark.parametrize("with_shift", [False, True])
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 999), turned=st.booleans(), still=st.booleans())
+def test_a_kernel_fits_as_its_twin(with_shift, seed, turned, still):
+    found, motion = pair(seed, (3.0, -2.0))
+    motion = motion if turned else np.eye(4)
+    motion[:3, 3] *= not still
+    costs = []
+    for choice in ("numba", "torch"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(VARIABLE, choice)
+            costs.append(fitted_cost(found, motion, with_shift))
+    assert costs[0] == pytest.approx(costs[1], rel=1e-3)

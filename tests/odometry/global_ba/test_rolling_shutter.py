@@ -6,13 +6,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dvo.core.kernels import VARIABLE
 from dvo.geometry import se3
 from dvo.metrics import evaluate
 from dvo.odometry.global_ba.final_adjustment import adjust_segment
-from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter
+from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 from dvo.odometry.global_ba.self_calibration import adjust_segments, find_readout, profile_minimum
 from dvo.synth.render.rolling import row_offsets
-from tests.support.archived_walk import ROWS, archived_walk, pose_at
+from tests.support.archived_walk import ROWS, M, archived_walk, pose_at
 
 
 def test_rows_are_read_at_the_times_that_the_renderer_reads_them():
@@ -93,3 +94,22 @@ def test_the_minimum_of_a_parabola_is_exact(centre, curvature):
 def test_a_minimum_at_the_end_of_the_range_has_no_deviation():
     found = profile_minimum(lambda x: 2 - x, 0.0, 0.25, 0.0, 1.0, 1)
     assert found.value == 1.0 and found.deviation == np.inf and found.gain == pytest.approx(0.5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 1000), st.floats(-0.08, 0.08), st.booleans(), st.floats(0, 3))
+def test_measurements_are_corrected_by_a_kernel_as_by_its_twin(seed, readout, empty, turn):
+    g = torch.Generator().manual_seed(seed)
+    graph, _ = archived_walk(frames=9)
+    part = graph.problem(True, 0)
+    part = part.edges(torch.rand(len(part.kk), generator=g) < (0.0 if empty else 0.5))
+    twists = torch.randn(9, 6, generator=g, dtype=torch.float64) * torch.tensor([0.3, 0.3, 0.3, turn, turn, turn])
+    poses, depths = se3.exp(twists), 0.05 + torch.rand(9, M, generator=g, dtype=torch.float64)
+    track = PoseTrack.through(0.1 * torch.arange(9, dtype=torch.float64), poses)
+    found = []
+    for choice in ("numba", "torch"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(VARIABLE, choice)
+            found.append(as_global_shutter(part, poses, depths, torch.arange(9), track, Shutter(readout, ROWS)))
+    for name in ("patches", "targets"):
+        torch.testing.assert_close(*(getattr(p, name) for p in found), atol=1e-7, rtol=1e-7)

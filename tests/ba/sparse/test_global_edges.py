@@ -1,0 +1,132 @@
+"""Compiled normal equations of a graph against their plain twins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dvo.ba.kernels import Kernel
+from dvo.ba.patch_problem import PatchProblem
+from dvo.ba.sparse import schur_pattern
+from dvo.ba.sparse.block_matrix import BlockMatrix
+from dvo.ba.sparse.global_adjust import GlobalBAOptions, SparseProblem, adjust_sparse
+from dvo.ba.sparse.levenberg import LMOptions
+from dvo.core.kernels import VARIABLE, available
+from dvo.geometry import se3
+
+KERNELS = [Kernel("none"), Kernel("huber", 0.5), Kernel("cauchy", 0.3)]
+NAMES = ("h_pp", "h_pl", "h_ll", "g_p", "g_l")
+
+
+def graph(seed, frames, per_frame, edges, dtype=torch.float64):
+    """Any edges, several times the same, into their own frame, behind the camera, without weight, or far off."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    patches = frames * per_frame
+    poses = se3.exp(torch.cat([0.3 * normal(frames, 3), 0.1 * normal(frames, 3)], 1))
+    poses[0, 2] -= 3.0  # nearer than the points: what it sees may lie behind it
+    depth = 0.2 + torch.rand(patches, generator=g, dtype=torch.float64)
+    xy = 40 + 12 * normal(patches, 2)
+    cut = torch.cat([xy, depth[:, None]], 1)[:, :, None, None]
+    kk = torch.randint(patches, (edges,), generator=g)
+    jj = torch.randint(frames, (edges,), generator=g)
+    targets = xy[kk] + 6 * normal(edges, 2)
+    targets[torch.rand(edges, generator=g) < 0.05] = torch.nan
+    weights = torch.rand(edges, 2, generator=g, dtype=torch.float64) * (torch.rand(edges, 1, generator=g) < 0.9)
+    intrinsics = torch.tensor([[40.0, 42.0, 39.0, 41.0]], dtype=torch.float64).expand(frames, 4)
+    values = [x.to(dtype) for x in (poses, cut, intrinsics, targets, weights)]
+    return PatchProblem(*values, kk // per_frame, jj, kk)
+
+
+def both(make):
+    """What a function gives with kernels, and without."""
+    found = []
+    for choice in ("numba", "torch"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(VARIABLE, choice)
+            assert available() == (choice == "numba")
+            found.append(make())
+    return found
+
+
+def close(found, wanted, tolerance):
+    scale = max(float(wanted.abs().max()), 1e-30) if wanted.numel() else 1.0
+    torch.testing.assert_close(found / scale, wanted / scale, atol=tolerance, rtol=tolerance)
+
+
+GRAPHS = dict(
+    seed=st.integers(0, 999), frames=st.integers(1, 9), per_frame=st.integers(1, 10), edges=st.integers(1, 200),
+    kernel=st.sampled_from(KERNELS), double=st.booleans(), held=st.integers(0, 511),
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(**GRAPHS)
+def test_sums_over_edges_are_those_of_the_twin(seed, frames, per_frame, edges, kernel, double, held):
+    problem = graph(seed, frames, per_frame, edges, torch.float64 if double else torch.float32)
+    fixed = [bool(held >> k & 1) for k in range(frames)]
+    options = GlobalBAOptions(fixed, kernel, 16.0)
+
+    def sums():
+        sparse = SparseProblem(problem, options)
+        return sparse, sparse.linearise(sparse.state), sparse.cost(sparse.state), sparse.inliers(sparse.state)
+
+    (a, found, cost, inliers), (b, wanted, twin_cost, twin_inliers) = both(sums)
+    for name in ("keys", "first", "frame", "patch"):
+        assert torch.equal(getattr(a.pattern, name), getattr(b.pattern, name))
+    assert all(torch.equal(x, y) for x, y in zip(a.at, b.at, strict=True))
+    assert torch.equal(a.pattern.reduced.keys, b.pattern.reduced.keys)
+    tolerance = 1e-11 if double else 2e-4
+    assert torch.equal(inliers, twin_inliers)
+    assert cost == pytest.approx(twin_cost, rel=tolerance)
+    for name in NAMES:
+        close(getattr(found, name), getattr(wanted, name), tolerance)
+
+
+@settings(max_examples=40, deadline=None)
+@given(**GRAPHS)
+def test_the_reduced_system_and_its_products_are_those_of_the_twin(
+    seed, frames, per_frame, edges, kernel, double, held
+):
+    problem = graph(seed, frames, per_frame, edges, torch.float64 if double else torch.float32)
+    sparse = SparseProblem(problem, GlobalBAOptions([bool(held >> k & 1) for k in range(frames)], kernel, 16.0))
+    system = sparse.linearise(sparse.state)
+    q = torch.where(system.h_ll > 0, 1 / (1 + system.h_ll), 0.0)
+    x = torch.randn(system.g_p.shape, generator=torch.Generator().manual_seed(seed)).to(q)
+    poses = BlockMatrix(system.pattern.h_pp, system.h_pp)
+
+    def products():
+        return system.reduce(poses, q).dense(), system._to_poses(q), system._to_depths(x)
+
+    if sparse.parts.count:
+        for found, wanted in zip(*both(products), strict=True):
+            close(found, wanted, 1e-11 if double else 2e-4)
+
+
+@pytest.mark.parametrize("marks", [schur_pattern.MARKS, 0])
+def test_steps_and_results_are_those_of_the_twin(monkeypatch, marks):
+    monkeypatch.setattr(schur_pattern, "MARKS", marks)
+    problem = graph(3, 8, 10, 600)
+    problem = problem.with_values(targets=torch.where(problem.targets.isfinite(), problem.targets, 0.0))
+    options = GlobalBAOptions(1, Kernel("huber", 0.5), 64.0, solver=LMOptions(max_iterations=6))
+    found, wanted = both(lambda: adjust_sparse(problem, options))
+    assert found.iterations == wanted.iterations and found.cost == pytest.approx(wanted.cost, rel=1e-9)
+    torch.testing.assert_close(found.poses_cw, wanted.poses_cw, atol=1e-7, rtol=1e-7)
+    again = adjust_sparse(problem, options)
+    assert torch.equal(again.poses_cw, found.poses_cw) and torch.equal(again.patches, found.patches)
+
+
+def test_gradients_and_other_types_are_for_the_twin():
+    problem = graph(1, 4, 3, 40)
+    edges = SparseProblem(problem, GlobalBAOptions()).edges
+    values = problem.poses_cw, problem.inverse_depths
+    assert edges._compiled(*values) == available()
+    assert not edges._compiled(values[0].clone().requires_grad_(), values[1])
+    assert not replace(edges, weight=edges.weight.float())._compiled(*values)

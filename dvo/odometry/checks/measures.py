@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -28,6 +29,9 @@ ROLLING_SHARE = 0.5
 """Share that counts of what shifts explain under a rolling shutter, whose correction for corners is approximate."""
 JUMP = 6.0
 """Length of a step over the longer one of the steps before and after, and over the median, of a jump."""
+
+_Placed = tuple[CheckPair, np.ndarray, np.ndarray]
+_Pose = Callable[[int], np.ndarray | None]  # of a frame, by its number
 
 
 def measure_quality(
@@ -71,13 +75,14 @@ def measure_quality(
         quality = replace(
             quality, inliers=float(total[2] / total[0]), agreement=agreement, residual=residual, spread=longest[2]
         )
-    pairs = _distances(graph, checks)
+    placed = list(_placed(graph, checks))
+    pairs = [(epipolar_distances(pair, *poses), median_displacement(pair.points)) for pair, *poses in placed]
     if pairs:
         distances = np.concatenate([away for away, _ in pairs])
         deviation = float(np.median(np.concatenate([away / moved for away, moved in pairs])))
         agreed = float((distances < NEAR_LINE).mean())
         quality = replace(quality, checks=len(pairs), deviation=deviation, check=agreed)
-        quality = replace(quality, crop=_shift_gain(graph, checks, shutter, stride))
+        quality = replace(quality, crop=_shift_gain(graph, placed, shutter, stride))
     verdict, reason, remedy = judge(quality, result.frames_read, cause)
     return replace(quality, verdict=verdict, reason=reason, remedy=remedy)
 
@@ -106,39 +111,32 @@ def _inliers(graph: Map, segment: int, shutter: Shutter) -> tuple[np.ndarray, np
     return counts, residual[confident].numpy(), float(spread)
 
 
-def _distances(graph: Map, checks: CheckPairs) -> list[tuple[np.ndarray, float]]:
-    """Distances of the corners of each pair whose frames have poses in one world, and their displacement, pixels."""
-    return [
-        (epipolar_distances(pair, first, second), median_displacement(pair.points))
-        for pair, first, second in _placed(graph, checks)
-    ]
-
-
-def _placed(graph: Map, checks: CheckPairs) -> Iterator[tuple[CheckPair, np.ndarray, np.ndarray]]:
+def _placed(graph: Map, checks: CheckPairs) -> Iterator[_Placed]:
     """Pairs whose frames have poses in one world, with these, ``T_cw``."""
-    log = graph.log
+    log, pose = graph.log, cache(graph.log.pose)
     for pair in checks.pairs:
         frames = [log.frames[number] for number in (pair.first, pair.second)]
-        first, second = (log.pose(number) for number in (pair.first, pair.second))
+        first, second = (pose(number) for number in (pair.first, pair.second))
         same = graph.world_of(frames[0].segment) == graph.world_of(frames[1].segment)
         if not any(frame.lost for frame in frames) and same and first is not None and second is not None:
             yield pair, first, second
 
 
-def _shift_gain(graph: Map, checks: CheckPairs, shutter: Shutter, stride: int) -> float:
+def _shift_gain(graph: Map, placed: Sequence[_Placed], shutter: Shutter, stride: int) -> float:
     """What shifts of the images explain of the corners, see :func:`dvo.odometry.checks.floating_crop.shift_gain`."""
-    pairs, motions = [], []
-    placed = list(_placed(graph, checks))
+    pairs, motions, pose = [], [], cache(graph.log.pose)
     for at in looked_at([pair for pair, *_ in placed]):
         pair, *poses = placed[at]
         first, second = (torch.as_tensor(pose, dtype=torch.float64) for pose in poses)
         motion = se3.relative(first, second)
         motions.append(se3.matrix(motion).numpy())
-        pairs.append(_as_read_at_once(graph, pair, motion, shutter, stride) if shutter.readout > 0 else pair)
+        pairs.append(_as_read_at_once(graph, pose, pair, motion, shutter, stride) if shutter.readout > 0 else pair)
     return shift_gain(pairs, motions) * (ROLLING_SHARE if shutter.readout > 0 else 1.0)
 
 
-def _as_read_at_once(graph: Map, pair: CheckPair, motion: Tensor, shutter: Shutter, stride: int) -> CheckPair:
+def _as_read_at_once(
+    graph: Map, pose: _Pose, pair: CheckPair, motion: Tensor, shutter: Shutter, stride: int
+) -> CheckPair:
     """Corners of a pair without what a rolling shutter adds: turns, and steps as if the camera moved evenly."""
     ends = [torch.as_tensor(part, dtype=torch.float64) for part in np.split(pair.points, 2, axis=1)]
     focal, centre = torch.as_tensor(pair.intrinsics, dtype=torch.float64).split(2)
@@ -150,7 +148,7 @@ def _as_read_at_once(graph: Map, pair: CheckPair, motion: Tensor, shutter: Shutt
     offsets = [shutter.offsets(xy[:, 1] / stride) for xy in ends]
     numbers = pair.first, pair.second
     first, second = (
-        turned(xy, so3.conjugate(_turn(graph, number, away)))
+        turned(xy, so3.conjugate(_turn(graph, pose, number, away)))
         for xy, number, away in zip(ends, numbers, offsets, strict=True)
     )
     times = [graph.log.frames[number].timestamp for number in numbers]
@@ -159,13 +157,13 @@ def _as_read_at_once(graph: Map, pair: CheckPair, motion: Tensor, shutter: Shutt
     return replace(pair, points=torch.cat(corrected, 1).numpy())
 
 
-def _turn(graph: Map, number: int, offsets: Tensor) -> Tensor:
+def _turn(graph: Map, pose: _Pose, number: int, offsets: Tensor) -> Tensor:
     """Rotations ``(N, 4)`` of a camera from the time of a frame to a little earlier or later ``(N,)``, seconds."""
     log = graph.log
-    near = [k for k in range(max(number - 2, 0), min(number + 3, len(log.frames))) if log.pose(k) is not None]
+    near = [k for k in range(max(number - 2, 0), min(number + 3, len(log.frames))) if pose(k) is not None]
     near = [k for k in near if not log.frames[k].lost and log.frames[k].segment == log.frames[number].segment]
     times = torch.tensor([log.frames[k].timestamp for k in near], dtype=torch.float64)
-    track = PoseTrack.through(times, torch.as_tensor(np.array([log.pose(k) for k in near]), dtype=torch.float64))
+    track = PoseTrack.through(times, torch.as_tensor(np.array([pose(k) for k in near]), dtype=torch.float64))
     return track.motion(torch.full((len(offsets),), near.index(number)), offsets)[:, 3:]
 
 

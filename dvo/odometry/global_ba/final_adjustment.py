@@ -82,7 +82,6 @@ class AdjustmentOptions:
 
 _MOTION_ITERATIONS = 5  # of a solution that the motion during the readout is taken from, at most
 _MOST = 1.5  # change of an inverse depth that is extrapolated
-_ABANDON = 1.25  # see :data:`dvo.ba.multistart.ABANDON`: many frames tell sooner than a window
 _RESTART_ITERATIONS = 20  # of the first frames from each start, at most
 
 
@@ -211,7 +210,7 @@ def _leave_minimum(
         return poses_cw, depths
     solver = LMOptions(max_iterations=_RESTART_ITERATIONS, tolerance=options.tolerance)
     settings = GlobalBAOptions(fixed[:n], options.kernels[-1], options.max_residual, solver=solver)
-    better = preferred(multistart(early, RESTARTS, settings, _ABANDON))
+    better = preferred(multistart(early, RESTARTS, settings))
     if better.start == PRESENT:
         return poses_cw, depths
 

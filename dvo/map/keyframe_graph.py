@@ -136,6 +136,41 @@ class KeyframeGraph(Map):
         identifier = window.remove(position).identifier
         self.log.reanchor(identifier, anchor, self.archive[identifier].pose_cw)
 
+    def attach(
+        self, identifier: int, timestamp: float, pose_cw: np.ndarray, kk: np.ndarray, targets: np.ndarray,
+        weights: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Archive a frame without patches, which was never in the window, relative to the newest keyframe.
+
+        Args:
+            identifier: of the frame, larger than that of any keyframe.
+            timestamp: seconds.
+            pose_cw: ``(7,)`` float64 world to camera.
+            kk: ``(e,)`` patches of the window that were measured in it.
+            targets, weights: ``(e, 2)`` positions in the frame, feature-map pixels, and their weights.
+        """
+        window, m = self.window, self.window.per_frame
+        newest = window.frames[-1]
+        relative = se3.relative(window.poses_cw[-1].double().cpu(), torch.from_numpy(pose_cw)).numpy()
+        self.archive.add(
+            ArchivedKeyframe(
+                identifier,
+                timestamp,
+                newest.intrinsics.float().cpu().numpy(),
+                relative,
+                newest.identifier,
+                np.zeros((0, 2), np.float32),
+                np.zeros(0, np.float32),
+                np.zeros((0, 3), np.uint8),
+            )  # fmt: skip
+        )
+        self.log.reanchor(identifier, newest.identifier, relative)
+        identifiers = np.array([frame.identifier for frame in window.frames], dtype=np.int32)
+        target = np.full(len(kk), identifier, np.int32)
+        self.archive.add_edges(
+            ArchivedEdges(identifiers[kk // m], (kk % m).astype(np.int16), target, targets, weights.astype(np.float16))
+        )
+
     def archive_oldest(self) -> None:
         """Move the oldest keyframe of the window to the archive; if there are guests alone, the measurements of one."""
         window, oldest = self.window, self.window.guests

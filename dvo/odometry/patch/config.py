@@ -48,6 +48,7 @@ _RANGES = {
     "initial_parallax": (0, math.inf),
     "initial_inliers": (0, 1),
     "keyframe_motion": (0, math.inf),
+    "network_motion": (0, math.inf),
     "keyframe_index": (2, 1000),
     "motion_damping": (0, 1),
     "lost_confidence": (0, 1),
@@ -111,6 +112,9 @@ class TrackerConfig:
             which they do not show the same scene.
         keyframe_motion: a keyframe is dropped again if the mean flow between its neighbours, in feature pixels, is
             below this.
+        network_motion: mean flow since the last frame that the network has measured, in feature pixels, up to which a
+            frame is aligned with the keyframes instead (:mod:`dvo.odometry.window.frame_alignment`); 0: the network
+            measures every frame. Without an alignment (``align``) it does too.
         keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
         motion_damping: factor of the last motion in the prediction of the next pose, in [0, 1].
         initial_pose: see :data:`InitialPose` (:mod:`dvo.odometry.patch.initial_pose`).
@@ -164,6 +168,7 @@ class TrackerConfig:
     initial_parallax: float = 1.0
     initial_inliers: float = 0.1
     keyframe_motion: float = 5.0
+    network_motion: float = 2.5
     keyframe_index: int = 4
     motion_damping: float = 0.5
     initial_pose: InitialPose = "motion"

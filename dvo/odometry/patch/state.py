@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+import numpy as np
 import torch
 
 from dvo.odometry.checks.check_pairs import CheckPairs
@@ -60,6 +61,7 @@ class TrackerState:
         checks: measurements that take no part in the trajectory.
         started: timestamp of the first measured pose, seconds; None before it.
         quality: of the result, after ``finish``.
+        guess: ``(7,)`` pose ``T_cw`` of the present frame by alignment, for the network to begin with; None: none.
         map: of the file that the tracker was loaded from, until the first frame of the new recording.
     """
 
@@ -82,6 +84,7 @@ class TrackerState:
     checks: CheckPairs = field(default_factory=CheckPairs)
     started: float | None = None
     quality: Quality | None = None
+    guess: np.ndarray | None = None
 
     @property
     def initialised(self) -> bool:

@@ -52,7 +52,9 @@ from dvo.odometry.patch.saving import save_map
 from dvo.odometry.patch.state import Phase, TrackerState
 from dvo.odometry.protocol import Estimate, Result, Status
 from dvo.odometry.segments import result_of
+from dvo.odometry.uncertainty.measurements import WindowMeasurements
 from dvo.odometry.uncertainty.uncertainty import LaterUncertainty
+from dvo.odometry.window.frame_alignment import FrameAlignment
 from dvo.odometry.window.motion import flow_magnitude
 from dvo.odometry.window.patch_window import PatchWindow
 from dvo.odometry.window.pose_validation import newest_support
@@ -116,6 +118,9 @@ class PatchOdometry:
             WINDOW_SENSORS.resolve(name)(self.model, self.device) for name in config.sensors
         ]
         self.patch_window = PatchWindow(self.model, self.window, config.window, self.device, self.sensors)
+        self.aligner: FrameAlignment | None = None
+        if config.network_motion > 0 and config.align != "none" and not self.sensors:
+            self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)
         self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
 
     @property
@@ -163,12 +168,38 @@ class PatchOdometry:
         if admitted.gap:
             state.interrupt(str(admitted.gap), is_gap=not admitted.gap.frozen)
         mask = self._without_fixed(image, admitted.mask)
+        if estimate := self._align(record, admitted, mask):
+            return estimate
         seen = observe(self.model, image, admitted.camera, self.select, self.device, mask=mask)
         seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)
         state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
         state.checks.see(len(self.graph.log.frames) - 1, image, seen.image_intrinsics, mask)
         estimate = self._take(View([record], seen))
         return self._begin_segment() if len(state.waiting) >= self.config.patience else estimate
+
+    def _align(self, record: FrameRecord, admitted: Admitted, mask: np.ndarray | None) -> Estimate | None:
+        """Align a frame that has moved little; None if the network has to measure it."""
+        state, window, config = self.state, self.window, self.config
+        state.guess = None
+        if self.aligner is None or state.phase is not Phase.TRACKING or window.guests or admitted.gap:
+            return None
+        image, camera = admitted.image, admitted.camera.intrinsics
+        found = self.aligner.align(image, camera, mask, record.timestamp, config.network_motion)
+        if found is None:
+            return None
+        if not (found.sure and found.slow) or found.motion > config.network_motion:
+            state.guess = found.pose_cw if found.sure else None
+            return None
+        state.checks.see(len(self.graph.log.frames) - 1, image, camera, mask)
+        identifier, state.keyframes = state.keyframes, state.keyframes + 1
+        weights = found.confidence * config.align_gain
+        self.graph.attach(identifier, record.timestamp, found.pose_cw, found.kk, found.targets, weights)
+        self.aligner.keep(image, record.timestamp, found.pose_cw)
+        record.place(identifier, self.graph.segment)
+        measured = found.pose_cw, found.kk, found.targets, found.confidence
+        seen = WindowMeasurements.of(self.patch_window).with_frame(record.timestamp, *measured)
+        pose_wc = se3.inverse(torch.from_numpy(found.pose_cw)).numpy()
+        return self._estimate(record, pose_wc, Status.TRACKING, seen)
 
     @torch.inference_mode()
     def finish(self) -> Result:
@@ -377,6 +408,9 @@ class PatchOdometry:
         """Pose and inverse depths that a new frame begins with: predicted, and the median of the frames before it."""
         window, config, seen, initialised = self.window, self.config, view.seen, self.state.initialised
         depth = first_depth(window, config, initialised, seen.measured)
+        guess = self.state.guess
+        if guess is not None and initialised:
+            return torch.from_numpy(guess).to(window.poses_cw), depth
         return first_pose(window, seen, view.records[0].timestamp, config, initialised), depth
 
     def _reduce(self) -> None:
@@ -394,14 +428,18 @@ class PatchOdometry:
             self.graph.archive_oldest()
         self.loops.advance(self.state.adjustable)
 
-    def _estimate(self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status) -> Estimate:
+    def _estimate(
+        self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status, seen: WindowMeasurements | None = None
+    ) -> Estimate:
+        """Estimate of a frame; ``seen``: measurements that its pose is the newest of, None for those of the window."""
         graph, state, reason = self.graph, self.state, record.reason if status is Status.LOST else ""
         recovered = pose_wc is not None and state.enter(graph.segment, graph.world_of(graph.segment))
         segment = graph.segment - graph.recording.segment
         if pose_wc is None:
             return Estimate(record.timestamp, None, status, 0.0, segment, reason, recovered)
         state.started = record.timestamp if state.started is None else state.started
-        sure = LaterUncertainty(self.patch_window, self.config.variance, state.ambiguous)
+        seen = seen or WindowMeasurements.of(self.patch_window)
+        sure = LaterUncertainty(seen, self.config.variance, state.ambiguous)
         return Estimate(record.timestamp, pose_wc, status, sure.confidence, segment, reason, recovered,
                         sure.covariance, sure.reference)  # fmt: skip
 

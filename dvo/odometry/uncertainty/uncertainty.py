@@ -68,12 +68,13 @@ class LaterUncertainty:
     The bytes are those that it would have had at once. Until then the measurements of the window are held.
 
     Args:
-        window, variance, ambiguous: see :func:`newest_uncertainty`.
+        window: its measurements now.
+        variance, ambiguous: see :func:`newest_uncertainty`.
     """
 
-    def __init__(self, window: PatchWindow, variance: float, ambiguous: bool = False) -> None:
+    def __init__(self, window: WindowMeasurements, variance: float, ambiguous: bool = False) -> None:
         self._compute: Callable[[], Uncertainty] | None
-        self._compute = partial(_uncertainty, WindowMeasurements.of(window), variance, ambiguous)
+        self._compute = partial(_uncertainty, window, variance, ambiguous)
         self._found = UNKNOWN
 
     def _value(self) -> Uncertainty:

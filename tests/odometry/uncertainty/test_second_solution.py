@@ -121,7 +121,7 @@ def test_covariance_and_confidence_are_those_of_the_mixture():
         expected = expected + other.probability * (own + np.outer(other.error, other.error))
     np.testing.assert_allclose(mixed.covariance, expected, rtol=1e-6)
     assert mixed.confidence == pytest.approx(share * plain.confidence)
-    later = LaterUncertainty(step, TrackerConfig().variance, ambiguous=True)
+    later = LaterUncertainty(WindowMeasurements.of(step), TrackerConfig().variance, ambiguous=True)
     assert np.array_equal(later.covariance(), mixed.covariance) and later.confidence() == mixed.confidence
 
 

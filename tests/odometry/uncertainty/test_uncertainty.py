@@ -166,7 +166,7 @@ def test_what_has_been_read_holds_no_window(tracked):
         gc.collect()
         return sum(type(one) is WindowMeasurements for one in gc.get_objects())
 
-    before, later = held(), LaterUncertainty(tracked[1], TrackerConfig().variance)
+    before, later = held(), LaterUncertainty(WindowMeasurements.of(tracked[1]), TrackerConfig().variance)
     assert held() == before + 1
     assert later.confidence() == newest_uncertainty(tracked[1], TrackerConfig().variance).confidence
     assert held() == before

@@ -1,0 +1,147 @@
+"""Alignment of frames between those that the network measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dvo
+from dvo.data.frame import Frame
+from dvo.geometry import se3
+from dvo.geometry.poses import se3_exp
+from dvo.metrics import evaluate
+from dvo.odometry.global_ba.attached_frames import place_attached
+from dvo.odometry.protocol import Status
+from dvo.odometry.window.frame_alignment import solve_pose, solve_pose_plain
+from dvo.synth.sequence import make_sequence
+
+SETTINGS = {"loops": False, "estimate_readout": False}
+CAMERA = np.array([300.0, 310.0, 160.0, 120.0])
+
+
+def film(count: int = 40, **options) -> tuple[list[Frame], object]:
+    values = {"family": "room", "kind": "handheld", "speed": 0.6, "fps": 30.0, "height": 240, "width": 320} | options
+    sequence = make_sequence(77, frames=count, **values)
+    return list(sequence), sequence.groundtruth
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Odometry after a slow walk, its estimates, result, frames and the truth."""
+    frames, truth = film()
+    odometry = dvo.load("small", **SETTINGS)
+    estimates = [odometry.track(frame) for frame in frames]
+    return odometry, estimates, odometry.finish(), frames, truth
+
+
+def aligned(odometry) -> list:
+    return odometry.graph.attached(0)
+
+
+def test_a_slow_camera_is_aligned_and_as_exact(walk):
+    odometry, estimates, result, frames, truth = walk
+    assert len(aligned(odometry)) > len(frames) // 3
+    assert len(result.trajectory) == len(frames) and result.quality.verdict == "good"
+    every = dvo.load("small", network_motion=0, **SETTINGS)
+    for frame in frames:
+        every.track(frame)
+    least = evaluate(every.finish().trajectory, truth).ate_percent
+    assert not aligned(every)
+    assert evaluate(result.trajectory, truth).ate_percent < max(2 * least, 1.0)
+    tracked = [estimate for estimate in estimates if estimate.status is Status.TRACKING]
+    assert all(0 < estimate.confidence <= 1 and np.isfinite(estimate.covariance).all() for estimate in tracked)
+    assert all(np.linalg.eigvalsh(estimate.covariance).min() > 0 for estimate in tracked)
+
+
+def test_again_the_same_bytes(walk):
+    odometry, _, result, frames, _ = walk
+    odometry.reset()
+    for frame in frames:
+        odometry.track(frame)
+    assert odometry.finish().trajectory.poses_wc.tobytes() == result.trajectory.poses_wc.tobytes()
+
+
+def test_a_fast_camera_is_measured_by_the_network():
+    frames, _ = film(14, speed=8.0, fps=8.0)
+    odometry = dvo.load("small", **SETTINGS)
+    for frame in frames:
+        odometry.track(frame)
+    odometry.finish()
+    assert not aligned(odometry)
+
+
+def test_another_picture_is_not_aligned(walk):
+    """A frame without a match is lost, as it is without the alignment."""
+    _, _, _, frames, _ = walk
+    other, _ = film(30, family="street")
+    odometry = dvo.load("small", **SETTINGS)
+    for frame in frames[:24]:
+        odometry.track(frame)
+    assert odometry.state.initialised
+    count = len(aligned(odometry))
+    for number in range(24, 28):
+        estimate = odometry.track(Frame(number, frames[number].timestamp, other[number].image, frames[0].camera))
+        assert estimate.status is Status.LOST and estimate.pose_wc is None
+    assert len(aligned(odometry)) == count
+    assert odometry.track(frames[28]).status is Status.TRACKING
+
+
+def test_final_poses_follow_their_measurements(walk):
+    """Moved away, attached frames return; keyframes stay."""
+    odometry, _, result, _, _ = walk
+    graph = odometry.graph
+    attached = [frame.identifier for frame in aligned(odometry)]
+    kept = np.array([frame.identifier for frame in graph.members(0)])
+    before, keyframes = graph.poses_cw(np.array(attached)), graph.poses_cw(kept)
+    noise = 2e-3 * torch.randn(len(attached), 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for identifier, pose in zip(attached, se3.retract(before, noise), strict=True):
+        graph.correct(identifier, pose.numpy())
+    assert place_attached(graph, 0) == len(attached)
+    assert torch.equal(graph.poses_cw(kept), keyframes)
+    away = se3.log(se3.relative(before, graph.poses_cw(np.array(attached))))
+    assert away.abs().max() < 2e-4 < noise.abs().max()
+    moved = graph.log.trajectory(0)
+    np.testing.assert_allclose(moved.poses_wc, result.trajectory.poses_wc, atol=1e-3)
+
+
+def test_saved_and_read_again(walk, tmp_path):
+    odometry, _, result, _, _ = walk
+    odometry.save(tmp_path / "map.dvo")
+    again = dvo.load_map(tmp_path / "map.dvo")
+    assert len(aligned(again)) == len(aligned(odometry))
+    np.testing.assert_array_equal(again.current().trajectory.poses_wc, result.trajectory.poses_wc)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(0, 2**31),
+    st.integers(6, 120),
+    st.floats(0, 0.4),
+    st.lists(st.floats(-0.05, 0.05), min_size=6, max_size=6),
+)
+def test_the_kernel_equals_its_twin(seed, count, wrong, xi):
+    random = np.random.default_rng(seed)
+    points = random.uniform(-1, 1, (count, 3)) + [0, 0, 2.0]
+    points[0, 2] = -1.0  # behind the camera
+    rotation, translation = se3_exp(np.array(xi))
+    seen = points @ rotation.T + translation
+    measured = seen[:, :2] / seen[:, 2:] * CAMERA[:2] + CAMERA[2:]
+    outliers = random.random(count) < wrong
+    measured[outliers] += random.normal(0, 30, (int(outliers.sum()), 2))
+    weights = random.uniform(0.05, 1, (count, 2))
+    given = points, measured, weights, CAMERA, np.eye(4), (4.0, 1.0, 0.3)
+    np.testing.assert_allclose(solve_pose(*given), solve_pose_plain(*given), atol=1e-7)
+
+
+def test_the_pose_is_exact_with_a_third_of_wrong_positions():
+    random = np.random.default_rng(3)
+    points = random.uniform(-1, 1, (60, 3)) + [0, 0, 3.0]
+    rotation, translation = se3_exp(np.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.015]))
+    seen = points @ rotation.T + translation
+    measured = seen[:, :2] / seen[:, 2:] * CAMERA[:2] + CAMERA[2:]
+    measured[:20] += random.uniform(20, 60, (20, 2))
+    found = solve_pose(points, measured, np.ones((60, 2)), CAMERA, np.eye(4), (4.0, 1.0, 0.3, 0.3))
+    assert np.abs(found[:3, 3] - translation).max() < 1e-4 and np.abs(found[:3, :3] - rotation).max() < 1e-4

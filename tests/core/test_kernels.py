@@ -38,6 +38,8 @@ def test_of_the_cpu_without_gradients(monkeypatch):
     assert available() and use_kernels(plain)
     assert not use_kernels(plain, recorded)
     assert not use_kernels(plain.double()) and not use_kernels(torch.zeros(3, device="meta"))
+    assert use_kernels(plain.double(), double=True) and use_kernels(plain, double=True)
+    assert not use_kernels(plain, plain.double(), double=True)
     with torch.inference_mode():
         assert use_kernels(plain, recorded)
 

@@ -12,7 +12,7 @@ from dvo.core.errors import DvoError
 from dvo.geometry import se3
 from dvo.map.archive import ArchiveConfig
 from dvo.metrics import evaluate
-from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment, extend_solution
+from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment, extend_solution, extrapolated
 from dvo.session.session import run
 from dvo.synth.sequence import make_sequence
 from tests.support.archived_walk import archived_walk
@@ -113,3 +113,22 @@ def test_frames_of_a_slow_start_get_poses_of_their_own():
 def test_options_out_of_range_are_named(change):
     with pytest.raises(DvoError, match=next(iter(change))):
         AdjustmentOptions(**change)
+
+
+@given(st.integers(0, 999), st.floats(-3, 3))
+def test_solutions_along_a_line_are_extrapolated_exactly(seed, ratio):
+    g = torch.Generator().manual_seed(seed)
+    first = se3.exp(torch.randn(4, 6, generator=g, dtype=torch.float64))
+    twist, grown = (
+        0.1 * torch.randn(4, 6, generator=g, dtype=torch.float64),
+        0.3 * torch.rand(4, 5, generator=g).double(),
+    )
+    depths = 0.2 + torch.rand(4, 5, generator=g, dtype=torch.float64)
+
+    def at(value):
+        return se3.compose(se3.exp(value * twist), first), depths * torch.exp(value * grown)
+
+    poses, found = extrapolated(*at(1.0), *at(0.0), ratio)
+    wanted, wanted_depths = at(1.0 + ratio)
+    assert se3.log(se3.relative(poses, wanted)).abs().max() < 1e-9
+    torch.testing.assert_close(found, wanted_depths, atol=1e-9, rtol=1e-9)

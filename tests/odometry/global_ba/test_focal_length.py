@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from dvo.geometry import se3
+from dvo.odometry.global_ba import focal_length
 from dvo.odometry.global_ba.final_adjustment import adjust_segment
 from dvo.odometry.global_ba.focal_length import find_focal
 from dvo.odometry.global_ba.rolling_shutter import Shutter
@@ -58,3 +59,17 @@ def test_driving_straight_ahead_does_not_tell(monkeypatch):
 def test_few_frames_conclude_nothing():
     found = find_focal(walk_with(0.9, frames=12), 0, Shutter(0.0, ROWS))
     assert found.minimum.deviation == np.inf and found.contrast == 0 and found.minimum.value == 0
+
+
+@pytest.mark.parametrize(("factor", "readout"), [(0.75, 0.0), (1.0, 0.0), (1.0, 0.06)])
+def test_a_quick_look_tells_a_wrong_focal_length_from_a_right_one(factor, readout, monkeypatch):
+    """Of a right one the coarse profile is enough; dropped frames may be left out."""
+    monkeypatch.setattr(focal_length, "QUICK_FRAMES", 30)
+    graph = walk_with(factor, dropped=tuple(range(1, 40, 2)), readout=readout)
+    shutter = Shutter(readout, ROWS)
+    adjust_segment(graph, 0, shutter=shutter)
+    found = find_focal(graph, 0, shutter, beyond=0.12)
+    if factor == 1:
+        assert abs(found.minimum.value) < 0.04 and found.contrast == 0
+    else:
+        assert np.exp(found.minimum.value) * factor == pytest.approx(1, abs=0.02) and found.contrast > 0.02

@@ -22,7 +22,6 @@ from dvo.geometry.poses import se3_exp
 from dvo.map.window import Window
 from dvo.nets.alignment.alignment import AlignmentOptions, accept, align_patches
 from dvo.nets.patch.config import ModelConfig
-from dvo.odometry.window.motion import predict_pose
 from dvo.odometry.window.patch_window import PatchWindow
 
 KEYFRAMES = 5
@@ -378,9 +377,16 @@ def solve_pose_plain(
 
 
 def _predicted(last: list[_Seen], time: float, damping: float) -> np.ndarray:
-    """Pose ``(4, 4)`` of a frame by the motion model."""
-    poses = se3.from_matrix(torch.from_numpy(np.stack([one.matrix for one in last])))
-    return _matrix(predict_pose(poses, [one.time for one in last], time, damping).numpy())
+    """Pose ``(4, 4)`` of a frame by the motion model, see :func:`dvo.odometry.window.motion.predict_pose`."""
+    newest = last[-1]
+    if len(last) == 1:
+        return newest.matrix
+    share = damping * min(2.0, max(0.0, (time - newest.time) / (newest.time - last[0].time)))
+    motion = newest.matrix @ np.linalg.inv(last[0].matrix)
+    step = np.eye(4)
+    step[:3, :3] = cv2.Rodrigues(share * cv2.Rodrigues(motion[:3, :3])[0])[0]
+    step[:3, 3] = share * motion[:3, 3]
+    return np.asarray(step @ newest.matrix)
 
 
 def _matrix(pose: np.ndarray) -> np.ndarray:

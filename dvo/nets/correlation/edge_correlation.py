@@ -16,7 +16,7 @@ from torch import Tensor
 from dvo.core.kernels import use_kernels
 
 FIRST_MAPS = 8  # map slots that memory is reserved for at first
-_PIECE = 32  # edges processed at once, so that the working set fits in the processor's cache
+_PIECE, _LARGE_PIECE = 32, 1024  # edges processed at once: in the cache of a processor; on other devices
 _SPREAD = 4  # pixels between those of a patch, up to which they share one window of the map
 
 
@@ -134,7 +134,8 @@ def correlate_edges(
     rows = torch.arange(side, device=at.device)
     pixels, steps = torch.arange(q, device=at.device), rows[:taps] * side
     runs = maps.as_strided((maps.numel() // c - side + 1, side * c), (c, 1))
-    for edges in torch.arange(e, device=at.device).split(_PIECE):
+    piece = _PIECE if at.device.type == "cpu" else _LARGE_PIECE
+    for edges in torch.arange(e, device=at.device).split(piece):
         window = runs.index_select(0, (first[edges, None] + rows * width).flatten()).view(-1, side * side, c)
         products = torch.bmm(features[kk[edges]], window.mT)
         row = torch.arange(len(edges), device=at.device)[:, None] * q + pixels

@@ -34,8 +34,9 @@ Section = dict[str, str]
 
 # Distribution and module of the packages that dvo needs.
 REQUIRED = (
-    ("torch", "torch"), ("numpy", "numpy"), ("opencv-python-headless", "cv2"), ("jaxtyping", "jaxtyping"),
-    ("safetensors", "safetensors"), ("pyyaml", "yaml"), ("rich", "rich"), ("matplotlib", "matplotlib"),
+    ("torch", "torch"), ("numpy", "numpy"), ("opencv-python-headless", "cv2"), ("numba", "numba"),
+    ("jaxtyping", "jaxtyping"), ("safetensors", "safetensors"), ("pyyaml", "yaml"), ("rich", "rich"),
+    ("matplotlib", "matplotlib"),
 )  # fmt: skip
 
 # Distribution, module and use of optional packages; the way to install them, where it is not "pip install NAME".

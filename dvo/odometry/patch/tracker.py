@@ -60,6 +60,9 @@ from dvo.odometry.window.patch_window import PatchWindow
 from dvo.odometry.window.pose_validation import newest_support
 from dvo.odometry.window.sensors import WINDOW_SENSORS, WindowSensor
 
+LOOK_EVERY = 3
+"""Aligned frames in a row, of which one is looked at for pixels that are fixed to the images."""
+
 
 @exclusive
 class PatchOdometry:
@@ -170,6 +173,8 @@ class PatchOdometry:
         mask = self._without_fixed(image, admitted.mask)
         if estimate := self._align(record, admitted, mask):
             return estimate
+        if self.aligner is not None:
+            self.aligner.age = 0
         seen = observe(self.model, image, admitted.camera, self.select, self.device, mask=mask)
         seen = measure_depth(self.model, seen, admitted.frame, self.config.scale, self.config.measuring)
         state.info = {"working_size": [*image.shape[1::-1]], "working_intrinsics": seen.image_intrinsics.tolist()}
@@ -352,7 +357,9 @@ class PatchOdometry:
     def _without_fixed(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
         """Mask of a frame without the pixels that are fixed to it, in which measurements of the window end too."""
         fixed = self.state.fixed
-        if fixed.see(image):
+        # Where little moves from frame to frame, every third frame tells as much.
+        skipped = self.aligner is not None and self.aligner.age % LOOK_EVERY > 0
+        if not skipped and fixed.see(image):
             size, unfixed = self.model.config.patch_size, fixed.mask
             self.window.unfixed = None if unfixed is None else visible_features(unfixed, size, self.device)
         left = fixed.mask if mask is None or fixed.mask is None else mask & fixed.mask

@@ -101,7 +101,7 @@ class FrameAlignment:
         self.patch_window, self.damping = window, damping
         self.options = replace(options, slope=0.0)
         self.age = 0
-        self._newest = -1  # keyframe that the network has measured last
+        self._poses: torch.Tensor | None = None  # of the window that it goes on from
         self._last: list[_Seen] = []
         self._patches: _Patches
 
@@ -150,12 +150,11 @@ class FrameAlignment:
         self._last = [self._last[-1], _Seen(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), time, _matrix(pose_cw))]
 
     def _begin(self, window: Window, intrinsics: np.ndarray) -> None:
-        """Go on from the newest keyframe if the network has measured it since; until then the window stays."""
-        newest = window.frames[-1]
-        if newest.identifier == self._newest:
+        """Go on from the newest keyframe if the window has changed since; poses are replaced, never written to."""
+        if window.poses_cw is self._poses:
             return
+        newest, self._poses = window.frames[-1], window.poses_cw
         self._patches = _Patches.of(window, intrinsics)
-        self._newest, self.age = newest.identifier, 0
         matrices = se3.matrix(window.poses_cw[-2:].double().cpu()).numpy()
         none = np.zeros((0, 0), np.uint8)
         before = [_Seen(none, f.timestamp, m) for f, m in zip(window.frames[-2:-1], matrices[:-1], strict=True)]

@@ -140,7 +140,9 @@ class KeyframeGraph(Map):
         self, identifier: int, timestamp: float, pose_cw: np.ndarray, kk: np.ndarray, targets: np.ndarray,
         weights: np.ndarray,
     ) -> None:  # fmt: skip
-        """Archive a frame without patches, which was never in the window, relative to the newest keyframe.
+        """Archive a frame that was never in the window as one that was dropped after the newest keyframe.
+
+        Its patches are those of that keyframe, without measurements.
 
         Args:
             identifier: of the frame, larger than that of any keyframe.
@@ -149,22 +151,11 @@ class KeyframeGraph(Map):
             kk: ``(e,)`` patches of the window that were measured in it.
             targets, weights: ``(e, 2)`` positions in the frame, feature-map pixels, and their weights.
         """
-        window, m = self.window, self.window.per_frame
-        newest = window.frames[-1]
-        relative = se3.relative(window.poses_cw[-1].double().cpu(), torch.from_numpy(pose_cw)).numpy()
-        self.archive.add(
-            ArchivedKeyframe(
-                identifier,
-                timestamp,
-                newest.intrinsics.float().cpu().numpy(),
-                relative,
-                newest.identifier,
-                np.zeros((0, 2), np.float32),
-                np.zeros(0, np.float32),
-                np.zeros((0, 3), np.uint8),
-            )  # fmt: skip
-        )
-        self.log.reanchor(identifier, newest.identifier, relative)
+        window, m, newest = self.window, self.window.per_frame, len(self.window) - 1
+        anchor = window.frames[newest].identifier
+        relative = se3.relative(window.poses_cw[newest].double().cpu(), torch.from_numpy(pose_cw)).numpy()
+        self._archive_keyframe(newest, relative, anchor, identifier, timestamp)
+        self.log.reanchor(identifier, anchor, relative)
         identifiers = np.array([frame.identifier for frame in window.frames], dtype=np.int32)
         target = np.full(len(kk), identifier, np.int32)
         self.archive.add_edges(
@@ -223,8 +214,11 @@ class KeyframeGraph(Map):
             )
         )
 
-    def _archive_keyframe(self, position: int, pose_cw: np.ndarray, anchor: int | None) -> None:
-        """Archive a keyframe; a dropped one, which has an ``anchor``, without features and image."""
+    def _archive_keyframe(
+        self, position: int, pose_cw: np.ndarray, anchor: int | None, identifier: int | None = None,
+        timestamp: float | None = None,
+    ) -> None:  # fmt: skip
+        """Archive a keyframe, perhaps as another one; a dropped one, with an ``anchor``, without features and image."""
         window, config = self.window, self.archive.config
         frame, m = window.frames[position], window.per_frame
         centre = window.patches.shape[-1] // 2
@@ -233,8 +227,8 @@ class KeyframeGraph(Map):
         image = frame.image if config.images and anchor is None else None
         self.archive.add(
             ArchivedKeyframe(
-                identifier=frame.identifier,
-                timestamp=frame.timestamp,
+                identifier=frame.identifier if identifier is None else identifier,
+                timestamp=frame.timestamp if timestamp is None else timestamp,
                 intrinsics=frame.intrinsics.float().cpu().numpy(),
                 pose_cw=pose_cw,
                 anchor=anchor,
@@ -244,7 +238,9 @@ class KeyframeGraph(Map):
                 matching=frame.matching.half().cpu().numpy() if features else None,
                 context=frame.context.half().cpu().numpy() if features else None,
                 jpeg=None if image is None else encode_jpeg(image, config.jpeg_quality),
-                measured=None if frame.measured is None else frame.measured.float().cpu().numpy(),
+                measured=None
+                if frame.measured is None or identifier is not None
+                else frame.measured.float().cpu().numpy(),
             )
         )
         if len(self.archive) % RELEASE_INTERVAL == 0:

@@ -184,23 +184,6 @@ class Map:
             and (frame.anchor is None or frame.anchor in self.archive)
         ]
 
-    def attached(self, segment: int) -> list[ArchivedKeyframe]:
-        """Archived frames of a segment without patches, relative to a keyframe that is archived.
-
-        Args:
-            segment: its number.
-
-        Returns:
-            By increasing identifier.
-        """
-        return [
-            frame
-            for frame in self.archive
-            if frame.anchor in self.archive
-            and not len(frame.inverse_depth)
-            and self._shares_world(frame.identifier, segment)
-        ]
-
     def _shares_world(self, identifier: int, segment: int) -> bool:
         own = self.segment_of(identifier)
         return own >= 0 and self.world_of(own) == self.world_of(segment)

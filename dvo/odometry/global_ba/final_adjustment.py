@@ -182,7 +182,11 @@ def adjust_segment(
             corrected = as_global_shutter(part, poses, found, rows, track, rolling)
             poses, found, _ = solve_part(corrected, poses, found, fixed, few)
         now[rows] = poses
-        change = _Change(old[end - 1], now[end - 1], change.scale * float((depths[new] / found[new]).median()))
+        measured = torch.zeros(len(part.patches), dtype=torch.bool)
+        measured[part.kk] = True
+        told = new[:, None] & measured.view_as(depths)
+        told = told if bool(told.any()) else new[:, None].expand_as(depths)
+        change = _Change(old[end - 1], now[end - 1], change.scale * float((depths[told] / found[told]).median()))
         for row in (~fixed).nonzero()[:, 0].tolist():
             graph.correct(int(part.identifiers[row]), poses[row].numpy(), found[row].numpy())
         solved, start = end, max(end - options.overlap, start + 1)

@@ -17,7 +17,6 @@ from torch import Tensor
 from dvo.geometry import se3
 from dvo.map.map import Map
 from dvo.map.recordings import count_earlier, increasing_times
-from dvo.odometry.global_ba.attached_frames import place_attached
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment, extrapolated, solve_part
 from dvo.odometry.global_ba.rolling_shutter import PoseTrack, Shutter, as_global_shutter
 
@@ -167,8 +166,6 @@ def adjust_segments(
             corrected = replace(options, kernels=options.kernels[-1:], restart_frames=0)
             for segment in segments:
                 adjust_segment(graph, segment, corrected, shutter)
-    for segment in segments:
-        place_attached(graph, segment, options, shutter)
     return {"readout": shutter.readout, "readout_from": source}
 
 

@@ -17,7 +17,7 @@ from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Status
 from dvo.synth.clip import make_clip
 
-CONFIG = TrackerConfig(pixels=0, initial_motion=0.3, initial_parallax=0.3, keyframe_motion=2.0)
+CONFIG = TrackerConfig(pixels=0, initial_motion=0.3, initial_parallax=0.3, keyframe_motion=2.0, network_motion=0)
 
 
 class TrueFlow:

@@ -113,8 +113,8 @@ class TrackerConfig:
         keyframe_motion: a keyframe is dropped again if the mean flow between its neighbours, in feature pixels, is
             below this.
         network_motion: mean flow since the last frame that the network has measured, in feature pixels, up to which a
-            frame is aligned with the keyframes instead (:mod:`dvo.odometry.window.frame_alignment`); 0: the network
-            measures every frame. Without an alignment (``align``) it does too.
+            frame is aligned with the keyframes instead (:mod:`dvo.odometry.window.frame_alignment`), but not above half
+            of ``keyframe_motion``; 0: the network measures every frame. Without an alignment (``align``) it does too.
         keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
         motion_damping: factor of the last motion in the prediction of the next pose, in [0, 1].
         initial_pose: see :data:`InitialPose` (:mod:`dvo.odometry.patch.initial_pose`).
@@ -226,6 +226,11 @@ class TrackerConfig:
             "late": replace(common, rounds=joined, later=1),
             "located": replace(common, rounds=(Round(many, 1.0),), checked=False),
         }
+
+    @property
+    def aligned_motion(self) -> float:
+        """Mean flow since the last frame of the network up to which frames are aligned, feature pixels."""
+        return 0.0 if self.align == "none" else min(self.network_motion, self.keyframe_motion / 2)
 
     @property
     def variance(self) -> float:

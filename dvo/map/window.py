@@ -6,8 +6,6 @@ Frames are numbered in three ways:
   (:meth:`Window.remove` renumbers);
 - its *identifier*, a running number that is never reused, used by the archive and the log;
 - its *map slot*, the index of its feature maps in the correlation caches, reused after it has left.
-
-An edge has an *edge slot*, its index in the correlation caches, until it is removed.
 """
 
 from __future__ import annotations
@@ -89,7 +87,6 @@ class Window:
         weights: ``(E, 2)`` of the targets in bundle adjustment; 0 for an edge before its first update.
         confidence: ``(E, 2)`` of the network in its measurements, in (0, 1); 0 before the first update.
         jj, kk: ``(E,)`` target frame and patch of each edge.
-        edge_slots: ``(E,)`` index of each edge in results that are kept from step to step.
         frames: the keyframes, oldest first.
         unfixed: ``(h, w)`` bool, pixels of the feature maps that are not fixed to the images; None: all. It counts for
             all frames but guests, beside their own masks.
@@ -104,7 +101,6 @@ class Window:
     confidence: Tensor
     jj: Tensor
     kk: Tensor
-    edge_slots: Tensor
     frames: list[Keyframe] = field(default_factory=list)
     unfixed: Tensor | None = None
     _edges: PatchGraph | None = None
@@ -128,7 +124,7 @@ class Window:
 
         index = torch.zeros(0, dtype=torch.long, device=device)
         patches, edges = zeros(0, 3, patch_size, patch_size), zeros(0, 2)
-        return cls(per_frame, zeros(0, 7), patches, zeros(0, hidden), edges, edges, edges, index, index, index)
+        return cls(per_frame, zeros(0, 7), patches, zeros(0, hidden), edges, edges, edges, index, index)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -259,61 +255,45 @@ class Window:
         self.patches = torch.cat([self.patches[:first], patches, self.patches[first:]])
         self.frames.insert(position, frame)
 
-    def connect(self, kk: Tensor, jj: Tensor) -> Tensor:
+    def connect(self, kk: Tensor, jj: Tensor) -> None:
         """Add edges, with zero state and confidence.
 
         Args:
             kk, jj: ``(e,)`` patch and target frame of each new edge.
-
-        Returns:
-            ``(e,)`` edge slots of the new edges, the lowest free ones.
         """
         self._edges = None
         count = len(kk)
-        free = torch.ones(len(self.edge_slots) + count, dtype=torch.bool, device=kk.device)
-        used = self.edge_slots[self.edge_slots < len(free)]
-        free[used] = False
-        slots = free.nonzero()[:count, 0]
-        self.edge_slots = torch.cat([self.edge_slots, slots])
         self.kk, self.jj = torch.cat([self.kk, kk]), torch.cat([self.jj, jj])
         self.hidden = torch.cat([self.hidden, self.hidden.new_zeros(count, self.hidden.shape[1])])
         self.targets = torch.cat([self.targets, self.targets.new_zeros(count, 2)])
         self.weights = torch.cat([self.weights, self.weights.new_zeros(count, 2)])
         self.confidence = torch.cat([self.confidence, self.confidence.new_zeros(count, 2)])
-        return slots
 
-    def connect_newest(self, lifetime: int, own: bool) -> Tensor:
+    def connect_newest(self, lifetime: int, own: bool) -> None:
         """Add edges from recent patches to the newest frame, and from its patches to recent frames.
 
         Args:
             lifetime: number of frames before the newest that take part.
             own: also from its patches to itself.
-
-        Returns:
-            Slots of the new edges.
         """
-        return self.connect_frame(len(self) - 1, lifetime, own)
+        self.connect_frame(len(self) - 1, lifetime, own)
 
-    def connect_frame(self, position: int, lifetime: int, own: bool) -> Tensor:
+    def connect_frame(self, position: int, lifetime: int, own: bool) -> None:
         """Add edges from the patches of the frames around a frame to it, and from its patches to them.
 
         Args:
             position: of the frame in the window; it has no edges yet.
             lifetime: number of frames on either side of it that take part, beside guests.
             own: also from its patches to itself.
-
-        Returns:
-            Slots of the new edges.
         """
         m, device = self.per_frame, self.jj.device
         near = torch.arange(max(0, position - lifetime), min(len(self), position + lifetime + 1), device=device)
         near = torch.cat([torch.arange(min(self.guests, int(near[0])), device=device), near])
         others = near[near != position]
         old = (others[:, None] * m + torch.arange(m, device=device)).flatten()
-        slots = [self.connect(old, torch.full_like(old, position))]
+        self.connect(old, torch.full_like(old, position))
         new, targets = torch.arange(position * m, (position + 1) * m, device=device), near if own else others
-        slots.append(self.connect(new.repeat_interleave(len(targets)), targets.repeat(m)))
-        return torch.cat(slots)
+        self.connect(new.repeat_interleave(len(targets)), targets.repeat(m))
 
     def keep(self, mask: Tensor) -> None:
         """Remove edges.
@@ -322,7 +302,7 @@ class Window:
             mask: ``(E,)`` bool, False for an edge to remove.
         """
         self._edges = None
-        self.kk, self.jj, self.edge_slots = self.kk[mask], self.jj[mask], self.edge_slots[mask]
+        self.kk, self.jj = self.kk[mask], self.jj[mask]
         self.hidden, self.targets, self.weights = self.hidden[mask], self.targets[mask], self.weights[mask]
         self.confidence = self.confidence[mask]
 

@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from dvo.ba.cold_start import damping_at
 from dvo.geometry import se3
 from dvo.map.edges import PatchGraph
-from dvo.models.clip_alignment import ClipAlignment
 from dvo.models.schedule import Stage, to_device, training_schedule
 from dvo.models.step import Mode, StepOptions, UpdateState, recent_depth, step
 from dvo.nets.correlation.correlation import Correlation, CorrelationVolume
@@ -117,7 +116,6 @@ class PatchVO(nn.Module):
         ba_iterations: int = 2,
         centres: Int[Tensor, "B N M 2"] | None = None,
         select: PatchSelection | None = None,
-        align_last: int = 0,
     ) -> Iterator[UpdateState]:
         """Run the updates of a schedule on a clip; the training pass.
 
@@ -138,8 +136,6 @@ class PatchVO(nn.Module):
             centres: integer patch centres ``x, y`` in feature pixels, at least one from the border, as many a frame as
                 in the schedule; None: the selection of the configuration draws them.
             select: selection of the patches if no ``centres`` are given, None for that of the configuration.
-            align_last: number of updates at the end whose measurements are aligned to a fraction of a pixel
-                (:class:`dvo.models.clip_alignment.ClipAlignment`) before bundle adjustment.
 
         Yields:
             The state after each update, with ``coords``. Poses and depths are detached between updates (DPVO 3.3): only
@@ -169,7 +165,6 @@ class PatchVO(nn.Module):
                 learn = _draw_edges(b, len(graph), correlation_gradient, generator).to(images.device)
             return Correlation(volume.lookup(coords, graph.kk, graph.jj, learn))
 
-        refine = ClipAlignment(images) if align_last > 0 else None
         for update, stage in enumerate(stages):
             poses, patches, hidden = state.poses_cw.detach(), state.patches.detach(), state.hidden
             coords = state.coords
@@ -184,7 +179,7 @@ class PatchVO(nn.Module):
             present = scaled[:, :frames]
             state = UpdateState(stage.graph, poses, patches, present, context, hidden, coords)
             options = StepOptions(mode, 1, ba_iterations, damping_at(update), (width, height))
-            state = step(self, state, lookup, options, refine if update >= len(stages) - align_last else None)
+            state = step(self, state, lookup, options)
             if state.coords is None:
                 state = state.reprojected()
             yield state

@@ -44,9 +44,8 @@ class UpdateState:
         coords: ``(B, E, p, p, 2)`` reprojection of the patches under these poses and depths; None if not computed yet.
         targets: ``(B, E, 2)`` positions of the patch centres measured by the network in the last step; None before
             the first one.
-        weights: ``(B, E, 2)`` of the targets in bundle adjustment: the confidence, unless a :class:`Refinement` has
-            changed it; None before the first step.
-        confidence: ``(B, E, 2)`` of the network, in (0, 1); None before the first step.
+        confidence: ``(B, E, 2)`` of the network in the targets, in (0, 1), their weights in bundle adjustment; None
+            before the first step.
         visible: ``(N, h, w)`` bool, pixels of the feature maps that measurements may lie in; None: all.
         states: ``(B, N, D)`` values of the further unknowns of the last step, by name.
     """
@@ -59,7 +58,6 @@ class UpdateState:
     hidden: Tensor
     coords: Tensor | None = None
     targets: Tensor | None = None
-    weights: Tensor | None = None
     confidence: Tensor | None = None
     visible: Tensor | None = None
     states: Mapping[str, Tensor] = field(default_factory=dict)
@@ -130,35 +128,6 @@ class Revision:
         return self.coords[:, :, centre, centre] + self.delta
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """Input of bundle adjustment.
-
-    Attributes:
-        targets: ``(B, E, 2)`` positions of the patch centres, feature pixels.
-        weights: ``(B, E, 2)`` of the targets.
-    """
-
-    targets: Tensor
-    weights: Tensor
-
-
-class Refinement(Protocol):
-    """Interface of a stage between the network and bundle adjustment, such as sub-pixel alignment."""
-
-    def __call__(self, state: UpdateState, revision: Revision) -> Measurement:
-        """Improve the measurements of the network.
-
-        Args:
-            state: before the step.
-            revision: output of the network.
-
-        Returns:
-            Targets and weights of all edges for bundle adjustment.
-        """
-        ...
-
-
 class StepModel(Protocol):
     """Interface of a model that a step can be taken with: it has an update operator."""
 
@@ -201,7 +170,6 @@ def step(
     state: UpdateState,
     lookup: CorrelationLookup,
     options: StepOptions = StepOptions(),  # noqa: B008
-    refine: Refinement | None = None,
 ) -> UpdateState:
     """Revise the flow of all edges, then fit poses and inverse depths to it by bundle adjustment.
 
@@ -210,26 +178,20 @@ def step(
         state: edges, poses and patches to start from. Detach poses and patches to cut gradients between steps.
         lookup: correlation of patches and feature maps.
         options: mode, fixed poses, damping.
-        refine: stage between the network and bundle adjustment, None for none; not used in mode ``flow``.
 
     Returns:
-        The state with new poses, patches, hidden state, targets, weights and confidence. ``coords`` is None, except
-        in mode ``flow``, in which each edge moves by its own revision alone.
+        The state with new poses, patches, hidden state, targets and confidence. ``coords`` is None, except in mode
+        ``flow``, in which each edge moves by its own revision alone.
 
     Raises:
         DvoError: invalid indices or weights, if ``options.check`` is set.
     """
     revision = revise(model, state, lookup)
-    graph, measured = state.graph, Measurement(revision.targets, revision.weights)
-    if refine is not None and options.mode != "flow":
-        measured = refine(state, revision)
-    state = replace(
-        state, hidden=revision.hidden, targets=measured.targets, weights=measured.weights, confidence=revision.weights,
-        coords=None,
-    )  # fmt: skip
+    graph, targets, weights = state.graph, revision.targets, revision.weights
+    state = replace(state, hidden=revision.hidden, targets=targets, confidence=weights, coords=None)
     if options.mode == "flow":
         return replace(state, coords=revision.coords + revision.delta[:, :, None, None])
-    given = state.poses_cw, state.patches, state.intrinsics, measured.targets, measured.weights
+    given = state.poses_cw, state.patches, state.intrinsics, targets, weights
     solved = solve(
         PatchProblem(*given, graph.ii, graph.jj, graph.kk, factors=options.factors, blocks=options.blocks),
         BAOptions(

@@ -40,7 +40,7 @@ def test_a_frame_in_between_is_joined_with_both_sides_and_its_removal_leaves_not
     w = window(5)
     w.poses_cw = se3.exp(torch.arange(30.0).view(5, 6) / 10)
     w.connect(torch.arange(10).repeat_interleave(5), torch.arange(5).repeat(10))
-    before, names = w.snapshot(), ("kk", "jj", "edge_slots", "poses_cw", "patches")
+    before, names = w.snapshot(), ("kk", "jj", "poses_cw", "patches")
     indices = {name: getattr(w, name) for name in names}
     empty = torch.zeros(0)
     new = Keyframe(9, 0.35, w.free_map_slot(), empty, empty, empty, w.frames[0].intrinsics)
@@ -56,16 +56,6 @@ def test_a_frame_in_between_is_joined_with_both_sides_and_its_removal_leaves_not
     w.remove(4)
     assert all(torch.equal(getattr(w, name), value) for name, value in indices.items())
     assert [f.identifier for f in w.frames] == [0, 1, 2, 3, 4]
-
-
-def test_slots_are_unique_and_reused():
-    w = window()
-    first = w.connect(torch.tensor([0, 1, 2]), torch.tensor([1, 1, 1]))
-    w.keep(torch.tensor([True, False, True]))
-    second = w.connect(torch.tensor([3, 4]), torch.tensor([1, 1]))
-    assert first.tolist() == [0, 1, 2]
-    assert second.tolist() == [1, 3]
-    assert len(set(w.edge_slots.tolist())) == len(w.edge_slots) == 4
 
 
 def test_reset_keeps_frames_patches_and_edges_but_not_what_was_estimated():

@@ -75,7 +75,7 @@ def test_both_loops_take_the_same_steps_on_one_graph(model, clip):
         stepper.step(StepOptions(damping=damping_at(update)))
         for ours, theirs in (
             (window.poses_cw, state.poses_cw), (window.patches, state.patches), (window.hidden, state.hidden),
-            (window.targets, state.targets), (window.weights, state.weights),
+            (window.targets, state.targets), (window.weights, state.confidence),
         ):  # fmt: skip
             torch.testing.assert_close(ours, theirs[0], rtol=1e-3, atol=1e-3)
     assert (window.poses_cw[1:] - se3.identity(FRAMES - 1)).abs().max() > 1e-3  # it did move
@@ -161,7 +161,7 @@ def test_the_update_operator_is_exchanged_by_a_word(clip):
 def test_gradients_reach_encoder_and_operator(model, clip):
     state, lookup, bounds = start(model, clip)
     after = step(model, state, lookup, StepOptions(bounds=bounds))
-    loss = after.targets.square().mean() + after.weights.mean() + after.poses_cw[..., :3].square().sum()
+    loss = after.targets.square().mean() + after.confidence.mean() + after.poses_cw[..., :3].square().sum()
     gradients = torch.autograd.grad(loss, [*model.parameters()], allow_unused=True)
     assert sum(g is not None and bool(g.abs().sum() > 0) for g in gradients) > 0.9 * len(gradients)
 

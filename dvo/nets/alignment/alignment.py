@@ -33,7 +33,6 @@ class AlignmentOptions:
         last_step: largest move of the last iteration, pixels.
         reach: largest distance from the measurement of the network, feature pixels.
         gain: factor of the weight of an aligned measurement in bundle adjustment.
-        moved: an edge is aligned anew once the measurement of the network has moved by this, feature pixels.
         slope: standard deviation of the slopes of surfaces before they are measured (:mod:`dvo.nets.patch.slopes`), 1 /
             feature pixel; 0: surfaces of constant depth.
 
@@ -47,7 +46,6 @@ class AlignmentOptions:
     last_step: float = 0.1
     reach: float = 0.3
     gain: float = 10.0
-    moved: float = 0.1
     slope: float = 0.0
 
     def __post_init__(self) -> None:
@@ -60,7 +58,6 @@ class AlignmentOptions:
                 "last_step": (0, 100),
                 "reach": (0, 100),
                 "gain": (0, 1e6),
-                "moved": (0, 100),
                 "slope": (0, 1),
             },
         )

@@ -71,13 +71,12 @@ class TrackerConfig:
         selection: of the patches, a name in :data:`dvo.nets.patch.selection.SELECTIONS`; empty for the one that the
             network was trained with.
         align: sub-pixel alignment of the measurements (:mod:`dvo.nets.alignment.alignment`), with the three settings
-            below: ``final`` for those that leave the window, which serves the final adjustment; ``always`` in every
-            step, which serves the poses of ``track`` as well and takes longer; ``none``.
+            below: ``final`` for those that leave the window, which serves the final adjustment, and of frames that
+            have moved little (``network_motion``); ``none``.
         align_gain: factor of the weight of aligned measurements in bundle adjustment.
         align_reach: largest distance of an alignment from the measurement of the network, feature pixels.
         align_slope: standard deviation, 1 / feature pixel, of the slopes of surfaces that an alignment of measurements
-            that leave the window finds too (:mod:`dvo.nets.patch.slopes`), with ``final``; 0: surfaces of constant
-            depth.
+            that leave the window finds too (:mod:`dvo.nets.patch.slopes`); 0: surfaces of constant depth.
         lifetime: largest distance, in frames, of the edges of a patch from its own frame.
         removal: age, in frames, above which the edges of a frame's patches are archived.
         optimisation: number of newest frames whose poses are optimised.
@@ -143,7 +142,7 @@ class TrackerConfig:
     pixels: int = 320 * 240
     patches: int = 24
     selection: str = ""
-    align: Literal["none", "final", "always"] = "final"
+    align: Literal["none", "final"] = "final"
     align_gain: float = 10.0
     align_reach: float = 0.3
     align_slope: float = 0.0
@@ -198,12 +197,7 @@ class TrackerConfig:
 
     @property
     def measuring(self) -> StepSettings:
-        """How edges between images that are not in the window are measured."""
-        return replace(self.window, align="none" if self.align == "none" else "final")
-
-    @property
-    def window(self) -> StepSettings:
-        """How the edges of the window are measured."""
+        """How edges are measured, those of the window and between images that are not in it."""
         return StepSettings(self.kernel, self.alignment, self.align)
 
     @property

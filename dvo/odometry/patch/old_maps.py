@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 OLD_VERSION = 2
 """Last version of the format of such files."""
 
+_GONE = {"align": "always"}
+"""Values of settings that are gone."""
+
 T = TypeVar("T")
 
 
@@ -70,6 +73,8 @@ class OldLoops:
 def old_table(source: MapReader, kind: type[T], name: str) -> T:
     """Read a table of a file; entries that are not known are left out, such as settings that are gone.
 
+    A setting with a value that is gone has its default.
+
     Args:
         source: map file of version 2; its description is changed.
         kind: dataclass of the table.
@@ -80,7 +85,10 @@ def old_table(source: MapReader, kind: type[T], name: str) -> T:
     """
     entry = _known(kind, source.description.get(name))
     if isinstance(entry, dict) and "config" in entry:
-        entry["config"] = _known(TrackerConfig, entry["config"])
+        settings = _known(TrackerConfig, entry["config"])
+        if isinstance(settings, dict):
+            settings = {k: value for k, value in settings.items() if k not in _GONE or value != _GONE[k]}
+        entry["config"] = settings
     source.description[name] = entry
     return source.table(kind, name)
 

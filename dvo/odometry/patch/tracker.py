@@ -120,7 +120,7 @@ class PatchOdometry:
         self.sensors: list[WindowSensor] = [
             WINDOW_SENSORS.resolve(name)(self.model, self.device) for name in config.sensors
         ]
-        self.patch_window = PatchWindow(self.model, self.window, config.window, self.device, self.sensors)
+        self.patch_window = PatchWindow(self.model, self.window, config.measuring, self.device, self.sensors)
         self.aligner: FrameAlignment | None = None
         if config.aligned_motion > 0 and not self.sensors:
             self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from dvo.geometry.projection import reproject
 from dvo.map.window import Window
-from dvo.models.step import Measurement, Revision, UpdateState
 from dvo.nets.alignment.alignment import AlignmentOptions, accept, align_patches, patch_warps
 from dvo.nets.patch.config import ModelConfig
 from dvo.nets.patch.slopes import SlopeEquations, slope_equations
@@ -29,20 +28,15 @@ class AlignmentSnapshot:
             grey level (:func:`dvo.nets.alignment.alignment.sample_images`).
         slot: map slot of the next frame.
         image: ``(H, W)`` what is in it; None if there is no such slot yet.
-        results: of the edges of the window: ``(E, 2)`` measurements that were aligned, infinite for none, ``(E, 2)``
-            their alignments, ``(E,)`` bool for those that were accepted; None if they are not kept.
     """
 
     count: int
     slot: int
     image: Tensor | None
-    results: tuple[Tensor, Tensor, Tensor] | None
 
 
 class WindowAlignment:
-    """Alignment of the edges of a window: as a :class:`dvo.models.step.Refinement`, or of those that leave it.
-
-    As a refinement it takes part in every step, and aligns new and moved edges only.
+    """Images of the keyframes of a window, and alignment of the edges that leave it.
 
     Args:
         window: provides the edges.
@@ -56,11 +50,6 @@ class WindowAlignment:
     def __init__(self, window: Window, options: AlignmentOptions, device: torch.device) -> None:
         self.window, self.options = window, options
         self.images = torch.zeros(0, 0, 0, device=device)
-        # By edge slot: measurement of the network that was aligned (infinite for none), its alignment, and whether the
-        # alignment was accepted.
-        self._measured = torch.zeros(0, 2, device=device)
-        self._aligned = torch.zeros(0, 2, device=device)
-        self._accepted = torch.zeros(0, dtype=torch.bool, device=device)
 
     def keep_image(self, map_slot: int, image: np.ndarray) -> None:
         """Store the working image of a frame.
@@ -76,68 +65,20 @@ class WindowAlignment:
             self.images = torch.cat([self.images, empty]) if len(self.images) else empty
         self.images[map_slot] = grey
 
-    def forget(self, edge_slots: Tensor) -> None:
-        """Invalidate the slots of new edges.
-
-        Args:
-            edge_slots: ``(e,)``.
-        """
-        if not len(edge_slots):
-            return
-        missing = int(edge_slots.max()) + 1 - len(self._measured)
-        if missing > 0:
-            self._measured = torch.cat([self._measured, self._measured.new_zeros(missing, 2)])
-            self._aligned = torch.cat([self._aligned, self._aligned.new_zeros(missing, 2)])
-            self._accepted = torch.cat([self._accepted, self._accepted.new_zeros(missing)])
-        self._measured[edge_slots] = torch.inf
-        self._accepted[edge_slots] = False
-
-    def snapshot(self, results: bool) -> AlignmentSnapshot:
-        """Record what one more frame changes and, if they are wanted, the results of the edges of the window.
-
-        Args:
-            results: are wanted.
-        """
-        slots = self.window.edge_slots
-        kept = (self._measured[slots], self._aligned[slots], self._accepted[slots]) if results else None
+    def snapshot(self) -> AlignmentSnapshot:
+        """Record what one more frame changes."""
         count, slot = len(self.images), self.window.free_map_slot()
-        return AlignmentSnapshot(count, slot, self.images[slot].clone() if slot < count else None, kept)
+        return AlignmentSnapshot(count, slot, self.images[slot].clone() if slot < count else None)
 
     def restore(self, before: AlignmentSnapshot) -> None:
-        """Restore the images and, if they were recorded, the results of the edges of the window.
+        """Restore the images.
 
         Args:
-            before: a snapshot of a window with the same frames and edges, to which one frame was added since.
+            before: a snapshot of a window with the same frames, to which one frame was added since.
         """
         self.images = self.images[: before.count]
         if before.image is not None:
             self.images[before.slot] = before.image
-        if before.results is not None:
-            slots = self.window.edge_slots
-            self.forget(slots)
-            self._measured[slots], self._aligned[slots], self._accepted[slots] = before.results
-
-    def __call__(self, state: UpdateState, revision: Revision) -> Measurement:
-        """Replace the measurements of the network by the alignments that are accepted.
-
-        Args:
-            state: of the window, with a batch dimension of 1.
-            revision: output of the network.
-
-        Returns:
-            Targets and weights for bundle adjustment.
-        """
-        options, slots, measured = self.options, self.window.edge_slots, revision.targets[0]
-        known = (measured - self._measured[slots]).norm(dim=-1) <= options.moved
-        stale = (~known).nonzero()[:, 0]
-        if len(stale):
-            self._align(revision, stale)
-        # The measurement may have moved a little since the alignment.
-        near = (self._aligned[slots] - measured).norm(dim=-1) <= options.reach
-        good = self._accepted[slots] & near
-        targets = torch.where(good[:, None], self._aligned[slots], measured)
-        weights = revision.weights[0] * torch.where(good, options.gain, 1.0)[:, None]
-        return Measurement(targets[None], weights[None])
 
     def finalise(self, edges: Tensor) -> None:
         """Replace the measurements of edges in the window by their alignments, where these are accepted.
@@ -206,14 +147,6 @@ class WindowAlignment:
         slopes[patches] = (slopes[patches] + change).clamp(-_STEEPEST, _STEEPEST)
         for frame in (patches // m).unique().tolist():
             window.frames[frame].slopes = slopes[frame * m : (frame + 1) * m].clone()
-
-    def _align(self, revision: Revision, edges: Tensor) -> None:
-        """Align edges and keep the result by edge slot."""
-        slots = self.window.edge_slots[edges]
-        self._measured[slots] = revision.targets[0, edges]
-        self._aligned[slots], self._accepted[slots] = self._find(
-            edges, revision.coords[0, edges], revision.targets[0, edges]
-        )
 
     def _find(self, edges: Tensor, coords: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
         """Align edges ``(e,)`` of the window from measured positions ``(e, 2)``, with warps from reprojected patches.

@@ -32,13 +32,13 @@ class StepSettings:
     Attributes:
         kernel: robust kernel of bundle adjustment, which takes the influence from moving bodies and wrong matches.
         alignment: options of the sub-pixel alignment.
-        align: which measurements are aligned to a fraction of a pixel: ``final``, those that leave the window;
-            ``always``, those of every step of an initialised window; ``none``.
+        align: which measurements are aligned to a fraction of a pixel: ``final``, those that leave the window, or
+            ``none``.
     """
 
     kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
     alignment: AlignmentOptions = AlignmentOptions()  # noqa: RUF009 (frozen)
-    align: Literal["none", "final", "always"] = "final"
+    align: Literal["none", "final"] = "final"
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,7 @@ class Snapshot:
 
     Attributes:
         window: poses, patches and edge states.
-        alignment: the image that one more frame replaces and, of an alignment in every step, its results; None
-            without one.
+        alignment: the image that one more frame replaces; None without an alignment.
     """
 
     window: WindowSnapshot
@@ -204,7 +203,7 @@ class PatchWindow:
             position: of the frame, which has no edges yet.
             lifetime: number of frames on either side of it that take part, beside guests.
         """
-        self._forget(self.window.connect_frame(position, lifetime, self.model.config.self_edges))
+        self.window.connect_frame(position, lifetime, self.model.config.self_edges)
 
     def connect_edges(self, kk: Tensor, jj: Tensor) -> None:
         """Add edges.
@@ -212,7 +211,7 @@ class PatchWindow:
         Args:
             kk, jj: ``(e,)`` patch and target frame of each new edge.
         """
-        self._forget(self.window.connect(kk, jj))
+        self.window.connect(kk, jj)
 
     def try_insert(
         self, view: View, position: int, identifier: int, pose_cw: Tensor, depth: Tensor, policy: InsertPolicy
@@ -255,12 +254,11 @@ class PatchWindow:
         """
         fixed = self.window.fixed(optimised)
         for _ in range(count):
-            self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)), align=True)
+            self.step(StepOptions(fixed=fixed, damping=damping_at(COLD_UPDATES)))
 
     def snapshot(self) -> Snapshot:
         """Record everything that steps and one new frame change, for :meth:`restore`."""
-        always = self.settings.align == "always"
-        alignment = None if self.alignment is None else self.alignment.snapshot(results=always)
+        alignment = None if self.alignment is None else self.alignment.snapshot()
         return Snapshot(self.window.snapshot(), alignment)
 
     def restore(self, before: Snapshot) -> None:
@@ -273,18 +271,13 @@ class PatchWindow:
         if self.alignment is not None and before.alignment is not None:
             self.alignment.restore(before.alignment)
 
-    def _forget(self, edge_slots: Tensor) -> None:
-        """Invalidate the alignments of new edges."""
-        if self.alignment is not None and self.settings.align == "always":
-            self.alignment.forget(edge_slots)
-
     def finalise(self, edges: Tensor) -> None:
         """Align edges that leave the window, if that is wanted.
 
         Args:
             edges: ``(e,)`` positions among the edges of the window.
         """
-        if self.alignment is not None and self.settings.align == "final":
+        if self.alignment is not None:
             self.alignment.finalise(edges)
 
     def state(self) -> UpdateState:
@@ -317,25 +310,22 @@ class PatchWindow:
         window.targets, window.weights = revision.targets[0], revision.weights[0]
         window.confidence = revision.weights[0]
 
-    def step(self, options: StepOptions, align: bool = False) -> None:
+    def step(self, options: StepOptions) -> None:
         """Take a step and store its result in the window, see :func:`dvo.models.step.step`.
 
         Args:
             options: of the step; ``bounds`` are replaced by those of the feature map, and ``kernel`` by that of the
                 settings; measured depths and the sensors of the window join its factors.
-            align: use the sub-pixel alignment, if it takes part in every step. Its large weights would keep the first
-                solution of a window from leaving a wrong minimum.
         """
-        refine = self.alignment if align and self.settings.align == "always" else None
         factors = *options.factors, *depth_factors(self.window.measured), *depth_factors(self.window.prior)
         factors += tuple(factor for sensor in self.sensors for factor in sensor.factors(self.window))
         blocks = {name: block for sensor in self.sensors for name, block in sensor.blocks(self.window).items()}
         options = replace(options, bounds=self.bounds, kernel=self.settings.kernel, factors=factors, blocks=blocks)
-        after = step(self.model, self.state(), self.correlation, options, refine)
-        assert after.targets is not None and after.weights is not None and after.confidence is not None
+        after = step(self.model, self.state(), self.correlation, options)
+        assert after.targets is not None and after.confidence is not None
         window = self.window
         window.poses_cw, window.patches, window.hidden = after.poses_cw[0], after.patches[0], after.hidden[0]
-        window.targets, window.weights = after.targets[0], after.weights[0]
+        window.targets, window.weights = after.targets[0], after.confidence[0]
         window.confidence = after.confidence[0]
         for name, values in after.states.items():
             for frame, value in zip(window.frames, values[0], strict=True):

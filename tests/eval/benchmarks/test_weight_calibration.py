@@ -5,7 +5,6 @@ import torch
 
 from dvo.odometry.load import load
 from dvo.synth.sequence import make_sequence
-from eval.benchmarks.error_budget import TrueMeasurements
 from eval.benchmarks.true_positions import TruePositions
 from eval.benchmarks.weight_calibration import Errors, Recorder, chi_of, main, table
 
@@ -46,23 +45,22 @@ def test_the_table_reports_the_other_sequences_over_the_fitted_sigma():
 def test_measurements_are_compared_with_the_truth():
     sequence = make_sequence(77, frames=32, height=192, width=256, fps=15.0, family="street", apart=True)
     depth = torch.stack([torch.as_tensor(sequence.rendering(i).depth[0]) for i in range(len(sequence))])
-    frames, found = list(sequence), {}
-    for align in ("final", "always"):
-        odometry = load("small", align=align, final_adjustment=False, restart=False)
-        recorder = Recorder(odometry, TruePositions(sequence, depth))
-        if align == "always":
-            odometry.patch_window.alignment = TrueMeasurements(odometry.window, sequence, depth)
-        for frame in frames:
-            odometry.track(frame)
-        odometry.finish()
-        found[align] = recorder.errors()
-    network, aligned = found["final"]["network"], found["final"]["aligned"]
+    truth = TruePositions(sequence, depth)
+    odometry = load("small", final_adjustment=False, restart=False)
+    recorder = Recorder(odometry, truth)
+    for frame in sequence:
+        odometry.track(frame)
+    found = recorder.errors()
+    network, aligned = found["network"], found["aligned"]
     assert 0.1 < len(aligned.weights) / len(network.weights) < 1
     torch.testing.assert_close(aligned.weights, 10 * aligned.confidence)
     assert 0.001 < chi_of(network).robust_sigma < 0.5
-    true = found["always"]
-    late = true["network"].squared[-len(network.weights) // 10 :]  # the initialisation is the network's
-    assert len(true["aligned"].weights) == 0 and late.max() < 1e-4 < network.squared.max()
+    exact, window = Recorder(odometry, truth), odometry.window
+    with torch.inference_mode():
+        window.targets = truth.find(window)[0]
+        odometry.patch_window.finalise(torch.arange(len(window.kk)))
+    true = exact.errors()["network"]
+    assert len(true.squared) > 0 and true.squared.max() < 1e-8 < network.squared.max()
 
 
 def test_recordings_and_unknown_suites_are_refused(capsys):

@@ -76,9 +76,18 @@ def test_settings_that_are_gone_are_left_out(old):
     assert dvo.load_map(old, weights=network()).config.patches == 4
 
 
+def test_a_setting_with_a_value_that_is_gone_has_its_default(old):
+    rewritten(old, {"tracker.config": {"patches": 4, "align": "always"}}, {})
+    found = dvo.load_map(old, weights=network())
+    assert found.config.align == "final" and len(found.finish().trajectory) == 9
+    rewritten(old, {"tracker.config": {"patches": 4, "align": "none"}}, {})
+    assert dvo.load_map(old, weights=network()).config.align == "none"
+
+
 WRONG = [
     ({"tracker.keyframes": 3}, {}, "keyframes"),
     ({"tracker.config": []}, {}, "config"),
+    ({"tracker.config": {"align": "sometimes"}}, {}, "align"),
     ({"tracker.info": None}, {}, "info"),
     ({"loops.loops": None}, {}, "loops"),
     ({}, {"window/keyframes": lambda a: a * 0}, "window/times"),

@@ -70,9 +70,7 @@ def lost_frames(frames, result):
     return np.flatnonzero(~np.isin([frame.timestamp for frame in frames], rows)).tolist()
 
 
-@pytest.mark.parametrize(
-    ("weights", "settings"), [("small", {}), ("mamba", {}), ("small", {"preset": "fast", "align": "always"})]
-)
+@pytest.mark.parametrize(("weights", "settings"), [("small", {}), ("mamba", {}), ("small", {"preset": "fast"})])
 def test_the_frame_after_the_dark_gets_a_pose_with_the_next_one(film, dark, monkeypatch, weights, settings):
     first = dark[BACK].timestamp
     refuse(monkeypatch, first)
@@ -106,15 +104,14 @@ def test_the_newest_views_are_tried_again_up_to_one_that_fails(dark, foreign, mo
     assert lost_frames(other, track(other, join_inliers=0.2)[1]) == list(range(CUT, BACK + 2))
 
 
-@pytest.mark.parametrize("align", [pytest.param("final", marks=pytest.mark.slow), "always"])
-def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch, tmp_path, align):
+def test_a_view_that_is_not_supported_changes_nothing(dark, foreign, monkeypatch, tmp_path):
     """Results and files are those of a tracker that does not try again, byte for byte."""
     frames = with_images(dark, [foreign], BACK)
     tries, kept = count_tries(monkeypatch), []
     for name in ("tried", "not"):
         if name == "not":
             monkeypatch.setattr(retry, "_join", lambda *given: False)
-        odometry = dvo.load("small", device="cpu", **FAST, align=align)
+        odometry = dvo.load("small", device="cpu", **FAST)
         estimates = []
         for frame in frames:
             estimates.append(told(odometry.track(frame)))

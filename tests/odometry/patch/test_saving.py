@@ -26,7 +26,7 @@ from tests.support.tiny_tracker import SMALL, frames, network, run, tracker
     ("operator", "settings"),
     [
         ("gated", {}),
-        ("gated", {"align": "always", "keyframe_motion": 1e9}),
+        ("gated", {"keyframe_motion": 1e9}),
         ("gated", {"align_slope": 0.03, "align_reach": 100.0}),
         ("mamba", {"align": "none", "initial_pose": "nearest", "selection": "structure", "restart": False}),
     ],

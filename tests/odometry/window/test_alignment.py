@@ -1,4 +1,4 @@
-"""Alignment of a window's edges: what is aligned when, and what the tracker makes of it."""
+"""Alignment of the edges that leave a window, and what the tracker makes of it."""
 
 import numpy as np
 import pytest
@@ -9,16 +9,15 @@ from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.map.window import Keyframe, Window
 from dvo.metrics import evaluate
-from dvo.models.step import Revision, UpdateState
-from dvo.nets.alignment.alignment import AlignmentOptions, align_patches, patch_warps
+from dvo.nets.alignment.alignment import AlignmentOptions, patch_warps
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.odometry.depth.patch_depth import followed_planes
-from dvo.odometry.window import alignment as window_alignment
 from dvo.odometry.window.alignment import WindowAlignment
 from dvo.session.session import run
 from dvo.synth.sequence import make_sequence
 
 SIZE, SHIFT = (96, 128), 3  # the second image is the first, shifted to the right by so many pixels
+ERROR = torch.tensor([0.15, -0.1])  # of the measurements, feature pixels
 
 
 def picture():
@@ -29,7 +28,7 @@ def picture():
 
 @pytest.fixture
 def two_frames():
-    """A window of two frames of a plane, its alignment, and a function that gives the state before a step."""
+    """A window of two frames of a plane, with the true shift measured with an error, and its alignment."""
     wide = picture()
     images = [np.repeat(wide[:, at : at + 128, None], 3, -1) for at in (16, 16 - SHIFT)]
     window = Window.empty(4, 3, 8, torch.device("cpu"))
@@ -42,57 +41,10 @@ def two_frames():
         frame = Keyframe(i, float(i), slot, torch.zeros(4, 1), torch.zeros(4, 8), torch.zeros(4, 3), torch.ones(4))
         window.append(frame, se3.identity(), patches)
     kk = torch.arange(4)
-    alignment.forget(window.connect(kk, torch.ones_like(kk)))
-
-    def before(error):
-        """State, and a network that measures the true shift with an error, feature pixels."""
-        state = UpdateState(window.edges, window.poses_cw[None], window.patches[None], window.intrinsics[None],
-                            window.context[None], window.hidden[None])  # fmt: skip
-        coords = window.patches[None, window.kk].permute(0, 1, 3, 4, 2)[..., :2]
-        delta = torch.tensor([SHIFT / 4, 0.0]) + error
-        weights = torch.full((1, len(window.kk), 2), 0.5)
-        return state, Revision(coords, window.hidden[None], delta.expand(1, len(window.kk), 2), weights)
-
-    return window, alignment, before
-
-
-def test_measurements_are_replaced_where_the_images_agree(two_frames):
-    window, alignment, before = two_frames
-    state, revision = before(torch.tensor([0.15, -0.1]))
-    measured = alignment(state, revision)
-    truth = window.patches[:4, :2, 1, 1] + torch.tensor([SHIFT / 4, 0.0])
-    error = (measured.targets[0] - truth).norm(dim=-1)
-    assert (error[:3] < 0.01).all()
-    assert torch.equal(measured.weights[0, :3], torch.full((3, 2), 5.0))  # ten times the confidence
-    assert torch.equal(measured.targets[0, 3], revision.targets[0, 3])  # its window is not inside the image
-    assert torch.equal(measured.weights[0, 3], torch.full((2,), 0.5))
-
-
-def test_only_new_and_moved_edges_are_aligned(two_frames, monkeypatch):
-    window, alignment, before = two_frames
-    asked = []
-
-    def spy(images, source, target, centres, *rest):
-        asked.append((centres[:, 0] / 4).tolist())
-        return align_patches(images, source, target, centres, *rest)
-
-    monkeypatch.setattr(window_alignment, "align_patches", spy)
-    first = alignment(*before(torch.tensor([0.1, 0.0])))
-    again = alignment(*before(torch.tensor([0.15, 0.0])))  # has moved by less than a tenth
-    assert torch.equal(first.targets[0, :3], again.targets[0, :3])
-    alignment(*before(torch.tensor([0.25, 0.0])))
-    alignment.forget(window.edge_slots[1:2])
-    alignment(*before(torch.tensor([0.25, 0.0])))
-    assert asked == [[8, 16, 24, 0], [8, 16, 24, 0], [16]]  # columns of the centres
-
-
-def test_an_alignment_that_the_network_has_left_is_not_used(two_frames):
-    window, alignment, before = two_frames
-    alignment.options = AlignmentOptions(moved=100)
-    alignment(*before(torch.tensor([0.1, 0.0])))
-    state, far = before(torch.tensor([1.0, 0.0]))
-    measured = alignment(state, far)
-    assert torch.equal(measured.targets, far.targets) and torch.equal(measured.weights, far.weights)
+    window.connect(kk, torch.ones_like(kk))
+    window.targets = patches[:, :2, 1, 1] + torch.tensor([SHIFT / 4, 0.0]) + ERROR
+    window.weights = torch.full((4, 2), 0.5)
+    return window, alignment
 
 
 @pytest.fixture(scope="module")
@@ -106,9 +58,8 @@ def tracked(clip, **settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("mode", "adjusted"), [("always", False), ("final", True)])
-def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip, mode, adjusted):
-    plain, aligned, again = (tracked(clip, align=align, final_adjustment=adjusted) for align in ("none", mode, mode))
+def test_the_tracker_is_more_exact_with_it_and_repeats_itself(clip):
+    plain, aligned, again = (tracked(clip, align=align) for align in ("none", "final", "final"))
     assert np.array_equal(aligned.poses_wc, again.poses_wc)
     errors = [evaluate(x, clip.groundtruth, rpe_gap=2).rpe_rot_deg for x in (plain, aligned)]
     assert len(aligned) == 24 and errors[1] < 0.75 * errors[0]
@@ -144,14 +95,11 @@ def test_slopes_of_surfaces_are_found_from_all_edges_of_a_patch():
 
 
 def test_measurements_that_leave_the_window_are_replaced_once(two_frames):
-    window, alignment, before = two_frames
-    error = torch.tensor([0.15, -0.1])
-    window.targets = before(error)[1].targets[0]
-    window.weights = torch.full((4, 2), 0.5)
+    window, alignment = two_frames
     alignment.finalise(torch.tensor([0, 2, 3]))
     truth = window.patches[:4, :2, 1, 1] + torch.tensor([SHIFT / 4, 0.0])
     found = (window.targets - truth).norm(dim=-1)
-    assert (found[[0, 2]] < 0.01).all() and torch.allclose(found[[1, 3]], error.norm())
+    assert (found[[0, 2]] < 0.01).all() and torch.allclose(found[[1, 3]], ERROR.norm())
     assert window.weights[:, 0].tolist() == [5.0, 0.5, 5.0, 0.5]  # edge 3: its window is not inside the image
 
 

@@ -14,7 +14,7 @@ from tests.support.tiny_tracker import SMALL, frames, tracker
 COUNT = 9
 
 
-@pytest.fixture(params=["final", "always", "none"])
+@pytest.fixture(params=["final", "none"])
 @torch.inference_mode()
 def tried(request):
     """A tracker between two frames, and a view that it has not seen."""
@@ -35,7 +35,6 @@ def content(window):
     found |= {"identifiers": [frame.identifier for frame in data.frames]}
     if shot.alignment is not None:
         found["images"] = window.alignment.images
-        found |= {f"result {k}": part for k, part in enumerate(shot.alignment.results or ())}
     return {name: value.clone() if isinstance(value, torch.Tensor) else value for name, value in found.items()}
 
 

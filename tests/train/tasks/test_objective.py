@@ -50,7 +50,7 @@ def test_further_terms_have_names_and_weights_of_their_own(name, weight, words, 
 def state_of(graph, poses_cw, patches, coords, targets, weights):
     """A state as a step leaves it; what the losses do not read is empty."""
     none = torch.zeros(1, 0)
-    return UpdateState(graph, poses_cw, patches, none, none, none, coords, targets, weights, weights)
+    return UpdateState(graph, poses_cw, patches, none, none, none, coords, targets, weights)
 
 
 def rendered(index, **options):

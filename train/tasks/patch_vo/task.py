@@ -54,8 +54,6 @@ class PatchVOTask(Task):
         augmentation: random changes of the clips, None for none.
         patches: patches a frame; None: those of the preset.
         selection: of the patches, a name in :data:`dvo.nets.patch.selection.SELECTIONS`; None: that of the preset.
-        align_last: updates at the end of a clip whose measurements are aligned to a fraction of a pixel, see
-            :meth:`dvo.models.patch_vo.PatchVO.unroll`.
         update_operator: name in :data:`dvo.nets.update.update.UPDATE_OPERATORS`; None: that of the preset.
         train_only: beginning of the names of the parameters that learn, the others are held; None: all.
 
@@ -81,7 +79,6 @@ class PatchVOTask(Task):
         augmentation: Augmentation | None = None,
         patches: int | None = None,
         selection: str | None = None,
-        align_last: int = 0,
         update_operator: str | None = None,
         train_only: str | None = None,
     ) -> None:
@@ -89,7 +86,7 @@ class PatchVOTask(Task):
         self.changes = {"training_patches": patches, "selection": selection, "update_operator": update_operator}
         self.updates, self.initial, self.settle = updates, initial, settle
         self.warmup_mode, self.warmup_until, self.warmup_steps = warmup_mode, warmup_until, warmup_steps
-        self.correlation_gradient, self.align_last = correlation_gradient, align_last
+        self.correlation_gradient = correlation_gradient
         self.loss = loss or LossConfig()
         self.augmentation = augmentation
         fixed = self.loss.balance != "none"
@@ -188,7 +185,6 @@ class PatchVOTask(Task):
             mode=mode,
             generator=self.generators(context.step, b),
             correlation_gradient=self.correlation_gradient,
-            align_last=self.align_last,
         )
         terms, measures = clip_terms(states, truth, self.loss, mode)
         return terms, measures, truth
@@ -269,7 +265,7 @@ class PatchVOTask(Task):
         states = list(
             net.unroll(
                 batch["images"], batch["intrinsics"], self.stages(net, n, "joint"), poses_cw=se3.identity(b, n),
-                generator=torch.Generator().manual_seed(seed), align_last=self.align_last,
+                generator=torch.Generator().manual_seed(seed),
             )
         )  # fmt: skip
         _, measures = clip_terms(states[-1:], truth, LossConfig())

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 Array = np.ndarray[Any, Any]
 
@@ -41,7 +41,7 @@ def by_point(camera: Array, point: Array, cameras: int, points: int) -> tuple[bo
     return True, order, start
 
 
-@compiled
+@part
 def _observed(
     rotations: Array, poses: Array, intrinsics: Array, radial: Array, points: Array, pixels: Array, c: int, k: int,
     o: int, jacobian: Array,
@@ -93,7 +93,7 @@ def half_squares(
     return total / 2
 
 
-@compiled
+@part
 def _inverse(h: Array, q: Array) -> None:
     """Inverse of a positive definite ``(3, 3)``, of which the lower triangle is read; zero if it is not one."""
     q.fill(0.0)

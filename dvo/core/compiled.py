@@ -48,3 +48,15 @@ def compiled(function: F) -> F:
         return numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # no place for the cache
         return numba.njit(**_OPTIONS)(function)
+
+
+def part(function: F) -> F:
+    """Compile a function that only compiled ones of its file call; it costs half the time, and no file of its own.
+
+    Args:
+        function: see :func:`compiled`.
+
+    Returns:
+        The same, compiled.
+    """
+    return numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)

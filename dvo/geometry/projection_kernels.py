@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 Array = np.ndarray[Any, Any]
 
@@ -80,7 +80,7 @@ def project_patches(
     return True
 
 
-@compiled
+@part
 def _rotation(pose: Array, r: Array) -> None:
     """Rotation matrix of a pose; the length of the quaternion, 1 to the last digit of float32, does not matter."""
     x, y, z, w = np.float64(pose[3]), np.float64(pose[4]), np.float64(pose[5]), np.float64(pose[6])

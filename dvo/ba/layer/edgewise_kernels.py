@@ -17,7 +17,7 @@ import numpy as np
 
 from dvo.ba.layer.schur import RETRIES
 from dvo.ba.limits import LARGEST
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 from dvo.geometry.so3 import SMALL
 
 Array = np.ndarray[Any, Any]
@@ -54,7 +54,7 @@ def frame_pairs(ii: Array, jj: Array, kk: Array, frames: int, patches: int) -> t
     return True, of_edge, ends[:found]
 
 
-@compiled
+@part
 def _rotation(q: Array, r: Array) -> None:
     """Matrix of a quaternion; its length, 1 to the last digit of float32, does not matter."""
     x, y, z, w = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
@@ -64,7 +64,7 @@ def _rotation(q: Array, r: Array) -> None:
     r[2, 0], r[2, 1], r[2, 2] = two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)
 
 
-@compiled
+@part
 def _pair_motions(poses: Array, ends: Array) -> Array:
     """Rotation and translation ``(Q, 3, 4)`` of ``T_j T_i^-1``."""
     rotations = np.empty((len(poses), 3, 3))
@@ -199,7 +199,7 @@ def add_reprojection(
     _add_pairs(motions, ends, sums, rows, h_pp, g_p)
 
 
-@compiled
+@part
 def _add_pairs(motions: Array, ends: Array, sums: Array, rows: Array, h_pp: Array, g_p: Array) -> None:
     """Add the blocks of both frames of each pair."""
     minus, block = np.zeros((6, 6)), np.empty((6, 6))
@@ -238,7 +238,7 @@ def _add_pairs(motions: Array, ends: Array, sums: Array, rows: Array, h_pp: Arra
                     h_pp[i + b, j + a] += across[a, b]
 
 
-@compiled
+@part
 def _product(x: Array, y: Array, out: Array, transposed: bool) -> None:
     """``x y`` or ``x^T y`` of 6x6 matrices."""
     out.fill(0.0)
@@ -249,7 +249,7 @@ def _product(x: Array, y: Array, out: Array, transposed: bool) -> None:
                 out[a, b] += factor * y[c, b]
 
 
-@compiled
+@part
 def _cholesky(s: Array, boost: float, factor: Array) -> bool:
     """Lower factor of ``s + boost I``, of which the lower triangle is read. False if that is not positive definite."""
     for a in range(len(s)):
@@ -268,7 +268,7 @@ def _cholesky(s: Array, boost: float, factor: Array) -> bool:
     return True
 
 
-@compiled
+@part
 def _factorise(s: Array, factor: Array) -> bool:
     """As :func:`dvo.ba.layer.schur.factorise`, of the lower triangle of one matrix."""
     if _cholesky(s, 0.0, factor):
@@ -287,7 +287,7 @@ def _factorise(s: Array, factor: Array) -> bool:
     return False
 
 
-@compiled
+@part
 def _eliminate(h_lp: Array, q: Array, weighted: Array, s: Array, x: Array) -> None:
     """Subtract ``E Q E^T`` from the lower triangle of ``s``, and ``E weighted`` from ``x``; four landmarks at a time.
 
@@ -316,7 +316,7 @@ def _eliminate(h_lp: Array, q: Array, weighted: Array, s: Array, x: Array) -> No
                 s[a, b] -= y * h_lp[k, b]
 
 
-@compiled
+@part
 def _solve_factored(factor: Array, x: Array) -> bool:
     """Solve ``L L^T x = x`` in place. False if the result is not finite."""
     size = len(x)
@@ -384,7 +384,7 @@ def solve_reduced(
         dl[k] = rest if abs(rest) <= LARGEST else 0.0
 
 
-@compiled
+@part
 def _retract_pose(pose: Array, step: Array) -> None:
     """Left retraction in place, as :func:`dvo.geometry.se3.retract`."""
     a, b, c = step[3], step[4], step[5]

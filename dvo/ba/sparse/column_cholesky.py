@@ -74,5 +74,7 @@ def solve_columns(plan: ColumnPlan, blocks: Tensor, rhs: Tensor) -> Tensor:
 
     x = torch.empty_like(rhs, memory_format=torch.contiguous_format)
     arrays = plan.rank, plan.start, plan.under, plan.rows, plan.columns, plan.place
-    done = column_kernels.solve(*arrays, blocks.contiguous().numpy(), rhs.contiguous().numpy(), x.numpy())
+    given = blocks.contiguous().numpy(), rhs.contiguous().numpy()
+    scratch = np.empty_like(given[1]), np.zeros(36 * len(plan.under), given[0].dtype)
+    done = column_kernels.solve(*arrays, *given, x.numpy(), *scratch)
     return x if done else torch.full_like(rhs, torch.nan)

@@ -16,17 +16,21 @@ def eliminate(size, rows, columns, most):
     Returns ``rank (n,)``, and ``start (n + 1,)`` and ``under`` of each column: ranks of its rows, rising, itself first.
     Empty arrays where there are more than ``most`` of them.
     """
-    near = np.zeros((size, size), np.bool_)
-    degree = np.zeros(size, np.int64)
+    near = np.empty((size, size), np.bool_)
+    degree, rank, order = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    start, members = np.empty(size + 1, np.int64), np.empty(size, np.int64)
+    for i in range(size):
+        degree[i], rank[i], start[i] = 0, -1, 0
+        for j in range(size):
+            near[i, j] = False
     for i in range(len(rows)):
         a, b = rows[i], columns[i]
         if a != b and not near[a, b]:
             near[a, b] = near[b, a] = True
             degree[a] += 1
             degree[b] += 1
-    rank, order = np.full(size, -1), np.empty(size, np.int64)
-    start = np.zeros(size + 1, np.int64)
-    found, members = np.empty(min(most, 64 * size), np.int64), np.empty(size, np.int64)
+    room = 64 * size if 64 * size < most else most
+    found = np.empty(room, np.int64)
     for step in range(size):
         best = -1
         for i in range(size):
@@ -41,9 +45,11 @@ def eliminate(size, rows, columns, most):
         end = begin + count + 1
         if end > most:
             return rank[:0], start[:0], found[:0]
-        if end > len(found):
-            more = np.empty(min(most, max(2 * len(found), end)), np.int64)
-            more[:begin] = found[:begin]
+        if end > room:
+            room = 2 * end if 2 * end < most else most
+            more = np.empty(room, np.int64)
+            for i in range(begin):
+                more[i] = found[i]
             found = more
         found[begin] = best
         for a in range(count):
@@ -57,9 +63,13 @@ def eliminate(size, rows, columns, most):
         start[step + 1] = end
     under = np.empty(start[size], np.int64)
     for step in range(size):
-        for i in range(start[step], start[step + 1]):
-            under[i] = rank[found[i]]
-        under[start[step] : start[step + 1]].sort()
+        begin = start[step]
+        for i in range(begin, start[step + 1]):
+            value, at = rank[found[i]], i
+            while at > begin and under[at - 1] > value:
+                under[at] = under[at - 1]
+                at -= 1
+            under[at] = value
     return rank, start, under
 
 
@@ -69,7 +79,7 @@ def places(rank, start, under, rows, columns):
     out = np.empty(len(rows), np.int64)
     for i in range(len(rows)):
         a, b = rank[rows[i]], rank[columns[i]]
-        low, high = min(a, b), max(a, b)
+        low, high = (a, b) if a < b else (b, a)
         begin, end = start[low], start[low + 1]
         while begin < end:
             middle = (begin + end) // 2
@@ -82,16 +92,17 @@ def places(rank, start, under, rows, columns):
 
 
 @compiled
-def solve(rank, start, under, rows, columns, place, blocks, rhs, x):
+def solve(rank, start, under, rows, columns, place, blocks, rhs, x, y, panel):
     """Factorise and substitute; False where the matrix is not positive definite.
+
+    ``y`` like ``rhs`` and ``panel (36 len(under),)``, of zeros, are for use within.
 
     Column ``j`` of the factor is stored as its six scalar columns, one after the other, each over all rows below.
     """
     size = len(rank)
-    panel = np.zeros(36 * len(under), blocks.dtype)
     for i in range(len(rows)):
         a, b = rank[rows[i]], rank[columns[i]]
-        low = min(a, b)
+        low = a if a < b else b
         height, first = 6 * (start[low + 1] - start[low]), 36 * start[low]
         at = first + 6 * (place[i] - start[low])
         for r in range(6):
@@ -100,11 +111,12 @@ def solve(rank, start, under, rows, columns, place, blocks, rhs, x):
     for j in range(size):
         begin, end = start[j], start[j + 1]
         height = 6 * (end - begin)
-        column = panel[36 * begin : 36 * end].reshape(6, height)
+        first = 36 * begin
         for k in range(6):
-            here = column[k]
+            here = panel[first + k * height : first + (k + 1) * height]
             for n in range(k):
-                factor, left = column[n, k], column[n]
+                left = panel[first + n * height : first + (n + 1) * height]
+                factor = left[k]
                 for r in range(height):
                     here[r] -= factor * left[r]
             pivot = here[k]
@@ -114,57 +126,63 @@ def solve(rank, start, under, rows, columns, place, blocks, rhs, x):
             for r in range(height):
                 here[r] *= scale
         for s in range(begin + 1, end):
-            to = under[s]
-            first, last = start[to], start[to + 1]
-            target = panel[36 * first : 36 * last].reshape(6, 6 * (last - first))
-            a, at = s, first  # rows of this column, and where they are in that one
+            to, own = under[s], first + 6 * (s - begin)
+            target, wide = start[to], 6 * (start[to + 1] - start[to])
+            a, at = s, target  # rows of this column, and where they are in that one
             while a < end:
                 while under[at] != under[a]:
                     at += 1
                 run = 1
                 while a + run < end and under[at + run] == under[a + run]:
                     run += 1
-                source, goes, width = 6 * (a - begin), 6 * (at - first), 6 * run
-                own = 6 * (s - begin)
-                p0, p1 = column[0, source : source + width], column[1, source : source + width]
-                p2, p3 = column[2, source : source + width], column[3, source : source + width]
-                p4, p5 = column[4, source : source + width], column[5, source : source + width]
+                source, goes, width = first + 6 * (a - begin), 36 * target + 6 * (at - target), 6 * run
+                p0 = panel[source : source + width]
+                p1 = panel[source + height : source + height + width]
+                p2 = panel[source + 2 * height : source + 2 * height + width]
+                p3 = panel[source + 3 * height : source + 3 * height + width]
+                p4 = panel[source + 4 * height : source + 4 * height + width]
+                p5 = panel[source + 5 * height : source + 5 * height + width]
                 for c in range(0, 6, 2):
-                    e0, e1, e2 = column[0, own + c], column[1, own + c], column[2, own + c]
-                    e3, e4, e5 = column[3, own + c], column[4, own + c], column[5, own + c]
-                    f0, f1, f2 = column[0, own + c + 1], column[1, own + c + 1], column[2, own + c + 1]
-                    f3, f4, f5 = column[3, own + c + 1], column[4, own + c + 1], column[5, own + c + 1]
-                    out, next_out = target[c, goes : goes + width], target[c + 1, goes : goes + width]
+                    e = panel[own + c : first + 6 * height]
+                    e0, e1, e2 = e[0], e[height], e[2 * height]
+                    e3, e4, e5 = e[3 * height], e[4 * height], e[5 * height]
+                    f0, f1, f2 = e[1], e[height + 1], e[2 * height + 1]
+                    f3, f4, f5 = e[3 * height + 1], e[4 * height + 1], e[5 * height + 1]
+                    out = panel[goes + c * wide : goes + c * wide + width]
+                    next_out = panel[goes + (c + 1) * wide : goes + (c + 1) * wide + width]
                     for r in range(width):
                         q0, q1, q2, q3, q4, q5 = p0[r], p1[r], p2[r], p3[r], p4[r], p5[r]
                         out[r] -= e0 * q0 + e1 * q1 + e2 * q2 + e3 * q3 + e4 * q4 + e5 * q5
                         next_out[r] -= f0 * q0 + f1 * q1 + f2 * q2 + f3 * q3 + f4 * q4 + f5 * q5
                 a, at = a + run, at + run
-    y = np.empty((size, 6), blocks.dtype)
     for i in range(size):
-        y[rank[i]] = rhs[i]
-    for j in range(size):
-        begin, end = start[j], start[j + 1]
-        column = panel[36 * begin : 36 * end].reshape(6, 6 * (end - begin))
         for k in range(6):
-            y[j, k] /= column[k, k]
+            y[rank[i], k] = rhs[i, k]
+    for j in range(size):
+        begin, height = start[j], 6 * (start[j + 1] - start[j])
+        for k in range(6):
+            column = panel[36 * begin + k * height : 36 * begin + (k + 1) * height]
+            pivot = y[j, k] / column[k]
+            y[j, k] = pivot
             for r in range(k + 1, 6):
-                y[j, r] -= column[k, r] * y[j, k]
-        for s in range(begin + 1, end):
-            for k in range(6):
+                y[j, r] -= column[r] * pivot
+            for s in range(1, height // 6):
+                to = under[begin + s]
                 for r in range(6):
-                    y[under[s], r] -= column[k, 6 * (s - begin) + r] * y[j, k]
+                    y[to, r] -= column[6 * s + r] * pivot
     for j in range(size - 1, -1, -1):
-        begin, end = start[j], start[j + 1]
-        column = panel[36 * begin : 36 * end].reshape(6, 6 * (end - begin))
-        for s in range(begin + 1, end):
-            for k in range(6):
-                for r in range(6):
-                    y[j, k] -= column[k, 6 * (s - begin) + r] * y[under[s], r]
+        begin, height = start[j], 6 * (start[j + 1] - start[j])
         for k in range(5, -1, -1):
+            column = panel[36 * begin + k * height : 36 * begin + (k + 1) * height]
+            total = y[j, k]
+            for s in range(1, height // 6):
+                from_row = under[begin + s]
+                for r in range(6):
+                    total -= column[6 * s + r] * y[from_row, r]
             for r in range(k + 1, 6):
-                y[j, k] -= column[k, r] * y[j, r]
-            y[j, k] /= column[k, k]
+                total -= column[r] * y[j, r]
+            y[j, k] = total / column[k]
     for i in range(size):
-        x[i] = y[rank[i]]
+        for k in range(6):
+            x[i, k] = y[rank[i], k]
     return True

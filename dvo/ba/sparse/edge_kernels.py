@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 from dvo.geometry.projection import MIN_Z_VALID
 
 NONE, HUBER, CAUCHY = 0, 1, 2
 """Names of robust kernels as numbers."""
 
 
-@compiled
+@part
 def _rho(s, name, width):
     square = width * width
     if name == HUBER:
@@ -23,7 +23,7 @@ def _rho(s, name, width):
     return s
 
 
-@compiled
+@part
 def _slope(s, name, width):
     square = width * width
     if name == HUBER:
@@ -33,7 +33,7 @@ def _slope(s, name, width):
     return 1.0
 
 
-@compiled
+@part
 def _relative(rotation, translation, i, j, r, move):
     """Rotation and translation of ``T_j T_i^-1``, into the last two arguments."""
     for a in range(3):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from dvo.core.compiled import compiled
@@ -10,13 +12,16 @@ from dvo.core.compiled import compiled
 @compiled
 def observations(patch, frame, patches, free):
     """Sorted ``patch * free + frame`` of the observations by free frames, each once."""
-    start = np.zeros(patches + 1, np.int64)
+    start, count = np.empty(patches + 1, np.int64), np.empty(patches, np.int64)
+    for k in range(patches):
+        start[k + 1], count[k] = 0, 0
+    start[0] = 0
     for m in range(len(patch)):
         if frame[m] < free:
             start[patch[m] + 1] += 1
     for k in range(patches):
         start[k + 1] += start[k]
-    found, count = np.empty(start[patches], np.int64), np.zeros(patches, np.int64)
+    found, total = np.empty(start[patches], np.int64), 0
     for m in range(len(patch)):
         if frame[m] < free:  # insertion into the few frames of the patch, rising
             k, f = patch[m], frame[m]
@@ -29,7 +34,8 @@ def observations(patch, frame, patches, free):
                 found[i] = found[i - 1]
             found[at] = f
             count[k] += 1
-    keys, end = np.empty(count.sum(), np.int64), 0
+            total += 1
+    keys, end = np.empty(total, np.int64), 0
     for k in range(patches):
         for i in range(start[k], start[k] + count[k]):
             keys[end] = k * free + found[i]
@@ -59,10 +65,15 @@ def find(keys, start, frame, patch, free):
 @compiled
 def coupled(keys, source, free, sources, others):
     """Sorted keys ``row * free + column`` of the lower triangle: pairs of frames of one source, and those of others."""
-    seen = np.zeros((sources, free), np.bool_)
+    seen, mark = np.empty((sources, free), np.bool_), np.empty((free, free), np.bool_)
+    members = np.empty(free, np.int64)
+    for f in range(free):
+        for s in range(sources):
+            seen[s, f] = False
+        for other in range(free):
+            mark[f, other] = False
     for key in keys:
         seen[source[key // free], key % free] = True
-    mark, members = np.zeros((free, free), np.bool_), np.empty(free, np.int64)
     for key in others:
         mark[key // free, key % free] = True
     for s in range(sources):
@@ -94,41 +105,45 @@ def reduce(h_pl, keys, start, q, free, by_source, first, pattern, row_start, blo
     ``by_source`` are the patches by source frames, of which ``first`` has the first of each: those of one source are
     seen from much the same frames, so that their sum is a dense product. ``row_start (n + 1,)`` is of the pattern.
     """
-    most, place = 1, np.full(free, -1)
-    members = np.empty(free, np.int64)
+    most, real = 1, h_pl.dtype.type
+    place, members, at = np.empty(free, np.int64), np.empty(free, np.int64), np.empty(free, np.int64)
+    for f in range(free):
+        place[f] = -1
     for s in range(len(first) - 1):
-        most = max(most, first[s + 1] - first[s])
+        if first[s + 1] - first[s] > most:
+            most = first[s + 1] - first[s]
     w = np.empty((most + 7) * 6 * free, h_pl.dtype)
     total = np.empty(6 * free, h_pl.dtype)
-    at = np.empty(free, np.int64)
     for s in range(len(first) - 1):
         count = 0
         for p in range(first[s], first[s + 1]):
             k = by_source[p]
             for o in range(start[k], start[k + 1]):
                 f = keys[o] - k * free
-                if place[f] < 0:
-                    place[f] = 0
-                    members[count] = f
-                    count += 1
+                place[f] = 0
+        for f in range(free):
+            if place[f] == 0:
+                place[f] = count
+                members[count] = f
+                count += 1
         if count == 0:
             continue
-        members[:count].sort()
-        for a in range(count):
-            place[members[a]] = a
         used, width = 0, 6 * count
         for p in range(first[s], first[s + 1]):
             k = by_source[p]
             if start[k] == start[k + 1]:
                 continue
-            root, row = np.sqrt(q[k]), w[used * width : (used + 1) * width]
-            row[:] = 0
+            root, row = math.sqrt(q[k]), w[used * width : (used + 1) * width]
+            for c in range(width):
+                row[c] = real(0)
             for o in range(start[k], start[k + 1]):
                 to = 6 * place[keys[o] - k * free]
                 for i in range(6):
                     row[to + i] = h_pl[o, i] * root
             used += 1
-        w[used * width : (used + 7) * width] = 0  # patches are taken by eight
+        row = w[used * width : (used + 7) * width]  # patches are taken by eight
+        for c in range(7 * width):
+            row[c] = real(0)
         for a in range(count):
             place[members[a]] = -1
             search = row_start[members[a]]
@@ -139,7 +154,8 @@ def reduce(h_pl, keys, start, q, free, by_source, first, pattern, row_start, blo
                 at[b] = search
             for i in range(6):
                 length, own = 6 * (a + 1), 6 * a + i
-                total[:length] = 0
+                for c in range(length):
+                    total[c] = real(0)
                 for p in range(0, used, 8):
                     w0, w1 = w[p * width : (p + 1) * width], w[(p + 1) * width : (p + 2) * width]
                     w2, w3 = w[(p + 2) * width : (p + 3) * width], w[(p + 3) * width : (p + 4) * width]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 
-@compiled
+@part
 def _sample(image, height, width, x, y):
     """Grey level of a flat image at ``x, y`` float32; outside that of the border, at NaN that of row or column 0."""
     x = min(x, np.float32(width - 1)) if x > 0 else np.float32(0)
@@ -21,7 +21,7 @@ def _sample(image, height, width, x, y):
     return upper + v * (lower - upper)
 
 
-@compiled
+@part
 def _centre(values):
     total = np.float32(0)
     for k in range(len(values)):
@@ -31,7 +31,7 @@ def _centre(values):
         values[k] -= total
 
 
-@compiled
+@part
 def _dot(first, second):
     total = np.float32(0)
     for k in range(len(first)):
@@ -39,7 +39,7 @@ def _dot(first, second):
     return np.float64(total)
 
 
-@compiled
+@part
 def _template(image, height, width, x, y, side, around, grey, gx, gy):
     """Fill the centred grey levels of a window and their central differences."""
     half = side // 2 + 1
@@ -57,7 +57,7 @@ def _template(image, height, width, x, y, side, around, grey, gx, gy):
     _centre(gy)
 
 
-@compiled
+@part
 def _look(image, height, width, x, y, warp, side, seen):
     """Fill the centred grey levels of a warped window."""
     half = side // 2

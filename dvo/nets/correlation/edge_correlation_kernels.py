@@ -16,7 +16,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 _WIDTH = 8
 _VECTOR = ir.VectorType(ir.FloatType(), _WIDTH)
@@ -76,7 +76,7 @@ def _eight_products(context, maps, first, feature, out, position):
     return types.void(maps, types.intp, feature, out, types.intp), generate
 
 
-@compiled
+@part
 def _products(maps, first, stride, feature, out):
     """Dot products of a feature with a window of pixels, from index ``first`` of flat maps with rows of ``stride``."""
     channels, taps = len(feature), len(out)

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 
-@compiled
+@part
 def _distances(x, first, second, rotation, towards, aside, out):
     """Sampson distances at ``x (7,)``: turn, direction, shift."""
     square = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
@@ -43,7 +43,7 @@ def _distances(x, first, second, rotation, towards, aside, out):
         out[n] = (bx * l0 + by * l1 + l2) / math.sqrt(max(gradient, 1e-18))
 
 
-@compiled
+@part
 def _cost(distances, scale, width):
     total = 0.0
     for r in distances:

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 
-@compiled
+@part
 def _undo(x, y, depth, fx, fy, cx, cy, nodes, twists, offset, nearest, out):
     """Position, pixels, and depth at the time of the frame of what was seen at another time, into ``out (3,)``."""
     tau0 = tau1 = tau2 = phi0 = phi1 = phi2 = 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 
 @compiled
@@ -67,7 +67,7 @@ def solve_pose_kernel(points, measured, weights, camera, pose, widths, iteration
                 break
 
 
-@compiled
+@part
 def _move(pose, step):
     """``Exp(step) pose`` in place."""
     x, y, z = step[3], step[4], step[5]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dvo.core.compiled import compiled
+from dvo.core.compiled import compiled, part
 
 Array = np.ndarray[Any, Any]
 
@@ -110,7 +110,7 @@ def mean_flow(
     return total / len(patches)
 
 
-@compiled
+@part
 def _motion(first: Array, second: Array, m: Array) -> None:
     """Rotation and translation of ``T_second T_first^-1``."""
     rotations = np.empty((2, 3, 3))
@@ -131,7 +131,7 @@ def _motion(first: Array, second: Array, m: Array) -> None:
         m[a, 3] = t
 
 
-@compiled
+@part
 def _projected(m: Array, source: Array, target: Array, patch: Array, least_divisor: float) -> tuple[float, float]:
     """Pixel of a point ``(3,)`` = x, y, inverse depth in the other frame."""
     x = (np.float64(patch[0]) - source[2]) / source[0]

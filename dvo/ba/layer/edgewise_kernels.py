@@ -38,12 +38,15 @@ def frame_pairs(ii: Array, jj: Array, kk: Array, frames: int, patches: int) -> t
         False if an index is out of range; pair of each edge ``(E,)``; frames of each pair ``(Q, 2)``.
     """
     count = len(ii)
-    of_edge, ends = np.empty(count, np.int64), np.empty((min(count, frames * frames), 2), np.int64)
+    of_edge, ends = np.empty(count, np.int64), np.empty((count, 2), np.int64)
     for e in range(count):
         if not (0 <= ii[e] < frames and 0 <= jj[e] < frames and 0 <= kk[e] < patches):
             return False, of_edge, ends[:0]
     found = 0
-    number = np.full((frames, frames), -1, np.int64)
+    number = np.empty((frames, frames), np.int64)
+    for i in range(frames):
+        for j in range(frames):
+            number[i, j] = -1
     for e in range(count):
         i, j = ii[e], jj[e]
         if number[i, j] < 0:
@@ -55,30 +58,32 @@ def frame_pairs(ii: Array, jj: Array, kk: Array, frames: int, patches: int) -> t
 
 
 @part
-def _rotation(q: Array, r: Array) -> None:
+def _rotation(x: float, y: float, z: float, w: float, r: Array) -> None:
     """Matrix of a quaternion; its length, 1 to the last digit of float32, does not matter."""
-    x, y, z, w = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
+    x, y, z, w = np.float64(x), np.float64(y), np.float64(z), np.float64(w)
     two = 2 / (x * x + y * y + z * z + w * w)
-    r[0, 0], r[0, 1], r[0, 2] = 1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)
-    r[1, 0], r[1, 1], r[1, 2] = two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)
-    r[2, 0], r[2, 1], r[2, 2] = two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)
+    xx, yy, zz, xy, xz, yz = two * x * x, two * y * y, two * z * z, two * x * y, two * x * z, two * y * z
+    xw, yw, zw = two * x * w, two * y * w, two * z * w
+    r[0], r[1], r[2] = 1 - yy - zz, xy - zw, xz + yw
+    r[3], r[4], r[5] = xy + zw, 1 - xx - zz, yz - xw
+    r[6], r[7], r[8] = xz - yw, yz + xw, 1 - xx - yy
 
 
 @part
 def _pair_motions(poses: Array, ends: Array) -> Array:
     """Rotation and translation ``(Q, 3, 4)`` of ``T_j T_i^-1``."""
-    rotations = np.empty((len(poses), 3, 3))
+    rotations = np.empty((len(poses), 9))
     for n in range(len(poses)):
-        _rotation(poses[n, 3:], rotations[n])
+        _rotation(poses[n, 3], poses[n, 4], poses[n, 5], poses[n, 6], rotations[n])
     motions = np.empty((len(ends), 3, 4))
     for p in range(len(ends)):
-        i, j = ends[p]
+        i, j = ends[p, 0], ends[p, 1]
         for a in range(3):
             t = np.float64(poses[j, a])
             for b in range(3):
                 r = 0.0
                 for c in range(3):
-                    r += rotations[j, a, c] * rotations[i, b, c]
+                    r += rotations[j, 3 * a + c] * rotations[i, 3 * b + c]
                 motions[p, a, b] = r
                 t -= r * poses[i, b]
             motions[p, a, 3] = t
@@ -123,7 +128,10 @@ def add_reprojection(
         h_pp: ``(P, P)``. h_lp: ``(K, P)``. h_ll: ``(K,)``. g_p: ``(P,)``. g_l: ``(K,)``.
     """
     motions = _pair_motions(poses, ends)
-    sums = np.zeros((len(ends), 27))  # upper triangle of J_j^T W J_j by rows, then J_j^T W r
+    sums = np.empty((len(ends), 27))  # upper triangle of J_j^T W J_j by rows, then J_j^T W r
+    for p in range(len(ends)):
+        for a in range(27):
+            sums[p, a] = 0.0
     jx, jy = np.empty(6), np.empty(6)
     least_z, longest, middle_x, middle_y, reach_x, reach_y, scale = gate
     longest, square = longest * longest, scale * scale
@@ -202,8 +210,11 @@ def add_reprojection(
 @part
 def _add_pairs(motions: Array, ends: Array, sums: Array, rows: Array, h_pp: Array, g_p: Array) -> None:
     """Add the blocks of both frames of each pair."""
-    minus, block = np.zeros((6, 6)), np.empty((6, 6))
-    across, own = np.empty((6, 6)), np.empty((6, 6))
+    minus, block = np.empty((6, 6)), np.empty((6, 6))
+    for a in range(6):
+        for b in range(6):
+            minus[a, b] = 0.0
+    across = np.empty((6, 6))
     for p in range(len(ends)):
         i, j = rows[ends[p, 0]], rows[ends[p, 1]]
         if ends[p, 0] == ends[p, 1] or (i < 0 and j < 0):
@@ -227,26 +238,22 @@ def _add_pairs(motions: Array, ends: Array, sums: Array, rows: Array, h_pp: Arra
             minus[0, 3 + b] = m[2, 3] * m[1, b] - m[1, 3] * m[2, b]
             minus[1, 3 + b] = m[0, 3] * m[2, b] - m[2, 3] * m[0, b]
             minus[2, 3 + b] = m[1, 3] * m[0, b] - m[0, 3] * m[1, b]
-        _product(block, minus, across, False)
-        _product(minus, across, own, True)
         for a in range(6):
             for b in range(6):
-                h_pp[i + a, i + b] += own[a, b]
+                x = 0.0
+                for c in range(6):
+                    x += block[a, c] * minus[c, b]
+                across[a, b] = x
+        for a in range(6):
+            for b in range(6):
+                x = 0.0
+                for c in range(6):
+                    x += minus[c, a] * across[c, b]
+                h_pp[i + a, i + b] += x
                 g_p[i + a] += minus[b, a] * total[21 + b]
                 if j >= 0:
                     h_pp[j + a, i + b] += across[a, b]
                     h_pp[i + b, j + a] += across[a, b]
-
-
-@part
-def _product(x: Array, y: Array, out: Array, transposed: bool) -> None:
-    """``x y`` or ``x^T y`` of 6x6 matrices."""
-    out.fill(0.0)
-    for a in range(6):
-        for c in range(6):
-            factor = x[c, a] if transposed else x[a, c]
-            for b in range(6):
-                out[a, b] += factor * y[c, b]
 
 
 @part
@@ -275,7 +282,8 @@ def _factorise(s: Array, factor: Array) -> bool:
         return True
     largest = TINY
     for a in range(len(s)):
-        largest = max(largest, abs(s[a, a]))
+        if abs(s[a, a]) > largest:
+            largest = abs(s[a, a])
         for b in range(a + 1):
             if not abs(s[a, b]) < math.inf:
                 return False
@@ -369,13 +377,17 @@ def solve_reduced(
     for a in range(size):
         h_pp[a, a] += h_pp[a, a] * relative + absolute
     factor = np.empty((size, size))
-    if not (_factorise(h_pp, factor) and _solve_factored(factor, dp)):
-        dp.fill(0.0)
+    good, far = _factorise(h_pp, factor) and _solve_factored(factor, dp), False
     for a in range(size):
-        if abs(dp[a]) > longest[a]:
-            dp.fill(0.0)
-            dl.fill(0.0)
-            return
+        if not good:
+            dp[a] = 0.0
+        far = far or abs(dp[a]) > longest[a]
+    if far:
+        for a in range(size):
+            dp[a] = 0.0
+        for k in range(count):
+            dl[k] = 0.0
+        return
     for k in range(count):
         rest = g_l[k]
         for a in range(size):
@@ -398,17 +410,19 @@ def _retract_pose(pose: Array, step: Array) -> None:
         sine, ow = math.sin(0.5 * t), math.cos(0.5 * t)
         k, third = sine / t, (t - 2 * sine * ow) / (s * t)
     ox, oy, oz, second = k * a, k * b, k * c, 2 * k * k
-    r = np.empty((3, 3))
-    _rotation(np.array([ox, oy, oz, ow]), r)
+    r = np.empty(9)
+    _rotation(ox, oy, oz, ow, r)
     px, py, pz = np.float64(pose[0]), np.float64(pose[1]), np.float64(pose[2])
     u, v, w = b * step[2] - c * step[1], c * step[0] - a * step[2], a * step[1] - b * step[0]
-    pose[0] = r[0, 0] * px + r[0, 1] * py + r[0, 2] * pz + step[0] + second * u + third * (b * w - c * v)
-    pose[1] = r[1, 0] * px + r[1, 1] * py + r[1, 2] * pz + step[1] + second * v + third * (c * u - a * w)
-    pose[2] = r[2, 0] * px + r[2, 1] * py + r[2, 2] * pz + step[2] + second * w + third * (a * v - b * u)
+    pose[0] = r[0] * px + r[1] * py + r[2] * pz + step[0] + second * u + third * (b * w - c * v)
+    pose[1] = r[3] * px + r[4] * py + r[5] * pz + step[1] + second * v + third * (c * u - a * w)
+    pose[2] = r[6] * px + r[7] * py + r[8] * pz + step[2] + second * w + third * (a * v - b * u)
     x, y, z, h = np.float64(pose[3]), np.float64(pose[4]), np.float64(pose[5]), np.float64(pose[6])
     qx, qy = ow * x + ox * h + oy * z - oz * y, ow * y + oy * h + oz * x - ox * z
     qz, qw = ow * z + oz * h + ox * y - oy * x, ow * h - ox * x - oy * y - oz * z
-    length = max(math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw), 1e-12)
+    length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
+    if length < 1e-12:
+        length = 1e-12
     pose[3], pose[4], pose[5], pose[6] = qx / length, qy / length, qz / length, qw / length
 
 
@@ -448,15 +462,20 @@ def take_steps(
         iterations: number of steps.
     """
     count = depths.shape[1]
-    longest = np.full(size, LARGEST)
+    longest = np.empty(size)
     h_pp, h_lp = np.empty((size, size)), np.empty((count, size))
     h_ll, g_p, g_l = np.empty(count), np.empty(size), np.empty(count)
     dp, dl = np.empty(size), np.empty(count)
     for b in range(len(poses)):
         for _ in range(iterations):
-            for x in (h_pp.ravel(), h_lp.ravel(), g_p, g_l):
-                x.fill(0.0)
-            h_ll.fill(depth_damping if depth_part else 0.0)
+            for a in range(size):
+                longest[a], g_p[a] = LARGEST, 0.0
+                for c in range(size):
+                    h_pp[a, c] = 0.0
+            for k in range(count):
+                g_l[k], h_ll[k] = 0.0, depth_damping if depth_part else 0.0
+                for a in range(size):
+                    h_lp[k, a] = 0.0
             add_reprojection(
                 poses[b], depths[b], centres[b], intrinsics[b], targets[b], weights[b], ii, jj, kk, pairs, ends, rows,
                 depth_part, gate, robust, h_pp, h_lp, h_ll, g_p, g_l,
@@ -467,4 +486,6 @@ def take_steps(
                     _retract_pose(poses[b, n], dp[rows[n] : rows[n] + 6])
             if depth_part:
                 for k in range(count):
-                    depths[b, k] = min(max(depths[b, k] + dl[k], low), high)
+                    d = depths[b, k] + dl[k]
+                    d = low if d < low else d
+                    depths[b, k] = high if d > high else d

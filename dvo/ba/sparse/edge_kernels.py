@@ -121,15 +121,22 @@ def accumulate(
     r, move = np.empty((3, 3), rotation.dtype), np.empty(3, rotation.dtype)
     free = len(g_p) - 1
     limit, real = max_residual * max_residual, h_pp.dtype.type
-    h, sums = np.zeros((6, 6), h_pp.dtype), np.zeros(6, h_pp.dtype)
-    jx, jy, row = np.zeros(6, h_pp.dtype), np.zeros(6, h_pp.dtype), np.zeros(6, h_pp.dtype)
-    ji, adjoint = np.zeros((6, 6), h_pp.dtype), np.zeros((6, 6), h_pp.dtype)
+    h, sums = np.empty((6, 6), h_pp.dtype), np.empty(6, h_pp.dtype)
+    jx, jy, row = np.empty(6, h_pp.dtype), np.empty(6, h_pp.dtype), np.empty(6, h_pp.dtype)
+    ji, adjoint = np.empty((6, 6), h_pp.dtype), np.empty((6, 6), h_pp.dtype)
+    for i in range(6):
+        jx[i], jy[i] = real(0), real(0)
+        for c in range(6):
+            adjoint[i, c] = real(0)
     for g in range(groups):
         pair = group_pair[g]
         fx, fy = focal[pair_j[pair], 0], focal[pair_j[pair], 1]
         _relative(rotation, translation, pair_i[pair], pair_j[pair], r, move)
         if g == 0 or group_pair[g - 1] != pair:
-            h[:], sums[:] = 0, 0
+            for i in range(6):
+                sums[i] = real(0)
+                for c in range(6):
+                    h[i, c] = real(0)
             # -Ad(G_ij); J_i = -J_j Ad(G_ij)
             for c in range(3):
                 for i in range(3):

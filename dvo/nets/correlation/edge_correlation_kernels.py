@@ -107,7 +107,9 @@ def correlate(maps, features, at, kk, frames, radius, out):
         for pixel in range(at.shape[1]):
             x, y = at[edge, pixel, 0] - np.float32(radius), at[edge, pixel, 1] - np.float32(radius)
             if math.isnan(x) or math.isnan(y):
-                out[edge, pixel] = np.nan
+                for i in range(taps - 1):
+                    for j in range(taps - 1):
+                        out[edge, pixel, i, j] = math.nan
                 continue
             x = min(max(x, np.float32(-taps)), np.float32(width - 2 * taps))
             y = min(max(y, np.float32(-taps)), np.float32(height - 2 * taps))

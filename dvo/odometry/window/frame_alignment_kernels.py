@@ -15,8 +15,10 @@ def solve_pose_kernel(points, measured, weights, camera, pose, widths, iteration
     h, g, j = np.empty((6, 6)), np.empty(6), np.empty((2, 6))
     for width in widths:
         for _ in range(iterations):
-            h[:] = 0.0
-            g[:] = 0.0
+            for k in range(6):
+                g[k] = 0.0
+                for m in range(6):
+                    h[k, m] = 0.0
             closest = 0.0
             for e in range(count):
                 p0, p1, p2 = points[e, 0], points[e, 1], points[e, 2]
@@ -77,8 +79,10 @@ def _move(pose, step):
         a, b, c = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
     else:
         a, b, c = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square, (angle - np.sin(angle)) / (square * angle)
-    turn, left = np.empty((3, 3)), np.empty((3, 3))
-    w = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn, left, w, before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 4))
+    w[0, 0], w[0, 1], w[0, 2] = 0.0, -z, y
+    w[1, 0], w[1, 1], w[1, 2] = z, 0.0, -x
+    w[2, 0], w[2, 1], w[2, 2] = -y, x, 0.0
     for i in range(3):
         for k in range(3):
             twice = 0.0
@@ -87,7 +91,9 @@ def _move(pose, step):
             one = 1.0 if i == k else 0.0
             turn[i, k] = one + a * w[i, k] + b * twice
             left[i, k] = one + b * w[i, k] + c * twice
-    before = pose.copy()
+    for i in range(3):
+        for k in range(4):
+            before[i, k] = pose[i, k]
     for i in range(3):
         for k in range(4):
             total = 0.0

@@ -49,7 +49,9 @@ def support(
         False if an index is out of range; mean confidence and share of inliers, 0 where nothing counts.
     """
     centre = patches.shape[2] // 2
-    motions, made = np.empty((len(poses), 3, 4)), np.zeros(len(poses), np.bool_)
+    motions, made = np.empty((len(poses), 3, 4)), np.empty(len(poses), np.bool_)
+    for i in range(len(poses)):
+        made[i] = False
     total, edges, earlier, inliers = 0.0, 0, 0, 0
     for e in range(len(jj)):
         k = kk[e]
@@ -94,9 +96,11 @@ def mean_flow(
     Returns:
         Pixels.
     """
-    whole, straight = np.empty((3, 4)), np.eye(3, 4)
+    whole, straight = np.empty((3, 4)), np.empty((3, 4))
     _motion(first, second, whole)
     for a in range(3):
+        for b in range(3):
+            straight[a, b] = 1.0 if a == b else 0.0
         straight[a, 3] = whole[a, 3]
     total, centre = 0.0, patches.shape[2] // 2
     for k in range(len(patches)):

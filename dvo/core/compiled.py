@@ -59,4 +59,5 @@ def part(function: F) -> F:
     Returns:
         The same, compiled.
     """
-    return numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_OPTIONS)(function)
+    options: dict[str, Any] = dict(_OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    return numba.njit(**options)(function)

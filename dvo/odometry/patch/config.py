@@ -167,7 +167,7 @@ class TrackerConfig:
     initial_parallax: float = 1.0
     initial_inliers: float = 0.1
     keyframe_motion: float = 5.0
-    network_motion: float = 2.5
+    network_motion: float = 1.2
     keyframe_index: int = 4
     motion_damping: float = 0.5
     initial_pose: InitialPose = "motion"
@@ -278,7 +278,14 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    "fast": {"pixels": 256 * 192, "patches": 16, "lifetime": 5, "removal": 7, "optimisation": 7},
+    "fast": {
+        "pixels": 256 * 192,
+        "patches": 16,
+        "lifetime": 5,
+        "removal": 7,
+        "optimisation": 7,
+        "network_motion": 2.5,
+    },
     "accurate": {"pixels": 448 * 336, "patches": 48, "updates": 2, "align_slope": 0.03},
 }
 """Settings that trade accuracy for speed, on top of those of the weights; ``dvo.load("small", preset="fast")``."""

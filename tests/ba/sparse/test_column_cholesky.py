@@ -10,7 +10,7 @@ from dvo.ba.sparse.block_matrix import BlockMatrix, make_pattern, solve_blocks
 from dvo.ba.sparse.cholesky import best_plan, solve_cholesky
 from dvo.ba.sparse.column_cholesky import plan_columns, solve_columns
 from dvo.core.kernels import VARIABLE
-from tests.ba.sparse.test_cholesky import PAIRS, system
+from tests.support.block_systems import PAIRS, system
 
 
 @settings(deadline=None)

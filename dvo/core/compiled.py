@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import sys
+import pickle
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
 from numba.core import event
+
+from dvo.core.text import print_line
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -20,11 +22,12 @@ class _Notice(event.Listener):
     """Prints a line when the first kernel of this process is compiled; those on the disk are not."""
 
     said = False
+    ours: set[Any] = set()
 
     def on_start(self, event: Any) -> None:
-        if not self.said:
+        if not self.said and event.data["dispatcher"].py_func in self.ours:
             _Notice.said = True
-            print("dvo: compiling kernels, once on this machine", file=sys.stderr, flush=True)
+            print_line("dvo: compiling kernels, once on this machine", error=True)
 
     def on_end(self, event: Any) -> None: ...
 
@@ -36,7 +39,7 @@ def compiled(function: F) -> F:
     """Compile a function of arrays and numbers when it is first called; it runs without the lock of the interpreter.
 
     Compiled code is kept beside the file or, where that cannot be written, in the cache of the user or in
-    ``$NUMBA_CACHE_DIR``; where none can, every process compiles its own.
+    ``$NUMBA_CACHE_DIR``; where none can, or a file of it is damaged, every process compiles its own.
 
     Args:
         function: of a file whose name ends in ``_kernels.py``.
@@ -44,10 +47,26 @@ def compiled(function: F) -> F:
     Returns:
         The same, compiled.
     """
+    _Notice.ours.add(function)
     try:
-        return numba.njit(cache=True, **_OPTIONS)(function)
+        kernel = numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # no place for the cache
         return numba.njit(**_OPTIONS)(function)
+    cache = kernel._cache
+    cache.save_overload, cache.load_overload = _tried(cache.save_overload), _tried(cache.load_overload)
+    return kernel
+
+
+def _tried(step: Callable[..., Any]) -> Callable[..., Any]:
+    """Step of numba's cache whose failure is that nothing was kept: a full disk, a damaged file."""
+
+    def guarded(*arguments: Any) -> Any:
+        try:
+            return step(*arguments)
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+            return None
+
+    return guarded
 
 
 def part(function: F) -> F:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import sys
 from functools import cache
 
 import torch
@@ -18,6 +17,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from dvo.core.errors import DvoError
+from dvo.core.text import print_line
 
 VARIABLE = "DVO_KERNELS"
 CHOICES = ("numba", "torch")
@@ -37,11 +37,16 @@ def use_kernels(*tensors: Tensor, double: bool = False) -> bool:
     Raises:
         DvoError: ``DVO_KERNELS`` has another value than ``numba`` or ``torch``.
     """
-    if not available() or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+    if not available() or is_transformed() or forward_ad._current_level >= 0:
         return False
     dtype = torch.float64 if double and any(x.dtype == torch.float64 for x in tensors) else torch.float32
     plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == dtype for x in tensors)
     return plain and not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
+
+
+def is_transformed() -> bool:
+    """True within ``torch.func`` (grad, vjp, jvp, vmap, ...)."""
+    return torch._C._are_functorch_transforms_active()
 
 
 def available() -> bool:
@@ -62,6 +67,6 @@ def _imported() -> bool:
         importlib.import_module("numba")
     except ImportError as error:  # also a numba that does not know this numpy
         reason = " ".join(str(error).split())[:200]
-        print(f"dvo: note: numba cannot be imported ({reason}): computing without kernels, slower", file=sys.stderr)
+        print_line(f"dvo: note: numba cannot be imported ({reason}): computing without kernels, slower", error=True)
         return False
     return True

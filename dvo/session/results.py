@@ -398,7 +398,7 @@ def versions() -> dict[str, str]:
         Name to version, for Python, the platform and the numerical packages.
     """
     found = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in ("dvo", "torch", "numpy", "opencv-python-headless"):
+    for name in ("dvo", "torch", "numpy", "numba", "opencv-python-headless"):
         try:
             found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:  # run from a checkout, or another build of the package

@@ -26,7 +26,7 @@ STAGES = {
     "reprojection": ("projection.py", "reproject"),
     "correlation": ("edge_correlation.py", "lookup"),
     "update operator": ("update.py", "forward"),
-    "bundle adjustment": ("layer.py", "bundle_adjust"),
+    "bundle adjustment": ("layer.py", "adjust_dense"),
     "keyframes": ("tracker.py", "_reduce"),
 }
 

@@ -83,6 +83,37 @@ def test_compiled_once_with_a_line(tmp_path):
         assert found.stderr.count("compiling kernels") == said
 
 
+def test_a_cache_that_is_damaged_or_cannot_be_written_is_none(tmp_path):
+    file, cache = tmp_path / "some_kernels.py", tmp_path / "cache"
+    file.write_text(KERNEL)
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "", "NUMBA_CACHE_DIR": str(cache)}
+
+    def run(program):
+        return subprocess.run([sys.executable, *program], env=environment, capture_output=True, text=True, check=True)
+
+    run([file])
+    kept = [found for found in cache.rglob("*.nb?") if found.is_file()]
+    assert kept
+    for found in kept:
+        found.write_bytes(b"\x80\x04")
+    assert run([file]).stdout.strip() == "1000.0 nan"
+    full = f"""
+import os, errno, numba.core.caching as caching
+def full(*_): raise OSError(errno.ENOSPC, "No space left on device")
+caching.IndexDataCacheFile.save = full
+exec(compile(open({str(file)!r}).read(), {str(file)!r}, "exec"))
+"""
+    for found in kept:
+        found.unlink()
+    assert run(["-c", full]).stdout.strip() == "1000.0 nan"
+
+
+def test_functions_of_other_programs_are_compiled_without_a_line():
+    program = "import numba, dvo.core.compiled; print(numba.njit(lambda x: x + 1)(1))"
+    found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "2" and "compiling" not in found.stderr
+
+
 def test_importing_dvo_does_not_import_numba():
     script = "import sys, dvo, dvo.cli; assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True)

@@ -25,12 +25,12 @@ from dvo.ba.layer.checks import FLOATS, INDICES, check_structure, check_values
 from dvo.ba.layer.edgewise import EdgewiseReprojection, measured_edges
 from dvo.ba.layer.grouped import group_measurements
 from dvo.ba.layer.step import gauss_newton
-from dvo.ba.layer.transforms import composed, is_transformed
+from dvo.ba.layer.transforms import composed
 from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
 from dvo.core.errors import DvoError
-from dvo.core.kernels import use_kernels
+from dvo.core.kernels import is_transformed, use_kernels
 from dvo.core.settings import shown
 from dvo.core.threads import use_threads
 from dvo.geometry.precision import full_precision

@@ -18,11 +18,6 @@ Tensors = tuple[Tensor, ...]
 Function = Callable[..., Tensors]
 
 
-def is_transformed() -> bool:
-    """True within ``torch.func`` (grad, vjp, jvp, vmap, ...)."""
-    return torch._C._are_functorch_transforms_active()
-
-
 def is_batched(x: Tensor) -> bool:
     """True for a tensor of ``torch.autograd.grad(..., is_grads_batched=True)``, whose vmap is another."""
     keys = str(torch._C._dispatch_keys(x))

@@ -199,7 +199,7 @@ class PatchOdometry:
         identifier, state.keyframes = state.keyframes, state.keyframes + 1
         weights = found.confidence * config.align_gain
         self.graph.attach(identifier, record.timestamp, found.pose_cw, found.kk, found.targets, weights)
-        self.aligner.keep(image, record.timestamp, found.pose_cw)
+        self.aligner.keep(found, record.timestamp)
         record.place(identifier, self.graph.segment)
         measured = found.pose_cw, found.kk, found.targets, found.confidence
         seen = WindowMeasurements.of(self.patch_window).with_frame(record.timestamp, *measured)

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from dvo.core.kernels import available
-from dvo.geometry import se3
-from dvo.geometry.poses import se3_exp
+from dvo.geometry.poses import pose_matrices, poses_from_matrices, se3_exp
 from dvo.map.window import Window
 from dvo.nets.alignment.alignment import AlignmentOptions, accept, align_patches
 from dvo.nets.patch.config import ModelConfig
@@ -62,6 +61,7 @@ class AlignedFrame:
             :func:`dvo.odometry.window.motion.flow_magnitude`.
         slow: the motion from the frame before is small (:data:`MAX_STEP`).
         sure: the pose is supported; otherwise it is a first guess.
+        grey: ``(H, W)`` uint8 image of the frame.
         kk: ``(e,)`` patches of the window that agree with it.
         targets: ``(e, 2)`` float32 their positions in the frame, feature pixels.
         confidence: ``(e, 2)`` float32 of the network in these patches, on average.
@@ -71,6 +71,7 @@ class AlignedFrame:
     motion: float
     slow: bool
     sure: bool
+    grey: np.ndarray
     kk: np.ndarray
     targets: np.ndarray
     confidence: np.ndarray
@@ -135,19 +136,22 @@ class FrameAlignment:
         found = self._refined(window, patches, image, mask, pose)
         if found is None:
             return None
-        pose = _matrix(found.pose_cw)
+        pose, sure, kept, measured = found
         slow = patches.motion(pose, last.matrix) <= MAX_STEP * limit
-        return replace(found, motion=patches.motion(pose), slow=slow)
+        targets = (measured / ModelConfig.STRIDE).astype(np.float32)
+        confidence = patches.confidence[kept].astype(np.float32)
+        rigid = poses_from_matrices(pose)
+        return AlignedFrame(rigid, patches.motion(pose), slow, sure, grey, patches.kk[kept], targets, confidence)
 
-    def keep(self, image: np.ndarray, time: float, pose_cw: np.ndarray) -> None:
+    def keep(self, frame: AlignedFrame, time: float) -> None:
         """Go on from an aligned frame.
 
         Args:
-            image, time: of the frame.
-            pose_cw: ``(7,)`` that it was given.
+            frame: of :meth:`align`.
+            time: of the frame, seconds.
         """
         self.age += 1
-        self._last = [self._last[-1], _Seen(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), time, _matrix(pose_cw))]
+        self._last = [self._last[-1], _Seen(frame.grey, time, pose_matrices(frame.pose_cw))]
 
     def _begin(self, window: Window, intrinsics: np.ndarray) -> None:
         """Go on from the newest keyframe if the window has changed since; poses are replaced, never written to."""
@@ -155,7 +159,7 @@ class FrameAlignment:
             return
         newest, self._poses = window.frames[-1], window.poses_cw
         self._patches = _Patches.of(window, intrinsics)
-        matrices = se3.matrix(window.poses_cw[-2:].double().cpu()).numpy()
+        matrices = pose_matrices(window.poses_cw[-2:].cpu().numpy())
         none = np.zeros((0, 0), np.uint8)
         before = [_Seen(none, f.timestamp, m) for f, m in zip(window.frames[-2:-1], matrices[:-1], strict=True)]
         assert newest.image is not None
@@ -163,8 +167,12 @@ class FrameAlignment:
 
     def _refined(
         self, window: Window, patches: _Patches, image: np.ndarray, mask: np.ndarray | None, pose: np.ndarray
-    ) -> AlignedFrame | None:
-        """Pose from the alignments with the images of the keyframes, from a pose ``(4, 4)`` nearby."""
+    ) -> tuple[np.ndarray, bool, np.ndarray, np.ndarray] | None:
+        """Pose ``(4, 4)`` from the alignments with the images of the keyframes, from one nearby.
+
+        Returns:
+            The pose; whether it is supported; rows of the patches that agree with it, and their positions, pixels.
+        """
         alignment, stride = self.patch_window.alignment, float(ModelConfig.STRIDE)
         assert alignment is not None
         height, width = image.shape[:2]
@@ -174,17 +182,17 @@ class FrameAlignment:
             return None
         slot = window.free_map_slot()  # the next keyframe takes it
         alignment.keep_image(slot, image)
-        start = torch.from_numpy(places[rows].astype(np.float32))
-        found = align_patches(
-            alignment.images, torch.from_numpy(patches.slots[rows]), torch.full((len(rows),), slot),
-            torch.from_numpy(patches.centres[rows].astype(np.float32)), start,
-            torch.from_numpy(warps[rows].astype(np.float32)), self.options,
-        )  # fmt: skip
-        good = accept(found, start, (width, height), stride, self.options).numpy()
+        device, slots = self.patch_window.device, torch.from_numpy(patches.slots[rows])
+        centres, start, warped = (
+            torch.from_numpy(x[rows].astype(np.float32)).to(device) for x in (patches.centres, places, warps)
+        )
+        pair = slots.to(device), torch.full_like(slots, slot, device=device)
+        found = align_patches(alignment.images, *pair, centres, start, warped, self.options)
+        good = accept(found, start, (width, height), stride, self.options).cpu().numpy()
         kept = rows[good]
         if len(kept) < MIN_INLIERS:
             return None
-        measured = found.positions.numpy()[good].astype(np.float64)
+        measured = found.positions.cpu().numpy()[good].astype(np.float64)
         pose, _ = patches.solved(kept, measured, pose, _FINE_WIDTHS)
         away = np.linalg.norm(patches.projected(kept, pose)[0] - measured, axis=1)
         agree = away < INLIER
@@ -194,10 +202,7 @@ class FrameAlignment:
             count >= max(MIN_INLIERS, MIN_SHARE * len(rows), MIN_AGREEMENT * len(kept))
             and len(np.unique(fields @ (FIELDS[1], 1))) >= MIN_FIELDS
         )
-        kept = kept[agree]
-        rigid = se3.normalise(se3.from_matrix(torch.from_numpy(pose))).numpy()
-        targets, confidence = (measured[agree] / stride).astype(np.float32), patches.confidence[kept].astype(np.float32)
-        return AlignedFrame(rigid, 0.0, False, bool(sure), patches.kk[kept], targets, confidence)
+        return pose, bool(sure), kept[agree], measured[agree]
 
 
 @dataclass(frozen=True)
@@ -242,7 +247,7 @@ class _Patches:
         offsets = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         xy = (centres[rows, None] + offsets - intrinsics[:, None, 2:]) / intrinsics[:, None, :2]
         rays = np.concatenate([xy, np.ones((len(rows), 3, 1))], 2) / depth[rows, None, None]
-        poses = se3.matrix(window.poses_cw.double().cpu()).numpy()
+        poses = pose_matrices(window.poses_cw.cpu().numpy())
         to_world = np.linalg.inv(poses)[frames]
         points = rays @ to_world[:, :3, :3].transpose(0, 2, 1) + to_world[:, None, :3, 3]
         slots = np.array([frame.map_slot for frame in window.frames])[frames]
@@ -386,7 +391,3 @@ def _predicted(last: list[_Seen], time: float, damping: float) -> np.ndarray:
     step[:3, :3] = cv2.Rodrigues(share * cv2.Rodrigues(motion[:3, :3])[0])[0]
     step[:3, 3] = share * motion[:3, 3]
     return np.asarray(step @ newest.matrix)
-
-
-def _matrix(pose: np.ndarray) -> np.ndarray:
-    return np.asarray(se3.matrix(torch.from_numpy(np.asarray(pose, np.float64))).numpy())

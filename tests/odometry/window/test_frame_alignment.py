@@ -57,7 +57,7 @@ def test_a_slow_camera_is_aligned_and_as_exact(walk):
         every.track(frame)
     least = evaluate(every.finish().trajectory, truth).ate_percent
     assert not aligned(every)
-    assert evaluate(result.trajectory, truth).ate_percent < max(2 * least, 1.0)
+    assert evaluate(result.trajectory, truth).ate_percent < 2 * least + 0.2
     tracked = [estimate for estimate in estimates if estimate.status is Status.TRACKING]
     assert all(0 < estimate.confidence <= 1 and np.isfinite(estimate.covariance).all() for estimate in tracked)
     assert all(np.linalg.eigvalsh(estimate.covariance).min() > 0 for estimate in tracked)

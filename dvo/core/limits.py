@@ -1,8 +1,9 @@
 """Limits of the system on this process: memory, threads, stack. What is too little is told before torch is imported.
 
 Under a limit that is too low torch and its libraries end in a crash, or in an error of many lines. The numbers are of a
-rendered clip of 320x240 pixels with the shipped weights (``dvo demo --frames 5``, kernels compiled anew, under ``ulimit -v`` and ``-d``, torch
-2.13 for the CPU); larger images need more, and end in an error that :func:`limit_error` describes.
+rendered clip of 320x240 pixels with the shipped weights (``dvo demo --frames 5`` with kernels compiled anew, under
+``ulimit -v`` and ``-d``, torch 2.13 for the CPU); larger images need more, and end in an error that :func:`limit_error`
+describes.
 """
 
 from __future__ import annotations

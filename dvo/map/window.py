@@ -269,15 +269,6 @@ class Window:
         self.weights = torch.cat([self.weights, self.weights.new_zeros(count, 2)])
         self.confidence = torch.cat([self.confidence, self.confidence.new_zeros(count, 2)])
 
-    def connect_newest(self, lifetime: int, own: bool) -> None:
-        """Add edges from recent patches to the newest frame, and from its patches to recent frames.
-
-        Args:
-            lifetime: number of frames before the newest that take part.
-            own: also from its patches to itself.
-        """
-        self.connect_frame(len(self) - 1, lifetime, own)
-
     def connect_frame(self, position: int, lifetime: int, own: bool) -> None:
         """Add edges from the patches of the frames around a frame to it, and from its patches to them.
 

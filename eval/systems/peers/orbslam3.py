@@ -91,6 +91,9 @@ class OrbSlam3:
         pace: seconds of the recording that are fed in a second, at most.
         sensor: of ``"stereo"`` and ``"rgbd"`` the trajectory is in metres.
 
+    Attributes:
+        waited: seconds that ``track`` has slept so far.
+
     Raises:
         DvoError: a pace that is not above 0, another sensor, or (when tracking) frames without what the sensor gives.
     """
@@ -116,7 +119,7 @@ class OrbSlam3:
         self._map_changes: list[float] = []
         self._frames = self._part = 0
         self._was_tracking = False
-        self._fed = self._stamp = self._computing = 0.0
+        self._fed = self._stamp = self._computing = self.waited = 0.0
 
     def track(self, frame: Frame) -> Estimate:
         image = self._pictures(frame)
@@ -134,8 +137,10 @@ class OrbSlam3:
         self._frames += 1
         # From frame to frame: after a pause of the machine nothing is made up for.
         due = self._fed + (frame.timestamp - self._stamp) / self._pace
-        time.sleep(max(0.0, due - time.perf_counter()))
+        before = time.perf_counter()
+        time.sleep(max(0.0, due - before))
         start = self._fed = time.perf_counter()
+        self.waited += start - before
         self._stamp = frame.timestamp
         said = getattr(self._slam, f"track_{self._sensor}")(image, *second, frame.timestamp)
         self._computing += time.perf_counter() - start

@@ -1,8 +1,9 @@
 """Single measurements for :mod:`eval.benchmarks.compare_commits`: ``python measurements.py tracking CLIP``.
 
 Run as a file, with the tree to be measured on PYTHONPATH. The file uses only names that exist in every version of dvo,
-so that it can measure all of them. Seconds are processor time of this process, which other load of the machine hardly
-changes.
+so that it can measure all of them. A line is printed for each part: ``SECONDS part processor wall``. The first are
+processor time of this process, which other load of the machine hardly changes; with several threads they count the work
+of all.
 """
 
 from __future__ import annotations
@@ -19,8 +20,22 @@ import torch
 
 import dvo
 
+Seconds = tuple[float, float]
+"""Processor time of this process, and time on the wall."""
 
-def tracking(clip: str, frames: int | None, preset: str | None = None) -> float:
+
+def now() -> Seconds:
+    """Both clocks."""
+    return time.process_time(), time.perf_counter()
+
+
+def since(start: Seconds) -> Seconds:
+    """Seconds of both clocks since a reading of :func:`now`."""
+    processor, wall = now()
+    return processor - start[0], wall - start[1]
+
+
+def tracking(clip: str, frames: int | None, preset: str | None = None) -> dict[str, Seconds]:
     """Track and finish a clip with the weights ``small``.
 
     Args:
@@ -29,18 +44,20 @@ def tracking(clip: str, frames: int | None, preset: str | None = None) -> float:
         preset: of the tracker; None for a version without presets.
 
     Returns:
-        Processor time without reading, seconds.
+        Seconds of ``track`` of all frames, and of ``finish``; without reading.
     """
     images = list(islice(dvo.open(clip), frames))
     odometry = dvo.load("small", seed=0, **({"preset": preset} if preset else {}))
-    start = time.process_time()
+    start = now()
     for frame in images:
         odometry.track(frame)
+    found = {"track": since(start)}
+    start = now()
     odometry.finish()
-    return time.process_time() - start
+    return {**found, "finish": since(start)}
 
 
-def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: int = 24) -> float:
+def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: int = 24) -> Seconds:
     """One bundle adjustment with its backward pass, on a problem as in training.
 
     Every patch has an edge into every other frame.
@@ -50,7 +67,7 @@ def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: 
         batch, frames, per_frame: clips, frames of each and patches of a frame.
 
     Returns:
-        Processor time of the fastest run, seconds.
+        Seconds of the fastest run.
     """
     generator = torch.Generator().manual_seed(0)
     count = frames * per_frame
@@ -67,22 +84,22 @@ def bundle_adjustment(repeats: int, batch: int = 1, frames: int = 8, per_frame: 
     targets = centres[:, kk] + torch.randn(batch, len(kk), 2, generator=generator)
     weights = torch.rand(targets.shape, generator=generator)
     plan = edge_plan(ii, jj, kk, frames, count)
-    best = float("inf")
+    best = float("inf"), float("inf")
     for _ in range(repeats):
         leaves = [x.clone().requires_grad_() for x in (poses, patches, intrinsics, targets, weights)]
-        start = time.process_time()
+        start = now()
         found: Any = dvo.bundle_adjust(*leaves, ii, jj, kk, plan=plan)
         moved, refined = (found.poses_cw, found.patches) if hasattr(found, "poses_cw") else found
         (moved.sum() + refined.sum()).backward()
-        best = min(best, time.process_time() - start)
+        best = min(best, since(start))
     return best
 
 
-def training() -> Callable[[], float]:
+def training() -> Callable[[], Seconds]:
     """A training step of ``small``: forward pass of a rendered clip, pose and flow loss, backward pass.
 
     Returns:
-        Function that takes one step, the same every time, and returns its processor time in seconds.
+        Function that takes one step, the same every time, and returns its seconds.
     """
     from dvo.geometry import se3
     from dvo.losses.pose import pose_errors
@@ -97,8 +114,8 @@ def training() -> Callable[[], float]:
     model = dvo.load_model("small").train()
     stages = training_schedule(8, model.config.training_patches, 10, 4, 4, model.config.self_edges)
 
-    def step() -> float:
-        start = time.process_time()
+    def step() -> Seconds:
+        start = now()
         states = model.unroll(
             clip.images[None], clip.intrinsics[None], stages, poses_cw=se3.identity(1, 8),
             generator=torch.Generator().manual_seed(0), correlation_gradient=0.3,
@@ -109,7 +126,7 @@ def training() -> Callable[[], float]:
             loss = loss + (errors.translation + errors.rotation).mean() + 0.1 * (state.targets - 20).abs().mean()
         loss.backward()
         model.zero_grad()
-        return time.process_time() - start
+        return since(start)
 
     return step
 
@@ -140,9 +157,10 @@ def main() -> None:
     line.add_argument("--frames", type=int)
     line.add_argument("--preset")
     line.add_argument("--repeats", type=int, default=30)
+    line.add_argument("--threads", type=int, default=1)
     given = line.parse_args()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    torch.set_num_threads(given.threads)
+    cv2.setNumThreads(given.threads)
     try:
         from dvo.core.allocator import reuse_freed_memory  # as `dvo run` and training do
 
@@ -153,14 +171,17 @@ def main() -> None:
         step = training()
         print("READY", flush=True)
         for _ in sys.stdin:  # one step for every line, so that two processes can take turns
-            print(f"SECONDS {step():.9f}", flush=True)
-        return
-    seconds = (
-        tracking(given.clip, given.frames, given.preset)
-        if given.what == "tracking"
-        else bundle_adjustment(given.repeats)
-    )
-    print(f"SECONDS {seconds:.9f}")
+            report("training", step())
+    elif given.what == "ba":
+        report("ba", bundle_adjustment(given.repeats))
+    else:
+        for part, seconds in tracking(given.clip, given.frames, given.preset).items():
+            report(part, seconds)
+
+
+def report(part: str, seconds: Seconds) -> None:
+    """Print the line of a part."""
+    print(f"SECONDS {part} {seconds[0]:.9f} {seconds[1]:.9f}", flush=True)
 
 
 if __name__ == "__main__":

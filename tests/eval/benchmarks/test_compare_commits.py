@@ -10,13 +10,14 @@ import pytest
 from dvo.core.errors import DvoError
 from eval.benchmarks import compare_commits
 from eval.benchmarks.compare_commits import (
+    Cost,
     Settings,
     alternate_steps,
+    costs,
     main,
-    median_ratio,
+    median_ratios,
     paired,
     same_trajectories,
-    seconds,
     worktree,
 )
 from eval.suites.suite import ROOT
@@ -67,17 +68,29 @@ def test_trees_take_turns_and_the_median_decides():
     order: list[Path] = []
     times = iter([2.0, 1.0, 2.0, 4.0, 2.0, 3.0])
 
-    def measure(tree: Path) -> float:
+    def measure(tree: Path) -> dict[str, Cost]:
         order.append(tree)
-        return next(times)
+        now = next(times)
+        return {"track": Cost(now, 2 * now if tree == current else now), "finish": Cost(1.0, now)}
 
     pairs = paired(measure, base, current, 3)
-    assert order == [base, current] * 3 and pairs == [(2.0, 1.0), (2.0, 4.0), (2.0, 3.0)]
-    assert median_ratio(pairs) == 1.5
+    assert order == [base, current] * 3 and [one["track"] for one, _ in pairs] == [Cost(2.0, 2.0)] * 3
+    assert median_ratios(pairs) == {"track": Cost(1.5, 3.0), "finish": Cost(1.0, 1.5)}
 
 
 def test_one_measurement_of_bundle_adjustment():
-    assert 1e-4 < seconds("ba", ROOT, Settings(Path())) < 10
+    (found,) = costs("ba", ROOT, Settings(Path())).items()
+    assert found[0] == "ba" and 1e-4 < found[1].processor < 10 and found[1].wall > 1e-4
+
+
+def test_track_and_finish_are_told_apart_and_have_the_threads_that_are_asked_for(tmp_path, monkeypatch):
+    (tmp_path / "steps.py").write_text(
+        "import os, sys\nprint('SECONDS track', float(sys.argv[sys.argv.index('--threads') + 1]), 1.5)\n"
+        "print('SECONDS finish', float(os.environ['OMP_NUM_THREADS']), 4.0)"
+    )
+    monkeypatch.setattr(compare_commits, "SCRIPT", str(tmp_path / "steps.py"))
+    found = costs("tracking", tmp_path, Settings(tmp_path, threads=3))
+    assert found == {"track": Cost(3.0, 1.5), "finish": Cost(3.0, 4.0)}
 
 
 def test_training_steps_of_two_trees_take_turns(tmp_path, monkeypatch):
@@ -87,12 +100,13 @@ def test_training_steps_of_two_trees_take_turns(tmp_path, monkeypatch):
         "import sys, pathlib\nprint('READY', flush=True)\n"
         "for number, _ in enumerate(sys.stdin):\n"
         "    with open('../turns', 'a') as file: file.write(pathlib.Path.cwd().name)\n"
-        "    print('SECONDS', 99 if number < 2 else 1 + ('b' == pathlib.Path.cwd().name), flush=True)\n"
+        "    print('SECONDS training', 99 if number < 2 else 1 + ('b' == pathlib.Path.cwd().name), 7, flush=True)\n"
     )
     monkeypatch.setattr(compare_commits, "SCRIPT", str(script))
     for name in "ab":
         (tmp_path / name).mkdir()
-    assert alternate_steps(tmp_path / "a", tmp_path / "b", 3) == (1.0, 2.0)
+    one, two = alternate_steps(tmp_path / "a", tmp_path / "b", 3)
+    assert (one, two) == ({"training": Cost(1.0, 7.0)}, {"training": Cost(2.0, 7.0)})
     assert (tmp_path / "turns").read_text() == "ababababab"
     script.write_text("print('no')")
     with pytest.raises(DvoError, match="training failed"):
@@ -101,6 +115,6 @@ def test_training_steps_of_two_trees_take_turns(tmp_path, monkeypatch):
 
 def test_failures_are_told(tmp_path, capsys):
     with pytest.raises(DvoError, match="failed"):
-        seconds("tracking", ROOT, Settings(tmp_path, "no such clip"))
+        costs("tracking", ROOT, Settings(tmp_path, "no such clip"))
     assert main(["--base", "HEAD", "--what", "beauty"]) == 2 and "beauty" in capsys.readouterr().err
     assert main(["--base", "HEAD", "--what", "ba", "--pairs", "0"]) == 2 and "--pairs" in capsys.readouterr().err

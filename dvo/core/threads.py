@@ -197,6 +197,13 @@ def core_left(busy: bool = True) -> Iterator[None]:
             torch.set_num_threads(count)
 
 
+def core_free() -> bool:
+    """Tell if a thread beside those of torch would have a core of its own."""
+    import torch
+
+    return torch.get_num_threads() < available_cores()
+
+
 def current_threads() -> Threads:
     """Threads of this process as they are now.
 

@@ -76,6 +76,14 @@ class Map:
         new.recordings = list(self.recordings)
         return new
 
+    def archived(self) -> Map:
+        """Map with the same archive, by references, and no log: for work beside tracking that reads it."""
+        new = Map(self.per_frame)
+        new.archive = self.archive.copy()
+        new.segment, new.starts, new.worlds = self.segment, list(self.starts), dict(self.worlds)
+        new.loops, new.metric, new.recordings = self.loops, dict(self.metric), list(self.recordings)
+        return new
+
     @property
     def recording(self) -> Recording:
         """The last recording; keyframes before it are its map."""

@@ -5,7 +5,7 @@ all keyframes of its world by a pose graph in Sim(3) (Strasdat, Montiel and Davi
 monocular SLAM", 2010; :mod:`dvo.odometry.loops.correction`). A loop between two segments joins their worlds.
 
 A search is done in steps, ``LoopOptions.steps`` with each frame, so that more frames take a little longer instead of
-some much longer.
+some much longer; if torch leaves a core free, the thread takes them ahead of the frames, and no frame takes longer.
 Pose graphs are solved beside tracking, in a thread of their own; the result is taken at a fixed frame,
 ``LoopOptions.delay`` frames later, and waited for if it is not there: the same frames give the same result, bit for
 bit on the CPU. In real time both are done in the thread and taken when they are there, and ``track`` never waits.
@@ -246,7 +246,9 @@ class LoopCloser:
             return None
         search = self.finder.prepare(kept[-1 - options.neighbours], self.pending)
         self.wait = options.every
-        return self.maintenance.in_steps("search", self.finder.verify(search), self._searched)
+        # In a segment that was located, tracking reads feature maps of the finder meanwhile.
+        ahead = self.graph.located is None
+        return self.maintenance.in_steps("search", self.finder.verify(search), self._searched, ahead)
 
     def next_job(self, ended: Job[Any], at_once: bool) -> Job[Any] | None:
         """Next job: a global adjustment, of a world that was corrected or is wanted, or a search after another one.
@@ -317,12 +319,13 @@ class LoopCloser:
         """
         if not loop.joins and self.is_within(loop, _SMALL_CORRECTION):
             return
-        correction = loop_correction.prepare(self.graph, self.finder.kept, self.loops, loop)
-        apply, delay = partial(self._apply, correction.identifiers), self.finder.options.delay
-        self.maintenance.job = self.maintenance.beside("correction", correction.solve, apply, delay)
+        work = partial(loop_correction.solve, self.graph.archived(), list(self.finder.kept), list(self.loops), loop)
+        delay = self.finder.options.delay
+        self.maintenance.job = self.maintenance.beside("correction", work, self._apply, delay)
 
-    def _apply(self, identifiers: np.ndarray, found: Tensor) -> Moved:
+    def _apply(self, solved: tuple[np.ndarray, Tensor]) -> Moved:
         """Correct the poses."""
+        identifiers, found = solved
         # At the end of a sequence keyframes of these worlds are archived that have not been looked at yet.
         later = self.graph.archive.kept_after(self.finder.kept[-1])
         kept = [*self.finder.kept, *(frame.identifier for frame in later)]

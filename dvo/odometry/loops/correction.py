@@ -1,7 +1,7 @@
 """Correction of the poses of a world by its loops: a pose graph in Sim(3).
 
-It is prepared and applied between two frames, and solved from a copy of what it needs. Keyframes that are archived
-meanwhile, and the window, are moved along with the last keyframe before them.
+It is applied between two frames, and prepared and solved beside tracking, from references to the keyframes. Those that
+are archived meanwhile, and the window, are moved along with the last keyframe before them.
 """
 
 from __future__ import annotations
@@ -103,6 +103,19 @@ def prepare(graph: Map, kept: Sequence[int], loops: Sequence[Loop], loop: Loop) 
     )  # fmt: skip
 
 
+def solve(graph: Map, kept: Sequence[int], loops: Sequence[Loop], loop: Loop) -> tuple[np.ndarray, Tensor]:
+    """Solve the pose graph of the worlds of a loop.
+
+    Args:
+        graph, kept, loops, loop: see :func:`prepare`; none of them changes meanwhile.
+
+    Returns:
+        Its keyframes ``(N,)`` and their similarities ``(N, 8)``.
+    """
+    correction = prepare(graph, kept, loops, loop)
+    return correction.identifiers, correction.solve()
+
+
 def apply(
     graph: KeyframeGraph, kept: Sequence[int], loop: Loop, identifiers: np.ndarray, found: Tensor
 ) -> dict[int, float]:
@@ -154,14 +167,14 @@ def _carried(graph: Map, identifiers: np.ndarray, found: Tensor, now: np.ndarray
     """Similarities ``(M, 8)`` of all keyframes; one that was not solved for moves with the last one of its segment."""
     position = {int(k): row for row, k in enumerate(identifiers)}
     last = {graph.segment_of(int(k)): int(k) for k in identifiers}
-    rows = []
-    for k in now.tolist():
-        anchor = k if k in position else last.get(graph.segment_of(k), int(identifiers[-1]))
-        base_cw, pose_cw = graph.poses_cw(np.array([anchor, k]))
-        step = sim3.from_se3(se3.relative(base_cw, pose_cw))
-        solved = found[position[anchor]]
-        rows.append(solved if anchor == k else sim3.compose(step, solved))
-    return torch.stack(rows)
+    carried = found[[position.get(k, 0) for k in now.tolist()]]
+    for row, k in enumerate(now.tolist()):
+        if k not in position:  # a few: there may be thousands that were solved for
+            anchor = last.get(graph.segment_of(k), int(identifiers[-1]))
+            base_cw, pose_cw = graph.poses_cw(np.array([anchor, k]))
+            step = sim3.from_se3(se3.relative(base_cw, pose_cw))
+            carried[row] = sim3.compose(step, found[position[anchor]])
+    return carried
 
 
 def _start(graph: Map, identifiers: np.ndarray, poses_cw: Tensor, loop: Loop) -> Tensor:

@@ -1,4 +1,4 @@
-"""Work beside tracking: in one thread, or in steps, some of which each frame takes."""
+"""Work beside tracking: in one thread, in steps, some of which each frame takes, or in both ways at once."""
 
 from __future__ import annotations
 
@@ -128,6 +128,60 @@ class Background:
             self._executor.submit(_give_way).result()
             torch.set_num_threads(count)  # of other threads that begin later
         return Task(self._executor.submit(_without_gradients, work))
+
+
+class StepsAhead(Generic[T]):
+    """Work in steps as :class:`Steps`, which a thread takes ahead of the frames: the same frame has the result.
+
+    Args:
+        generator: see :class:`Steps`; what it reads must not change meanwhile.
+        background: its thread.
+    """
+
+    def __init__(self, generator: Generator[None, None, T], background: Background) -> None:
+        self._generator = generator
+        self._ahead, self._taken, self._ended = 0, 0, False  # steps by the thread, and by the frames
+        self._changed = threading.Condition()
+        self._task = background.start(self._work)
+
+    @property
+    def done(self) -> bool:
+        """True if :meth:`result` returns at once."""
+        return self._task.done
+
+    def step(self) -> bool:
+        """Take a step, which is waited for if the thread has not come to it.
+
+        Returns:
+            True once all have been taken.
+        """
+        self._taken += 1
+        if not self._task.done:  # a forked process has no thread that would notify it
+            with self._changed:
+                self._changed.wait_for(lambda: self._ahead >= self._taken or self._ended)
+        if self._ahead >= self._taken:
+            return False
+        self.result()  # raises what has ended the work
+        return True
+
+    def result(self) -> T:
+        """Result of the work; see :meth:`Task.result`."""
+        return self._task.result()
+
+    def _work(self) -> T:
+        try:
+            while True:
+                try:
+                    next(self._generator)
+                except StopIteration as end:
+                    return end.value
+                with self._changed:
+                    self._ahead += 1
+                    self._changed.notify()
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify()
 
 
 def _give_way() -> None:

@@ -1,9 +1,9 @@
 """Maintenance of a map while tracking goes on: one worker, one job at a time, applied at a stated frame.
 
 A job (search for a loop, correction by a pose graph, global adjustment) reads a snapshot, or takes a step with each
-frame. Its result is applied between two frames: at a frame that is fixed when the job begins, so that the same frames
-give the same bytes, or in real time as soon as it is there. What has moved is told as one message, which everything
-follows that must.
+frame, which the thread has taken before if it has a core. Its result is applied between two frames: at a frame that is
+fixed when the job begins, so that the same frames give the same bytes, or in real time as soon as it is there. What has
+moved is told as one message, which everything follows that must.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
-from dvo.odometry.maintenance.background import Background, Steps, Task, all_steps
+from dvo.core.threads import core_free
+from dvo.odometry.maintenance.background import Background, Steps, StepsAhead, Task, all_steps
 
 T = TypeVar("T")
 Kind = Literal["search", "correction", "adjustment"]
@@ -33,7 +34,7 @@ class Job(Generic[T]):
     """
 
     kind: Kind
-    task: Task[T] | Steps[T]
+    task: Task[T] | Steps[T] | StepsAhead[T]
     apply: Callable[[T], Moved]
     left: int = 0
 
@@ -94,15 +95,21 @@ class MapMaintenance:
         """
         return Job(kind, self._background.start(work), apply, left)
 
-    def in_steps(self, kind: Kind, steps: Generator[None, None, T], apply: Callable[[T], Moved]) -> Job[T]:
+    def in_steps(
+        self, kind: Kind, steps: Generator[None, None, T], apply: Callable[[T], Moved], ahead: bool = False
+    ) -> Job[T]:
         """Job in steps, some with each frame; in real time in the thread.
 
         Args:
             kind: of the work.
             steps: see :class:`dvo.odometry.maintenance.background.Steps`.
             apply: see :class:`Job`.
+            ahead: what the steps read does not change meanwhile. If a core is free, the thread takes them ahead of the
+                frames; the result is taken at the same frame.
         """
-        return Job(kind, self._background.start(partial(all_steps, steps)) if self.real_time else Steps(steps), apply)
+        if self.real_time:
+            return Job(kind, self._background.start(partial(all_steps, steps)), apply)
+        return Job(kind, StepsAhead(steps, self._background) if ahead and core_free() else Steps(steps), apply)
 
     def advance(self, owner: Owner, at_once: bool = False) -> bool:
         """Take the result of the job in progress if its time has come, and begin the next one; once a frame.
@@ -148,7 +155,7 @@ class MapMaintenance:
 
     def _is_due(self, job: Job[Any]) -> bool:
         """Find out if the result of a job is taken with this frame; one in steps takes its next ones."""
-        if isinstance(job.task, Steps):
+        if isinstance(job.task, (Steps, StepsAhead)):
             task = job.task
             return any(task.step() for _ in range(self.steps))
         if job.kind == "search":

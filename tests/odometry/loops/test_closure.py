@@ -209,7 +209,8 @@ def test_a_correction_at_the_end_moves_keyframes_that_were_not_looked_at(correct
     while len(graph.window):
         graph.archive_oldest()
     last, later = loops.finder.kept[-1], [frame.identifier for frame in graph.archive.kept_after(loops.finder.kept[-1])]
-    scale = float(loops.maintenance.job.task.result()[list(loops.maintenance.job.apply.args[0]).index(last), 7])
+    identifiers, found = loops.maintenance.job.task.result()
+    scale = float(found[identifiers.tolist().index(last), 7])
     steps = [se3.relative(*graph.poses_cw(np.array([last, k]))) for k in later]
     loops.wait = 1000  # no further search
     assert loops.advance([0], at_once=True) and loops.corrections == 1

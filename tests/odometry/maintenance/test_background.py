@@ -6,10 +6,10 @@ import threading
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dvo.odometry.maintenance.background import Background, Steps, all_steps
+from dvo.odometry.maintenance.background import Background, Steps, StepsAhead, all_steps
 from dvo.odometry.maintenance.maintenance import MapMaintenance
 from tests.support.forked import in_fork
 
@@ -37,12 +37,42 @@ def test_steps_are_taken_one_by_one_or_all_for_the_result(number, early):
     assert taken == [*range(number), True] and all_steps(counted(number, [])) == "done"
 
 
-def test_an_error_of_a_step_is_raised_by_it():
+@settings(deadline=None)
+@given(number=st.integers(0, 6), early=st.integers(0, 8))
+def test_steps_ahead_end_with_the_frame_that_would_have_taken_the_last(number, early):
+    taken, background = [], Background()
+    steps, plain = StepsAhead(counted(number, taken), background), Steps(counted(number, []))
+    for call in range(number + 1):
+        if call == early:
+            assert steps.result() == "done" and len(taken) == number + 1
+        assert steps.step() == plain.step() and len(taken) > call
+    assert steps.done and steps.step() and steps.result() == "done" and taken == [*range(number), True]
+
+
+def test_a_thread_takes_steps_ahead_of_the_frames_and_is_waited_for():
+    second, release = threading.Event(), threading.Event()
+
+    def work():
+        yield
+        second.set()
+        yield
+        release.wait(60)
+        return threading.get_ident()
+
+    steps = StepsAhead(work(), Background())
+    assert second.wait(60) and not steps.done
+    assert not steps.step() and not steps.step()
+    threading.Timer(0.05, release.set).start()
+    assert steps.step() and steps.result() != threading.get_ident()
+
+
+@pytest.mark.parametrize("build", [Steps, lambda work: StepsAhead(work, Background())], ids=["steps", "ahead"])
+def test_an_error_of_a_step_is_raised_by_it(build):
     def fails():
         yield
         raise ValueError("no")
 
-    steps = Steps(fails())
+    steps = build(fails())
     assert not steps.step()
     with pytest.raises(ValueError, match="no"):
         steps.step()
@@ -113,6 +143,20 @@ def test_a_forked_process_does_not_wait_for_the_thread():
     assert in_fork(lambda: background.start(lambda: 3).result()) == "3"
     release.set()
     assert running.result() is True and waiting.result() == 2
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_does_not_wait_for_steps_ahead():
+    release = threading.Event()
+
+    def work():
+        release.wait(60)
+        yield
+
+    steps = StepsAhead(work(), Background())
+    assert in_fork(steps.step).startswith("DvoError: fork: this process was forked while a thread worked")
+    release.set()
+    assert not steps.step() and steps.step()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")

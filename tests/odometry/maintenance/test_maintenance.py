@@ -3,7 +3,9 @@
 import threading
 
 import pytest
+import torch
 
+from dvo.odometry.maintenance.background import Steps
 from dvo.odometry.maintenance.maintenance import MapMaintenance
 
 
@@ -56,6 +58,29 @@ def test_steps_are_taken_with_the_frames():
         assert not maintenance.advance(owner) and not maintenance.occupies_core
         counts += 1
     assert counts == 3 and found == ["loop"] and not owner.told
+
+
+@pytest.mark.parametrize("cores, thread", [(1, False), (2, True)])
+def test_the_thread_takes_steps_ahead_if_it_has_a_core(monkeypatch, cores, thread):
+    """The result is taken at the same frame, and at once where it is waited for."""
+    monkeypatch.setattr("dvo.core.threads.available_cores", lambda: cores * torch.get_num_threads())
+    maintenance, owner, found, where = MapMaintenance(steps=2), Owner(), [], []
+
+    def steps():
+        for _ in range(4):
+            where.append(threading.get_ident() != threading.main_thread().ident)
+            yield
+        return "loop"
+
+    for at_once, frames in ((False, 3), (True, 1)):
+        job = maintenance.in_steps("search", steps(), lambda loop: found.append(loop) or {}, ahead=True)
+        maintenance.job, counts = job, 0
+        while maintenance.job is not None:
+            assert not maintenance.advance(owner, at_once) and not maintenance.occupies_core
+            counts += 1
+        assert counts == frames
+    assert found == ["loop", "loop"] and where == [thread] * 8
+    assert isinstance(maintenance.in_steps("search", steps(), found.append).task, Steps)
 
 
 def test_what_follows_is_waited_for_too():

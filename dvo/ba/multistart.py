@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -65,11 +67,28 @@ class Solution:
     cost: float
 
 
+class Begun(Protocol):
+    """Work that another thread has begun, or will."""
+
+    def withdraw(self) -> bool:
+        """Take the work back; True if it has not begun, and never will."""
+        ...
+
+    def result(self) -> Solution:
+        """Result of the work, waited for if need be."""
+        ...
+
+
+Beside = Callable[[Callable[[], Solution]], Begun]
+"""Function that gives work to another thread."""
+
+
 def multistart(
     problem: PatchProblem,
     starts: Mapping[str, Start],
     options: GlobalBAOptions = OPTIONS,
     abandon: float = ABANDON,
+    beside: Beside | None = None,
 ) -> list[Solution]:
     """Solve a problem from several starts.
 
@@ -78,6 +97,7 @@ def multistart(
         starts: by name; that of the present values, if they are one, is :data:`PRESENT`.
         options: of each solution. Without iterations the starts are ranked as they are.
         abandon: see :data:`ABANDON`.
+        beside: gives a part of the starts to another thread, with the same solutions; None to take all here.
 
     Returns:
         The solutions, least cost first; without those that were abandoned.
@@ -100,18 +120,22 @@ def multistart(
     def rated(name: str, now: PatchProblem, cost: float) -> Solution:
         return Solution(name, now, cost if cost == cost else float("inf"))
 
-    count, found = options.solver.max_iterations, []
-    limit = float("inf")
+    def begun(name: str) -> Solution:
+        with torch.no_grad():
+            return solved(name, starts[name](problem, options), half)
+
+    count, limit = options.solver.max_iterations, float("inf")
+    half, found, others = count // 2, [], [name for name in starts if name != PRESENT]
+    tasks = {} if beside is None else {name: beside(partial(begun, name)) for name in others}
     with torch.no_grad():
-        for name in sorted(starts, key=lambda name: name != PRESENT):
-            now, half = starts[name](problem, options), count // 2
-            if name != PRESENT:
-                first = solved(name, now, half)
-                if first.cost > limit:
-                    continue
-                now = first.problem
-            found.append(solved(name, now, count if name == PRESENT else count - half))
-            limit = abandon * found[0].cost if found[0].start == PRESENT else limit
+        if PRESENT in starts:
+            found.append(solved(PRESENT, starts[PRESENT](problem, options), count))
+            limit = abandon * found[0].cost
+        taken = {name: begun(name) for name in reversed(others) if name not in tasks or tasks[name].withdraw()}
+        for name in others:
+            first = taken[name] if name in taken else tasks[name].result()
+            if first.cost <= limit:
+                found.append(solved(name, first.problem, count - half))
     return sorted(found, key=lambda solution: solution.cost)
 
 

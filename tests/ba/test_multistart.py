@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dvo.ba.multistart import (
+    AS_THEY_ARE,
     COLD_STARTS,
     DEPTH_STARTS,
     OPTIONS,
@@ -119,6 +120,40 @@ def test_a_start_that_leads_nowhere_is_abandoned():
 
     names = [[s.start for s in multistart(problem, {"far": far, PRESENT: present}, abandon=x)] for x in (2.0, 1e9)]
     assert names == [[PRESENT], [PRESENT, "far"]]
+
+
+class Given:
+    """Work for another thread, which has begun it, or has not when it is taken back."""
+
+    def __init__(self, work, has_begun):
+        self.outcome, self.work, self.asked = work() if has_begun else None, work, 0
+
+    def withdraw(self):
+        return self.outcome is None
+
+    def result(self):
+        assert self.outcome is not None
+        self.asked += 1
+        return self.outcome
+
+
+@pytest.mark.parametrize("starts", [RESTARTS, DEPTH_STARTS, {PRESENT: present, **COLD_STARTS}], ids=len)
+@pytest.mark.parametrize("begun", [(True, True), (True, False), (False, False)])
+def test_solutions_are_the_same_with_a_part_beside(starts, begun):
+    _, problem = scene(3, moving=0.3)
+    for options in (OPTIONS, AS_THEY_ARE):
+        given = []
+
+        def beside(work, given=given):
+            given.append(Given(work, begun[len(given)]))
+            return given[-1]
+
+        plain, found = multistart(problem, starts, options), multistart(problem, starts, options, beside=beside)
+        assert [(one.start, one.cost) for one in found] == [(one.start, one.cost) for one in plain]
+        for one, other in zip(found, plain, strict=True):
+            assert torch.equal(one.problem.poses_cw, other.problem.poses_cw)
+            assert torch.equal(one.problem.patches, other.problem.patches)
+        assert [one.asked for one in given] == [int(k) for k in begun]
 
 
 def test_starts_are_positive_and_keep_the_median():

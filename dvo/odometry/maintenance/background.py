@@ -36,6 +36,10 @@ class Task(Generic[T]):
         """True if :meth:`result` returns, or raises, at once."""
         return self._outcome.done() or self._process != os.getpid()
 
+    def withdraw(self) -> bool:
+        """Take the work back; True if it has not begun, and never will."""
+        return self._outcome.cancel()
+
     def result(self) -> T:
         """Result of the work, waited for if need be.
 

@@ -111,6 +111,11 @@ class MapMaintenance:
             return Job(kind, self._background.start(partial(all_steps, steps)), apply)
         return Job(kind, StepsAhead(steps, self._background) if ahead and core_free() else Steps(steps), apply)
 
+    @property
+    def helper(self) -> Callable[[Callable[[], T]], Task[T]] | None:
+        """Function that gives work to the thread; None if that has a job, or no core of its own."""
+        return self._background.start if self.job is None and core_free() else None
+
     def advance(self, owner: Owner, at_once: bool = False) -> bool:
         """Take the result of the job in progress if its time has come, and begin the next one; once a frame.
 

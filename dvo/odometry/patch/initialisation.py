@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from dvo.ba.cold_start import damping_at
-from dvo.ba.multistart import AS_THEY_ARE, COLD_STARTS, PRESENT, RESTARTS, Solution, multistart, preferred, present
+from dvo.ba.multistart import (
+    AS_THEY_ARE,
+    COLD_STARTS,
+    PRESENT,
+    RESTARTS,
+    Beside,
+    Solution,
+    multistart,
+    preferred,
+    present,
+)
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.window import Window
 from dvo.models.step import Revision, StepOptions
@@ -92,7 +102,7 @@ def first_motion(revision: Revision, window: Window, config: TrackerConfig, wait
     return not confident or flow_revision(revision, window) >= needed(waited)[0] * config.initial_motion
 
 
-def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int) -> bool:
+def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int, beside: Beside | None = None) -> bool:
     """Optimise the first window.
 
     After half of the updates the window is also solved from identity poses with the current flow, and the better of the
@@ -103,6 +113,7 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int) ->
         patch_window: the first keyframes; changed in place.
         config: settings of the tracker.
         waited: frames since the segment has begun, see :func:`needed`.
+        beside: see :func:`dvo.ba.multistart.multistart`.
 
     Returns:
         True if the parallax is sufficient for tracking.
@@ -112,7 +123,7 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int) ->
     for age in range(config.initial_updates):
         patch_window.step(StepOptions(fixed=1, damping=damping_at(age)))
         if age == config.initial_updates // 2 and not measured:
-            _solve_again(patch_window)
+            _solve_again(patch_window, beside)
             match_window(window)
     n = len(window)
     if measured:
@@ -123,12 +134,12 @@ def initialise(patch_window: PatchWindow, config: TrackerConfig, waited: int) ->
     return seen >= needed(waited)[1] * config.initial_parallax
 
 
-def _solve_again(patch_window: PatchWindow) -> None:
+def _solve_again(patch_window: PatchWindow, beside: Beside | None) -> None:
     """Replace poses and depths by a solution from one pose for all frames, if it suits the current flow better."""
     window, revision = patch_window.window, patch_window.revise()
     problem = window.problem().with_values(targets=revision.targets[0], weights=revision.weights[0])
     # Not solved further: a narrow kernel would fit the first, coarse flow.
-    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE))
+    best = preferred(multistart(problem, {PRESENT: present, **COLD_STARTS}, AS_THEY_ARE, beside=beside))
     if best.start != PRESENT:
         _take(window, best)
 
@@ -139,7 +150,9 @@ def _take(window: Window, solution: Solution) -> None:
     window.poses_cw, window.patches = problem.poses_cw.to(window.poses_cw), problem.patches.to(window.patches)
 
 
-def initialise_related(graph: KeyframeGraph, patch_window: PatchWindow, config: TrackerConfig, waited: int) -> bool:
+def initialise_related(
+    graph: KeyframeGraph, patch_window: PatchWindow, config: TrackerConfig, waited: int, beside: Beside | None = None
+) -> bool:
     """Optimise the first window without the frames that do not show the scene of the newest ones.
 
     Where frames are removed, the others begin anew: poses and depths that were fitted to another scene, or to noise,
@@ -150,14 +163,15 @@ def initialise_related(graph: KeyframeGraph, patch_window: PatchWindow, config: 
         patch_window: the window.
         config: settings of the tracker.
         waited: frames since the segment has begun, see :func:`needed`.
+        beside: see :func:`dvo.ba.multistart.multistart`.
 
     Returns:
         True if the frames are as many as an initialisation needs, and the parallax is sufficient for tracking.
     """
-    enough = initialise(patch_window, config, waited)
+    enough = initialise(patch_window, config, waited, beside)
     if drop_unrelated(graph, patch_window, config):
         graph.window.reset()
-        enough = len(graph.window) >= config.initial_frames and initialise(patch_window, config, waited)
+        enough = len(graph.window) >= config.initial_frames and initialise(patch_window, config, waited, beside)
     return enough and len(graph.window) >= config.initial_frames
 
 
@@ -195,12 +209,13 @@ def restart_due(age: int, ambiguous: bool) -> bool:
     return age in RESTART_AGES or (ambiguous and age % RETRY_EVERY == 0)
 
 
-def leave_minimum(patch_window: PatchWindow, config: TrackerConfig) -> bool:
+def leave_minimum(patch_window: PatchWindow, config: TrackerConfig, beside: Beside | None = None) -> bool:
     """Start the window anew if that leads to a better solution (:mod:`dvo.ba.multistart`).
 
     Args:
         patch_window: of an initialised tracker; its poses and inverse depths are changed in place.
         config: scale of the covariance.
+        beside: see :func:`dvo.ba.multistart.multistart`.
 
     Returns:
         True if another solution is nearly as good as the one that is left
@@ -209,7 +224,7 @@ def leave_minimum(patch_window: PatchWindow, config: TrackerConfig) -> bool:
     window = patch_window.window
     if measured_share(window.measured) >= MEASURED_SHARE:
         return False
-    found = multistart(window.problem(), RESTARTS)
+    found = multistart(window.problem(), RESTARTS, beside=beside)
     best = preferred(found)
     if best.start != PRESENT:
         _take(window, best)

@@ -301,7 +301,7 @@ class PatchOdometry:
         record.place(identifier, self.graph.segment, state.resume())
         state.tracked += 1
         if config.restart and restart_due(state.tracked, state.ambiguous) and not window.guests:
-            state.ambiguous = leave_minimum(self.patch_window, config)
+            state.ambiguous = leave_minimum(self.patch_window, config, self.loops.maintenance.helper)
         retry_waiting(self.graph, self.patch_window, state, config, record)
         if self.graph.located is not None and state.tracked % REFRESH_EVERY == 0:
             hold_to_map(self.graph, self.patch_window, self.loops.finder)
@@ -345,7 +345,8 @@ class PatchOdometry:
                 return self._estimate(record, None, Status.INITIALISING)
         record.place(identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
-            enough = initialise_related(self.graph, self.patch_window, config, state.waited)
+            beside = self.loops.maintenance.helper
+            enough = initialise_related(self.graph, self.patch_window, config, state.waited, beside)
             if enough and newest_support(window).reaches(config.lost_confidence, config.min_inliers):
                 state.initialise(self.graph.segment)
                 if config.restart:

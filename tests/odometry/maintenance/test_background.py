@@ -100,6 +100,15 @@ def test_a_task_is_not_done_before_its_work():
     assert task.result() is True and task.done
 
 
+def test_work_that_has_not_begun_is_taken_back():
+    begun, release, background = threading.Event(), threading.Event(), Background()
+    first = background.start(lambda: begun.set() or release.wait(60))
+    second = background.start(lambda: pytest.fail("it was taken back"))
+    assert begun.wait(60) and second.withdraw() and not first.withdraw()
+    release.set()
+    assert first.result() is True and not first.withdraw() and background.start(lambda: 3).result() == 3
+
+
 def test_an_error_of_the_work_is_that_of_the_result():
     def fail():
         raise ValueError("no")

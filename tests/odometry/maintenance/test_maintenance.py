@@ -83,6 +83,17 @@ def test_the_thread_takes_steps_ahead_if_it_has_a_core(monkeypatch, cores, threa
     assert isinstance(maintenance.in_steps("search", steps(), found.append).task, Steps)
 
 
+def test_the_thread_helps_if_it_has_a_core_and_no_job(monkeypatch):
+    cores = [torch.get_num_threads() + 1]
+    monkeypatch.setattr("dvo.core.threads.available_cores", lambda: cores[0])
+    maintenance = MapMaintenance()
+    assert maintenance.helper(threading.get_ident).result() != threading.get_ident()
+    maintenance.job = maintenance.beside("correction", lambda: None, lambda _: {}, 1)
+    assert maintenance.helper is None
+    maintenance.job, cores[0] = None, torch.get_num_threads()
+    assert maintenance.helper is None
+
+
 def test_what_follows_is_waited_for_too():
     maintenance = MapMaintenance()
     owner = Owner(

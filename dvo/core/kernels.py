@@ -1,9 +1,9 @@
 """Choice between compiled kernels and their plain PyTorch twins.
 
 A kernel is a loop over numbers, compiled by numba when it is first called and then kept on the disk. The twin is its
-specification: it serves where gradients or an accelerator are asked for, where numba cannot be imported, and everywhere
-with ``DVO_KERNELS=torch``. Kernels stand in files named ``*_kernels.py``, which import numba and are imported where
-:func:`use_kernels` says so, since that takes half a second.
+specification: it serves on an accelerator, where derivatives are asked for that no kernel computes, where numba cannot
+be imported, and everywhere with ``DVO_KERNELS=torch``. Kernels stand in files named ``*_kernels.py``, which import
+numba and are imported where :func:`use_kernels` says so, since that takes half a second.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ VARIABLE = "DVO_KERNELS"
 CHOICES = ("numba", "torch")
 
 
-def use_kernels(*tensors: Tensor, double: bool = False) -> bool:
+def use_kernels(*tensors: Tensor, double: bool = False, adjoint: bool = False) -> bool:
     """Tell if a computation on these tensors is one for kernels.
 
     Args:
         tensors: the floating-point arguments.
         double: the kernels take float64 as well.
+        adjoint: first derivatives have kernels too, hence autograd may record.
 
     Returns:
         True for float32 tensors (or float64, where these are taken) on the CPU of which no derivative is recorded, by
-        autograd, as dual numbers or within ``torch.func``, if kernels are there and wanted.
+        autograd (unless ``adjoint``), as dual numbers or within ``torch.func``, if kernels are there and wanted.
 
     Raises:
         DvoError: ``DVO_KERNELS`` has another value than ``numba`` or ``torch``.
@@ -41,7 +42,7 @@ def use_kernels(*tensors: Tensor, double: bool = False) -> bool:
         return False
     dtype = torch.float64 if double and any(x.dtype == torch.float64 for x in tensors) else torch.float32
     plain = all(type(x) is Tensor and x.device.type == "cpu" and x.dtype == dtype for x in tensors)
-    return plain and not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors))
+    return plain and (adjoint or not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)))
 
 
 def is_transformed() -> bool:

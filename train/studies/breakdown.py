@@ -14,6 +14,7 @@ import torch
 
 import dvo.models.step as step_module
 import train.tasks.patch_vo.objective as objective
+from dvo.ba.layer import edgewise
 from dvo.ba.layer.step import GaussNewtonStep
 from dvo.core.command_line import OneLineParser
 from dvo.nets.correlation import correlation
@@ -38,8 +39,10 @@ LOSS: tuple[tuple[str, Any, str], ...] = (
 )
 BACKWARD: tuple[tuple[str, Any, str], ...] = (
     ("correlation look-up, backward", correlation._Lookup, "backward"),
-    ("correlation volume, backward", correlation._Volume, "backward"),
+    ("correlation look-up, backward", correlation._WindowLookup, "backward"),
+    ("correlation volume, backward", correlation._Source, "backward"),
     ("bundle adjustment, backward", GaussNewtonStep, "backward"),
+    ("bundle adjustment, backward", edgewise._Recorded, "backward"),
 )
 
 
@@ -126,7 +129,7 @@ def table(seconds: dict[str, float]) -> str:
     step = seconds["step"]
     forward = [name for name, _, _ in FORWARD]
     loss = [name for name, _, _ in LOSS]
-    backward = [name for name, _, _ in BACKWARD]
+    backward = list(dict.fromkeys(name for name, _, _ in BACKWARD))
     # Reprojection is called by the objective under its own name, so nothing here is counted twice.
     rest = seconds["forward and loss"] - sum(seconds.get(n, 0.0) for n in (*forward, *loss))
     behind = seconds["backward"] - sum(seconds.get(n, 0.0) for n in backward)

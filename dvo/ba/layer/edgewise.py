@@ -1,14 +1,15 @@
-"""Patch reprojection of one camera without gradients, by compiled loops over the edges.
+"""Patch reprojection of one camera by compiled loops over the edges.
 
-:mod:`dvo.ba.layer.grouped` is the twin: it takes any device and records gradients. Nothing is sorted here, and a whole
-solution is one call where no other factor takes part.
+:mod:`dvo.ba.layer.grouped` is the twin: it takes any device, and its derivatives are of any order. Nothing is sorted
+here, and a whole solution is one call where no other factor takes part. First derivatives have kernels only then.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,14 @@ from torch import Tensor
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
 from dvo.ba.edges import plan_edges
 from dvo.ba.kernels import Kernel
+from dvo.ba.layer import step
 from dvo.ba.layer.grouped import GroupedReprojection, group_measurements
 from dvo.ba.layer.reprojection import MARGIN, PatchReprojection
 from dvo.ba.layer.step import normal_equations
+from dvo.ba.layer.transforms import composed, pulled_back
 from dvo.ba.options import BADamping
 from dvo.ba.problem import Factor, Linearisation, NormalEquations, Problem, State
-from dvo.core.kernels import use_kernels
+from dvo.core.kernels import is_transformed, use_kernels
 from dvo.geometry.projection import MIN_Z_VALID
 
 Array = np.ndarray[Any, Any]
@@ -166,18 +169,106 @@ def gauss_newton(problem: Problem, iterations: int, damping: BADamping, depth_ra
             state = state.moved(*_step(problem, damping))
             problem = Problem(state, problem.factors)
         return problem
+    tensors = problem.tensors()
+    recorded = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    solve = _Recorded.apply if recorded else partial(_taken, None)
+    poses, inverse_depths = solve(problem, _Settings(iterations, damping, depth_range), *tensors)
+    return Problem(state.with_values({POSES: poses, INVERSE_DEPTHS: inverse_depths}), problem.factors)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Arguments of :func:`gauss_newton`."""
+
+    iterations: int
+    damping: BADamping
+    depth_range: tuple[float, float]
+
+    def numbers(self) -> tuple[float, ...]:
+        """Those of the kernels."""
+        damping = self.damping
+        return tuple(float(x) for x in (damping.pose, damping.relative, damping.depth, *self.depth_range))
+
+
+def _constants(problem: Problem, settings: _Settings) -> tuple[Any, ...]:
+    """Arguments of the kernels from the edges to the damping."""
+    state, factor = problem.state, problem.factors[0]
+    assert isinstance(factor, EdgewiseReprojection)
+    held = state[INVERSE_DEPTHS].held
+    return *factor._edges(), _rows(state), state.size, not held, *factor._gate(), *settings.numbers()
+
+
+def _taken(path: list[Array] | None, problem: Problem, settings: _Settings, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """New poses and inverse depths; values of both before each step are added to the path."""
     from dvo.ba.layer.edgewise_kernels import take_steps
 
-    factor, held = problem.factors[0], state[INVERSE_DEPTHS].held
+    poses, inverse_depths, *measured = (x.detach().contiguous().numpy() for x in tensors)
+    poses, inverse_depths = poses.copy(), inverse_depths.copy()
+    arguments: tuple[Any, ...] = (poses, inverse_depths, *measured, *_constants(problem, settings))
+    if path is None:
+        take_steps(*arguments, int(settings.iterations))
+    else:
+        for _ in range(settings.iterations):
+            path += [poses.copy(), inverse_depths.copy()]
+            take_steps(*arguments, 1)
+    return torch.from_numpy(poses), torch.from_numpy(inverse_depths)
+
+
+def _by_twin(problem: Problem, settings: _Settings, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """The same by operations that autograd records, any number of times."""
+    problem = problem.with_tensors(tensors)
+    factor = problem.factors[0]
     assert isinstance(factor, EdgewiseReprojection)
-    values = factor._values(state)
-    poses, inverse_depths = values[0].copy(), values[1].copy()
-    numbers = [float(x) for x in (damping.pose, damping.relative, damping.depth, *depth_range)]
-    of_edges = *values[2:], *factor._edges(), _rows(state), state.size, not held, *factor._gate()
-    arguments: tuple[Any, ...] = (poses, inverse_depths, *of_edges, *numbers, int(iterations))
-    take_steps(*arguments)
-    found = {POSES: torch.from_numpy(poses), INVERSE_DEPTHS: torch.from_numpy(inverse_depths)}
-    return Problem(state.with_values(found), problem.factors)
+    problem = Problem(problem.state, (factor._grouped(problem.state),))
+    state = step.gauss_newton(problem, settings.iterations, settings.damping).state
+    return state[POSES].value, state[INVERSE_DEPTHS].value
+
+
+class _Recorded(torch.autograd.Function):
+    """``(problem, settings, *problem.tensors())`` to new poses and inverse depths, with a compiled adjoint."""
+
+    @staticmethod
+    def forward(ctx: Any, problem: Problem, settings: _Settings, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.problem, ctx.settings, ctx.path, ctx.count = problem, settings, [], len(tensors)
+        # Indices are saved for autograd to notice if they are changed before the backward pass.
+        ctx.save_for_backward(*tensors, *problem.indices())
+        return _taken(ctx.path, problem, settings, *tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        step.refuse_batch(grads[0])
+        tensors = ctx.saved_tensors[: ctx.count]
+        needed = [i for i in range(len(tensors)) if ctx.needs_input_grad[i + 2]]
+        found: Sequence[Tensor]
+        if torch.is_grad_enabled() or is_transformed():
+            twin = partial(_by_twin, ctx.problem, ctx.settings)
+            found = composed(partial(pulled_back, twin, needed, len(tensors)), *tensors, *grads)
+        else:
+            every = _taken_back(ctx.path, ctx.problem, ctx.settings, tensors, grads)
+            found = step.finite([every[i] for i in needed], grads)
+        out: list[Tensor | None] = [None] * len(tensors)
+        for i, gradient in zip(needed, found, strict=True):
+            out[i] = gradient
+        return None, None, *out
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
+        step.refuse_dual_numbers()
+
+
+def _taken_back(
+    path: list[Array], problem: Problem, settings: _Settings, tensors: Sequence[Tensor], grads: Sequence[Tensor]
+) -> list[Tensor]:
+    """Gradients by all tensors from those by the new poses and inverse depths."""
+    from dvo.ba.layer.edgewise_kernels import take_back_step
+
+    measured = [x.detach().contiguous().numpy() for x in tensors[2:]]
+    constants = _constants(problem, settings)
+    sums = [x.double().contiguous().numpy().copy() for x in grads] + [np.zeros(x.shape) for x in measured]
+    for at in range(len(path) - 2, -1, -2):
+        arguments: tuple[Any, ...] = (path[at], path[at + 1], *measured, *constants, *sums)
+        take_back_step(*arguments)
+    return [torch.from_numpy(x).float() for x in sums]
 
 
 def _step(problem: Problem, damping: BADamping) -> tuple[Tensor, Tensor]:

@@ -366,17 +366,35 @@ def solve_reduced(
         longest: ``(P,)`` largest number of a step in each unknown.
         dp: ``(P,)`` filled with the steps. dl: ``(K,)``, too.
     """
+    _solve(h_pp, h_lp, h_ll, g_p, g_l, absolute, relative, longest, dp, dl, np.empty(len(g_l)), np.empty_like(h_pp))
+
+
+@part
+def _solve(
+    h_pp: Array,
+    h_lp: Array,
+    h_ll: Array,
+    g_p: Array,
+    g_l: Array,
+    absolute: float,
+    relative: float,
+    longest: Array,
+    dp: Array,
+    dl: Array,
+    q: Array,
+    factor: Array,
+) -> bool:
+    """As :func:`solve_reduced`; fills the inverse curvatures ``q (K,)``, zero for a step that is too long, and the
+    Cholesky factor too. False where poses do not move."""
     size, count = len(g_p), len(g_l)
-    q, weighted = np.empty(count), np.empty(count)
     for k in range(count):
         q[k] = 1 / h_ll[k] if h_ll[k] > 0 else 0.0
-        weighted[k] = q[k] * g_l[k]
+    weighted = q * g_l
     for a in range(size):
         dp[a] = g_p[a]
     _eliminate(h_lp, q, weighted, h_pp, dp)
     for a in range(size):
         h_pp[a, a] += h_pp[a, a] * relative + absolute
-    factor = np.empty((size, size))
     good, far = _factorise(h_pp, factor) and _solve_factored(factor, dp), False
     for a in range(size):
         if not good:
@@ -386,29 +404,60 @@ def solve_reduced(
         for a in range(size):
             dp[a] = 0.0
         for k in range(count):
-            dl[k] = 0.0
-        return
+            dl[k] = q[k] = 0.0
+        return False
+    _substitute(h_lp, q, g_l, dp, dl)
     for k in range(count):
+        if not abs(dl[k]) <= LARGEST:
+            dl[k] = 0.0
+    return good
+
+
+@part
+def _substitute(h_lp: Array, q: Array, g_l: Array, dp: Array, dl: Array) -> None:
+    """``dl = Q (g_l - E^T dp)``."""
+    for k in range(len(dl)):
         rest = g_l[k]
-        for a in range(size):
+        for a in range(len(dp)):
             rest -= h_lp[k, a] * dp[a]
-        rest *= q[k]
-        dl[k] = rest if abs(rest) <= LARGEST else 0.0
+        dl[k] = q[k] * rest
+
+
+@part
+def _exp_terms(s: float) -> tuple[float, float, float]:
+    """Of a squared angle, as :func:`dvo.geometry.so3.exp_terms`: factor of the rotation vector in the quaternion, last
+    number of the quaternion, second coefficient of the left Jacobian."""
+    if s < SMALL:
+        return (
+            1 / 2 + s * (-1 / 48 + s * (1 / 3840 - s / 645120)),
+            1 + s * (-1 / 8 + s * (1 / 384 - s / 46080)),
+            1 / 6 + s * (-1 / 120 + s * (1 / 5040 - s / 362880)),
+        )
+    t = math.sqrt(s)
+    sine, cosine = math.sin(0.5 * t), math.cos(0.5 * t)
+    return sine / t, cosine, (t - 2 * sine * cosine) / (s * t)
+
+
+@part
+def _exp_slopes(s: float) -> tuple[float, float, float]:
+    """Derivatives of :func:`_exp_terms`."""
+    if s < SMALL:
+        return (
+            -1 / 48 + s * (1 / 1920 - s / 215040),
+            -1 / 8 + s * (1 / 192 - s / 15360),
+            -1 / 120 + s * (1 / 2520 - s / 120960),
+        )
+    t = math.sqrt(s)
+    sine, cosine = math.sin(0.5 * t), math.cos(0.5 * t)
+    third = (2 * sine * sine - 3 * (t - 2 * sine * cosine) / t) / (s * t)
+    return (0.5 * cosine - sine / t) / (2 * s), -0.25 * sine / t, third / (2 * t)
 
 
 @part
 def _retract_pose(pose: Array, step: Array) -> None:
     """Left retraction in place, as :func:`dvo.geometry.se3.retract`."""
     a, b, c = step[3], step[4], step[5]
-    s = a * a + b * b + c * c
-    if s < SMALL:
-        k = 1 / 2 + s * (-1 / 48 + s * (1 / 3840 - s / 645120))
-        ow = 1 + s * (-1 / 8 + s * (1 / 384 - s / 46080))
-        third = 1 / 6 + s * (-1 / 120 + s * (1 / 5040 - s / 362880))
-    else:
-        t = math.sqrt(s)
-        sine, ow = math.sin(0.5 * t), math.cos(0.5 * t)
-        k, third = sine / t, (t - 2 * sine * ow) / (s * t)
+    k, ow, third = _exp_terms(a * a + b * b + c * c)
     ox, oy, oz, second = k * a, k * b, k * c, 2 * k * k
     r = np.empty(9)
     _rotation(ox, oy, oz, ow, r)
@@ -424,6 +473,19 @@ def _retract_pose(pose: Array, step: Array) -> None:
     if length < 1e-12:
         length = 1e-12
     pose[3], pose[4], pose[5], pose[6] = qx / length, qy / length, qz / length, qw / length
+
+
+@part
+def _clear(depth_damping: float, h_pp: Array, h_lp: Array, h_ll: Array, g_p: Array, g_l: Array) -> None:
+    """Equations of nothing but damping of the depths."""
+    for a in range(len(g_p)):
+        g_p[a] = 0.0
+        for c in range(len(g_p)):
+            h_pp[a, c] = 0.0
+    for k in range(len(g_l)):
+        g_l[k], h_ll[k] = 0.0, depth_damping
+        for a in range(len(g_p)):
+            h_lp[k, a] = 0.0
 
 
 @compiled
@@ -462,20 +524,13 @@ def take_steps(
         iterations: number of steps.
     """
     count = depths.shape[1]
-    longest = np.empty(size)
+    longest = np.full(size, LARGEST)
     h_pp, h_lp = np.empty((size, size)), np.empty((count, size))
     h_ll, g_p, g_l = np.empty(count), np.empty(size), np.empty(count)
     dp, dl = np.empty(size), np.empty(count)
     for b in range(len(poses)):
         for _ in range(iterations):
-            for a in range(size):
-                longest[a], g_p[a] = LARGEST, 0.0
-                for c in range(size):
-                    h_pp[a, c] = 0.0
-            for k in range(count):
-                g_l[k], h_ll[k] = 0.0, depth_damping if depth_part else 0.0
-                for a in range(size):
-                    h_lp[k, a] = 0.0
+            _clear(depth_damping if depth_part else 0.0, h_pp, h_lp, h_ll, g_p, g_l)
             add_reprojection(
                 poses[b], depths[b], centres[b], intrinsics[b], targets[b], weights[b], ii, jj, kk, pairs, ends, rows,
                 depth_part, gate, robust, h_pp, h_lp, h_ll, g_p, g_l,
@@ -489,3 +544,400 @@ def take_steps(
                     d = depths[b, k] + dl[k]
                     d = low if d < low else d
                     depths[b, k] = high if d > high else d
+
+
+@compiled
+def take_back_step(
+    poses: Array,
+    depths: Array,
+    centres: Array,
+    intrinsics: Array,
+    targets: Array,
+    weights: Array,
+    ii: Array,
+    jj: Array,
+    kk: Array,
+    pairs: Array,
+    ends: Array,
+    rows: Array,
+    size: int,
+    depth_part: bool,
+    gate: tuple[float, ...],
+    robust: int,
+    pose_damping: float,
+    relative: float,
+    depth_damping: float,
+    low: float,
+    high: float,
+    d_poses: Array,
+    d_depths: Array,
+    d_centres: Array,
+    d_intrinsics: Array,
+    d_targets: Array,
+    d_weights: Array,
+) -> None:
+    """Adjoint of one of :func:`take_steps`; the formula is that of :mod:`dvo.ba.layer.adjoint`.
+
+    Args:
+        poses, depths: before the step.
+        d_poses, d_depths: gradients by those after it; they become those before it.
+        d_centres, d_intrinsics, d_targets, d_weights: gradients are added to these. All six are float64.
+    """
+    frames, count = poses.shape[1], depths.shape[1]
+    longest = np.full(size, LARGEST)
+    h_pp, h_lp, factor = np.empty((size, size)), np.empty((count, size)), np.empty((size, size))
+    h_ll, q = np.empty(count), np.empty(count)
+    g_p, dp, lp, s = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    g_l, dl, ll, c_l, curve = np.empty(count), np.empty(count), np.empty(count), np.empty(count), np.empty(count)
+    for b in range(len(poses)):
+        _clear(depth_damping if depth_part else 0.0, h_pp, h_lp, h_ll, g_p, g_l)
+        add_reprojection(
+            poses[b], depths[b], centres[b], intrinsics[b], targets[b], weights[b], ii, jj, kk, pairs, ends, rows,
+            depth_part, gate, robust, h_pp, h_lp, h_ll, g_p, g_l,
+        )  # fmt: skip
+        good = _solve(h_pp, h_lp, h_ll, g_p, g_l, pose_damping, relative, longest, dp, dl, q, factor)
+        for n in range(frames):
+            if rows[n] >= 0:
+                own = slice(rows[n], rows[n] + 6)
+                _take_back_retraction(poses[b, n], dp[own], d_poses[b, n], lp[own])
+        for k in range(count):
+            c_l[k] = 0.0
+            if depth_part:
+                there = depths[b, k] + dl[k]
+                if not low <= there <= high:
+                    d_depths[b, k] = 0.0
+                c_l[k] = d_depths[b, k]
+        # H lambda = c, with the factor of the step
+        for k in range(count):
+            weighted = q[k] * c_l[k]
+            for a in range(size):
+                lp[a] -= h_lp[k, a] * weighted
+        if not (good and _solve_factored(factor, lp)):
+            for a in range(size):
+                lp[a] = 0.0
+        _substitute(h_lp, q, c_l, lp, ll)
+        for a in range(size):
+            s[a] = -relative * lp[a] * dp[a]
+        for k in range(count):
+            curve[k] = 0.0
+            for a in range(size):
+                e = h_lp[k, a] * q[k]
+                curve[k] += s[a] * e * e
+                h_lp[k, a] = -2 * s[a] * e
+        _add_edge_gradients(
+            poses[b], depths[b], centres[b], intrinsics[b], targets[b], weights[b], ii, jj, kk, pairs, ends, rows,
+            gate, robust, lp, dp, ll, dl, s, h_lp, curve, d_poses[b], d_depths[b], d_centres[b], d_intrinsics[b],
+            d_targets[b], d_weights[b],
+        )  # fmt: skip
+
+
+@part
+def _add_matrix_gradient(x: float, y: float, z: float, w: float, g: Array, out: Array) -> None:
+    """Gradient by a quaternion from that by its rotation matrix ``g (3, 3)``, as of :func:`dvo.geometry.so3.matrix`."""
+    x, y, z, w = np.float64(x), np.float64(y), np.float64(z), np.float64(w)
+    s01, s02, s12 = g[0, 1] + g[1, 0], g[0, 2] + g[2, 0], g[1, 2] + g[2, 1]
+    a, b, c = g[2, 1] - g[1, 2], g[0, 2] - g[2, 0], g[1, 0] - g[0, 1]
+    out[0] += 2 * (x * (g[0, 0] - g[1, 1] - g[2, 2]) + y * s01 + z * s02 + w * a)
+    out[1] += 2 * (x * s01 + y * (g[1, 1] - g[0, 0] - g[2, 2]) + z * s12 + w * b)
+    out[2] += 2 * (x * s02 + y * s12 + z * (g[2, 2] - g[0, 0] - g[1, 1]) + w * c)
+    out[3] += 2 * (w * (g[0, 0] + g[1, 1] + g[2, 2]) + x * a + y * b + z * c)
+
+
+@part
+def _take_back_retraction(pose: Array, step: Array, d_pose: Array, d_step: Array) -> None:
+    """Adjoint of :func:`_retract_pose`: ``d_pose`` becomes the gradient before it, ``d_step`` is filled."""
+    tx, ty, tz, fa, fb, fc = step[0], step[1], step[2], step[3], step[4], step[5]
+    square = fa * fa + fb * fb + fc * fc
+    k, o, third = _exp_terms(square)
+    k_slope, o_slope, third_slope = _exp_slopes(square)
+    a, b, c, second = k * fa, k * fb, k * fc, 2 * k * k
+    x, y, z, w = np.float64(pose[3]), np.float64(pose[4]), np.float64(pose[5]), np.float64(pose[6])
+    qx, qy = o * x + a * w + b * z - c * y, o * y + b * w + c * x - a * z
+    qz, qw = o * z + c * w + a * y - b * x, o * w - a * x - b * y - c * z
+    length = max(math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw), 1e-12)
+    qx, qy, qz, qw = qx / length, qy / length, qz / length, qw / length
+    along = qx * d_pose[3] + qy * d_pose[4] + qz * d_pose[5] + qw * d_pose[6]
+    gx, gy = (d_pose[3] - along * qx) / length, (d_pose[4] - along * qy) / length
+    gz, gw = (d_pose[5] - along * qz) / length, (d_pose[6] - along * qw) / length
+    d_q = np.empty(4)  # of the step
+    d_q[0], d_q[1] = gx * w - gy * z + gz * y - gw * x, gx * z + gy * w - gz * x - gw * y
+    d_q[2], d_q[3] = gy * x - gx * y + gz * w - gw * z, gx * x + gy * y + gz * z + gw * w
+    d_pose[3], d_pose[4] = gx * o + gy * c - gz * b - gw * a, gy * o - gx * c + gz * a - gw * b
+    d_pose[5], d_pose[6] = gx * b - gy * a + gz * o - gw * c, gx * a + gy * b + gz * c + gw * o
+    g0, g1, g2 = d_pose[0], d_pose[1], d_pose[2]
+    outer, r = np.empty((3, 3)), np.empty(9)
+    for n in range(3):
+        t = np.float64(pose[n])
+        outer[0, n], outer[1, n], outer[2, n] = g0 * t, g1 * t, g2 * t
+    _add_matrix_gradient(a, b, c, o, outer, d_q)
+    _rotation(a, b, c, o, r)
+    for n in range(3):
+        d_pose[n] = r[n] * g0 + r[3 + n] * g1 + r[6 + n] * g2
+    # t + second (f x t) + third (f x (f x t)) of the step
+    u0, u1, u2 = fb * tz - fc * ty, fc * tx - fa * tz, fa * ty - fb * tx
+    v0, v1, v2 = fb * u2 - fc * u1, fc * u0 - fa * u2, fa * u1 - fb * u0
+    d_second, d_third = g0 * u0 + g1 * u1 + g2 * u2, g0 * v0 + g1 * v1 + g2 * v2
+    h0, h1, h2 = third * g0, third * g1, third * g2
+    w0 = second * g0 + h1 * fc - h2 * fb
+    w1 = second * g1 + h2 * fa - h0 * fc
+    w2 = second * g2 + h0 * fb - h1 * fa
+    d_k = d_q[0] * fa + d_q[1] * fb + d_q[2] * fc + 4 * k * d_second
+    d_square = 2 * (d_k * k_slope + d_q[3] * o_slope + d_third * third_slope)
+    d_step[0], d_step[1], d_step[2] = g0 + w1 * fc - w2 * fb, g1 + w2 * fa - w0 * fc, g2 + w0 * fb - w1 * fa
+    d_step[3] = k * d_q[0] + d_square * fa + u1 * h2 - u2 * h1 + ty * w2 - tz * w1
+    d_step[4] = k * d_q[1] + d_square * fb + u2 * h0 - u0 * h2 + tz * w0 - tx * w2
+    d_step[5] = k * d_q[2] + d_square * fc + u0 * h1 - u1 * h0 + tx * w1 - ty * w0
+
+
+@part
+def _adjoint_of(m: Array, out: Array) -> None:
+    """Adjoint ``(6, 6)`` of a motion ``(3, 4)``."""
+    for b in range(3):
+        for a in range(3):
+            out[a, b] = out[3 + a, 3 + b] = m[a, b]
+            out[3 + a, b] = 0.0
+        out[0, 3 + b] = m[1, 3] * m[2, b] - m[2, 3] * m[1, b]
+        out[1, 3 + b] = m[2, 3] * m[0, b] - m[0, 3] * m[2, b]
+        out[2, 3 + b] = m[0, 3] * m[1, b] - m[1, 3] * m[0, b]
+
+
+@part
+def _add_edge_gradients(
+    poses: Array,
+    depths: Array,
+    centres: Array,
+    intrinsics: Array,
+    targets: Array,
+    weights: Array,
+    ii: Array,
+    jj: Array,
+    kk: Array,
+    pairs: Array,
+    ends: Array,
+    rows: Array,
+    gate: tuple[float, ...],
+    robust: int,
+    lambda_p: Array,
+    delta_p: Array,
+    lambda_l: Array,
+    delta_l: Array,
+    s: Array,
+    e: Array,
+    curve: Array,
+    d_poses: Array,
+    d_depths: Array,
+    d_centres: Array,
+    d_intrinsics: Array,
+    d_targets: Array,
+    d_weights: Array,
+) -> None:
+    """Add the gradients of phi (:mod:`dvo.ba.layer.adjoint`) of one element of a batch; ``e (K, P)``, ``curve (K,)``
+    is c there."""
+    motions, count = _pair_motions(poses, ends), len(ends)
+    adjoints, flows, changes = np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros((count, 6))
+    diagonals, turned = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))  # J diag(s) J^T of both ends; Ad diag(s_i)
+    for p in range(count):
+        i, j = rows[ends[p, 0]], rows[ends[p, 1]]
+        _adjoint_of(motions[p], adjoints[p])
+        if ends[p, 0] == ends[p, 1]:
+            continue
+        for a in range(6):
+            if j >= 0:
+                flows[p, a], changes[p, a] = lambda_p[j + a], delta_p[j + a]
+                diagonals[p, a, a] = s[j + a]
+            if i >= 0:
+                for c in range(6):
+                    flows[p, a] -= adjoints[p, a, c] * lambda_p[i + c]
+                    changes[p, a] -= adjoints[p, a, c] * delta_p[i + c]
+                    turned[p, a, c] = adjoints[p, a, c] * s[i + c]
+        if i >= 0:
+            for a in range(6):
+                for b in range(6):
+                    for c in range(6):
+                        diagonals[p, a, b] += turned[p, a, c] * adjoints[p, b, c]
+    d_flows, d_changes = np.zeros((count, 6)), np.zeros((count, 6))
+    d_diagonals, d_adjoints, d_motions = np.zeros((count, 6, 6)), np.zeros((count, 6, 6)), np.zeros((count, 3, 4))
+    jx, jy, gx, gy = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    e_i, e_here = np.empty(6), np.empty(6)
+    least_z, longest, middle_x, middle_y, reach_x, reach_y, scale = gate
+    longest, square = longest * longest, scale * scale
+    for edge in range(len(ii)):
+        i, j, k, p = ii[edge], jj[edge], kk[edge], pairs[edge]
+        target_x, target_y = np.float64(targets[edge, 0]), np.float64(targets[edge, 1])
+        weight_x, weight_y = np.float64(weights[edge, 0]), np.float64(weights[edge, 1])
+        if not (abs(target_x) <= LARGEST and abs(target_y) <= LARGEST):
+            continue
+        if not (abs(weight_x) < math.inf and abs(weight_y) < math.inf):
+            continue
+        m, d = motions[p], np.float64(depths[k])
+        fix, fiy = np.float64(intrinsics[i, 0]), np.float64(intrinsics[i, 1])
+        u = (np.float64(centres[k, 0]) - intrinsics[i, 2]) / fix
+        v = (np.float64(centres[k, 1]) - intrinsics[i, 3]) / fiy
+        z = m[2, 0] * u + m[2, 1] * v + m[2, 2] + m[2, 3] * d
+        if not z > least_z:
+            continue
+        inv_z = 1 / z
+        px = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * d
+        py = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * d
+        x, y = px * inv_z, py * inv_z
+        fx, fy = np.float64(intrinsics[j, 0]), np.float64(intrinsics[j, 1])
+        cx, cy = np.float64(intrinsics[j, 2]), np.float64(intrinsics[j, 3])
+        tx, ty = (target_x - cx) / fx, (target_y - cy) / fy
+        rx, ry = tx - x, ty - y
+        if not rx * fx * (rx * fx) + ry * fy * (ry * fy) < longest:
+            continue
+        if not (abs(cx - middle_x + x * fx) < reach_x and abs(cy - middle_y + y * fy) < reach_y):
+            continue
+        slope = 1.0
+        wx, wy = weight_x * fx * fx, weight_y * fy * fy
+        if robust != NONE:
+            norm = (wx * rx * rx + wy * ry * ry) / square
+            slope = 1 / (1 + norm) if robust == CAUCHY else 1 / math.sqrt(norm) if norm > 1 else 1.0
+            wx, wy = wx * slope, wy * slope
+        h = d * inv_z
+        jx[0], jx[1], jx[2], jx[3], jx[4], jx[5] = h, 0.0, -h * x, -x * y, x * x + 1, -y
+        jy[0], jy[1], jy[2], jy[3], jy[4], jy[5] = 0.0, h, -h * y, -y * y - 1, x * y, x
+        dx, dy = (m[0, 3] - x * m[2, 3]) * inv_z, (m[1, 3] - y * m[2, 3]) * inv_z
+        # J lambda, J delta, J diag(s) J^T and J e
+        flow_x, flow_y, change_x, change_y = dx * lambda_l[k], dy * lambda_l[k], dx * delta_l[k], dy * delta_l[k]
+        bent_x = bent_y = mixed_x = mixed_y = 0.0
+        apart = i != j
+        if apart:
+            to = rows[j]
+            for a in range(6):
+                e_here[a] = e[k, to + a] if to >= 0 else 0.0
+            to = rows[i]
+            if to >= 0:
+                for a in range(6):
+                    e_i[a] = e[k, to + a]
+                for a in range(6):
+                    for b in range(6):
+                        e_here[a] -= adjoints[p, a, b] * e_i[b]
+            for a in range(6):
+                flow_x, flow_y = flow_x + jx[a] * flows[p, a], flow_y + jy[a] * flows[p, a]
+                change_x, change_y = change_x + jx[a] * changes[p, a], change_y + jy[a] * changes[p, a]
+                mixed_x, mixed_y = mixed_x + jx[a] * e_here[a], mixed_y + jy[a] * e_here[a]
+                gx[a] = gy[a] = 0.0
+                for b in range(6):
+                    gx[a] += diagonals[p, a, b] * jx[b]
+                    gy[a] += diagonals[p, a, b] * jy[b]
+                bent_x, bent_y = bent_x + jx[a] * gx[a], bent_y + jy[a] * gy[a]
+        # By the weights, the residuals and the two directional derivatives
+        cl = curve[k]
+        by_wx = flow_x * (rx - change_x) + bent_x + dx * (mixed_x + dx * cl)
+        by_wy = flow_y * (ry - change_y) + bent_y + dy * (mixed_y + dy * cl)
+        by_rx, by_ry = wx * flow_x, wy * flow_y
+        by_flow_x, by_flow_y = wx * (rx - change_x), wy * (ry - change_y)
+        by_dx = by_flow_x * lambda_l[k] - by_rx * delta_l[k] + wx * (mixed_x + 2 * dx * cl)
+        by_dy = by_flow_y * lambda_l[k] - by_ry * delta_l[k] + wy * (mixed_y + 2 * dy * cl)
+        by_x, by_y, by_h = -by_rx, -by_ry, 0.0
+        if apart:
+            wdx, wdy = wx * dx, wy * dy
+            for a in range(6):
+                flow, change = flows[p, a], changes[p, a]
+                gx[a] = by_flow_x * flow - by_rx * change + 2 * wx * gx[a] + wdx * e_here[a]
+                gy[a] = by_flow_y * flow - by_ry * change + 2 * wy * gy[a] + wdy * e_here[a]
+                d_flows[p, a] += by_flow_x * jx[a] + by_flow_y * jy[a]
+                d_changes[p, a] -= by_rx * jx[a] + by_ry * jy[a]
+                ax, ay = wx * jx[a], wy * jy[a]
+                for b in range(6):
+                    d_diagonals[p, a, b] += ax * jx[b] + ay * jy[b]
+            if rows[i] >= 0:
+                for a in range(6):
+                    by_e = wdx * jx[a] + wdy * jy[a]
+                    for b in range(6):
+                        d_adjoints[p, a, b] -= by_e * e_i[b]
+            by_h = gx[0] - x * gx[2] + gy[1] - y * gy[2]
+            by_x += 2 * x * gx[4] - h * gx[2] - y * gx[3] + y * gy[4] + gy[5]
+            by_y += x * gy[4] - x * gx[3] - gx[5] - h * gy[2] - 2 * y * gy[3]
+        # By the point and the motion
+        tz = m[2, 3]
+        by_x -= by_dx * tz * inv_z
+        by_y -= by_dy * tz * inv_z
+        by_inv = by_dx * (m[0, 3] - x * tz) + by_dy * (m[1, 3] - y * tz) + by_h * d + by_x * px + by_y * py
+        by_px, by_py, by_pz = by_x * inv_z, by_y * inv_z, -by_inv * inv_z * inv_z
+        g = d_motions[p]
+        g[0, 3] += by_dx * inv_z + by_px * d
+        g[1, 3] += by_dy * inv_z + by_py * d
+        g[2, 3] += by_pz * d - (by_dx * x + by_dy * y) * inv_z
+        g[0, 0] += by_px * u
+        g[0, 1] += by_px * v
+        g[0, 2] += by_px
+        g[1, 0] += by_py * u
+        g[1, 1] += by_py * v
+        g[1, 2] += by_py
+        g[2, 0] += by_pz * u
+        g[2, 1] += by_pz * v
+        g[2, 2] += by_pz
+        d_depths[k] += by_h * inv_z + by_px * m[0, 3] + by_py * m[1, 3] + by_pz * m[2, 3]
+        # By what is measured
+        by_u = (m[0, 0] * by_px + m[1, 0] * by_py + m[2, 0] * by_pz) / fix
+        by_v = (m[0, 1] * by_px + m[1, 1] * by_py + m[2, 1] * by_pz) / fiy
+        d_centres[k, 0] += by_u
+        d_centres[k, 1] += by_v
+        d_intrinsics[i, 0] -= by_u * u
+        d_intrinsics[i, 1] -= by_v * v
+        d_intrinsics[i, 2] -= by_u
+        d_intrinsics[i, 3] -= by_v
+        by_tx, by_ty = by_rx / fx, by_ry / fy
+        d_targets[edge, 0] += by_tx
+        d_targets[edge, 1] += by_ty
+        by_wx, by_wy = by_wx * slope * fx, by_wy * slope * fy
+        d_weights[edge, 0] += by_wx * fx
+        d_weights[edge, 1] += by_wy * fy
+        d_intrinsics[j, 0] += 2 * by_wx * weight_x - by_tx * tx
+        d_intrinsics[j, 1] += 2 * by_wy * weight_y - by_ty * ty
+        d_intrinsics[j, 2] -= by_tx
+        d_intrinsics[j, 3] -= by_ty
+    for p in range(count):
+        i = rows[ends[p, 0]]
+        if ends[p, 0] == ends[p, 1] or i < 0:
+            continue
+        for a in range(6):
+            for b in range(6):
+                total = -d_flows[p, a] * lambda_p[i + b] - d_changes[p, a] * delta_p[i + b]
+                for c in range(6):
+                    total += 2 * d_diagonals[p, a, c] * turned[p, c, b]
+                d_adjoints[p, a, b] += total
+    _add_motion_gradients(poses, ends, motions, d_motions, d_adjoints, d_poses)
+
+
+@part
+def _add_motion_gradients(
+    poses: Array, ends: Array, motions: Array, d_motions: Array, d_adjoints: Array, d_poses: Array
+) -> None:
+    """From the motions ``(Q, 3, 4)`` of the pairs of frames and their adjoints ``(Q, 6, 6)`` to the poses."""
+    frames = len(poses)
+    rotations, d_rotations = np.empty((frames, 9)), np.zeros((frames, 3, 3))
+    for n in range(frames):
+        _rotation(poses[n, 3], poses[n, 4], poses[n, 5], poses[n, 6], rotations[n])
+    skew = np.empty((3, 3))
+    for p in range(len(ends)):
+        i, j, m, g, ad = ends[p, 0], ends[p, 1], motions[p], d_motions[p], d_adjoints[p]
+        for a in range(3):
+            for b in range(3):
+                g[a, b] += ad[a, b] + ad[3 + a, 3 + b]
+                x = 0.0
+                for c in range(3):
+                    x += ad[a, 3 + c] * m[b, c]
+                skew[a, b] = x
+        for b in range(3):  # minus the skew matrix of t times the upper right block
+            g[0, b] += m[2, 3] * ad[1, 3 + b] - m[1, 3] * ad[2, 3 + b]
+            g[1, b] += m[0, 3] * ad[2, 3 + b] - m[2, 3] * ad[0, 3 + b]
+            g[2, b] += m[1, 3] * ad[0, 3 + b] - m[0, 3] * ad[1, 3 + b]
+        g[0, 3] += skew[2, 1] - skew[1, 2]
+        g[1, 3] += skew[0, 2] - skew[2, 0]
+        g[2, 3] += skew[1, 0] - skew[0, 1]
+        for a in range(3):
+            d_poses[j, a] += g[a, 3]
+            for b in range(3):
+                d_poses[i, b] -= m[a, b] * g[a, 3]
+                g[a, b] -= g[a, 3] * poses[i, b]
+        for a in range(3):
+            for b in range(3):
+                for c in range(3):
+                    d_rotations[j, a, b] += g[a, c] * rotations[i, 3 * c + b]
+                    d_rotations[i, a, b] += g[c, a] * rotations[j, 3 * c + b]
+    for n in range(frames):
+        x, y, z, w = poses[n, 3], poses[n, 4], poses[n, 5], poses[n, 6]
+        _add_matrix_gradient(x, y, z, w, d_rotations[n], d_poses[n, 3:])

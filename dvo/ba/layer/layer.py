@@ -230,7 +230,7 @@ def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped:
     reprojection: Factor | None = None
     fast = grouped and given.sensors is None and refine == "none"
     others = (*(block.value for block in further.values()), *(x for factor in more for x in factor.tensors()))
-    if fast and use_kernels(poses.value, depths.value, *measured, *others):
+    if fast and use_kernels(poses.value, depths.value, *measured, *others, adjoint=not (more or further)):
         reprojection = measured_edges(*measured, given.ii, given.jj, given.kk, **gate)
     if reprojection is not None:
         pass

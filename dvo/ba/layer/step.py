@@ -121,11 +121,7 @@ class GaussNewtonStep(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        if is_batched(grads[0]):
-            raise DvoError(
-                "a batch of gradients (is_grads_batched, vectorize)", field="bundle_adjust",
-                remedy="use torch.func.vmap of torch.func.vjp, or torch.func.jacrev",
-            )  # fmt: skip
+        refuse_batch(grads[0])
         *kept, h_pl, q, factor, ok, dp, dl = ctx.saved_tensors
         tensors = kept[: ctx.count]
         out: list[Tensor | None] = [None] * len(tensors)
@@ -139,17 +135,35 @@ class GaussNewtonStep(torch.autograd.Function):
                 lp, ll = SchurFactor(h_pl, q, factor, ok).solve(grads[0], grads[1][..., None])
                 constants = adjoint_constants(ctx.damping.relative, h_pl[..., 0], q[..., 0, 0], lp, dp, ll[..., 0], dl)
                 found = gradients(ctx.problem, tensors, needed, constants, ctx.memos)
-        for i, gradient in zip(needed, _finite(found, grads), strict=True):
+        for i, gradient in zip(needed, finite(found, grads), strict=True):
             out[i] = gradient
         return None, None, *out
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> None:
-        raise DvoError("dual numbers are not followed", field="bundle_adjust", remedy="use torch.func.jvp")
+        refuse_dual_numbers()
 
 
-def _finite(found: Sequence[Tensor | None], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
-    """Of finite gradients come finite ones: what is too large for its type is none. A NaN stays one."""
+def refuse_batch(gradient: Tensor) -> None:
+    """Raises:
+    DvoError: a gradient of ``torch.autograd.grad(..., is_grads_batched=True)``.
+    """
+    if is_batched(gradient):
+        raise DvoError(
+            "a batch of gradients (is_grads_batched, vectorize)", field="bundle_adjust",
+            remedy="use torch.func.vmap of torch.func.vjp, or torch.func.jacrev",
+        )  # fmt: skip
+
+
+def refuse_dual_numbers() -> None:
+    """Raises:
+    DvoError: always.
+    """
+    raise DvoError("dual numbers are not followed", field="bundle_adjust", remedy="use torch.func.jvp")
+
+
+def finite(found: Sequence[Tensor | None], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
+    """Of finite gradients ``grads`` come finite ones: what is too large for its type is none. A NaN stays one."""
     given = [x for x in found if x is not None]
     if not is_transformed() and sums_up(*(x.detach() for x in given)):
         return list(found)

@@ -6,7 +6,8 @@ with the ``(2r + 2)^2`` nearest map features, bilinearly blended to ``(2r + 1)^2
 Three implementations give the same values:
 
 - :func:`correlate_reference`, the specification: bilinear sampling of the features, then dot products.
-- :class:`CorrelationVolume`: all products of a clip as one matrix product, then cheap look-ups. For training.
+- :class:`CorrelationVolume`: all products of a clip as one matrix product, then cheap look-ups; or, of large maps on a
+  CPU, products with the windows that are looked up, and no others, by a kernel. For training.
 - :class:`dvo.nets.correlation.edge_correlation.EdgeCorrelation`: products with one window of features an edge. For
   tracking, where the volume would not fit.
 
@@ -24,6 +25,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from dvo.core.errors import DvoError
+from dvo.core.kernels import use_kernels
 from dvo.geometry.precision import full_precision
 from dvo.map.edges import PatchGraph
 from dvo.nets.patch.patchifier import pool_levels
@@ -127,29 +130,73 @@ def axis_taps(position: Tensor, size: int, radius: int) -> tuple[Tensor, Tensor,
     return index.clamp(0, size - 1), (1 - fraction) * inside[..., :-1], fraction * inside[..., 1:]
 
 
-class _Volume(torch.autograd.Function):
-    """All dot products of patch pixels and map pixels.
+@dataclass(frozen=True)
+class _Taps:
+    """Cells of a volume and bilinear weights, ``(edges, x taps, y taps, pixels)`` or of length one along an axis."""
 
-    A dense gradient of the volume for every look-up would be as large as the volume. Instead each look-up accumulates
-    its gradient in one buffer and returns a scalar token to autograd, which calls this backward after all look-ups.
+    index: Tensor
+    ax: Tensor
+    bx: Tensor
+    ay: Tensor
+    by: Tensor
+
+    @classmethod
+    def at(cls, position: Tensor, start: Tensor, size: tuple[int, int], radius: int) -> _Taps:
+        """Taps at ``position (edges, pixels, 2)`` in the slices of a volume that begin at ``start (edges, pixels)``."""
+        h, w = size
+        ix, ax, bx = axis_taps(position[..., 0], w, radius)
+        iy, ay, by = axis_taps(position[..., 1], h, radius)
+        # (edges, pixels, taps) -> (edges, x taps, y taps, pixels), the order of DPVO's channels
+        ix, ax, bx = (t.mT.contiguous()[:, :, None, :] for t in (ix, ax, bx))
+        iy, ay, by = (t.mT.contiguous()[:, None, :, :] for t in (iy * w + start[..., None], ay, by))
+        return cls(ix + iy, ax, bx, ay, by)
+
+    def add_gradient(self, grad: Tensor, store: dict[str, Tensor], length: int) -> None:
+        """Add the gradient of a look-up to that of the volume, which has ``length`` cells."""
+        rows = F.pad(grad * self.ax, (0, 0, 0, 0, 0, 1)) + F.pad(grad * self.bx, (0, 0, 0, 0, 1, 0))
+        values = F.pad(rows * self.ay, (0, 0, 0, 1)) + F.pad(rows * self.by, (0, 0, 1, 0))
+        if "volume" not in store:
+            store["volume"] = values.new_zeros(length)
+        store["volume"].index_add_(0, self.index.flatten(), values.flatten())
+
+
+def _as_columns(level: Tensor) -> Tensor:
+    """Maps ``(B, N, C, h, w)`` as ``(B, C, N h w)``."""
+    return level.permute(0, 2, 1, 3, 4).reshape(level.shape[0], level.shape[2], -1)
+
+
+class _Source(torch.autograd.Function):
+    """What look-ups take their products from: features ``(B, K, q, C)`` of patch pixels and maps ``(B, N, C, h, w)``.
+
+    A dense gradient for every look-up would be as large as the volume. Instead each look-up accumulates its gradient
+    in one buffer and returns a scalar token to autograd, which calls this backward after all look-ups.
     """
 
     @staticmethod
-    def forward(ctx: Any, patches: Tensor, maps: Tensor, store: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        ctx.save_for_backward(patches, maps)
+    def forward(ctx: Any, features: Tensor, level: Tensor, store: dict[str, Tensor]) -> Tensor:
+        ctx.save_for_backward(features, level)
         ctx.store = store
-        volume = torch.matmul(patches, maps)
-        ctx.mark_non_differentiable(volume)
-        return volume, patches.new_zeros(())
+        return features.new_zeros(())
 
     @staticmethod
     def backward(ctx: Any, *_: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        patches, maps = ctx.saved_tensors
-        grad = ctx.store.pop("grad", None)
-        if grad is None:
-            return None, None, None
-        grad = grad.view(*patches.shape[:-1], maps.shape[-1])
-        return torch.matmul(grad, maps.mT), torch.matmul(patches.mT, grad), None
+        features, level = ctx.saved_tensors
+        store = ctx.store
+        by_features, by_level = store.pop("features", None), store.pop("maps", None)
+        if by_features is not None and by_level is not None:
+            by_features, border = by_features.view(features.shape), (by_level.shape[1] - level.shape[-2]) // 2
+            inner = by_level[:, border : border + level.shape[-2], border : border + level.shape[-1]]
+            by_level = inner.permute(0, 3, 1, 2).reshape(level.shape)
+        grad = store.pop("volume", None)
+        if grad is not None:
+            rows, columns = features.flatten(1, 2), _as_columns(level)
+            grad = grad.view(*rows.shape[:2], columns.shape[-1])
+            by_rows, by_columns = torch.matmul(grad, columns.mT), torch.matmul(rows.mT, grad)
+            b, n, c, h, w = level.shape
+            more = by_rows.view(features.shape), by_columns.view(b, c, n, h, w).transpose(1, 2)
+            by_features = more[0] if by_features is None else by_features + more[0]
+            by_level = more[1] if by_level is None else by_level + more[1]
+        return by_features, by_level, None
 
 
 class _Lookup(torch.autograd.Function):
@@ -167,38 +214,107 @@ class _Lookup(torch.autograd.Function):
         learn: Tensor | None,
         store: dict[str, Tensor],
     ) -> Tensor:
-        h, w = size
-        ix, ax, bx = axis_taps(position[..., 0], w, radius)
-        iy, ay, by = axis_taps(position[..., 1], h, radius)
-        # (edges, pixels, taps) -> (edges, x taps, y taps, pixels), the order of DPVO's channels
-        ix, ax, bx = (t.mT.contiguous()[:, :, None, :] for t in (ix, ax, bx))
-        iy, ay, by = (t.mT.contiguous()[:, None, :, :] for t in (iy * w + start[..., None], ay, by))
-        index = ix + iy
-        values = volume.view(-1).index_select(0, index.view(-1)).view(index.shape)  # several times faster than take
-        rows = torch.addcmul(values[:, :, :-1] * ay, values[:, :, 1:], by)
-        out = torch.addcmul(rows[:, :-1] * ax, rows[:, 1:], bx)
+        taps = _Taps.at(position, start, size, radius)
+        # several times faster than take
+        values = volume.view(-1).index_select(0, taps.index.view(-1)).view(taps.index.shape)
+        rows = torch.addcmul(values[:, :, :-1] * taps.ay, values[:, :, 1:], taps.by)
+        out = torch.addcmul(rows[:, :-1] * taps.ax, rows[:, 1:], taps.bx)
+        kept = taps.index, taps.ax, taps.bx, taps.ay, taps.by
         if learn is not None:
-            index, ax, bx, ay, by = (t[learn] for t in (index, ax, bx, ay, by))
-        ctx.save_for_backward(index, ax, bx, ay, by, learn)
+            kept = tuple(t[learn] for t in kept)  # type: ignore[assignment]
+        ctx.save_for_backward(*kept, learn)
         ctx.store, ctx.length = store, volume.numel()
         return out
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        index, ax, bx, ay, by, learn = ctx.saved_tensors
+        *kept, learn = ctx.saved_tensors
         grad = grads[0] if learn is None else grads[0][learn]
-        rows = F.pad(grad * ax, (0, 0, 0, 0, 0, 1)) + F.pad(grad * bx, (0, 0, 0, 0, 1, 0))
-        values = F.pad(rows * ay, (0, 0, 0, 1)) + F.pad(rows * by, (0, 0, 1, 0))
-        if "grad" not in ctx.store:
-            ctx.store["grad"] = values.new_zeros(ctx.length)
-        ctx.store["grad"].index_add_(0, index.flatten(), values.flatten())
+        _Taps(*kept).add_gradient(grad, ctx.store, ctx.length)
         return (grad.new_zeros(()), *[None] * 7)
+
+
+class _WindowLookup(torch.autograd.Function):
+    """The same by kernels, from features ``(B K, q, C)`` and maps ``(B N, H, W, C)`` in a border of zeros."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        token: Tensor,
+        features: Tensor,
+        maps: Tensor,
+        position: Tensor,
+        kk: Tensor,
+        frames: Tensor,
+        radius: int,
+        learn: Tensor | None,
+        store: dict[str, Tensor],
+        whole: tuple[int, tuple[int, int]],
+    ) -> Tensor:
+        from dvo.nets.correlation.edge_correlation_kernels import correlate
+
+        side = 2 * radius + 1
+        out = position.new_empty(len(position), side, side, position.shape[1])  # edges, x offset, y offset, pixel
+        given = (x.numpy() for x in (maps, features, position, kk, frames))
+        correlate(*given, radius, out.permute(0, 3, 2, 1).numpy())
+        ctx.save_for_backward(features, maps, position, kk, frames, learn)
+        ctx.radius, ctx.store, ctx.whole = radius, store, whole
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        features, maps, position, kk, frames, learn = ctx.saved_tensors
+        grad, store = grads[0], ctx.store
+        nothing = (grad.new_zeros(()), *[None] * 9)
+        if torch.is_grad_enabled():  # to be differentiated again: what the twin does
+            count, (h, w) = ctx.whole
+            pixel = torch.arange(features.shape[1])
+            start = ((kk[:, None] * len(pixel) + pixel) * count + (frames % count)[:, None]) * (h * w)
+            if learn is not None:
+                position, start, grad = position[learn], start[learn], grad[learn]
+            length = features.shape[0] * len(pixel) * count * h * w
+            _Taps.at(position, start, (h, w), ctx.radius).add_gradient(grad, store, length)
+            return nothing
+        from dvo.nets.correlation.edge_correlation_kernels import correlate_adjoint
+
+        if "features" not in store:
+            store["features"], store["maps"] = torch.zeros_like(features), torch.zeros_like(maps)
+        edges = torch.arange(len(position)) if learn is None else learn
+        given = (x.numpy() for x in (maps, features, position, kk, frames))
+        sums = store["maps"].numpy(), store["features"].numpy()
+        correlate_adjoint(*given, ctx.radius, edges.numpy(), grad.contiguous().permute(0, 3, 2, 1).numpy(), *sums)
+        return nothing
+
+
+@dataclass(frozen=True)
+class _Level:
+    """A level of the pyramid: the whole volume, or where its windows are found.
+
+    Attributes:
+        token: of :class:`_Source`.
+        store: gradients of the look-ups so far.
+        size: height and width of a map.
+        volume: ``(B, K q, N h w)``; None for windows.
+        features, maps: see :class:`_WindowLookup`; None for a volume.
+    """
+
+    token: Tensor
+    store: dict[str, Tensor]
+    size: tuple[int, int]
+    volume: Tensor | None = None
+    features: Tensor | None = None
+    maps: Tensor | None = None
+
+
+FEW_PIXELS = 4
+"""A volume is multiplied out for maps of at most this many times the pixels of a window."""
 
 
 class CorrelationVolume:
     """All correlations of a clip, computed once and looked up at every update.
 
-    Memory is ``B * K * p^2 * N * h * w`` floats, summed over the levels.
+    Memory is ``B * K * p^2 * N * h * w`` floats, summed over the levels. On the CPU, levels with maps that are much
+    larger than a window are not multiplied out, but looked up window by window by a kernel.
 
     Args:
         patches: ``(B, K, C, p, p)`` matching features of the patches, of any height and width, up to whole frames.
@@ -213,14 +329,19 @@ class CorrelationVolume:
         self.pixels, self.patches = p * q, k
         if patches.dtype in (torch.float16, torch.bfloat16):  # too coarse to place a peak between two pixels
             patches, maps = patches.float(), maps.float()
-        rows = patches.permute(0, 1, 3, 4, 2).reshape(b, k * p * q, c)
-        self.levels = []
-        for level in pool_levels(maps, pyramid):
-            columns = level.permute(0, 2, 1, 3, 4).reshape(b, c, -1)
-            store: dict[str, Tensor] = {}
-            with full_precision(rows.device):
-                volume, token = _Volume.apply(rows, columns, store)
-            self.levels.append((volume, token, store, (level.shape[-2], level.shape[-1])))
+        features = patches.permute(0, 1, 3, 4, 2).reshape(b, k, p * q, c)
+        self.levels = [self._level(features, level) for level in pool_levels(maps, pyramid)]
+
+    def _level(self, features: Tensor, level: Tensor) -> _Level:
+        store: dict[str, Tensor] = {}
+        size = level.shape[-2], level.shape[-1]
+        token: Tensor = _Source.apply(features, level, store)
+        taps, (h, w) = 2 * self.radius + 2, size
+        if h * w > FEW_PIXELS * taps**2 and use_kernels(features, level, adjoint=True):
+            maps = F.pad(level.detach().flatten(0, 1).permute(0, 2, 3, 1), (0, 0, *[taps] * 4)).contiguous()
+            return _Level(token, store, size, features=features.detach().flatten(0, 1).contiguous(), maps=maps)
+        with torch.no_grad(), full_precision(features.device):
+            return _Level(token, store, size, volume=torch.matmul(features.flatten(1, 2), _as_columns(level)))
 
     def lookup(
         self,
@@ -239,16 +360,37 @@ class CorrelationVolume:
 
         Returns:
             One tensor ``(B, E, (2r+1)^2 * p^2)`` for each level, channels in the order ``offsets_first``.
+
+        Raises:
+            DvoError: an index out of range.
         """
         b, e = coords.shape[:2]
         position = coords.detach().reshape(b * e, self.pixels, 2)
-        pixel = torch.arange(self.pixels, device=kk.device)
-        clip = torch.arange(b, device=kk.device) * (self.patches * self.pixels)
-        row = (clip[:, None, None] + kk[:, None] * self.pixels + pixel).reshape(b * e, self.pixels)
-        frame = jj.repeat(b)[:, None]
+        clip = torch.arange(b, device=kk.device)[:, None]
+        patch, frame = (clip * self.patches + kk).flatten(), (clip * self.frames + jj).flatten()
         levels = []
-        for (volume, token, store, (h, w)), scale in zip(self.levels, self.pyramid, strict=True):
-            start = (row * self.frames + frame) * (h * w)
-            args = (position / scale, (h, w), self.radius, learn, store)
-            levels.append(_Lookup.apply(token, volume, start, *args).reshape(b, e, -1))
+        for level, scale in zip(self.levels, self.pyramid, strict=True):
+            at = position / scale
+            if level.volume is not None:
+                pixel, (h, w) = torch.arange(self.pixels, device=kk.device), level.size
+                row = patch[:, None] * self.pixels + pixel
+                start = (row * self.frames + jj.repeat(b)[:, None]) * (h * w)
+                args = (start, at, level.size, self.radius, learn, level.store)
+                found = _Lookup.apply(level.token, level.volume, *args)
+            else:
+                for index, count in ((kk, self.patches), (jj, self.frames), (learn, b * e)):
+                    check_range(index, count)
+                args = (at, patch, frame, self.radius, learn, level.store, (self.frames, level.size))
+                found = _WindowLookup.apply(level.token, level.features, level.maps, *args)
+            levels.append(found.reshape(b, e, -1))
         return levels
+
+
+def check_range(index: Tensor | None, count: int) -> None:
+    """Check indices that a kernel would follow out of its arrays.
+
+    Raises:
+        DvoError: one that is not in ``0 .. count - 1``.
+    """
+    if index is not None and len(index) and (int(index.min()) < 0 or int(index.max()) >= count):
+        raise DvoError("an index out of range", field="lookup", remedy=f"give 0 to {count - 1}")

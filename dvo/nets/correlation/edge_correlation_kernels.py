@@ -1,8 +1,9 @@
-"""Kernel of :class:`dvo.nets.correlation.edge_correlation.EdgeCorrelation`.
+"""Kernel of :class:`dvo.nets.correlation.edge_correlation.EdgeCorrelation`, and its adjoint.
 
 Nearly all of its time goes into dot products of a patch feature with the pixels of a row of a window. The compiler
 would sum each of them across the lanes of a vector on its own, which costs as much as the products;
-:func:`_eight_products` states in vector instructions how eight of them are summed at once.
+:func:`_eight_products` states in vector instructions how eight of them are summed at once, and :func:`_eight_adjoints`
+how a row of eight is taken back.
 """
 
 from __future__ import annotations
@@ -76,6 +77,55 @@ def _eight_products(context, maps, first, feature, out, position):
     return types.void(maps, types.intp, feature, out, types.intp), generate
 
 
+@intrinsic
+def _eight_adjoints(context, maps, first, d_maps, feature, d_feature, weights, position):
+    """Take eight products back, of which ``weights`` holds the gradients from ``position``.
+
+    ``d_maps`` receives those of the eight pixels from ``first``, ``d_feature`` that of the feature. Maps and weights are
+    flat; all arrays are contiguous and of float32; the channels are a multiple of eight.
+    """
+
+    def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
+        def array(k: int) -> Any:
+            return cgutils.create_struct_proxy(signature.args[k])(target, builder, value=given[k])
+
+        def vector(pointer: Any) -> Any:
+            return builder.bitcast(pointer, _VECTOR.as_pointer())
+
+        def plus(before: Any, a: Any, b: Any) -> Any:
+            return builder.fadd(before, builder.fmul(a, b, flags=("contract",)), flags=("contract",))
+
+        channels = builder.extract_value(array(3).shape, 0)
+        start, d_start = (builder.gep(array(k).data, [given[1]]) for k in (0, 2))
+        own = builder.load(vector(builder.gep(array(5).data, [given[6]])), align=4)
+        lanes = ir.VectorType(ir.IntType(32), _WIDTH)
+        each = [builder.shuffle_vector(own, own, ir.Constant(lanes, [k] * _WIDTH)) for k in range(_WIDTH)]
+        entry, loop, end = builder.block, builder.append_basic_block(), builder.append_basic_block()
+        builder.branch(loop)
+
+        builder.position_at_end(loop)
+        channel = builder.phi(channels.type)
+        feature_part = builder.load(vector(builder.gep(array(3).data, [channel])), align=4)
+        d_feature_at = vector(builder.gep(array(4).data, [channel]))
+        total = builder.load(d_feature_at, align=4)
+        pixel, d_pixel = builder.gep(start, [channel]), builder.gep(d_start, [channel])
+        for weight in each:
+            total = plus(total, weight, builder.load(vector(pixel), align=4))
+            sums = plus(builder.load(vector(d_pixel), align=4), weight, feature_part)
+            builder.store(sums, vector(d_pixel), align=4)
+            pixel, d_pixel = builder.gep(pixel, [channels]), builder.gep(d_pixel, [channels])
+        builder.store(total, d_feature_at, align=4)
+        following = builder.add(channel, ir.Constant(channels.type, _WIDTH))
+        builder.cbranch(builder.icmp_signed("<", following, channels), loop, end)
+        channel.add_incoming(ir.Constant(channels.type, 0), entry)
+        channel.add_incoming(following, loop)
+
+        builder.position_at_end(end)
+        return target.get_dummy_value()
+
+    return types.void(maps, types.intp, d_maps, feature, d_feature, weights, types.intp), generate
+
+
 @part
 def _products(maps, first, stride, feature, out):
     """Dot products of a feature with a window of pixels, from index ``first`` of flat maps with rows of ``stride``."""
@@ -96,6 +146,36 @@ def _products(maps, first, stride, feature, out):
             out[row, column] = total
 
 
+@part
+def _adjoint_of_products(maps, d_maps, first, stride, feature, d_feature, weights):
+    """Take :func:`_products` back, of which ``weights`` are the gradients: add to those of the maps and the feature."""
+    channels, taps = len(feature), len(weights)
+    if channels % _WIDTH == 0 and taps % _WIDTH == 0:
+        flat = weights.reshape(-1)
+        for row in range(taps):
+            for left in range(0, taps, _WIDTH):
+                at = first + row * stride + left * channels
+                _eight_adjoints(maps, at, d_maps, feature, d_feature, flat, row * taps + left)  # type: ignore[call-arg]
+        return
+    for row in range(taps):
+        for column in range(taps):
+            weight, at = weights[row, column], first + row * stride + column * channels
+            for k in range(channels):
+                d_feature[k] += weight * maps[at + k]
+                d_maps[at + k] += weight * feature[k]
+
+
+@part
+def _corner(x, y, radius, height, width):
+    """Left and top of a window, one beyond the border for one far out, and the fractions."""
+    taps = 2 * radius + 2
+    x, y = x - np.float32(radius), y - np.float32(radius)
+    x = min(max(x, np.float32(-taps)), np.float32(width - 2 * taps))
+    y = min(max(y, np.float32(-taps)), np.float32(height - 2 * taps))
+    left, top = math.floor(x), math.floor(y)
+    return left + taps, top + taps, x - np.float32(left), y - np.float32(top)
+
+
 @compiled
 def correlate(maps, features, at, kk, frames, radius, out):
     """Fill ``out (E, q, 2r+1, 2r+1)``; the other arguments are those of the twin, maps and features contiguous."""
@@ -105,20 +185,55 @@ def correlate(maps, features, at, kk, frames, radius, out):
     products = np.empty((taps, taps), np.float32)
     for edge in range(len(at)):
         for pixel in range(at.shape[1]):
-            x, y = at[edge, pixel, 0] - np.float32(radius), at[edge, pixel, 1] - np.float32(radius)
+            x, y = at[edge, pixel, 0], at[edge, pixel, 1]
             if math.isnan(x) or math.isnan(y):
                 for i in range(taps - 1):
                     for j in range(taps - 1):
                         out[edge, pixel, i, j] = math.nan
                 continue
-            x = min(max(x, np.float32(-taps)), np.float32(width - 2 * taps))
-            y = min(max(y, np.float32(-taps)), np.float32(height - 2 * taps))
-            left, top = math.floor(x), math.floor(y)
-            fx, fy = x - np.float32(left), y - np.float32(top)
-            first = ((frames[edge] * height + top + taps) * width + left + taps) * channels
+            left, top, fx, fy = _corner(x, y, radius, height, width)
+            first = ((frames[edge] * height + top) * width + left) * channels
             _products(flat, first, width * channels, features[kk[edge], pixel], products)
             for i in range(taps - 1):
                 for j in range(taps - 1):
                     u = products[i, j] + fy * (products[i + 1, j] - products[i, j])
                     v = products[i, j + 1] + fy * (products[i + 1, j + 1] - products[i, j + 1])
                     out[edge, pixel, i, j] = u + fx * (v - u)
+
+
+@compiled
+def correlate_adjoint(maps, features, at, kk, frames, radius, edges, grad, d_maps, d_features):
+    """Add the gradients of :func:`correlate` by maps and features, in the order of ``edges``.
+
+    ``edges (L,)`` are those that propagate one; ``grad (E, q, 2r+1, 2r+1)`` is that of ``out``. A position that is not
+    a number leaves NaN.
+    """
+    taps = 2 * radius + 2
+    _, height, width, channels = maps.shape
+    flat, d_flat = maps.reshape(-1), d_maps.reshape(-1)
+    weights = np.empty((taps, taps), np.float32)
+    for edge in edges:
+        k = kk[edge]
+        for pixel in range(at.shape[1]):
+            x, y = at[edge, pixel, 0], at[edge, pixel, 1]
+            if math.isnan(x) or math.isnan(y):
+                d_features[k, pixel, 0] = math.nan
+                d_maps[frames[edge], taps, taps, 0] = math.nan
+                continue
+            left, top, fx, fy = _corner(x, y, radius, height, width)
+            for i in range(taps):
+                for j in range(taps):
+                    weights[i, j] = 0
+            for i in range(taps - 1):
+                for j in range(taps - 1):
+                    g = grad[edge, pixel, i, j]
+                    right = fx * g
+                    here = g - right
+                    weights[i, j] += here - fy * here
+                    weights[i, j + 1] += right - fy * right
+                    weights[i + 1, j] += fy * here
+                    weights[i + 1, j + 1] += fy * right
+            first = ((frames[edge] * height + top) * width + left) * channels
+            _adjoint_of_products(
+                flat, d_flat, first, width * channels, features[k, pixel], d_features[k, pixel], weights
+            )

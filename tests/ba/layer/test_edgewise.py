@@ -23,7 +23,7 @@ from dvo.ba.layer.schur import eliminate
 from dvo.ba.layer.step import normal_equations
 from dvo.ba.limits import LARGEST
 from dvo.ba.patch_problem import PatchProblem
-from dvo.core.kernels import VARIABLE
+from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.geometry import se3
 
 Maker = Callable[..., Any]
@@ -178,17 +178,79 @@ def test_the_solution_is_that_of_the_twin(seed: int, size: int, count: int, kind
         assert found[0].any()
 
 
-def test_what_is_recorded_or_transformed_is_not_for_kernels(problem: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+def gradients(p: Any, options: BAOptions, dtype: torch.dtype, seed: int) -> list[torch.Tensor]:
+    """By tangents of the poses, patches, intrinsics, targets and weights, of random numbers times the results."""
+    generator = torch.Generator().manual_seed(seed)
+    poses, *floats = (x.detach().to(dtype) for x in p.arguments()[:5])
+    leaves = [torch.zeros_like(poses[..., :6]).requires_grad_(), *(x.clone().requires_grad_() for x in floats)]
+    poses = se3.compose(se3.exp(leaves[0]), se3.normalise(poses))
+    result = bundle_adjust(poses, *leaves[1:], p.ii, p.jj, p.kk, options)
+    parts = result.poses_cw, result.patches
+    total = sum((x * torch.randn(x.shape, generator=generator).to(dtype)).sum() for x in parts)
+    assert isinstance(total, torch.Tensor)
+    found = torch.autograd.grad(total, leaves, allow_unused=True)
+    return [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, found, strict=True)]
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.integers(0, 10_000), st.integers(1, 2), st.sampled_from([0, 1, 5, 40, 90]),
+    st.fixed_dictionaries({name: st.sampled_from(values) for name, values in OPTIONS.items()}),
+)  # fmt: skip
+def test_gradients_are_those_of_the_twin(
+    problem: Maker, seed: int, batch: int, edges: int, changes: dict[str, Any]
+) -> None:
+    options = replace(BAOptions(**changes), damping=replace(changes["damping"], pose=1.0))
+    p = uneven(problem, seed, batch, edges)
+    for x, y in zip(*(gradients(p, options, dtype, seed) for dtype in (torch.float32, torch.float64)), strict=True):
+        assert x.dtype == torch.float32
+        scale = float(y.abs().max()) if y.numel() else 0.0
+        torch.testing.assert_close(x.double(), y, atol=3e-4 * scale + 1e-7, rtol=1e-3)
+
+
+def test_what_has_no_kernel_is_left_to_the_twin(problem: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
     p = uneven(problem, 1, 1, 60)
     given = PatchProblem(*p.arguments())
     leaf = given.with_values(weights=given.weights.clone().requires_grad_())
-    assert not isinstance(make_problem(leaf).factors[0], EdgewiseReprojection)
-    prior = DepthPrior(torch.ones(1, 24), torch.ones(1, 24).requires_grad_())
+    assert isinstance(make_problem(leaf).factors[0], EdgewiseReprojection)
+    prior = DepthPrior(torch.ones(1, 24), torch.ones(1, 24))
+    assert isinstance(make_problem(given.with_values(factors=(prior,))).factors[0], EdgewiseReprojection)
+    assert not isinstance(make_problem(leaf.with_values(factors=(prior,))).factors[0], EdgewiseReprojection)
+    prior = replace(prior, weight=prior.weight.clone().requires_grad_())
     assert not isinstance(make_problem(given.with_values(factors=(prior,))).factors[0], EdgewiseReprojection)
     with torch.no_grad():
         assert isinstance(make_problem(leaf).factors[0], EdgewiseReprojection)
     monkeypatch.setenv(VARIABLE, "torch")
     assert not isinstance(make_problem(given).factors[0], EdgewiseReprojection)
+
+
+def test_a_gradient_is_differentiated_again_as_by_the_twin(problem: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+    p = uneven(problem, 3, 2, 80)
+    options, second = BAOptions(damping=BADamping(pose=1.0)), []
+    for choice in CHOICES:
+        monkeypatch.setenv(VARIABLE, choice)
+        weights = p.weights.clone().requires_grad_()
+        result = bundle_adjust(p.poses, p.patches, p.intrinsics, p.targets, weights, p.ii, p.jj, p.kk, options)
+        (first,) = torch.autograd.grad(result.poses_cw.square().sum(), weights, create_graph=True)
+        second += torch.autograd.grad(first.square().sum(), weights)
+    assert float(second[1].abs().max()) > 0
+    torch.testing.assert_close(second[0], second[1], atol=1e-3 * float(second[1].abs().max()), rtol=1e-2)
+
+
+@pytest.mark.parametrize("name", ["targets", "ii", "kk"])
+def test_what_is_changed_before_the_backward_pass_is_noticed(problem: Maker, name: str) -> None:
+    p = uneven(problem, 1, 1, 60).leaves()
+    p = replace(p, **{name: getattr(p, name).detach().clone()})
+    total = p.adjust().poses_cw.sum()
+    getattr(p, name)[..., 0] = 0
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        total.backward()
+
+
+def test_a_gradient_that_is_none_is_not_hidden(problem: Maker) -> None:
+    p = uneven(problem, 1, 1, 60).leaves()
+    (p.adjust().patches.sum() * math.nan).backward()
+    assert p.targets.grad is not None and p.targets.grad.isnan().all()
 
 
 @pytest.mark.parametrize(("name", "value"), [("jj", 4), ("ii", -1), ("kk", 24)])

@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dvo.core.errors import DvoError
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.nets.correlation.correlation import CorrelationVolume, correlate_reference
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
@@ -132,6 +133,68 @@ def test_kernel_equals_twin(seed, edges, channels, side, radius, spread, special
     for kernel, twin in zip(*found, strict=True):
         torch.testing.assert_close(kernel, twin, rtol=1e-5, atol=1e-5 * channels**0.5, equal_nan=True)
         assert kernel.isnan().any() == (special is not None and math.isnan(special) and edges > 0)
+
+
+def trained(choice, maps, patches, coords, kk, jj, learn, radius, again=False):
+    """Channels of two look-ups and the gradients by patches and maps, or those of the squares of these gradients."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, choice)
+        leaves = [x.clone().requires_grad_() for x in (patches, maps)]
+        volume = CorrelationVolume(*leaves, (1, 2), radius)
+        assert (volume.levels[0].volume is None) == (choice == "numba")
+        found = [c for move in (0.0, 0.3) for c in volume.lookup(coords + move, kk, jj, learn)]
+        total = sum((c * torch.linspace(-1, 1, c.shape[-1])).sum() + 1e-3 * c.square().sum() for c in found)
+        gradients = torch.autograd.grad(total, leaves, create_graph=again)
+        if again:
+            gradients = torch.autograd.grad(sum(g.square().sum() for g in gradients), leaves)
+        return [*(c.detach() for c in found), *gradients]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    batch=st.integers(1, 2),
+    edges=st.integers(1, 12),
+    channels=st.sampled_from([1, 3, 8, 24]),
+    side=st.sampled_from([1, 3]),
+    radius=st.sampled_from([1, 2, 3]),
+    spread=st.sampled_from([0.0, 2.0, 30.0]),
+    special=st.sampled_from([None, None, math.nan, math.inf, 1e30, -3.5e9]),
+    share=st.sampled_from([None, 0.0, 0.5]),
+    again=st.booleans(),
+)
+def test_kernel_of_training_equals_volume(
+    seed, batch, edges, channels, side, radius, spread, special, share, again
+):  # fmt: skip
+    g = torch.Generator().manual_seed(seed)
+    patches = torch.randn(batch, 4, channels, side, side, generator=g)
+    maps = torch.randn(batch, 3, channels, 20, 24, generator=g)
+    kk, jj = torch.randint(4, (edges,), generator=g), torch.randint(3, (edges,), generator=g)
+    coords = torch.rand(batch, edges, 1, 1, 2, generator=g) * 40 - 10
+    coords = coords + spread * torch.rand(batch, edges, side, side, 2, generator=g)
+    learn = None if share is None else torch.randperm(batch * edges, generator=g)[: round(share * batch * edges)]
+    nan = special is not None and math.isnan(special)
+    if special is not None:
+        coords[0, edges // 2, 0, side - 1, seed % 2] = special
+    given = maps, patches, coords, kk, jj, learn, radius, again
+    kernel, twin = trained("numba", *given), trained("torch", *given)
+    for x, y in zip(kernel[:4], twin[:4], strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-5 * channels**0.5, equal_nan=True)
+        assert x.isnan().any() == nan
+    for x, y in zip(kernel[4:], twin[4:], strict=True):
+        if y.isnan().any():  # which cells are spoilt does not matter
+            assert x.isnan().any()
+        else:
+            torch.testing.assert_close(x, y, rtol=1e-4, atol=1e-5 * float(y.abs().max()) + 1e-6)
+
+
+@pytest.mark.parametrize(("name", "value"), [("kk", 4), ("jj", 3), ("jj", -1), ("learn", 5)])
+def test_kernel_of_training_reads_nothing_beside_the_arrays(name, value):
+    given = {"kk": torch.arange(4), "jj": torch.tensor([0, 1, 2, 0]), "learn": torch.arange(2)}
+    given[name] = torch.cat((given[name][1:], torch.tensor([value])))
+    volume = CorrelationVolume(torch.zeros(1, 4, 8, 3, 3), torch.zeros(1, 3, 8, 20, 24))
+    with pytest.raises(DvoError, match="out of range"):
+        volume.lookup(torch.zeros(1, 4, 3, 3, 2), **given)
 
 
 def test_far_away_positions_are_zero_not_an_overflow():

@@ -50,6 +50,12 @@ def is_transformed() -> bool:
     return torch._C._are_functorch_transforms_active()
 
 
+def is_batched(x: Tensor) -> bool:
+    """True for a tensor of ``torch.autograd.grad(..., is_grads_batched=True)``, whose vmap is another."""
+    keys = str(torch._C._dispatch_keys(x))
+    return "Batched" in keys and "FuncTorch" not in keys
+
+
 def available() -> bool:
     """Tell if kernels are wanted, and numba can be imported; if it cannot, one line says so.
 

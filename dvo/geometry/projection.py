@@ -8,13 +8,16 @@ which stays finite for points at infinity (Teed et al., "Deep Patch Visual Odome
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from dvo.core.kernels import use_kernels
+from dvo.core.errors import DvoError
+from dvo.core.kernels import is_batched, use_kernels
 from dvo.geometry import se3, so3
 from dvo.geometry.precision import full_precision
 
@@ -147,10 +150,16 @@ def reproject(
         >>> flow = seen.coords - patches[:, kk, :2].permute(0, 1, 3, 4, 2)
         >>> flow[~seen.valid] = 0
     """
-    if not jacobians and use_kernels(poses_cw, patches, intrinsics):
+    if not jacobians and use_kernels(poses_cw, patches, intrinsics, adjoint=True):
         found = by_kernel(poses_cw, patches, intrinsics, ii, jj, kk)
         if found is not None:
             return found
+    return _by_twin(poses_cw, patches, intrinsics, ii, jj, kk, jacobians)
+
+
+def _by_twin(
+    poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor, kk: Tensor, jacobians: bool = False
+) -> Reprojection:
     with full_precision(poses_cw.device):
         b, k, _, p, q = patches.shape
         matrices = motion_matrices(poses_cw, intrinsics, ii, jj)
@@ -176,7 +185,7 @@ def reproject(
 def by_kernel(
     poses_cw: Tensor, patches: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor, kk: Tensor
 ) -> Reprojection | None:
-    """:func:`reproject` without Jacobians by a compiled loop.
+    """:func:`reproject` without Jacobians by a compiled loop; first derivatives by another one.
 
     Args:
         poses_cw, patches, intrinsics, ii, jj, kk: see :func:`reproject`; what is not an index is float32, on the CPU.
@@ -191,12 +200,69 @@ def by_kernel(
     indices = [x for x in (ii, jj, kk) if x.dtype == torch.int64 and x.device == poses_cw.device]
     if any(found != wanted for found, wanted in shapes) or [tuple(x.shape) for x in indices] != [(edges,)] * 3:
         return None
+    tensors = poses_cw, patches, intrinsics, ii, jj, kk
+    if not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)):
+        found = _projected(tensors)
+        return None if found is None else Reprojection(*found)
+    limits = (ii, n), (jj, n), (kk, k)
+    if edges and any(int(x.min()) < 0 or int(x.max()) >= count for x, count in limits):
+        return None
+    coords, depth, valid = _Projected.apply(*tensors)
+    return Reprojection(coords, depth, valid)
+
+
+def _projected(tensors: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor] | None:
+    """``coords``, ``depth`` and ``valid`` of :func:`reproject`; None for an index out of range."""
     from dvo.geometry.projection_kernels import project_patches
 
-    coords, depth = poses_cw.new_empty(b, edges, p, q, 2), poses_cw.new_empty(b, edges, p, q)
+    (b, _, _, p, q), edges = tensors[1].shape, len(tensors[3])
+    coords, depth = tensors[0].new_empty(b, edges, p, q, 2), tensors[0].new_empty(b, edges, p, q)
     valid = torch.empty(b, edges, p, q, dtype=torch.bool)
-    floats = [x.detach().contiguous() for x in (poses_cw, patches.flatten(3), intrinsics)]
     out = coords.flatten(2, 3), depth.flatten(2), valid.flatten(2)
-    given = [x.numpy() for x in (*floats, *(x.contiguous() for x in indices))]
-    arguments: tuple[Any, ...] = (*given, MIN_Z_DIVISION, MIN_Z_VALID, *(x.numpy() for x in out))
-    return Reprojection(coords, depth, valid) if project_patches(*arguments) else None
+    arguments: tuple[Any, ...] = (*_arrays(tensors), MIN_Z_DIVISION, MIN_Z_VALID, *(x.numpy() for x in out))
+    return (coords, depth, valid) if project_patches(*arguments) else None
+
+
+class _Projected(torch.autograd.Function):
+    """:func:`_projected` of indices in range, with a compiled adjoint."""
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(*tensors)
+        found = _projected(tensors)
+        assert found is not None
+        ctx.mark_non_differentiable(found[2])
+        return found
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        tensors, again = ctx.saved_tensors, torch.is_grad_enabled()
+        needed = [i for i in range(3) if ctx.needs_input_grad[i]]
+        out: list[Tensor | None] = [None] * 6
+        found: Sequence[Tensor]
+        if again or is_batched(grads[0]) or is_batched(grads[1]):
+            with torch.enable_grad():
+                leaves = [x.view_as(x) if again else x.detach().requires_grad_() for x in tensors[:3]]
+                twin = _by_twin(*leaves, *tensors[3:])
+                wanted = [leaves[i] for i in needed]
+                found = torch.autograd.grad((twin.coords, twin.depth), wanted, grads[:2], create_graph=again)
+        else:
+            from dvo.geometry.projection_kernels import project_patches_adjoint
+
+            sums = [np.zeros(x.shape) for x in (tensors[0], tensors[1].flatten(3), tensors[2])]
+            given = grads[0].flatten(2, 3).contiguous().numpy(), grads[1].flatten(2).contiguous().numpy()
+            arguments: tuple[Any, ...] = (*_arrays(tensors), MIN_Z_DIVISION, *given, *sums)
+            project_patches_adjoint(*arguments)
+            found = [torch.from_numpy(sums[i]).float().view(tensors[i].shape) for i in needed]
+        for i, gradient in zip(needed, found, strict=True):
+            out[i] = gradient
+        return tuple(out)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> None:
+        raise DvoError("dual numbers are not followed", field="reproject", remedy="use torch.func.jvp")
+
+
+def _arrays(tensors: Sequence[Tensor]) -> list[np.ndarray[Any, Any]]:
+    poses_cw, patches, *others = tensors
+    return [x.detach().contiguous().numpy() for x in (poses_cw, patches.flatten(3), *others)]

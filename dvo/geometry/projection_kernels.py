@@ -1,4 +1,4 @@
-"""Kernel of :func:`dvo.geometry.projection.reproject` without Jacobians.
+"""Kernel of :func:`dvo.geometry.projection.reproject` without Jacobians, and its adjoint.
 
 Values are float32, what is computed of them float64.
 """
@@ -78,6 +78,122 @@ def project_patches(
                 depth[b, e, a] = z
                 valid[b, e, a] = z > least_z
     return True
+
+
+@compiled
+def project_patches_adjoint(
+    poses: Array,
+    patches: Array,
+    intrinsics: Array,
+    ii: Array,
+    jj: Array,
+    kk: Array,
+    least_divisor: float,
+    by_coords: Array,
+    by_depth: Array,
+    d_poses: Array,
+    d_patches: Array,
+    d_intrinsics: Array,
+) -> None:
+    """Add the gradients of :func:`project_patches` by poses, patches and intrinsics, whose indices are in range.
+
+    Args:
+        poses, patches, intrinsics, ii, jj, kk, least_divisor: see there.
+        by_coords: ``(B, E, A, 2)``, by_depth: ``(B, E, A)``: gradients.
+        d_poses, d_patches, d_intrinsics: float64.
+    """
+    batch, frames = poses.shape[:2]
+    rotations, motions = np.empty((frames, 3, 3)), np.empty((frames, frames, 3, 4))
+    for b in range(batch):
+        for n in range(frames):
+            _rotation(poses[b, n], rotations[n])
+        for i in range(frames):
+            for j in range(frames):
+                m = motions[i, j]
+                for a in range(3):
+                    t = np.float64(poses[b, j, a])
+                    for c in range(3):
+                        r = rotations[j, a, 0] * rotations[i, c, 0]
+                        r += rotations[j, a, 1] * rotations[i, c, 1] + rotations[j, a, 2] * rotations[i, c, 2]
+                        m[a, c] = r
+                        t -= r * poses[b, i, c]
+                    m[a, 3] = t
+        d_motions = np.zeros((frames, frames, 3, 4))
+        for e in range(len(ii)):
+            i, j, k = ii[e], jj[e], kk[e]
+            m, g, patch = motions[i, j], d_motions[i, j], patches[b, k]
+            fix, fiy = np.float64(intrinsics[b, i, 0]), np.float64(intrinsics[b, i, 1])
+            fx, fy = np.float64(intrinsics[b, j, 0]), np.float64(intrinsics[b, j, 1])
+            for a in range(patch.shape[1]):
+                gx, gy = np.float64(by_coords[b, e, a, 0]), np.float64(by_coords[b, e, a, 1])
+                gz = np.float64(by_depth[b, e, a])
+                if gx == 0 and gy == 0 and gz == 0:
+                    continue
+                u = (np.float64(patch[0, a]) - intrinsics[b, i, 2]) / fix
+                v = (np.float64(patch[1, a]) - intrinsics[b, i, 3]) / fiy
+                d = np.float64(patch[2, a])
+                x = m[0, 0] * u + m[0, 1] * v + m[0, 2] + m[0, 3] * d
+                y = m[1, 0] * u + m[1, 1] * v + m[1, 2] + m[1, 3] * d
+                z = m[2, 0] * u + m[2, 1] * v + m[2, 2] + m[2, 3] * d
+                ahead = not z < least_divisor
+                inverse = 1 / (z if ahead else least_divisor)
+                x, y = x * inverse, y * inverse
+                d_intrinsics[b, j, 0] += gx * x
+                d_intrinsics[b, j, 1] += gy * y
+                d_intrinsics[b, j, 2] += gx
+                d_intrinsics[b, j, 3] += gy
+                gx, gy = gx * fx * inverse, gy * fy * inverse
+                if ahead:
+                    gz -= gx * x + gy * y
+                by_u = (m[0, 0] * gx + m[1, 0] * gy + m[2, 0] * gz) / fix
+                by_v = (m[0, 1] * gx + m[1, 1] * gy + m[2, 1] * gz) / fiy
+                d_patches[b, k, 0, a] += by_u
+                d_patches[b, k, 1, a] += by_v
+                d_patches[b, k, 2, a] += m[0, 3] * gx + m[1, 3] * gy + m[2, 3] * gz
+                d_intrinsics[b, i, 0] -= by_u * u
+                d_intrinsics[b, i, 1] -= by_v * v
+                d_intrinsics[b, i, 2] -= by_u
+                d_intrinsics[b, i, 3] -= by_v
+                g[0, 0] += gx * u
+                g[0, 1] += gx * v
+                g[0, 2] += gx
+                g[0, 3] += gx * d
+                g[1, 0] += gy * u
+                g[1, 1] += gy * v
+                g[1, 2] += gy
+                g[1, 3] += gy * d
+                g[2, 0] += gz * u
+                g[2, 1] += gz * v
+                g[2, 2] += gz
+                g[2, 3] += gz * d
+        d_rotations = np.zeros((frames, 3, 3))
+        for i in range(frames):
+            for j in range(frames):
+                m, g = motions[i, j], d_motions[i, j]
+                for a in range(3):
+                    d_poses[b, j, a] += g[a, 3]
+                    for c in range(3):
+                        d_poses[b, i, c] -= m[a, c] * g[a, 3]
+                        g[a, c] -= g[a, 3] * poses[b, i, c]
+                for a in range(3):
+                    for c in range(3):
+                        for k in range(3):
+                            d_rotations[j, a, c] += g[a, k] * rotations[i, k, c]
+                            d_rotations[i, a, c] += g[k, a] * rotations[j, k, c]
+        for n in range(frames):
+            _add_rotation_gradient(poses[b, n], d_rotations[n], d_poses[b, n])
+
+
+@part
+def _add_rotation_gradient(pose: Array, g: Array, out: Array) -> None:
+    """Gradient by the quaternion of a pose from that by its matrix, as of :func:`dvo.geometry.so3.matrix`."""
+    x, y, z, w = np.float64(pose[3]), np.float64(pose[4]), np.float64(pose[5]), np.float64(pose[6])
+    s01, s02, s12 = g[0, 1] + g[1, 0], g[0, 2] + g[2, 0], g[1, 2] + g[2, 1]
+    a, b, c = g[2, 1] - g[1, 2], g[0, 2] - g[2, 0], g[1, 0] - g[0, 1]
+    out[3] += 2 * (x * (g[0, 0] - g[1, 1] - g[2, 2]) + y * s01 + z * s02 + w * a)
+    out[4] += 2 * (x * s01 + y * (g[1, 1] - g[0, 0] - g[2, 2]) + z * s12 + w * b)
+    out[5] += 2 * (x * s02 + y * s12 + z * (g[2, 2] - g[0, 0] - g[1, 1]) + w * c)
+    out[6] += 2 * (w * (g[0, 0] + g[1, 1] + g[2, 2]) + x * a + y * b + z * c)
 
 
 @part

@@ -163,7 +163,7 @@ class PatchVO(nn.Module):
             learn = None
             if correlation_gradient < 1 and torch.is_grad_enabled():
                 learn = _draw_edges(b, len(graph), correlation_gradient, generator).to(images.device)
-            return Correlation(volume.lookup(coords, graph.kk, graph.jj, learn))
+            return Correlation(volume.lookup(coords, graph.kk, graph.jj, learn), learn=learn)
 
         for update, stage in enumerate(stages):
             poses, patches, hidden = state.poses_cw.detach(), state.patches.detach(), state.hidden

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dvo.core.kernels import VARIABLE
+from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.geometry import se3
 from dvo.geometry.projection import Reprojection, by_kernel, reproject
 
@@ -202,6 +202,51 @@ def test_the_kernel_projects_as_its_twin(
     torch.testing.assert_close(found.coords.double(), expected.coords, rtol=1e-5, atol=1e-6 * scale, equal_nan=True)
     assert torch.equal(found.valid, expected.valid)
     assert found.coords.dtype == torch.float32
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.integers(0, 10_000), st.integers(1, 2), st.sampled_from([0, 1, 7, 60]),
+    st.sampled_from([(1, 1), (3, 3), (4, 5)]), st.sampled_from([math.nan, 1e3, -1e3, 0.0]),
+)  # fmt: skip
+def test_the_adjoint_is_that_of_the_twin(
+    monkeypatch: pytest.MonkeyPatch, seed: int, batch: int, count: int, size: tuple[int, int], bad: float
+) -> None:
+    """The twin in double precision; a number that is none spoils the same gradients."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    generator = torch.Generator().manual_seed(seed)
+    poses = se3.exp(torch.randn(batch, 4, 6, generator=generator))
+    patches = 40 * torch.rand(batch, 5, 3, *size, generator=generator)
+    patches[:, :, 2] /= 20
+    patches[:, 0, 2, 0, 0] = bad
+    intrinsics = torch.tensor([30.0, 32, 20, 15]) + torch.rand(batch, 4, 4, generator=generator)
+    indices = [torch.randint(high, (count,), generator=generator) for high in (4, 4, 5)]
+    factors = [torch.randn(batch, count, *size, *last, generator=generator) for last in ((2,), ())]
+    gradients = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [x.to(dtype).requires_grad_() for x in (se3.normalise(poses.double()), patches, intrinsics)]
+        found = reproject(*leaves, *indices)
+        total = (found.coords * factors[0].to(dtype)).sum() + (found.depth * factors[1].to(dtype)).sum()
+        gradients.append(torch.autograd.grad(total, leaves))
+    for x, y in zip(*gradients, strict=True):
+        assert x.dtype == torch.float32
+        scale = float(y.nan_to_num(0, 0, 0).abs().max())
+        torch.testing.assert_close(x.double(), y, rtol=1e-4, atol=1e-5 * scale + 1e-6, equal_nan=True)
+
+
+def test_the_adjoint_is_differentiated_again_and_takes_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds, batches = [], []
+    for choice in CHOICES:
+        monkeypatch.setenv(VARIABLE, choice)
+        leaves = [x.float().requires_grad_() for x in scene()]
+        coords = reproject(*leaves, *edges()).coords
+        first = torch.autograd.grad(coords.square().sum(), leaves, create_graph=True)
+        seconds.append(torch.autograd.grad(sum(g.square().sum() for g in first) * 1e-6, leaves, retain_graph=True))
+        many = torch.stack((torch.ones_like(coords), coords.detach()))
+        batches.append(torch.autograd.grad(coords, leaves, many, is_grads_batched=True))
+    for found in (seconds, batches):
+        for x, y in zip(*found, strict=True):
+            torch.testing.assert_close(x, y, rtol=1e-3, atol=1e-4 * float(y.abs().max()))
 
 
 @pytest.mark.parametrize("name", ["ii", "jj", "kk"])

@@ -39,7 +39,6 @@ LOSS: tuple[tuple[str, Any, str], ...] = (
 )
 BACKWARD: tuple[tuple[str, Any, str], ...] = (
     ("correlation look-up, backward", correlation._Lookup, "backward"),
-    ("correlation look-up, backward", correlation._WindowLookup, "backward"),
     ("correlation volume, backward", correlation._Source, "backward"),
     ("bundle adjustment, backward", GaussNewtonStep, "backward"),
     ("bundle adjustment, backward", edgewise._Recorded, "backward"),

@@ -205,12 +205,13 @@ def _taken(path: list[Array] | None, problem: Problem, settings: _Settings, *ten
     poses, inverse_depths, *measured = (x.detach().contiguous().numpy() for x in tensors)
     poses, inverse_depths = poses.copy(), inverse_depths.copy()
     arguments: tuple[Any, ...] = (poses, inverse_depths, *measured, *_constants(problem, settings))
+    count: tuple[Any, ...] = (int(settings.iterations) if path is None else 1,)
     if path is None:
-        take_steps(*arguments, int(settings.iterations))
+        take_steps(*arguments, *count)
     else:
         for _ in range(settings.iterations):
             path += [poses.copy(), inverse_depths.copy()]
-            take_steps(*arguments, 1)
+            take_steps(*arguments, *count)
     return torch.from_numpy(poses), torch.from_numpy(inverse_depths)
 
 
@@ -239,7 +240,7 @@ class _Recorded(torch.autograd.Function):
         step.refuse_batch(grads[0])
         tensors = ctx.saved_tensors[: ctx.count]
         needed = [i for i in range(len(tensors)) if ctx.needs_input_grad[i + 2]]
-        found: Sequence[Tensor]
+        found: Sequence[Tensor | None]
         if torch.is_grad_enabled() or is_transformed():
             twin = partial(_by_twin, ctx.problem, ctx.settings)
             found = composed(partial(pulled_back, twin, needed, len(tensors)), *tensors, *grads)

@@ -17,12 +17,12 @@ from torch import Tensor
 
 from dvo.ba.layer.adjoint import adjoint_constants, gradients
 from dvo.ba.layer.schur import SchurFactor, damped, eliminate, factorise, invert_blocks, sums_up
-from dvo.ba.layer.transforms import Tensors, composed, is_batched, pulled_back
+from dvo.ba.layer.transforms import Tensors, composed, pulled_back
 from dvo.ba.limits import LARGEST
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
 from dvo.core.errors import DvoError
-from dvo.core.kernels import is_transformed
+from dvo.core.kernels import is_batched, is_transformed
 from dvo.geometry.precision import full_precision
 
 

@@ -18,12 +18,6 @@ Tensors = tuple[Tensor, ...]
 Function = Callable[..., Tensors]
 
 
-def is_batched(x: Tensor) -> bool:
-    """True for a tensor of ``torch.autograd.grad(..., is_grads_batched=True)``, whose vmap is another."""
-    keys = str(torch._C._dispatch_keys(x))
-    return "Batched" in keys and "FuncTorch" not in keys
-
-
 def composed(function: Function, *tensors: Tensor) -> Tensors:
     """Call a function so that it can be differentiated again and transformed.
 

@@ -46,10 +46,12 @@ class Correlation:
             :class:`dvo.nets.update.update.Update` undoes that on the weights of its first layer rather than on every
             edge.
         order: order of the channels of a level.
+        learn: see :meth:`CorrelationVolume.lookup`; the others need no gradient.
     """
 
     levels: list[Tensor]
     order: ChannelOrder = "offsets_first"
+    learn: Tensor | None = None
 
 
 class CorrelationLookup(Protocol):
@@ -199,91 +201,101 @@ class _Source(torch.autograd.Function):
         return by_features, by_level, None
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a look-up reads.
+
+    Attributes:
+        position: ``(edges, pixels, 2)`` in pixels of the level.
+        start: ``(edges, pixels)`` beginnings of slices of the volume.
+        patch, frame: ``(edges,)`` over the batch.
+        learn: edges that propagate a gradient, None for all.
+    """
+
+    position: Tensor
+    start: Tensor
+    patch: Tensor
+    frame: Tensor
+    learn: Tensor | None
+
+    def tensors(self) -> tuple[Tensor | None, ...]:
+        """All of them, in this order."""
+        return self.position, self.start, self.patch, self.frame, self.learn
+
+    def edges(self) -> Any:
+        """``learn`` for kernels."""
+        return (torch.arange(len(self.position)) if self.learn is None else self.learn).numpy()
+
+
 class _Lookup(torch.autograd.Function):
-    """Bilinear look-up of windows in slices of a volume, see :class:`CorrelationVolume`."""
+    """Bilinear look-up of windows, see :class:`CorrelationVolume`: ``(edges, x offset, y offset, pixels)``."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        token: Tensor,
-        volume: Tensor,
-        start: Tensor,
-        position: Tensor,
-        size: tuple[int, int],
-        radius: int,
-        learn: Tensor | None,
-        store: dict[str, Tensor],
-    ) -> Tensor:
-        taps = _Taps.at(position, start, size, radius)
+    def forward(ctx: Any, token: Tensor, level: _Level, radius: int, *tensors: Tensor | None) -> Tensor:
+        place = _Place(*tensors)  # type: ignore[arg-type]
+        ctx.level, ctx.radius = level, radius
+        ctx.save_for_backward(*tensors)
+        volume = level.volume
+        if level.kernels:
+            return _by_kernel(level, radius, place)
+        assert volume is not None
+        taps = _Taps.at(place.position, place.start, level.size, radius)
         # several times faster than take
         values = volume.view(-1).index_select(0, taps.index.view(-1)).view(taps.index.shape)
         rows = torch.addcmul(values[:, :, :-1] * taps.ay, values[:, :, 1:], taps.by)
-        out = torch.addcmul(rows[:, :-1] * taps.ax, rows[:, 1:], taps.bx)
-        kept = taps.index, taps.ax, taps.bx, taps.ay, taps.by
-        if learn is not None:
-            kept = tuple(t[learn] for t in kept)  # type: ignore[assignment]
-        ctx.save_for_backward(*kept, learn)
-        ctx.store, ctx.length = store, volume.numel()
-        return out
+        return torch.addcmul(rows[:, :-1] * taps.ax, rows[:, 1:], taps.bx)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        *kept, learn = ctx.saved_tensors
-        grad = grads[0] if learn is None else grads[0][learn]
-        _Taps(*kept).add_gradient(grad, ctx.store, ctx.length)
+        place, level, grad = _Place(*ctx.saved_tensors), ctx.level, grads[0]
+        if level.kernels and not torch.is_grad_enabled():
+            _by_adjoint(level, ctx.radius, place, grad)
+        else:
+            position, start = place.position, place.start
+            if place.learn is not None:
+                position, start, grad = (x[place.learn] for x in (position, start, grad))
+            _Taps.at(position, start, level.size, ctx.radius).add_gradient(grad, level.store, level.length)
         return (grad.new_zeros(()), *[None] * 7)
 
 
-class _WindowLookup(torch.autograd.Function):
-    """The same by kernels, from features ``(B K, q, C)`` and maps ``(B N, H, W, C)`` in a border of zeros."""
+def _by_kernel(level: _Level, radius: int, place: _Place) -> Tensor:
+    import dvo.nets.correlation.edge_correlation_kernels as kernels
 
-    @staticmethod
-    def forward(
-        ctx: Any,
-        token: Tensor,
-        features: Tensor,
-        maps: Tensor,
-        position: Tensor,
-        kk: Tensor,
-        frames: Tensor,
-        radius: int,
-        learn: Tensor | None,
-        store: dict[str, Tensor],
-        whole: tuple[int, tuple[int, int]],
-    ) -> Tensor:
-        from dvo.nets.correlation.edge_correlation_kernels import correlate
+    position, side = place.position, 2 * radius + 1
+    out = position.new_empty(len(position), side, side, position.shape[1])
+    to = out.permute(0, 3, 2, 1).numpy()
+    given: tuple[Any, ...]
+    if level.volume is not None:
+        given = level.volume.view(-1).numpy(), place.start.numpy(), position.numpy(), *level.size, radius, to
+        kernels.look_up(*given)
+    else:
+        arrays: tuple[Any, ...] = (level.maps, level.features, position, place.patch, place.frame)
+        given = *(x.numpy() for x in arrays), radius, to
+        kernels.correlate(*given)
+    return out
 
-        side = 2 * radius + 1
-        out = position.new_empty(len(position), side, side, position.shape[1])  # edges, x offset, y offset, pixel
-        given = (x.numpy() for x in (maps, features, position, kk, frames))
-        correlate(*given, radius, out.permute(0, 3, 2, 1).numpy())
-        ctx.save_for_backward(features, maps, position, kk, frames, learn)
-        ctx.radius, ctx.store, ctx.whole = radius, store, whole
-        return out
 
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        features, maps, position, kk, frames, learn = ctx.saved_tensors
-        grad, store = grads[0], ctx.store
-        nothing = (grad.new_zeros(()), *[None] * 9)
-        if torch.is_grad_enabled():  # to be differentiated again: what the twin does
-            count, (h, w) = ctx.whole
-            pixel = torch.arange(features.shape[1])
-            start = ((kk[:, None] * len(pixel) + pixel) * count + (frames % count)[:, None]) * (h * w)
-            if learn is not None:
-                position, start, grad = position[learn], start[learn], grad[learn]
-            length = features.shape[0] * len(pixel) * count * h * w
-            _Taps.at(position, start, (h, w), ctx.radius).add_gradient(grad, store, length)
-            return nothing
-        from dvo.nets.correlation.edge_correlation_kernels import correlate_adjoint
+def _by_adjoint(level: _Level, radius: int, place: _Place, grad: Tensor) -> None:
+    """Add to the gradients in the store."""
+    import dvo.nets.correlation.edge_correlation_kernels as kernels
 
-        if "features" not in store:
-            store["features"], store["maps"] = torch.zeros_like(features), torch.zeros_like(maps)
-        edges = torch.arange(len(position)) if learn is None else learn
-        given = (x.numpy() for x in (maps, features, position, kk, frames))
-        sums = store["maps"].numpy(), store["features"].numpy()
-        correlate_adjoint(*given, ctx.radius, edges.numpy(), grad.contiguous().permute(0, 3, 2, 1).numpy(), *sums)
-        return nothing
+    store, edges = level.store, place.edges()
+    by_out = grad.contiguous().permute(0, 3, 2, 1).numpy()
+    given: tuple[Any, ...]
+    if level.volume is not None:
+        if "volume" not in store:
+            store["volume"] = grad.new_zeros(level.length)
+        given = place.start.numpy(), place.position.numpy(), *level.size, radius, edges, by_out
+        kernels.look_up_adjoint(*given, store["volume"].numpy())
+        return
+    if "features" not in store:
+        for name, x in (("features", level.features), ("maps", level.maps)):
+            assert x is not None
+            store[name] = torch.zeros_like(x)
+    arrays: tuple[Any, ...] = (level.maps, level.features, place.position, place.patch, place.frame)
+    sums = store["maps"].numpy(), store["features"].numpy()
+    given = *(x.numpy() for x in arrays), radius, edges, by_out, *sums
+    kernels.correlate_adjoint(*given)
 
 
 @dataclass(frozen=True)
@@ -294,13 +306,17 @@ class _Level:
         token: of :class:`_Source`.
         store: gradients of the look-ups so far.
         size: height and width of a map.
-        volume: ``(B, K q, N h w)``; None for windows.
-        features, maps: see :class:`_WindowLookup`; None for a volume.
+        length: of the volume.
+        kernels: look up by kernels.
+        volume: ``(B, K q, N h w)``; None for windows, which kernels alone take.
+        features: ``(B K, q, C)``, and maps: ``(B N, H, W, C)`` in a border of zeros; None for a volume.
     """
 
     token: Tensor
     store: dict[str, Tensor]
     size: tuple[int, int]
+    length: int
+    kernels: bool
     volume: Tensor | None = None
     features: Tensor | None = None
     maps: Tensor | None = None
@@ -336,12 +352,14 @@ class CorrelationVolume:
         store: dict[str, Tensor] = {}
         size = level.shape[-2], level.shape[-1]
         token: Tensor = _Source.apply(features, level, store)
-        taps, (h, w) = 2 * self.radius + 2, size
-        if h * w > FEW_PIXELS * taps**2 and use_kernels(features, level, adjoint=True):
+        (h, w), (b, k, q, _), taps = size, features.shape, 2 * self.radius + 2
+        kernels = use_kernels(features, level, adjoint=True)
+        common = token, store, size, b * k * q * self.frames * h * w, kernels
+        if kernels and h * w > FEW_PIXELS * taps**2:
             maps = F.pad(level.detach().flatten(0, 1).permute(0, 2, 3, 1), (0, 0, *[taps] * 4)).contiguous()
-            return _Level(token, store, size, features=features.detach().flatten(0, 1).contiguous(), maps=maps)
+            return _Level(*common, features=features.detach().flatten(0, 1).contiguous(), maps=maps)
         with torch.no_grad(), full_precision(features.device):
-            return _Level(token, store, size, volume=torch.matmul(features.flatten(1, 2), _as_columns(level)))
+            return _Level(*common, volume=torch.matmul(features.flatten(1, 2), _as_columns(level)))
 
     def lookup(
         self,
@@ -368,20 +386,16 @@ class CorrelationVolume:
         position = coords.detach().reshape(b * e, self.pixels, 2)
         clip = torch.arange(b, device=kk.device)[:, None]
         patch, frame = (clip * self.patches + kk).flatten(), (clip * self.frames + jj).flatten()
+        row = patch[:, None] * self.pixels + torch.arange(self.pixels, device=kk.device)
+        slices = row * self.frames + jj.repeat(b)[:, None]
+        if any(level.kernels for level in self.levels):
+            for index, count in ((kk, self.patches), (jj, self.frames), (learn, b * e)):
+                check_range(index, count)
         levels = []
         for level, scale in zip(self.levels, self.pyramid, strict=True):
-            at = position / scale
-            if level.volume is not None:
-                pixel, (h, w) = torch.arange(self.pixels, device=kk.device), level.size
-                row = patch[:, None] * self.pixels + pixel
-                start = (row * self.frames + jj.repeat(b)[:, None]) * (h * w)
-                args = (start, at, level.size, self.radius, learn, level.store)
-                found = _Lookup.apply(level.token, level.volume, *args)
-            else:
-                for index, count in ((kk, self.patches), (jj, self.frames), (learn, b * e)):
-                    check_range(index, count)
-                args = (at, patch, frame, self.radius, learn, level.store, (self.frames, level.size))
-                found = _WindowLookup.apply(level.token, level.features, level.maps, *args)
+            at, start = (position / scale).contiguous(), slices * (level.size[0] * level.size[1])
+            place = _Place(at, start, patch, frame, learn)
+            found: Tensor = _Lookup.apply(level.token, level, self.radius, *place.tensors())
             levels.append(found.reshape(b, e, -1))
         return levels
 

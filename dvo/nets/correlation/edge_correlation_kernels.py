@@ -81,8 +81,8 @@ def _eight_products(context, maps, first, feature, out, position):
 def _eight_adjoints(context, maps, first, d_maps, feature, d_feature, weights, position):
     """Take eight products back, of which ``weights`` holds the gradients from ``position``.
 
-    ``d_maps`` receives those of the eight pixels from ``first``, ``d_feature`` that of the feature. Maps and weights are
-    flat; all arrays are contiguous and of float32; the channels are a multiple of eight.
+    ``d_maps`` receives those of the eight pixels from ``first``, ``d_feature`` that of the feature. Maps and
+    weights are flat; all arrays are contiguous and of float32; the channels are a multiple of eight.
     """
 
     def generate(target: Any, builder: Any, signature: Any, given: Any) -> Any:
@@ -176,6 +176,32 @@ def _corner(x, y, radius, height, width):
     return left + taps, top + taps, x - np.float32(left), y - np.float32(top)
 
 
+@part
+def _blend(products, fx, fy, out):
+    """Bilinear blend of a window of products."""
+    for i in range(len(out)):
+        for j in range(len(out)):
+            u = products[i, j] + fy * (products[i + 1, j] - products[i, j])
+            v = products[i, j + 1] + fy * (products[i + 1, j + 1] - products[i, j + 1])
+            out[i, j] = u + fx * (v - u)
+
+
+@part
+def _take_back_blend(grad, fx, fy, weights):
+    """Fill the gradients of a window of products from that of their blend."""
+    for i in range(len(weights)):
+        for j in range(len(weights)):
+            weights[i, j] = 0
+    for i in range(len(weights) - 1):
+        for j in range(len(weights) - 1):
+            right = fx * grad[i, j]
+            here = grad[i, j] - right
+            weights[i, j] += here - fy * here
+            weights[i, j + 1] += right - fy * right
+            weights[i + 1, j] += fy * here
+            weights[i + 1, j + 1] += fy * right
+
+
 @compiled
 def correlate(maps, features, at, kk, frames, radius, out):
     """Fill ``out (E, q, 2r+1, 2r+1)``; the other arguments are those of the twin, maps and features contiguous."""
@@ -194,11 +220,7 @@ def correlate(maps, features, at, kk, frames, radius, out):
             left, top, fx, fy = _corner(x, y, radius, height, width)
             first = ((frames[edge] * height + top) * width + left) * channels
             _products(flat, first, width * channels, features[kk[edge], pixel], products)
-            for i in range(taps - 1):
-                for j in range(taps - 1):
-                    u = products[i, j] + fy * (products[i + 1, j] - products[i, j])
-                    v = products[i, j + 1] + fy * (products[i + 1, j + 1] - products[i, j + 1])
-                    out[edge, pixel, i, j] = u + fx * (v - u)
+            _blend(products, fx, fy, out[edge, pixel])
 
 
 @compiled
@@ -221,19 +243,49 @@ def correlate_adjoint(maps, features, at, kk, frames, radius, edges, grad, d_map
                 d_maps[frames[edge], taps, taps, 0] = math.nan
                 continue
             left, top, fx, fy = _corner(x, y, radius, height, width)
-            for i in range(taps):
-                for j in range(taps):
-                    weights[i, j] = 0
-            for i in range(taps - 1):
-                for j in range(taps - 1):
-                    g = grad[edge, pixel, i, j]
-                    right = fx * g
-                    here = g - right
-                    weights[i, j] += here - fy * here
-                    weights[i, j + 1] += right - fy * right
-                    weights[i + 1, j] += fy * here
-                    weights[i + 1, j + 1] += fy * right
+            _take_back_blend(grad[edge, pixel], fx, fy, weights)
             first = ((frames[edge] * height + top) * width + left) * channels
             _adjoint_of_products(
                 flat, d_flat, first, width * channels, features[k, pixel], d_features[k, pixel], weights
             )
+
+
+@compiled
+def look_up(volume, start, at, height, width, radius, out):
+    """Fill ``out (E, q, 2r+1, 2r+1)`` from slices of a volume, flat, that begin at ``start (E, q)``."""
+    taps = 2 * radius + 2
+    products = np.empty((taps, taps), np.float32)
+    for edge in range(len(at)):
+        for pixel in range(at.shape[1]):
+            x, y, first = at[edge, pixel, 0], at[edge, pixel, 1], start[edge, pixel]
+            if math.isnan(x) or math.isnan(y):
+                for i in range(taps - 1):
+                    for j in range(taps - 1):
+                        out[edge, pixel, i, j] = math.nan
+                continue
+            left, top, fx, fy = _corner(x, y, radius, height + 2 * taps, width + 2 * taps)
+            for i in range(taps):
+                row = top - taps + i
+                for j in range(taps):
+                    column = left - taps + j
+                    inside = 0 <= row < height and 0 <= column < width
+                    products[i, j] = volume[first + row * width + column] if inside else 0
+            _blend(products, fx, fy, out[edge, pixel])
+
+
+@compiled
+def look_up_adjoint(start, at, height, width, radius, edges, grad, d_volume):
+    """Add the gradient of :func:`look_up` by the volume; see :func:`correlate_adjoint`."""
+    taps = 2 * radius + 2
+    weights = np.empty((taps, taps), np.float32)
+    for edge in edges:
+        for pixel in range(at.shape[1]):
+            x, y, first = at[edge, pixel, 0], at[edge, pixel, 1], start[edge, pixel]
+            if math.isnan(x) or math.isnan(y):
+                d_volume[first] = math.nan
+                continue
+            left, top, fx, fy = _corner(x, y, radius, height + 2 * taps, width + 2 * taps)
+            _take_back_blend(grad[edge, pixel], fx, fy, weights)
+            for i in range(max(0, taps - top), min(taps, height + taps - top)):
+                for j in range(max(0, taps - left), min(taps, width + taps - left)):
+                    d_volume[first + (top - taps + i) * width + left - taps + j] += weights[i, j]

@@ -6,6 +6,7 @@ configuration is a name in :data:`UPDATE_OPERATORS`.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, Protocol
 
 import torch
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dvo.core.kernels import is_transformed
 from dvo.core.registry import Registry
 from dvo.map.edges import Groups, PatchGraph
 from dvo.nets.correlation.correlation import Correlation
@@ -170,10 +172,34 @@ def first_layer(layer: nn.Linear, correlation: Correlation, taps: int) -> Tensor
     if correlation.order == "pixels_first":
         table = table.unflatten(1, (taps, taps, -1)).permute(0, 3, 2, 1, 4).flatten(1, 3)
     weights = table.unbind(-1)
-    out = functional.linear(levels[0], weights[0], layer.bias)
+    learn = correlation.learn
+    plain = learn is None or is_transformed() or torch.is_autocast_enabled(learn.device.type)
+    linear = functional.linear if plain else partial(_Learnt.apply, learn)
+    out: Tensor = linear(levels[0], weights[0], layer.bias)
     for level, weight in zip(levels[1:], weights[1:], strict=True):
-        out = out + functional.linear(level, weight)
+        out = out + linear(level, weight, None)
     return out
+
+
+class _Learnt(torch.autograd.Function):
+    """A linear layer whose input receives a gradient in the rows ``learn`` alone, and zeros elsewhere."""
+
+    @staticmethod
+    def forward(ctx: Any, learn: Tensor, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        ctx.save_for_backward(x, weight, learn)
+        return functional.linear(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, learn = ctx.saved_tensors
+        grad, by_x, by_weight, by_bias = grads[0].flatten(0, 1), None, None, None
+        if ctx.needs_input_grad[1]:
+            by_x = torch.zeros_like(x).flatten(0, 1).index_add(0, learn, grad[learn] @ weight).view(x.shape)
+        if ctx.needs_input_grad[2]:
+            by_weight = grad.mT @ x.flatten(0, 1)
+        if ctx.needs_input_grad[3]:
+            by_bias = grad.sum(0)
+        return None, by_x, by_weight, by_bias
 
 
 def encode_correlation(layers: nn.Sequential, correlation: Correlation, taps: int) -> Tensor:

@@ -106,3 +106,20 @@ def test_schedule_carries_each_edge_to_its_place():
         assert int(old.sum()) == len(before.graph)
         assert torch.equal(now.graph.kk[old], before.graph.kk[now.carry[old]])
         assert torch.equal(now.graph.jj[old], before.graph.jj[now.carry[old]])
+
+
+def test_only_the_learning_edges_send_a_gradient_to_the_correlation():
+    """Gradients of the layer are those of all edges."""
+    torch.manual_seed(0)
+    layer, learn = torch.nn.Linear(12, 5).double(), torch.tensor([4, 1, 7])
+    factor = torch.randn(2, 4, 5, dtype=torch.float64)
+    found = []
+    for chosen in (learn, None):
+        levels = [torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(i)).double() for i in range(2)]
+        leaves = [x.requires_grad_() for x in levels]
+        out = first_layer(layer, Correlation(leaves, learn=chosen), 1)
+        found.append([out, *torch.autograd.grad((out.square() * factor).sum(), [*layer.parameters(), *leaves])])
+    some = torch.zeros(8, 1, dtype=torch.float64).index_fill(0, learn, 1.0).view(2, 4, 1)
+    expected = [*found[1][:3], *(g * some for g in found[1][3:])]
+    for x, y in zip(found[0], expected, strict=True):
+        torch.testing.assert_close(x, y)

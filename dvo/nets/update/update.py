@@ -194,7 +194,7 @@ class _Learnt(torch.autograd.Function):
         x, weight, learn = ctx.saved_tensors
         grad, by_x, by_weight, by_bias = grads[0].flatten(0, 1), None, None, None
         if ctx.needs_input_grad[1]:
-            by_x = torch.zeros_like(x).flatten(0, 1).index_add(0, learn, grad[learn] @ weight).view(x.shape)
+            by_x = torch.zeros_like(x).flatten(0, 1).index_add_(0, learn, grad[learn] @ weight).view(x.shape)
         if ctx.needs_input_grad[2]:
             by_weight = grad.mT @ x.flatten(0, 1)
         if ctx.needs_input_grad[3]:

@@ -12,6 +12,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
@@ -34,6 +35,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "weights"
 
 _METADATA = 1_000_000  # characters of the sizes, or of the model card
 _OTHER = "give weights of this network"
+_DRAWN = {Tensor.normal_, Tensor.log_normal_, Tensor.exponential_, Tensor.cauchy_, Tensor.geometric_}
 
 
 @dataclass(frozen=True)
@@ -245,10 +247,19 @@ def load_model(name_or_file: str | Path = "small", device: torch.device | str = 
 def _skeleton(architecture: str, config: NetworkConfig) -> nn.Module:
     """Network with shapes and no memory for its tensors, if it can be built so."""
     try:
-        with torch.device("meta"):
+        with torch.device("meta"), _Undrawn():
             return build_network(architecture, config)
     except (NotImplementedError, RuntimeError):  # a constructor that reads values of its tensors
         return build_network(architecture, config)
+
+
+class _Undrawn(TorchFunctionMode):
+    """Draws no numbers for tensors without memory: torch would import its compiler for it, which takes seconds."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in _DRAWN and args and args[0].is_meta:
+            return args[0]
+        return func(*args, **(kwargs or {}))
 
 
 def _compare(model: nn.Module, tensors: dict[str, Tensor], path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import subprocess
 import sys
 
 import pytest
@@ -279,3 +280,9 @@ def test_unknown_setting_is_named():
     with pytest.raises(DvoError, match="colour"):
         ModelConfig.from_dict({"colour": 1})
     assert ModelConfig.from_dict(PRESETS["small"].to_dict()) == PRESETS["small"]
+
+
+def test_loading_does_not_import_the_compiler_of_torch():
+    names = ("small", "droid", "tartanvo", "deepvo")
+    program = f"import sys, dvo; [dvo.load_model(name) for name in {names}]; assert 'torch._dynamo' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)

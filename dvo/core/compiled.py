@@ -14,8 +14,10 @@ from dvo.core.text import print_line
 F = TypeVar("F", bound=Callable[..., Any])
 
 # The order of sums may be changed when a kernel is compiled, so that they use vector instructions; it is then fixed.
-# Infinite numbers and NaN keep their meaning.
-_OPTIONS: dict[str, Any] = dict(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+# Infinite numbers and NaN keep their meaning. Nothing in C calls a kernel.
+_OPTIONS: dict[str, Any] = dict(
+    nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}, no_cfunc_wrapper=True
+)
 
 
 class _Notice(event.Listener):
@@ -78,5 +80,5 @@ def part(function: F) -> F:
     Returns:
         The same, compiled.
     """
-    options: dict[str, Any] = dict(_OPTIONS, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    options: dict[str, Any] = dict(_OPTIONS, no_cpython_wrapper=True)
     return numba.njit(**options)(function)

@@ -26,7 +26,8 @@ def _distances(x, first, second, rotation, towards, aside, out):
     for i in range(3):
         d[i] = towards[i] + x[3] * aside[0, i] + x[4] * aside[1, i]
     length = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    d /= length
+    for i in range(3):
+        d[i] /= length
     for k in range(3):
         essential[0, k] = d[1] * turn[2, k] - d[2] * turn[1, k]
         essential[1, k] = d[2] * turn[0, k] - d[0] * turn[2, k]
@@ -63,7 +64,8 @@ def fit(first, second, rotation, towards, aside, unknowns, scale, width, iterati
     cost, damping = _cost(now, scale, width), 1e-3
     for _ in range(iterations):
         for i in range(unknowns):
-            near[:] = x
+            for k in range(7):
+                near[k] = x[k]
             near[i] += delta
             _distances(near, first, second, rotation, towards, aside, beside)
             for n in range(count):
@@ -92,7 +94,8 @@ def fit(first, second, rotation, towards, aside, unknowns, scale, width, iterati
                         lifted[i, i] = math.sqrt(total) if total > 0 else 1.0
                     else:
                         lifted[i, j] = total / lifted[j, j]
-            step[:] = x
+            for i in range(7):
+                step[i] = x[i]
             for i in range(unknowns):
                 total = gradient[i]
                 for k in range(i):
@@ -106,7 +109,10 @@ def fit(first, second, rotation, towards, aside, unknowns, scale, width, iterati
             _distances(step, first, second, rotation, towards, aside, after)
             found = _cost(after, scale, width)
             if solvable and found < cost:
-                x[:], now[:] = step, after
+                for i in range(7):
+                    x[i] = step[i]
+                for n in range(count):
+                    now[n] = after[n]
                 cost, damping, better = found, damping / 5, True
             else:
                 damping *= 8

@@ -14,6 +14,8 @@ LARGEST = 1e8
 a few of them are numbers of float32."""
 SHORTEST_FOCAL = 1e-3
 """Least focal length, pixels (1 in normalised coordinates)."""
+RETRIES = 6
+"""Attempts after a failed factorisation, each with ten times the damping."""
 LARGEST_TURN = 10.0
 """Largest step of the logarithm of a focal length, or of a principal point in focal lengths."""
 

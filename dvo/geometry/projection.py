@@ -19,12 +19,8 @@ from torch import Tensor
 from dvo.core.errors import DvoError
 from dvo.core.kernels import is_batched, use_kernels
 from dvo.geometry import se3, so3
+from dvo.geometry.bounds import MIN_Z_DIVISION, MIN_Z_VALID
 from dvo.geometry.precision import full_precision
-
-MIN_Z_DIVISION = 0.1
-"""The projection divides by ``max(Z, this)``."""
-MIN_Z_VALID = 0.2
-"""A point is valid only where ``Z`` is greater: in front of the camera by a fifth of its depth in frame i."""
 
 
 @dataclass(frozen=True)

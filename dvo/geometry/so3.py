@@ -10,9 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Below this squared angle the closed forms lose digits in their derivatives and a series of four terms is exact.
-SMALL = 1e-3
-
+from dvo.geometry.bounds import SMALL
 
 # A product of quaternions, the matrix of one, and the matrix of a cross product are fixed linear maps of the (pairs of)
 # numbers. Written as one matrix product they take a tenth of the calls, which is what counts on the few poses of a

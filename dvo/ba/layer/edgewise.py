@@ -27,7 +27,7 @@ from dvo.ba.layer.transforms import composed, pulled_back
 from dvo.ba.options import BADamping
 from dvo.ba.problem import Factor, Linearisation, NormalEquations, Problem, State
 from dvo.core.kernels import is_transformed, use_kernels
-from dvo.geometry.projection import MIN_Z_VALID
+from dvo.geometry.bounds import MIN_Z_VALID
 
 Array = np.ndarray[Any, Any]
 _ROBUST = {"none": 0, "huber": 1, "cauchy": 2}

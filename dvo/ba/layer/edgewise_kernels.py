@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from dvo.ba.layer.schur import RETRIES
-from dvo.ba.limits import LARGEST
+from dvo.ba.limits import LARGEST, RETRIES
 from dvo.core.compiled import compiled, part
-from dvo.geometry.so3 import SMALL
+from dvo.geometry.bounds import SMALL
 
 Array = np.ndarray[Any, Any]
 

@@ -19,7 +19,7 @@ from dvo.ba.edges import EdgePlan
 from dvo.ba.kernels import Kernel
 from dvo.ba.layer.linearisation import NormalEquations
 from dvo.geometry import so3
-from dvo.geometry.projection import MIN_Z_VALID
+from dvo.geometry.bounds import MIN_Z_VALID
 
 Counted = tuple[Tensor, Tensor | None]
 """Of a slice of groups: places that count, ``(B, G, 1, M)`` bool, and their kernel weights of the same shape."""

@@ -13,7 +13,7 @@ from dvo.ba.kernels import Kernel
 from dvo.ba.limits import LARGEST
 from dvo.ba.problem import Factor, Linearisation
 from dvo.geometry import se3
-from dvo.geometry.projection import MIN_Z_VALID
+from dvo.geometry.bounds import MIN_Z_VALID
 
 MARGIN = 64.0
 """A projection counts while it lies within the feature map enlarged by this many pixels on each side."""

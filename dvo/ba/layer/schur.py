@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-RETRIES = 6
-"""Attempts after a failed factorisation, each with ten times the damping."""
+from dvo.ba.limits import RETRIES
 
 
 def factorise(s: Tensor) -> tuple[Tensor, Tensor]:

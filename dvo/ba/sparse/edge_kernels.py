@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from dvo.core.compiled import compiled, part
-from dvo.geometry.projection import MIN_Z_VALID
+from dvo.geometry.bounds import MIN_Z_VALID
 
 NONE, HUBER, CAUCHY = 0, 1, 2
 """Names of robust kernels as numbers."""

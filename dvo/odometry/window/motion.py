@@ -7,7 +7,8 @@ from torch import Tensor
 
 from dvo.core.kernels import use_kernels
 from dvo.geometry import se3
-from dvo.geometry.projection import MIN_Z_DIVISION, reproject
+from dvo.geometry.bounds import MIN_Z_DIVISION
+from dvo.geometry.projection import reproject
 from dvo.map.window import Window
 
 LONGEST = 1e3

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from dvo.core.kernels import use_kernels
-from dvo.geometry.projection import MIN_Z_DIVISION, reproject
+from dvo.geometry.bounds import MIN_Z_DIVISION
+from dvo.geometry.projection import reproject
 from dvo.map.window import Window
 from dvo.odometry.frames.content import MATCHED, matched_share
 

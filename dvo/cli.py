@@ -19,6 +19,7 @@ from typing import NoReturn
 from dvo import __version__
 from dvo.commands import BAD_INPUT, HUNG_UP, INTERRUPTED, OK, Terminated, ending_signals
 from dvo.commands.calibrate_options import add_calibrate
+from dvo.commands.kernels import compiled_meanwhile
 from dvo.commands.run_options import add_batch_options, add_folder_options, add_run_options, add_tracking_options
 from dvo.commands.stream_options import add_stream_options
 from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed
@@ -206,10 +207,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None, received: Sequence[KeyboardInterrupt]) -> int:
     try:
         arguments = build_parser().parse_args(argv)
-        check_limits(TRACKING if arguments.command in _TRACKING else LOADING)
-        module, function = arguments.run.split(":")
-        command: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
-        return command(arguments)
+        is_tracking = arguments.command in _TRACKING
+        check_limits(TRACKING if is_tracking else LOADING)
+        # The process of a program, and not a call from one, may have another process beside it.
+        with compiled_meanwhile(arguments) if is_tracking and argv is None else contextlib.nullcontext():
+            module, function = arguments.run.split(":")
+            command: Callable[[argparse.Namespace], int] = getattr(import_module(module), function)
+            return command(arguments)
     except SystemExit as exit_:  # argparse: --help, --version, or a wrong option
         return exit_.code if isinstance(exit_.code, int) else BAD_INPUT
     except (Exception, KeyboardInterrupt) as error:

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numba
 from numba.core import event
 
-from dvo.core.text import print_line
+from dvo.core import ahead
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -23,13 +23,11 @@ _OPTIONS: dict[str, Any] = dict(
 class _Notice(event.Listener):
     """Prints a line when the first kernel of this process is compiled; those on the disk are not."""
 
-    said = False
     ours: set[Any] = set()
 
     def on_start(self, event: Any) -> None:
-        if not self.said and event.data["dispatcher"].py_func in self.ours:
-            _Notice.said = True
-            print_line("dvo: compiling kernels, once on this machine", error=True)
+        if event.data["dispatcher"].py_func in self.ours:
+            ahead.tell()
 
     def on_end(self, event: Any) -> None: ...
 
@@ -55,8 +53,29 @@ def compiled(function: F) -> F:
     except RuntimeError:  # no place for the cache
         return numba.njit(**_OPTIONS)(function)
     cache = kernel._cache
-    cache.save_overload, cache.load_overload = _tried(cache.save_overload), _tried(cache.load_overload)
+    cache.save_overload, load = _tried(cache.save_overload), _tried(cache.load_overload)
+
+    def load_or_wait(*arguments: Any) -> Any:
+        found = load(*arguments)
+        if found is None and ahead.brought(name_of(function)):
+            ahead.tell()
+            found = load(*arguments)
+        return found
+
+    cache.load_overload = load_or_wait
     return kernel
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """Name of a kernel for :mod:`dvo.core.ahead`.
+
+    Args:
+        function: compiled or not.
+
+    Returns:
+        ``module:function``.
+    """
+    return f"{function.__module__}:{function.__name__}"
 
 
 def _tried(step: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import os
 import resource
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +37,29 @@ def pytest_runtest_call(item):
 REPOSITORY = Path(__file__).resolve().parent.parent
 CORE = ("geometry", "ba", "nets", "map", "data", "metrics", "eval/scoring")
 """Rooms whose tests are the marker ``core``, but for those that are slow."""
+FOLDERS = tuple(f"{REPOSITORY / 'tests' / room}{os.sep}" for room in CORE)
+
+# Python compiles what many processes of the tests import once, as it does numba's kernels.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of the core rooms."""
-    folders = tuple(REPOSITORY / "tests" / room for room in CORE)
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """With ``-m core`` alone, other rooms are not even imported."""
+    path = f"{collection_path}{os.sep}"
+    other = config.option.markexpr == "core" and not any(path.startswith(f) or f.startswith(path) for f in FOLDERS)
+    return True if other else None
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
+    """Mark the tests of the core rooms, before they are chosen by their markers."""
     for item in items:
-        if any(folder in item.path.parents for folder in folders) and item.get_closest_marker("slow") is None:
+        if str(item.path).startswith(FOLDERS) and item.get_closest_marker("slow") is None:
             item.add_marker(pytest.mark.core)
+    yield
+    gc.collect()
+    gc.freeze()  # all that was imported: the collector need not go through it again and again
 
 
 # The same examples on every run; no deadline, because machines are shared.

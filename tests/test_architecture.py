@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -50,9 +51,16 @@ def room_of(file: Path) -> str:
     return file.relative_to(ROOT / "dvo").parts[0].removesuffix(".py")
 
 
-def imports(file: Path) -> Iterator[tuple[int, str]]:
+@cache
+def look(file: Path) -> tuple[tuple[tuple[int, str], ...], tuple[str, ...]]:
+    """Imports and bad habits of a file."""
+    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    return tuple(imported(file, nodes)), tuple(bad_habits(file, nodes))
+
+
+def imported(file: Path, nodes: list[ast.AST]) -> Iterator[tuple[int, str]]:
     """Line and full module name of every import, also inside functions."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -61,6 +69,10 @@ def imports(file: Path) -> Iterator[tuple[int, str]]:
             module = ".".join(part for part in (base, node.module) if part)
             yield node.lineno, module
             yield from ((node.lineno, f"{module}.{alias.name}") for alias in node.names)
+
+
+def imports(file: Path) -> tuple[tuple[int, str], ...]:
+    return look(file)[0]
 
 
 def name(file: Path) -> str:
@@ -73,21 +85,24 @@ def test_every_room_has_its_arrows() -> None:
     assert rooms - set(ARROWS) <= TOP, "a new room needs a row in ARROWS, here and in the README"
 
 
-@pytest.mark.parametrize("file", LIBRARY, ids=name)
-def test_imports_follow_the_arrows(file: Path) -> None:
-    room = room_of(file)
-    for line, module in imports(file):
-        parts = module.split(".")
-        assert parts[0] not in ("train", "eval", "tests"), f"{name(file)}:{line} imports {module}"
-        if room in TOP or parts[0] != "dvo":
-            continue
-        target = parts[1] if len(parts) > 1 else "__init__"
-        if target == "__init__" or not is_module(target):
-            # `import dvo` or `from dvo import X`: only the package's own names, which need no room
-            assert parts[1:] in ([], ["__version__"]), f"{name(file)}:{line} imports {module}"
-            continue
-        allowed = ARROWS[room] | {room, "core"}
-        assert target in allowed, f"{name(file)}:{line}: {room} must not know {target}"
+def wrong_import(room: str, module: str) -> bool:
+    parts = module.split(".")
+    if parts[0] in ("train", "eval", "tests"):
+        return True
+    if room in TOP or parts[0] != "dvo":
+        return False
+    target = parts[1] if len(parts) > 1 else "__init__"
+    if target == "__init__" or not is_module(target):
+        # `import dvo` or `from dvo import X`: only the package's own names, which need no room
+        return parts[1:] not in ([], ["__version__"])
+    return target not in ARROWS[room] | {room, "core"}
+
+
+@pytest.mark.parametrize("room", sorted({room_of(file) for file in LIBRARY}))
+def test_imports_follow_the_arrows(room: str) -> None:
+    wrong = [f"{name(file)}:{line}: {room} must not import {module}" for file in LIBRARY if room_of(file) == room
+             for line, module in imports(file) if wrong_import(room, module)]  # fmt: skip
+    assert not wrong, "\n".join(wrong)
 
 
 def floor_of(room: str, parts: tuple[str, ...]) -> int:
@@ -124,35 +139,58 @@ def test_no_file_stands_in_a_circle() -> None:
     assert not taken, f"these import each other: {sorted(taken)}"
 
 
-@pytest.mark.parametrize("file", TESTS, ids=name)
-def test_tests_share_only_what_lies_in_support(file: Path) -> None:
-    programs = (room for room in ("fuzz", "faults") if (ROOT / "tests" / room) in file.parents)
-    own = f"tests.{next(programs, 'support')}"
-    for line, module in imports(file):
-        if module.split(".")[0] == "tests":
-            assert any(f"{module}.".startswith(f"{room}.") for room in ("tests.support", own)), (
-                f"{name(file)}:{line} imports {module}: what tests share belongs into tests/support"
-            )
-            last = module.rsplit(".", 1)[-1]
-            assert not last.startswith("test_"), f"{name(file)}:{line} imports a test's file, {module}"
+def test_tests_share_only_what_lies_in_support() -> None:
+    wrong = []
+    for file in TESTS:
+        programs = (room for room in ("fuzz", "faults") if (ROOT / "tests" / room) in file.parents)
+        own = f"tests.{next(programs, 'support')}"
+        for line, module in imports(file):
+            shared = any(f"{module}.".startswith(f"{room}.") for room in ("tests.support", own))
+            of_a_test = module.rsplit(".", 1)[-1].startswith("test_")
+            if module.split(".")[0] == "tests" and (not shared or of_a_test):
+                wrong.append(f"{name(file)}:{line} imports {module}: what tests share belongs into tests/support")
+    assert not wrong, "\n".join(wrong)
 
 
+@cache
 def is_module(target: str) -> bool:
     return (ROOT / "dvo" / target).is_dir() or (ROOT / "dvo" / f"{target}.py").is_file()
 
 
-@pytest.mark.parametrize("file", EVERYTHING, ids=name)
-def test_habits(file: Path) -> None:
-    text = file.read_text(encoding="utf-8")
-    tree = ast.parse(text)
-    asked = {id(part) for node in ast.walk(tree) if isinstance(node, ast.Compare) for part in node.comparators}
-    for node in ast.walk(tree):
-        where = f"{name(file)}:{getattr(node, 'lineno', 0)}"
-        assert not (isinstance(node, ast.ExceptHandler) and node.type is None), f"{where} bare except"
-        if isinstance(node, ast.ImportFrom):
-            assert all(alias.name != "*" for alias in node.names), f"{where} import *"
-        # Asking what a device is (device.type == ...) is fine, choosing one is not.
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in asked:
-            assert node.value != "cuda" and not node.value.startswith("cuda:"), f"{where} names a device"
-        if isinstance(node, ast.Attribute) and node.attr == "cuda":  # torch.backends.cuda is a setting, not a device
-            assert ast.unparse(node.value) == "torch.backends", f"{where} names a device"
+def bad_habits(file: Path, nodes: list[ast.AST]) -> Iterator[str]:
+    """Bare ``except``, ``import *``, and places that choose a device by its name."""
+    asked = {id(part) for node in nodes if isinstance(node, ast.Compare) for part in node.comparators}
+    for node in nodes:
+        match node:
+            case ast.ExceptHandler(type=None):
+                fault = "bare except"
+            case ast.ImportFrom(names=[ast.alias(name="*")]):
+                fault = "import *"
+            # Asking what a device is (device.type == ...) is fine, choosing one is not.
+            case ast.Constant(value="cuda") if id(node) not in asked:
+                fault = "names a device"
+            case ast.Constant(value=str(value)) if value.startswith("cuda:") and id(node) not in asked:
+                fault = "names a device"
+            # torch.backends.cuda is a setting, not a device
+            case ast.Attribute(attr="cuda") if ast.unparse(node.value) != "torch.backends":
+                fault = "names a device"
+            case _:
+                continue
+        yield f"{name(file)}:{node.lineno} {fault}"
+
+
+@pytest.mark.parametrize("folder", ["dvo", "train", "eval"])
+def test_habits(folder: str) -> None:
+    wrong = [fault for file in EVERYTHING if name(file).startswith(folder) for fault in look(file)[1]]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_bad_habits_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "ROOT", tmp_path)
+    file = tmp_path / "a.py"
+    file.write_text(
+        "from os import *\ntry:\n    x.cuda()\nexcept:\n    y = 'cuda:1'\n"
+        "z = y == 'cuda' or torch.backends.cuda\nfrom .. import b\n"
+    )
+    assert list(look(file)[1]) == [f"a.py:{line} {fault}" for line, fault in (
+        (1, "import *"), (4, "bare except"), (3, "names a device"), (5, "names a device"))]  # fmt: skip

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,12 +27,12 @@ OUTSIDE = ROOT / "tests" / "outside"
 NAME = "distance_vo"
 
 
-def command(*arguments, cwd=ROOT):
-    """Run ``python ARGUMENTS`` with the package on the path; returns what it printed."""
+def command(*arguments, cwd=ROOT, told=""):
+    """Run ``python ARGUMENTS`` with the package on the path and a text to read; returns what it printed."""
     path = os.pathsep.join([str(OUTSIDE), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     done = subprocess.run(
         [sys.executable, *map(str, arguments)], cwd=cwd, env={**os.environ, "PYTHONPATH": path}, capture_output=True,
-        text=True, timeout=600,
+        text=True, timeout=600, input=told,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -50,40 +51,119 @@ def recording(tmp_path_factory):
     return folder
 
 
-def test_export_in_a_format_of_the_package(tmp_path):
-    times, out = np.arange(4) / 10, tmp_path / "out"
+# One process does what the tests below look at, because its start takes most of the time. Each part prints a line.
+PARTS = {
+    "announced": """
+from dvo.models.registry import ARCHITECTURES; from dvo.odometry.registry import ODOMETRIES
+from dvo.data.readers.registry import READERS; from dvo.synth.scenes.families import FAMILIES
+from train.tasks.registry import TASKS; from eval.systems.registry import SYSTEMS
+from eval.scoring.metric_table import METRICS; from dvo.data.calibration.read import DIALECTS
+from dvo.odometry.loops.place_descriptors import PLACE_DESCRIPTORS
+from train.tasks.patch_vo.objective import LOSS_TERMS
+print([n in r for n, r in (('distance_vo', ARCHITECTURES), ('distance_vo', ODOMETRIES), ('array', READERS),
+    ('shed', FAMILIES), ('distance_vo', TASKS), ('standing-still', SYSTEMS), ('end_error', METRICS),
+    ('focal', DIALECTS), ('mean_colour', PLACE_DESCRIPTORS), ('nearness', LOSS_TERMS))])
+""",
+    "update operator": """
+from dataclasses import replace; from dvo.nets.patch.config import preset
+from dvo.models.patch_vo import PatchVO
+model = PatchVO(replace(preset('tiny'), update_operator='still'))
+intrinsics = torch.tensor([50.0, 50, 32, 24]).expand(1, 3, 4)
+state = model(torch.zeros(1, 3, 3, 48, 64, dtype=torch.uint8), intrinsics, updates=2)
+print(type(model.update).__name__, float(state.poses_cw[..., :3].abs().max()) < 1e-4)
+""",
+    "metric": """
+from eval.suites.suite import read_suite
+print(read_suite(folder / 'a.yaml').sequences[0].judged_by)
+""",
+    "place descriptor": """
+found = dvo.load('small', loop={'descriptor': 'mean_colour'}).loops.finder
+print(found.descriptor.name, found.places.dimensions)
+""",
+    "sensor": """
+from dvo.synth.sequence import make_sequence; from dvo.geometry import se3; from dataclasses import replace
+size = {'frames': 24, 'height': 96, 'width': 128, 'fps': 10.0}
+clip = make_sequence(5, family='room', kind='straight', speed=4.0, **size)
+odometry = dvo.load('small', pixels=0, patches=24, sensors='tape')
+for frame in clip: odometry.track(frame)
+# A frame without content and a repeated one are seen too.
+for time in (2.4, 2.5): odometry.track(replace(frame, timestamp=time, image=0 * frame.image))
+frames, poses = odometry.window.frames, odometry.window.poses_cw
+steps = se3.inverse(poses)[:, :3].diff(dim=0).norm(dim=1)
+wanted = 2 * torch.tensor([f.timestamp for f in frames]).diff()
+print(odometry.sensors[0].seen, len(frames) > 3, bool((steps / wanted - 1).abs().max() < 0.05),
+    all(abs(float(f.states['tape']) - 2 * f.timestamp) < 0.02 for f in frames))
+""",
+    "loss term": """
+from train.tasks.patch_vo.objective import LossConfig, Terms
+from train.tasks.patch_vo.task import PatchVOTask; from train.tasks.task import StepContext
+found = {}
+for weight in (0.0, 2.0):
+    loss = LossConfig(terms={'nearness': weight})
+    task = PatchVOTask('tiny', updates=2, warmup_until=0.0, patches=4, loss=loss); torch.manual_seed(0)
+    net = task.network(); context = StepContext(net, 0, task.buffers())
+    g = torch.Generator().manual_seed(0); poses = torch.zeros(1, 8, 7); poses[..., 6] = 1
+    poses[..., 0] = 0.1 * torch.arange(8)
+    batch = {'images': torch.randint(0, 255, (1, 8, 3, 48, 64), generator=g, dtype=torch.uint8),
+        'depth': torch.ones(1, 8, 48, 64), 'poses_cw': poses,
+        'intrinsics': torch.tensor([50.0, 50, 32, 24]).expand(1, 8, 4)}
+    step = task.accept_loss(context, task.compute_loss(context, batch))
+    found[weight] = float(step.loss), float(step.measures['loss_nearness'])
+print(found[2.0][1] > 0, abs(found[2.0][0] - found[0.0][0] - found[2.0][1]) < 1e-4 * found[2.0][0])
+""",
+    "odometry": "print(dvo.load('standing-still', height=2.0).name)",
+    "export": "command('export', folder / 'results', folder / 'exported', '--to', 'positions')",
+    "run": "command('run', recording, '--system', 'standing-still', '--set', 'height=1.5', '--out', folder / 'out')",
+    "dialect": "command('run', recording, '--system', 'standing-still', '--calib', folder / 'camera.txt', "
+    "'--out', folder / 'focal')",
+    "scene": "command('synth', 'preview', 'shed', '--rows', '1', '--size', '48x32', '--out', folder / 'shed.png')",
+}
+PROGRAM = """
+import contextlib, io, json, sys
+from pathlib import Path
+import torch, dvo
+from dvo.cli import main
+
+def command(*arguments):
+    assert main([str(argument) for argument in arguments]) == 0
+
+folder, recording = map(Path, sys.argv[1:])
+told = {}
+for name, part in json.load(sys.stdin).items():
+    with contextlib.redirect_stdout(io.StringIO()) as text:
+        exec(part, dict(globals()))
+    told[name] = text.getvalue().strip()
+print(json.dumps(told))
+"""
+
+
+@pytest.fixture(scope="module")
+def done(recording, tmp_path_factory):
+    """What each of the parts has printed (``told``), and the folder of their files."""
+    folder = tmp_path_factory.mktemp("parts")
+    times = np.arange(4) / 10
+    (folder / "results").mkdir()
     poses = np.column_stack([times, 2 * times, np.zeros((4, 4)), np.ones(4)])
-    (tmp_path / "results").mkdir()
-    write_tum(tmp_path / "results" / "trajectory.txt", Trajectory(times, poses))
-    assert "4 poses" in command("-m", "dvo", "export", tmp_path / "results", out, "--to", "positions")
-    np.testing.assert_allclose(np.loadtxt(out / "positions.csv", delimiter=","), poses[:, :3])
+    write_tum(folder / "results" / "trajectory.txt", Trajectory(times, poses))
+    (folder / "camera.txt").write_text("FOCAL 60 64 48\n")
+    (folder / "a.yaml").write_text("name: a\nlabel: b\nsequences: [{name: c, path: d, judged_by: end_error}]\n")
+    told = json.loads(command("-c", PROGRAM, folder, recording, told=json.dumps(PARTS)).splitlines()[-1])
+    return SimpleNamespace(told=told, folder=folder)
 
 
-def test_parts_are_announced_without_a_call():
-    listed = command("-c", (
-        "from dvo.models.registry import ARCHITECTURES; from dvo.odometry.registry import ODOMETRIES\n"
-        "from dvo.data.readers.registry import READERS; from dvo.synth.scenes.families import FAMILIES\n"
-        "from train.tasks.registry import TASKS; from eval.systems.registry import SYSTEMS\n"
-        "from eval.scoring.metric_table import METRICS; from dvo.data.calibration.read import DIALECTS\n"
-        "from dvo.odometry.loops.place_descriptors import PLACE_DESCRIPTORS\n"
-        "from train.tasks.patch_vo.objective import LOSS_TERMS\n"
-        "print([n in r for n, r in (('distance_vo', ARCHITECTURES), ('distance_vo', ODOMETRIES), ('array', READERS),\n"
-        "    ('shed', FAMILIES), ('distance_vo', TASKS), ('standing-still', SYSTEMS), ('end_error', METRICS),\n"
-        "    ('focal', DIALECTS), ('mean_colour', PLACE_DESCRIPTORS), ('nearness', LOSS_TERMS))])"
-    ))  # fmt: skip
-    assert listed.strip() == str([True] * 10)
+def test_export_in_a_format_of_the_package(done):
+    assert "4 poses" in done.told["export"]
+    times = np.arange(4) / 10
+    found = np.loadtxt(done.folder / "exported" / "positions.csv", delimiter=",")
+    np.testing.assert_allclose(found, np.column_stack([times, 2 * times, 0 * times]))
 
 
-def test_the_update_operator_is_chosen_by_a_word():
-    found = command("-c", (
-        "import torch; from dataclasses import replace; from dvo.nets.patch.config import preset\n"
-        "from dvo.models.patch_vo import PatchVO\n"
-        "model = PatchVO(replace(preset('tiny'), update_operator='still'))\n"
-        "intrinsics = torch.tensor([50.0, 50, 32, 24]).expand(1, 3, 4)\n"
-        "state = model(torch.zeros(1, 3, 3, 48, 64, dtype=torch.uint8), intrinsics, updates=2)\n"
-        "print(type(model.update).__name__, float(state.poses_cw[..., :3].abs().max()) < 1e-4)"
-    ))  # fmt: skip
-    assert found.strip() == "Still True"
+def test_parts_are_announced_without_a_call(done):
+    assert done.told["announced"] == str([True] * 10)
+
+
+def test_the_update_operator_is_chosen_by_a_word(done):
+    assert done.told["update operator"] == "Still True"
 
 
 @pytest.mark.slow
@@ -127,87 +207,37 @@ def test_the_system_is_evaluated_beside_the_others(recording, tmp_path):
     assert "end error m" in (tmp_path / "runs" / "table.md").read_text()
 
 
-def test_a_sequence_is_judged_by_the_metric():
-    found = command("-c", (
-        "from eval.suites.suite import read_suite; from pathlib import Path; import tempfile\n"
-        "file = Path(tempfile.mkdtemp()) / 'a.yaml'\n"
-        "file.write_text('name: a\\nlabel: b\\nsequences: [{name: c, path: d, judged_by: end_error}]\\n')\n"
-        "print(read_suite(file).sequences[0].judged_by)"
-    ))  # fmt: skip
-    assert found.strip() == "end_error"
+def test_a_sequence_is_judged_by_the_metric(done):
+    assert done.told["metric"] == "end_error"
 
 
-def test_a_calibration_of_the_dialect_is_read(recording, tmp_path):
-    file, out = tmp_path / "camera.txt", tmp_path / "out"
-    file.write_text("FOCAL 60 64 48\n")
-    command("-m", "dvo", "run", recording, "--system", "standing-still", "--calib", file, "--out", out)
-    camera = json.loads((out / "run.json").read_text())["camera"]
+def test_a_calibration_of_the_dialect_is_read(done):
+    camera = json.loads((done.folder / "focal" / "run.json").read_text())["camera"]
     assert [camera[name] for name in ("fx", "fy", "cx", "cy")] == [60, 60, 31.5, 23.5]
 
 
-def test_places_are_described_by_the_descriptor():
-    told = command("-c", (
-        "import dvo; found = dvo.load('small', loop={'descriptor': 'mean_colour'}).loops.finder\n"
-        "print(found.descriptor.name, found.places.dimensions)"
-    ))  # fmt: skip
-    assert told.strip() == "mean colour 3"
+def test_places_are_described_by_the_descriptor(done):
+    assert done.told["place descriptor"] == "mean colour 3"
 
 
-def test_the_sensor_takes_part_in_the_window():
+def test_the_sensor_takes_part_in_the_window(done):
     """It fixes the scale, its own unknowns come and go with the keyframes, and it has seen every frame."""
-    told = command("-c", (
-        "import dvo, torch; from dvo.synth.sequence import make_sequence\n"
-        "size = {'frames': 24, 'height': 96, 'width': 128, 'fps': 10.0}\n"
-        "clip = make_sequence(5, family='room', kind='straight', speed=4.0, **size)\n"
-        "odometry = dvo.load('small', pixels=0, patches=24, sensors='tape')\n"
-        "for frame in clip: odometry.track(frame)\n"
-        "from dataclasses import replace\n"  # a frame without content and a repeated one are seen too
-        "for time in (2.4, 2.5): odometry.track(replace(frame, timestamp=time, image=0 * frame.image))\n"
-        "frames, poses = odometry.window.frames, odometry.window.poses_cw\n"
-        "from dvo.geometry import se3\n"
-        "steps = se3.inverse(poses)[:, :3].diff(dim=0).norm(dim=1)\n"
-        "wanted = 2 * torch.tensor([f.timestamp for f in frames]).diff()\n"
-        "print(odometry.sensors[0].seen, len(frames) > 3, bool((steps / wanted - 1).abs().max() < 0.05),\n"
-        "    all(abs(float(f.states['tape']) - 2 * f.timestamp) < 0.02 for f in frames))"
-    ))  # fmt: skip
-    assert told.strip() == "26 True True True"
+    assert done.told["sensor"] == "26 True True True"
 
 
-def test_the_loss_term_is_in_the_loss_and_in_the_log():
-    told = command("-c", (
-        "import torch; from train.tasks.patch_vo.objective import LossConfig, Terms\n"
-        "from train.tasks.patch_vo.task import PatchVOTask; from train.tasks.task import StepContext\n"
-        "found = {}\n"
-        "for weight in (0.0, 2.0):\n"
-        "    loss = LossConfig(terms={'nearness': weight})\n"
-        "    task = PatchVOTask('tiny', updates=2, warmup_until=0.0, patches=4, loss=loss); torch.manual_seed(0)\n"
-        "    net = task.network(); context = StepContext(net, 0, task.buffers())\n"
-        "    g = torch.Generator().manual_seed(0); poses = torch.zeros(1, 8, 7); poses[..., 6] = 1\n"
-        "    poses[..., 0] = 0.1 * torch.arange(8)\n"
-        "    batch = {'images': torch.randint(0, 255, (1, 8, 3, 48, 64), generator=g, dtype=torch.uint8),\n"
-        "        'depth': torch.ones(1, 8, 48, 64), 'poses_cw': poses,\n"
-        "        'intrinsics': torch.tensor([50.0, 50, 32, 24]).expand(1, 8, 4)}\n"
-        "    step = task.accept_loss(context, task.compute_loss(context, batch))\n"
-        "    found[weight] = float(step.loss), float(step.measures['loss_nearness'])\n"
-        "print(found[2.0][1] > 0, abs(found[2.0][0] - found[0.0][0] - found[2.0][1]) < 1e-4 * found[2.0][0])"
-    ))  # fmt: skip
-    assert told.strip() == "True True"
+def test_the_loss_term_is_in_the_loss_and_in_the_log(done):
+    assert done.told["loss term"] == "True True"
 
 
-def test_the_odometry_without_weights_tracks_on_the_command_line(recording, tmp_path):
+def test_the_odometry_without_weights_tracks_on_the_command_line(done):
     """By its name, with a setting of its own; the reader is that of the package too."""
-    command(
-        "-m", "dvo", "run", recording, "--system", "standing-still", "--set", "height=1.5", "--out", tmp_path / "out"
-    )
-    poses = np.loadtxt(tmp_path / "out" / "trajectory.txt")
+    poses = np.loadtxt(done.folder / "out" / "trajectory.txt")
     assert len(poses) == 6 and (poses[:, 2] == -1.5).all()
-    told = command("-c", "import dvo; print(dvo.load('standing-still', height=2.0).name)")
-    assert told.strip() == "standing-still"
+    assert done.told["odometry"] == "standing-still"
 
 
-def test_the_scene_family_is_rendered(tmp_path):
-    command("-m", "dvo", "synth", "preview", "shed", "--rows", "1", "--size", "48x32", "--out", tmp_path / "shed.png")
-    assert (tmp_path / "shed.png").stat().st_size > 1000
+def test_the_scene_family_is_rendered(done):
+    assert (done.folder / "shed.png").stat().st_size > 1000
 
 
 def test_the_factor_fixes_the_scale(monkeypatch):

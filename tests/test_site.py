@@ -78,6 +78,7 @@ def test_script_of_the_figures_draws_them(tmp_path, monkeypatch):
         assert min(picture.shape[:2]) > 200 and picture.std() > 10, path.name  # something is drawn
 
 
+@pytest.mark.slow
 def test_site_builds_without_a_warning(tmp_path):
     missing = [name for name in NEEDED if not is_there(name)]
     if missing:

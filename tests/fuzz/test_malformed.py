@@ -16,7 +16,7 @@ from tests.fuzz.mutations import BYTES, PLACES, mutate_folder
 from tests.fuzz.text import MUTATIONS as TEXT
 from tests.fuzz.text import YAML
 
-SAMPLE = ["--cases", "100", "--jobs", "2"]  # two of each reader
+SAMPLE = ["--cases", "50", "--jobs", "1"]  # one of each reader
 
 
 def test_a_sample_fails_nowhere(repository):
@@ -27,8 +27,8 @@ def test_a_sample_fails_nowhere(repository):
     assert done.returncode == 0, done.stdout + done.stderr
     total = next(line.split() for line in done.stdout.splitlines() if line.startswith("total"))
     tried, refused, accepted, failed = (int(number) for number in total[1:])
-    assert (tried, failed) == (100, 0)
-    assert refused > 25 and accepted > 10  # else the inputs are not near to valid ones
+    assert (tried, failed) == (50, 0)
+    assert refused > 12 and accepted > 5  # else the inputs are not near to valid ones
 
 
 def test_names_are_unique_and_chosen_by_their_beginnings():

@@ -52,7 +52,7 @@ def plan_columns(size: int, rows: Tensor, columns: Tensor) -> ColumnPlan | None:
 
     if not 0 < size <= MAX_SIZE:
         return None
-    a, b = rows.numpy(), columns.numpy()
+    a, b = rows.contiguous().numpy(), columns.contiguous().numpy()  # kernels are compiled for each layout
     rank, start, under = column_kernels.eliminate(size, a, b, MAX_BLOCKS)
     if not len(rank):
         return None

@@ -48,21 +48,28 @@ def aligned(odometry) -> list:
     ]
 
 
-def test_a_slow_camera_is_aligned_and_as_exact(walk):
+def test_a_slow_camera_is_aligned(walk):
     odometry, estimates, result, frames, truth = walk
     assert len(aligned(odometry)) > len(frames) // 3
     assert len(result.trajectory) == len(frames) and result.quality.verdict == "good"
+    assert evaluate(result.trajectory, truth).ate_percent < 1
+    tracked = [estimate for estimate in estimates if estimate.status is Status.TRACKING]
+    assert all(0 < estimate.confidence <= 1 and np.isfinite(estimate.covariance).all() for estimate in tracked)
+    assert all(np.linalg.eigvalsh(estimate.covariance).min() > 0 for estimate in tracked)
+
+
+@pytest.mark.slow
+def test_it_is_as_exact_as_with_the_network_at_every_frame(walk):
+    _, _, result, frames, truth = walk
     every = dvo.load("small", **SETTINGS | {"network_motion": 0})
     for frame in frames:
         every.track(frame)
     least = evaluate(every.finish().trajectory, truth).ate_percent
     assert not aligned(every)
     assert evaluate(result.trajectory, truth).ate_percent < 2 * least + 0.2
-    tracked = [estimate for estimate in estimates if estimate.status is Status.TRACKING]
-    assert all(0 < estimate.confidence <= 1 and np.isfinite(estimate.covariance).all() for estimate in tracked)
-    assert all(np.linalg.eigvalsh(estimate.covariance).min() > 0 for estimate in tracked)
 
 
+@pytest.mark.slow
 def test_again_the_same_bytes(walk):
     odometry, _, result, frames, _ = walk
     odometry.reset()
@@ -72,7 +79,7 @@ def test_again_the_same_bytes(walk):
 
 
 def test_a_fast_camera_is_measured_by_the_network():
-    frames, _ = film(14, speed=8.0, fps=8.0)
+    frames, _ = film(14, speed=8.0, fps=8.0, height=120, width=160)
     odometry = dvo.load("small", **SETTINGS)
     for frame in frames:
         odometry.track(frame)
@@ -81,16 +88,17 @@ def test_a_fast_camera_is_measured_by_the_network():
 
 
 def test_another_picture_is_not_aligned(walk):
-    """A frame without a match is lost, as it is without the alignment."""
-    _, _, _, frames, _ = walk
-    other, _ = film(30, family="street")
+    """A frame without a match is lost, as it is without the alignment; up to it all is as before, to the byte."""
+    _, before, _, frames, _ = walk
+    other, _ = film(4, family="street")
     odometry = dvo.load("small", **SETTINGS)
-    for frame in frames[:24]:
-        odometry.track(frame)
+    for frame, same in zip(frames[:24], before, strict=False):
+        estimate = odometry.track(frame)
+        assert estimate.status is same.status and np.array_equal(estimate.pose_wc, same.pose_wc)
     assert odometry.state.initialised
     count = len(aligned(odometry))
-    for number in range(24, 28):
-        estimate = odometry.track(Frame(number, frames[number].timestamp, other[number].image, frames[0].camera))
+    for number, view in enumerate(other, 24):
+        estimate = odometry.track(Frame(number, frames[number].timestamp, view.image, frames[0].camera))
         assert estimate.status is Status.LOST and estimate.pose_wc is None
     assert len(aligned(odometry)) == count
     assert odometry.track(frames[28]).status is Status.TRACKING

@@ -161,6 +161,27 @@ def grey_windows(
     return offsets[1:-1, 1:-1].reshape(1, -1, 2), around[:, 1:-1, 1:-1].flatten(1), across.flatten(1), down.flatten(1)
 
 
+def texture(
+    images: Float[Tensor, "N H W"], frames: Int[Tensor, " E"], centres: Float[Tensor, "E 2"], side: int
+) -> Float[Tensor, " E"]:
+    """How strong the texture of windows is in the direction in which it is weakest (Shi and Tomasi, CVPR 1994).
+
+    Along an edge, or on a bare surface, an alignment moves with the noise, however well the windows correlate.
+
+    Args:
+        images: grey levels.
+        frames: image of each window.
+        centres: of the windows, pixels.
+        side: of the windows, pixels, odd.
+
+    Returns:
+        Root of the smaller eigenvalue of the mean structure tensor, grey levels a pixel.
+    """
+    _, _, gx, gy = grey_windows(images, frames, centres, side)
+    a, b, c = gx.square().mean(1), (gx * gy).mean(1), gy.square().mean(1)
+    return ((a + c) / 2 - (((a - c) / 2).square() + b.square()).sqrt()).clamp(min=0).sqrt()
+
+
 def align_patches(
     images: Float[Tensor, "N H W"],
     source: Int[Tensor, " E"],

@@ -19,7 +19,7 @@ import torch
 from dvo.core.kernels import available
 from dvo.geometry.poses import pose_matrices, poses_from_matrices, se3_exp
 from dvo.map.window import Window
-from dvo.nets.alignment.alignment import AlignmentOptions, accept, align_patches
+from dvo.nets.alignment.alignment import AlignmentOptions, accept, align_patches, texture
 from dvo.nets.patch.config import ModelConfig
 from dvo.odometry.window.patch_window import PatchWindow
 
@@ -27,8 +27,11 @@ KEYFRAMES = 5
 """Newest keyframes whose patches are aligned."""
 MIN_CONFIDENCE = 0.1
 """Mean confidence of a patch in its measurements from which on it is aligned."""
+MIN_TEXTURE = 2.5
+"""Texture of its window (:func:`dvo.nets.alignment.alignment.texture`), grey levels a pixel, from which on it is; where
+surfaces are bare, few are, and the network measures the frame."""
 MIN_INLIERS, MIN_SHARE, MIN_AGREEMENT = 16, 0.4, 0.6
-"""Patches that have to agree with the pose, their share of those in view, and of those that were aligned."""
+"""Patches that have to agree with the pose, their share of those in view, textured or not, and of those aligned."""
 INLIER = 0.75
 """Largest distance of such a patch from its reprojection, pixels of the working image."""
 MIN_FIELDS = 6
@@ -158,7 +161,8 @@ class FrameAlignment:
         if window.poses_cw is self._poses:
             return
         newest, self._poses = window.frames[-1], window.poses_cw
-        self._patches = _Patches.of(window, intrinsics)
+        assert self.patch_window.alignment is not None
+        self._patches = _Patches.of(window, intrinsics, self.patch_window.alignment.images, self.options.window)
         matrices = pose_matrices(window.poses_cw[-2:].cpu().numpy())
         none = np.zeros((0, 0), np.uint8)
         before = [_Seen(none, f.timestamp, m) for f, m in zip(window.frames[-2:-1], matrices[:-1], strict=True)]
@@ -177,7 +181,7 @@ class FrameAlignment:
         assert alignment is not None
         height, width = image.shape[:2]
         places, warps, in_view = patches.warped(pose, (width, height), mask)
-        rows = np.flatnonzero(in_view)
+        rows = np.flatnonzero(in_view & patches.textured)
         if len(rows) < MIN_INLIERS:
             return None
         slot = window.free_map_slot()  # the next keyframe takes it
@@ -199,7 +203,7 @@ class FrameAlignment:
         fields = (measured[agree] / (width, height) * FIELDS).astype(int).clip(0, np.array(FIELDS) - 1)
         count = int(agree.sum())
         sure = (
-            count >= max(MIN_INLIERS, MIN_SHARE * len(rows), MIN_AGREEMENT * len(kept))
+            count >= max(MIN_INLIERS, MIN_SHARE * in_view.sum(), MIN_AGREEMENT * len(kept))
             and len(np.unique(fields @ (FIELDS[1], 1))) >= MIN_FIELDS
         )
         return pose, bool(sure), kept[agree], measured[agree]
@@ -215,6 +219,7 @@ class _Patches:
         centres: ``(K, 2)`` in their keyframes.
         points: ``(K, 3, 3)`` world points of the centre and of the pixels a feature pixel to the right and below.
         confidence: ``(K, 2)`` mean of the network's in their measurements.
+        textured: ``(K,)`` bool, those that can be aligned (:data:`MIN_TEXTURE`).
         camera: ``(4,)`` fx fy cx cy of the working image.
         newest: ``(4, 4)`` pose of the newest keyframe, world to camera.
     """
@@ -224,11 +229,12 @@ class _Patches:
     centres: np.ndarray
     points: np.ndarray
     confidence: np.ndarray
+    textured: np.ndarray
     camera: np.ndarray
     newest: np.ndarray
 
     @classmethod
-    def of(cls, window: Window, camera: np.ndarray) -> _Patches:
+    def of(cls, window: Window, camera: np.ndarray, images: torch.Tensor, side: int) -> _Patches:
         m, n, stride = window.per_frame, len(window), ModelConfig.STRIDE
         first = max(0, n - KEYFRAMES)
         middle = window.patches.shape[-1] // 2
@@ -251,7 +257,10 @@ class _Patches:
         to_world = np.linalg.inv(poses)[frames]
         points = rays @ to_world[:, :3, :3].transpose(0, 2, 1) + to_world[:, None, :3, 3]
         slots = np.array([frame.map_slot for frame in window.frames])[frames]
-        return cls(rows + first * m, slots, centres[rows] * stride, points, mean[rows], np.asarray(camera, np.float64),
+        pixels = centres[rows] * stride
+        places = torch.from_numpy(slots), torch.from_numpy(pixels.astype(np.float32))
+        textured = texture(images, *(x.to(images.device) for x in places), side).cpu().numpy() > MIN_TEXTURE
+        return cls(rows + first * m, slots, pixels, points, mean[rows], textured, np.asarray(camera, np.float64),
                    poses[-1])  # fmt: skip
 
     def projected(self, rows: np.ndarray | slice, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -307,7 +316,7 @@ class _Patches:
         inside = (
             ((before >= _MARGIN) & (before < size - _MARGIN)).all(1) & (z[:, 2] > NEAREST) & (ahead[:, 2] > NEAREST)
         )
-        rows = np.flatnonzero(inside)
+        rows = np.flatnonzero(inside & self.textured)
         if len(rows) < MIN_INLIERS:
             return None
         first = np.ascontiguousarray(before[rows, None], dtype=np.float32)

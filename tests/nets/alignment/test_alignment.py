@@ -17,6 +17,7 @@ from dvo.nets.alignment.alignment import (
     patch_warps,
     sample_images,
     sample_images_plain,
+    texture,
 )
 from dvo.nets.patch.patchifier import patch_coordinates
 from dvo.nets.patch.selection import structure_selection
@@ -26,10 +27,10 @@ ONE, TWO = torch.tensor([0]), torch.tensor([1])
 PLAIN = AlignmentOptions(iterations=8)
 
 
-def texture(x, y):
+def waves(x, y):
     """Smooth grey levels with structure in every direction, defined between the pixels too."""
-    waves = ((0.31, 0.12, 1.0), (-0.17, 0.28, 2.0), (0.05, -0.35, 0.3), (0.4, 0.33, 0.7))
-    return 127 + 28 * sum(torch.sin(a * x + b * y + c) for a, b, c in waves)
+    sines = ((0.31, 0.12, 1.0), (-0.17, 0.28, 2.0), (0.05, -0.35, 0.3), (0.4, 0.33, 0.7))
+    return 127 + 28 * sum(torch.sin(a * x + b * y + c) for a, b, c in sines)
 
 
 def grid(height=60, width=80):
@@ -73,8 +74,8 @@ def test_a_known_warp_is_found(dx, dy, turn, zoom, gain, offset):
     there = centre[0] + torch.tensor([dx, dy], dtype=torch.float64)
     x, y = grid()
     back = torch.linalg.inv(warp) @ (torch.stack([x, y], -1) - there)[..., None]
-    second = gain * texture(*(back[..., 0] + centre[0]).unbind(-1)) + offset
-    images = torch.stack([texture(x, y), second])
+    second = gain * waves(*(back[..., 0] + centre[0]).unbind(-1)) + offset
+    images = torch.stack([waves(x, y), second])
     found = align_patches(images, ONE, TWO, centre, centre, warp[None], PLAIN)
     assert (found.positions - there).norm() < 0.03
     assert found.correlation > 0.99 and found.last_step < 0.01
@@ -83,7 +84,7 @@ def test_a_known_warp_is_found(dx, dy, turn, zoom, gain, offset):
 @pytest.mark.slow
 def test_it_is_differentiable():
     x, y = grid(24, 24)
-    images = torch.stack([texture(x, y), texture(x - 0.4, y + 0.3)])
+    images = torch.stack([waves(x, y), waves(x - 0.4, y + 0.3)])
     options = AlignmentOptions(window=5, iterations=2)
 
     def positions(images, start, warps):
@@ -103,7 +104,7 @@ def test_the_kernel_finds_what_the_twin_finds(seed, edges, window, reach, iterat
     """Windows inside, across the border and outside; positions without a value stay without one and harm no other."""
     g = torch.Generator().manual_seed(seed)
     x, y = grid(30, 40)
-    images = torch.stack([texture(x, y), texture(x * 1.02 + 0.4, y - 0.3), 90 + 20 * (not flat) * texture(y, x) / 127])
+    images = torch.stack([waves(x, y), waves(x * 1.02 + 0.4, y - 0.3), 90 + 20 * (not flat) * waves(y, x) / 127])
     source, target = torch.randint(3, (2, edges), generator=g)
     centres = torch.rand(edges, 2, generator=g) * 40 - 5 + reach * (seed % 3 == 0)
     start = centres + torch.rand(edges, 2, generator=g) - 0.5
@@ -190,3 +191,24 @@ def test_rendered_motion_is_measured_to_a_tenth_of_a_pixel():
     before, after = ((x - truth)[good].norm(dim=-1).median() for x in (start, found.positions))
     assert good.float().mean() > 0.3
     assert after < 0.15 < 1.0 < before
+
+
+@given(angle=st.floats(0, math.pi), noise=st.floats(0, 1))
+@settings(max_examples=30, deadline=None)
+def test_an_edge_has_no_texture_along_itself(angle, noise):
+    x, y = grid()
+    torch.manual_seed(0)
+    across = (x - 40) * math.cos(angle) + (y - 30) * math.sin(angle)
+    images = torch.stack([127 + 60 * torch.tanh(across / 3), torch.full_like(x, 90), waves(x, y)])
+    images = images + noise * torch.randn_like(images)
+    edge, bare, rich = texture(images, torch.arange(3), torch.tensor([[40.0, 30.0]] * 3).double(), 13)
+    assert edge < 0.5 + noise and bare < noise + 1e-3 and rich > 4
+
+
+def test_texture_is_that_of_a_ramp_both_ways():
+    x, y = grid()
+    images = torch.stack([3 * x, 3 * x + 2 * y])
+    found = texture(images, torch.arange(2), torch.tensor([[40.0, 30.0]] * 2).double(), 13)
+    assert found.abs().max() < 1e-5  # one gradient alone
+    bent = torch.where(x < 40, 3 * x, 3 * 40 + 2 * y)[None]
+    assert texture(bent, ONE, torch.tensor([[40.0, 30.0]]).double(), 13)[0] > 1

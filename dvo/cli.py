@@ -53,7 +53,7 @@ def build_parser() -> argparse.ArgumentParser:
     demo = commands.add_parser("demo", help="render a clip, track it and compare with the ground truth")
     add_folder_options(demo)
     add_tracking_options(demo)
-    demo.add_argument("--frames", type=positive_int, default=180, help="length of the clip (default: %(default)s)")
+    demo.add_argument("--frames", type=positive_int, default=60, help="length of the clip (default: %(default)s)")
     demo.set_defaults(run="dvo.demo:demo")
 
     run = commands.add_parser("run", help="track a video, a folder of images or a dataset sequence", epilog=EXIT_CODES)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from rich.progress import Progress
 
 from dvo.commands.console import StderrConsole, say, seed_everything
 from dvo.commands.run import device_for, load_odometry, track
+from dvo.core.threads import current_threads
 from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 from dvo.session.results import results_folder
-from dvo.synth.sequence import make_sequence
+from dvo.synth.sequence import SyntheticSequence, make_sequence
 
 NAME, SCENE, FAMILY, FPS = "demo", 0, "room", 30.0
 
@@ -56,10 +58,23 @@ def render_clip(frames: int) -> RenderedClip:
         task = progress.add_task("rendering", total=frames)
         sequence = make_sequence(SCENE, frames=frames, family=FAMILY, kind="handheld", fps=FPS)
         rendered = []
-        for frame in sequence:
+        for frame in _frames(sequence, current_threads().count):
             rendered.append(frame)
             progress.advance(task)
     return RenderedClip(NAME, rendered, sequence.groundtruth)
+
+
+def _frames(sequence: SyntheticSequence, threads: int) -> Iterator[Frame]:
+    """Frames of a sequence, by several threads: tensors of one are too small for those of torch."""
+    yield sequence.frame(0)  # it fills caches of the scene
+    if threads == 1:
+        yield from (sequence.frame(index) for index in range(1, len(sequence)))
+        return
+    pool = ThreadPoolExecutor(threads)
+    try:
+        yield from pool.map(sequence.frame, range(1, len(sequence)))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def demo(arguments: argparse.Namespace) -> int:

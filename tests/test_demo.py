@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.data.trajectory import read_tum
-from dvo.demo import render_clip
+from dvo.demo import _frames, render_clip
+from dvo.synth.sequence import make_sequence
 
 
 def test_the_clip_is_the_same_every_time_and_moves():
@@ -23,6 +25,26 @@ def test_the_clip_is_the_same_every_time_and_moves():
         np.testing.assert_array_equal(a.image, b.image)
     assert np.abs(np.diff([frame.image.astype(float) for frame in first], axis=0)).mean() > 0.5
     assert first.groundtruth.path_length > 0.01
+
+
+def test_threads_render_what_one_does_and_stop_when_asked_to(monkeypatch):
+    sequence = make_sequence(0, frames=40, family="room")
+    for one, several in zip(_frames(sequence, 1), [*zip(range(6), _frames(sequence, 3), strict=False)], strict=False):
+        assert one.index == several[0] == several[1].index
+        np.testing.assert_array_equal(one.image, several[1].image)
+    rendered, stop = [], threading.Event()
+
+    def slow(_, index):
+        rendered.append(index)
+        if index > 1:
+            stop.wait(30)
+
+    monkeypatch.setattr(type(sequence), "frame", slow)
+    frames = _frames(sequence, 2)
+    next(frames), next(frames)
+    threading.Timer(0.2, stop.set).start()  # when all others are cancelled
+    frames.close()
+    assert len(rendered) < 20
 
 
 def test_demo_reports_the_error_against_ground_truth(monkeypatch, fake_odometry, tmp_path, capsys):

@@ -44,6 +44,11 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Device of the tests with the marker ``gpu``."""
+    parser.addoption("--device", default="", help="of the tests with the marker gpu: cpu, cuda, cuda:N")
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """With ``-m core`` alone, other rooms are not even imported."""
     path = f"{collection_path}{os.sep}"

@@ -1,5 +1,8 @@
 """Choice between compiled kernels and their plain PyTorch twins.
 
+On the CPU, kernels are loops of numba (:func:`use_kernels`); on CUDA, they are written in Triton, which comes with such
+builds of torch (:func:`use_device_kernels`), in files named ``*_triton.py``.
+
 A kernel is a loop over numbers, compiled by numba when it is first called and then kept on the disk. The twin is its
 specification: it serves on an accelerator, where derivatives are asked for that no kernel computes, where numba cannot
 be imported, and everywhere with ``DVO_KERNELS=torch``. Kernels stand in files named ``*_kernels.py``, which import
@@ -45,6 +48,41 @@ def use_kernels(*tensors: Tensor, double: bool = False, adjoint: bool = False) -
     return plain and (adjoint or not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)))
 
 
+def use_device_kernels(*tensors: Tensor) -> bool:
+    """Tell if a computation on these tensors is one for kernels of Triton.
+
+    The first call with tensors of a CUDA device imports triton and tries a kernel on the device; if that fails, one
+    line says so, and the twins compute everything on it.
+
+    Args:
+        tensors: the floating-point arguments.
+
+    Returns:
+        True for float32 tensors on one CUDA device of which no derivative is recorded (see :func:`use_kernels`), if
+        kernels are there and wanted.
+
+    Raises:
+        DvoError: see :func:`use_kernels`.
+    """
+    device = tensors[0].device
+    if device.type != "cuda" or _chosen() != CHOICES[0] or is_transformed() or forward_ad._current_level >= 0:
+        return False
+    if any(type(x) is not Tensor or x.device != device or x.dtype != torch.float32 for x in tensors):
+        return False
+    return not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)) and _works_on(device)
+
+
+@cache
+def _works_on(device: torch.device) -> bool:
+    try:
+        importlib.import_module("dvo.core.device_triton").check(device)
+    except Exception as error:  # of Triton, of its compiler or of the driver
+        reason = " ".join(f"{type(error).__name__} {error}".split())[:200]
+        print_line(f"dvo: note: no kernels on {device} ({reason}): computing without them, slower", error=True)
+        return False
+    return True
+
+
 def is_transformed() -> bool:
     """True within ``torch.func`` (grad, vjp, jvp, vmap, ...)."""
     return torch._C._are_functorch_transforms_active()
@@ -62,10 +100,14 @@ def available() -> bool:
     Raises:
         DvoError: see :func:`use_kernels`.
     """
+    return _chosen() == CHOICES[0] and _imported()
+
+
+def _chosen() -> str:
     chosen = os.environ.get(VARIABLE) or CHOICES[0]
     if chosen not in CHOICES:
         raise DvoError(f"is {chosen!r}", field=VARIABLE, remedy=f"set it to {' or '.join(CHOICES)}, or unset it")
-    return chosen == "numba" and _imported()
+    return chosen
 
 
 @cache

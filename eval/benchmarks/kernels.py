@@ -22,29 +22,32 @@ from dvo.nets.alignment.alignment import align_patches
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation
 
 Call = Callable[[], Tensor]
+CPU = torch.device("cpu")
 
 
-def edge_correlation(generator: torch.Generator, scale: int) -> tuple[str, Call]:
+def edge_correlation(generator: torch.Generator, device: torch.device, scale: int) -> tuple[str, Call]:
     """Look-up of the edges of a window at one level of 320x240 video.
 
     Args:
         generator: of the input.
+        device: to compute on.
         scale: of the level.
     """
     edges, patches, frames, channels, height, width = 720, 192, 9, 64, 60, 80
-    level = EdgeCorrelation(scale, radius=3, device="cpu")
+    level = EdgeCorrelation(scale, radius=3, device=device)
     for slot in range(frames):
-        level.keep_map(slot, torch.randn(channels, height // scale, width // scale, generator=generator))
+        level.keep_map(slot, torch.randn(channels, height // scale, width // scale, generator=generator).to(device))
     features = torch.randn(patches, 9, channels, generator=generator)
     kk = torch.randint(patches, (edges,), generator=generator)
     slots = torch.randint(frames, (edges,), generator=generator)
     ticks = torch.arange(3.0)
     patch = torch.stack(torch.meshgrid(ticks, ticks, indexing="xy"), -1)
     coords = torch.rand(edges, 1, 1, 2, generator=generator) * torch.tensor([width, height]) + 1.05 * patch
-    return f"{edges} edges, {channels} channels", lambda: level.lookup(coords, features, kk, slots)
+    given = [x.to(device) for x in (coords, features, kk, slots)]
+    return f"{edges} edges, {channels} channels", lambda: level.lookup(*given)
 
 
-def alignment(generator: torch.Generator) -> tuple[str, Call]:
+def alignment(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
     """Alignment of the edges that leave a window."""
     edges, frames, height, width = 240, 8, 240, 320
     noise = torch.rand(frames, 1, height // 4, width // 4, generator=generator) * 255
@@ -53,24 +56,26 @@ def alignment(generator: torch.Generator) -> tuple[str, Call]:
     centres = torch.rand(edges, 2, generator=generator) * torch.tensor([width, height])
     start = centres + torch.rand(edges, 2, generator=generator)
     warps = torch.eye(2) + 0.1 * torch.rand(edges, 2, 2, generator=generator)
-    return f"{edges} edges", lambda: align_patches(images, source, source, centres, start, warps).positions
+    given = [x.to(device) for x in (images, source, source, centres, start, warps)]
+    return f"{edges} edges", lambda: align_patches(*given).positions
 
 
-KERNELS: dict[str, Callable[[torch.Generator], tuple[str, Call]]] = {
-    "correlation, level 1": lambda generator: edge_correlation(generator, 1),
-    "correlation, level 4": lambda generator: edge_correlation(generator, 4),
+KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] = {
+    "correlation, level 1": lambda generator, device: edge_correlation(generator, device, 1),
+    "correlation, level 4": lambda generator, device: edge_correlation(generator, device, 4),
     "alignment": alignment,
 }
-"""By name: a function of a random generator that returns a description of the size and a call to time, which asks
-:func:`dvo.core.kernels.use_kernels`."""
+"""By name: a function of a random generator and a device that returns a description of the size and a call to time,
+which asks :func:`dvo.core.kernels.use_kernels`."""
 
 
-def compare(call: Call, repeats: int) -> tuple[float, float, float]:
+def compare(call: Call, repeats: int, device: torch.device) -> tuple[float, float, float]:
     """Run a kernel and its twin in turns.
 
     Args:
         call: computes with either.
         repeats: number of runs of each, after one that is not timed.
+        device: that computes, and is waited for.
 
     Returns:
         Median seconds of the kernel and of the twin, and the largest absolute difference of the results.
@@ -82,6 +87,7 @@ def compare(call: Call, repeats: int) -> tuple[float, float, float]:
             with mock.patch.dict(os.environ, {VARIABLE: choice}):
                 start = time.perf_counter()
                 found[choice] = call()
+                getattr(torch, device.type).synchronize()  # a module for each kind of device
                 seconds[choice] += [time.perf_counter() - start] if repeat else []
     kernel, twin = CHOICES
     largest = (found[kernel] - found[twin]).abs().max().item()
@@ -101,8 +107,8 @@ def main() -> None:
     print(f"{'kernel':24} {'size':28} {'ms':>8} {'twin ms':>8} {'ratio':>6} {'difference':>11}")
     with torch.inference_mode():
         for name in chosen:
-            size, call = KERNELS[name](torch.Generator().manual_seed(0))
-            kernel, twin, largest = compare(call, options.repeats)
+            size, call = KERNELS[name](torch.Generator().manual_seed(0), CPU)
+            kernel, twin, largest = compare(call, options.repeats, CPU)
             print(f"{name:24} {size:28} {1e3 * kernel:8.2f} {1e3 * twin:8.2f} {twin / kernel:6.1f} {largest:11.1e}")
 
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dvo.core.kernels import use_kernels
+from dvo.core.kernels import use_device_kernels, use_kernels
 
 FIRST_MAPS = 8  # map slots that memory is reserved for at first
 _PIECE, _LARGE_PIECE = 32, 1024  # edges processed at once: in the cache of a processor; on other devices
@@ -89,6 +89,10 @@ class EdgeCorrelation:
                 self.maps.numpy(), features.contiguous().numpy(), at.numpy(), kk.numpy(), frames.numpy(), self.radius,
                 out.numpy(),
             )  # fmt: skip
+        elif use_device_kernels(self.maps, features, at):
+            from dvo.nets.correlation import edge_correlation_triton
+
+            out = edge_correlation_triton.correlate(self.maps, features, at, kk, frames, self.radius)
         else:
             out = correlate_edges(self.maps, features, at, kk, frames, self.radius)
         return out.flatten(1)

@@ -6,6 +6,7 @@ row of the result, and the others go on. What a section leaves of its time is sh
 - `tests`: those with the marker `gpu`: kernels and their twins, layers, a training step and the tracker on the device
   against the CPU.
 - `waits`: synchronisations of a frame that the network measures.
+- `kernels`: kernels of the device and their twins.
 - `presets`: frames per second of the tracker by preset, and of the weights `full`.
 - `videos`: frames per second of one video, and of 16 in one go.
 - `training`: steps per second by batch size, clips rendered on the device.

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 
 from dvo.core.errors import DvoError
+from dvo.core.kernels import use_device_kernels
 from dvo.core.yaml_files import read_yaml
 from dvo.data.frame import Frame
 from dvo.models.weights import FOLDER, LoadedWeights, load_weights
@@ -24,6 +25,7 @@ from dvo.odometry.protocol import Odometry, Status
 from dvo.synth.sequence import make_sequence
 from eval.benchmarks.device.rows import Row, reason_of
 from eval.benchmarks.device.waits import waits_of_device, waits_of_stand_in
+from eval.benchmarks.kernels import KERNELS, compare
 from eval.suites.suite import ROOT
 
 _OUTCOME = re.compile(r"^(tests/\S+::\S+) (PASSED|FAILED|ERROR|SKIPPED)")
@@ -128,6 +130,30 @@ def waits(given: Setting) -> Iterator[Row]:
     yield from _cases("waits", given, [(name, counted(measure)) for measure, name in case_of.items()])
 
 
+def kernels(given: Setting) -> Iterator[Row]:
+    """Milliseconds of kernels, on one thread where the CPU computes, with their ratio to the PyTorch twins.
+
+    Args:
+        given: device and time.
+    """
+
+    def one(name: str) -> Callable[[float], Row]:
+        def measure(_: float) -> Row:
+            with torch.inference_mode():
+                size, call = KERNELS[name](torch.Generator().manual_seed(0), given.device)
+                kernel, twin, largest = compare(call, 2 if given.quick else 30, given.device)
+            note = f"{size}; twin {1e3 * twin:.3g} ms, ratio {twin / kernel:.2f}, difference {largest:.1e}"
+            return Row("kernels", name, 1e3 * kernel, "ms", given.memory_mb(), note)
+
+        return measure
+
+    tried = use_device_kernels(torch.zeros(1, device=given.device)) or given.device.type == "cpu"
+    if not tried:
+        yield Row("kernels", "all", note="left out: no kernels on this device, see the line on the error output")
+        return
+    yield from _cases("kernels", given, [(name, one(name)) for name in KERNELS])
+
+
 def presets(given: Setting) -> Iterator[Row]:
     """Frames per second of the tracker with every preset, the weights ``full`` among them.
 
@@ -184,7 +210,8 @@ def training(given: Setting) -> Iterator[Row]:
 
 SECTIONS: dict[str, tuple[float, Callable[[Setting], Iterator[Row]]]] = {
     "tests": (0.25, tests),
-    "waits": (0.1, waits),
+    "waits": (0.05, waits),
+    "kernels": (0.05, kernels),
     "presets": (0.25, presets),
     "videos": (0.2, videos),
     "training": (0.2, training),

@@ -35,12 +35,31 @@ for _v, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
     _HAT[_v, _row, _column], _HAT[_v, _column, _row] = 1, -1
 # R v = vector part of q v q^-1
 _CONJUGATE = torch.tensor([-1.0, -1.0, -1.0, 1.0])
-_MATRIX = torch.einsum("avc,cbr,b->abrv", _MULTIPLY[:, :3], _MULTIPLY[..., :3], _CONJUGATE)
+_MATRIX = torch.einsum("avc,cbr,b->abrv", _MULTIPLY[:, :3], _MULTIPLY[..., :3], _CONJUGATE).reshape(16, 9)
+_MULTIPLY, _HAT = _MULTIPLY.view(16, 4), _HAT.view(3, 9)
+
+
+_MOVED: dict[tuple[int, torch.device, torch.dtype], Tensor] = {}
+
+
+def _like(table: Tensor, x: Tensor) -> Tensor:
+    """A constant of this file (itself, no view of it) with the type and on the device of a tensor.
+
+    It is moved once, as that waits for the device.
+    """
+    if x.device == table.device:
+        return table.to(x)
+    key = id(table), x.device, x.dtype
+    moved = _MOVED.get(key)
+    if moved is None:
+        with torch.inference_mode(False):  # for computations with gradients, too
+            moved = _MOVED[key] = table.to(x.device, x.dtype)
+    return moved
 
 
 def _linear(x: Tensor, table: Tensor) -> Tensor:
     """``x (..., I)`` by ``table (I, O)``, never in the reduced precision of TF32 or autocast."""
-    table = table.to(x)
+    table = _like(table, x)
     if x.device.type == "cpu" and not torch.is_autocast_enabled("cpu"):
         return x @ table
     return (x[..., :, None] * table).sum(-2)
@@ -53,7 +72,7 @@ def _bilinear(a: Tensor, b: Tensor, table: Tensor) -> Tensor:
 
 def hat(v: Tensor) -> Tensor:
     """Skew matrix ``(..., 3, 3)`` of ``v (..., 3)``: ``hat(a) b = a x b``."""
-    return _linear(v, _HAT.view(3, 9)).unflatten(-1, (3, 3))
+    return _linear(v, _HAT).unflatten(-1, (3, 3))
 
 
 def cross(a: Tensor, b: Tensor, dim: int = -1) -> Tensor:
@@ -70,12 +89,12 @@ def multiply(a: Tensor, b: Tensor) -> Tensor:
     Returns:
         ``(..., 4)``.
     """
-    return _bilinear(a, b, _MULTIPLY.view(16, 4))
+    return _bilinear(a, b, _MULTIPLY)
 
 
 def conjugate(q: Tensor) -> Tensor:
     """Conjugate of a quaternion ``(..., 4)``, the inverse of a unit one."""
-    return q * _CONJUGATE.to(q)
+    return q * _like(_CONJUGATE, q)
 
 
 def rotate(q: Tensor, v: Tensor) -> Tensor:
@@ -98,7 +117,7 @@ def normalise(q: Tensor) -> Tensor:
 
 def matrix(q: Tensor) -> Tensor:
     """Rotation matrices ``(..., 3, 3)`` of unit quaternions ``(..., 4)``."""
-    return _bilinear(q, q, _MATRIX.reshape(16, 9)).unflatten(-1, (3, 3))
+    return _bilinear(q, q, _MATRIX).unflatten(-1, (3, 3))
 
 
 def from_matrix(r: Tensor) -> Tensor:
@@ -160,7 +179,7 @@ def exp_terms(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     t = safe.sqrt()
     sin, cos = (0.5 * t).sin(), (0.5 * t).cos()
     closed = torch.cat((sin / t, cos, (t - 2 * sin * cos) / (safe * t)), -1)
-    c0, c1, c2, c3 = _EXP_SERIES.to(phi)
+    c0, c1, c2, c3 = _like(_EXP_SERIES, phi)
     k, w, c = torch.where(small, c0 + low * (c1 + low * (c2 + low * c3)), closed).split(1, -1)
     return torch.cat((k * phi, w), -1), 2 * k * k, c
 

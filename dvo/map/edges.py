@@ -65,13 +65,14 @@ def group_edges(keys: Int[Tensor, " E"]) -> Groups:
     """
     order = torch.argsort(keys, stable=True)
     _, group, counts = torch.unique(keys, return_inverse=True, return_counts=True)
-    widest = int(counts.max()) if len(counts) else 0
+    sizes = counts.tolist()
+    widest = max(sizes, default=0)
     first = torch.cumsum(counts, 0) - counts
     slots = torch.arange(widest, device=keys.device)
     mask = slots < counts[:, None]
     members = order[(first[:, None] + slots).clamp(max=max(len(keys) - 1, 0))] if len(keys) else slots[None, :0]
     members = torch.where(mask, members, torch.zeros_like(members))
-    return Groups(members, mask[..., None], group, bool(mask.all()))
+    return Groups(members, mask[..., None], group, all(size == widest for size in sizes))
 
 
 def ordered(groups: Groups, rank: Int[Tensor, " E"]) -> Groups:
@@ -89,16 +90,20 @@ def ordered(groups: Groups, rank: Int[Tensor, " E"]) -> Groups:
     return replace(groups, members=groups.members.gather(1, torch.argsort(ranks, dim=1, stable=True)))
 
 
-def build_graph(ii: Int[Tensor, " E"], jj: Int[Tensor, " E"], kk: Int[Tensor, " E"]) -> PatchGraph:
+def build_graph(
+    ii: Int[Tensor, " E"], jj: Int[Tensor, " E"], kk: Int[Tensor, " E"], frames: int | None = None
+) -> PatchGraph:
     """Build the neighbourhoods of a set of edges.
 
     Args:
         ii, jj, kk: source frame, target frame and patch of each edge, in any order.
+        frames: their number, if it is known: else an accelerator is waited for.
 
     Returns:
         The graph, its edges in the given order.
     """
-    frames = int(torch.maximum(ii.max(), jj.max())) + 1 if len(ii) else 1
+    if frames is None:
+        frames = int(torch.maximum(ii.max(), jj.max())) + 1 if len(ii) else 1
     keys = kk * frames + jj
     order = torch.argsort(keys, stable=True)
     same = kk[order][1:] == kk[order][:-1]

@@ -197,20 +197,22 @@ class KeyframeGraph(Map):
     def _archive_edges(self, mask: Tensor) -> None:
         """Archive the edges where ``mask (E,)`` is True, without those that have not been updated yet."""
         window, m = self.window, self.window.per_frame
-        chosen = mask & (window.weights > 0).any(-1)
-        if not chosen.any():
+        chosen = (mask & (window.weights > 0).any(-1)).nonzero()[:, 0]
+        if not len(chosen):
             return
         if self.finalise is not None:
-            self.finalise(chosen.nonzero()[:, 0])
+            self.finalise(chosen)
         identifiers = np.array([frame.identifier for frame in window.frames], dtype=np.int32)
-        kk, jj = window.kk[chosen].cpu().numpy(), window.jj[chosen].cpu().numpy()
+        # Few copies: each waits for an accelerator.
+        kk, jj = torch.stack((window.kk, window.jj))[:, chosen].cpu().numpy()
+        targets, weights = torch.stack((window.targets, window.weights))[:, chosen].float().cpu()
         self.archive.add_edges(
             ArchivedEdges(
                 source=identifiers[kk // m],
                 patch=(kk % m).astype(np.int16),
                 target=identifiers[jj],
-                position=window.targets[chosen].float().cpu().numpy(),
-                weight=window.weights[chosen].half().cpu().numpy(),
+                position=targets.numpy().copy(),  # without the weights beside it
+                weight=weights.half().numpy(),
             )
         )
 

@@ -217,7 +217,7 @@ class Window:
     def edges(self) -> PatchGraph:
         """Edges with their neighbourhoods; built on first access after a change."""
         if self._edges is None:
-            self._edges = build_graph(self.ii, self.jj, self.kk)
+            self._edges = build_graph(self.ii, self.jj, self.kk, len(self))
         return self._edges
 
     def free_map_slot(self) -> int:
@@ -278,9 +278,13 @@ class Window:
             own: also from its patches to itself.
         """
         m, device = self.per_frame, self.jj.device
-        near = torch.arange(max(0, position - lifetime), min(len(self), position + lifetime + 1), device=device)
-        near = torch.cat([torch.arange(min(self.guests, int(near[0])), device=device), near])
-        others = near[near != position]
+        first, end = max(0, position - lifetime), min(len(self), position + lifetime + 1)
+
+        def places(*ranges: tuple[int, int]) -> Tensor:
+            return torch.cat([torch.arange(*one, device=device) for one in ranges])
+
+        guests = 0, min(self.guests, first)
+        near, others = places(guests, (first, end)), places(guests, (first, position), (position + 1, end))
         old = (others[:, None] * m + torch.arange(m, device=device)).flatten()
         self.connect(old, torch.full_like(old, position))
         new, targets = torch.arange(position * m, (position + 1) * m, device=device), near if own else others
@@ -293,9 +297,10 @@ class Window:
             mask: ``(E,)`` bool, False for an edge to remove.
         """
         self._edges = None
-        self.kk, self.jj = self.kk[mask], self.jj[mask]
-        self.hidden, self.targets, self.weights = self.hidden[mask], self.targets[mask], self.weights[mask]
-        self.confidence = self.confidence[mask]
+        kept = mask.nonzero()[:, 0]  # once: an accelerator is waited for until their number is known
+        self.kk, self.jj = self.kk[kept], self.jj[kept]
+        self.hidden, self.targets, self.weights = self.hidden[kept], self.targets[kept], self.weights[kept]
+        self.confidence = self.confidence[kept]
 
     def touching(self, position: int) -> Tensor:
         """Select the edges of a frame.

@@ -237,7 +237,7 @@ def group_measurements(
     weight = weight * (f_j * f_j)
     gate = Gate(max_residual, f_j.detach().mT, kernel=kernel)
     if bounds is not None:
-        middle = centres.new_tensor(bounds) / 2
+        middle = torch.stack([centres.new_full((), side) for side in bounds]) / 2  # a copy would wait for the device
         gate = replace(gate, offset=(c_j.detach() - middle).mT, reach=middle[:, None] + MARGIN)
     assert poses.slot is not None
     index = sum_index(plan, poses.slot, poses.free, len(centres))

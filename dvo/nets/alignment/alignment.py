@@ -270,8 +270,8 @@ def accept(
         ``(E,)`` bool, True for the alignment.
     """
     half = options.window // 2
-    high = torch.tensor(size, device=measured.device) - 1 - half
-    inside = ((found.positions >= half) & (found.positions <= high)).all(-1)
+    x, y = found.positions.unbind(-1)
+    inside = (x >= half) & (x <= size[0] - 1 - half) & (y >= half) & (y <= size[1] - 1 - half)
     near = (found.positions - measured).norm(dim=-1) <= options.reach * pixels
     converged = found.last_step <= options.last_step
     return inside & near & converged & (found.correlation >= options.correlation)

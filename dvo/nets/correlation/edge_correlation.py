@@ -123,7 +123,7 @@ def correlate_edges(
     if not e:
         return out
     # A window beyond the border contains only zeros, at any position.
-    limit = torch.tensor([width - 2 * taps, height - 2 * taps], dtype=at.dtype, device=at.device)
+    limit = _pair(at, width - 2 * taps, height - 2 * taps)
     position = (at - radius).clamp(min=-taps).minimum(limit)
     base = position.floor()
     fx, fy = (position - base)[..., None, None, :].unbind(-1)
@@ -132,7 +132,7 @@ def correlate_edges(
     spread = (corner - low[:, None]).flatten(1).amax(1)
     side = taps + min(int(spread.max()), _SPREAD)
     # The pixels of a patch share the products with one window of the map, which is moved inwards at the far border.
-    origin = low.minimum(torch.tensor([width - side, height - side], device=at.device))
+    origin = low.minimum(_pair(low, width - side, height - side))
     inner = (corner - origin[:, None]).clamp(max=side - taps)
     first = (frames * height + origin[:, 1]) * width + origin[:, 0]
     rows = torch.arange(side, device=at.device)
@@ -157,3 +157,8 @@ def correlate_edges(
         )
         out[wide] = found.view(-1, q, taps - 1, taps - 1)
     return out
+
+
+def _pair(like: Tensor, x: int, y: int) -> Tensor:
+    """``(2,)`` numbers, filled in on the device: a copy from the CPU would wait for it."""
+    return torch.cat((like.new_full((1,), x), like.new_full((1,), y)))

@@ -94,7 +94,14 @@ def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Fea
     Returns:
         Features of a batch of one frame; the same image gives the same ones, bit for bit on the CPU.
     """
-    rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
+    return _encode(model, _on(image, device))
+
+
+def _on(image: np.ndarray, device: torch.device) -> Tensor:
+    return torch.from_numpy(image).to(device).permute(2, 0, 1)
+
+
+def _encode(model: PatchVO, rgb: Tensor) -> Features:
     return model.patchify.encode(normalise_images(rgb)[None, None])
 
 
@@ -119,8 +126,8 @@ def observe(
     Returns:
         Features and patches.
     """
-    rgb = torch.from_numpy(image).to(device).permute(2, 0, 1)
-    features = encode_image(model, image, device)
+    rgb = _on(image, device)
+    features = _encode(model, rgb)
     centres = select(rgb[None, None])
     if mask is not None:
         again = partial(select, rgb[None, None])

@@ -56,12 +56,12 @@ def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tenso
     if rotation:
         part[:3] = 0
     else:
-        part[3:] = torch.tensor([0.0, 0, 0, 1], device=device)
+        part[3:6], part[6] = 0, 1
     poses = torch.stack([se3.identity(device=device), motion, part])[None]
-    intrinsics = window.intrinsics[[i, j, j]][None]
+    intrinsics = torch.stack([window.frames[k].intrinsics for k in (i, j, j)])[None]
     kk = torch.arange(m, device=device)
     c = patches.shape[-1] // 2
-    targets = torch.tensor([1, 2], device=device).repeat_interleave(m)
+    targets = torch.arange(1, 3, device=device).repeat_interleave(m)
     there = reproject(poses, patches, intrinsics, torch.zeros_like(targets), targets, kk.repeat(2)).coords
     whole, only = there[0, :, c, c].split(m)
     return whole, only

@@ -69,15 +69,12 @@ def support_of(window: Window, position: int) -> PoseSupport:
     found = _by_kernel(window, position)
     if found is not None:
         return found
-    into = (window.jj == position) & (window.ii <= position)
-    if not bool(into.any()):
+    into = measured(window, window.confidence, (window.jj == position) & (window.ii <= position)).nonzero()[:, 0]
+    if not len(into):
         return PoseSupport(0.0, 0.0)
-    into = measured(window, window.confidence, into)
-    if not bool(into.any()):
-        return PoseSupport(0.0, 0.0)
+    earlier = into[window.ii[into] < position]
     confidence = float(window.confidence[into].mean())
-    earlier = into & (window.ii < position)
-    if not bool(earlier.any()):
+    if not len(earlier):
         return PoseSupport(confidence, 0.0)
     return PoseSupport(confidence, _inliers(window, earlier))
 

@@ -16,6 +16,8 @@ from unittest import mock
 import torch
 from torch import Tensor
 
+from dvo.ba.kernels import Kernel
+from dvo.ba.layer.layer import BAOptions, bundle_adjust
 from dvo.core.command_line import OneLineParser
 from dvo.core.kernels import CHOICES, VARIABLE
 from dvo.nets.alignment.alignment import align_patches
@@ -60,10 +62,28 @@ def alignment(generator: torch.Generator, device: torch.device) -> tuple[str, Ca
     return f"{edges} edges", lambda: align_patches(*given).positions
 
 
+def window_solver(generator: torch.Generator, device: torch.device) -> tuple[str, Call]:
+    """Two Gauss-Newton steps on a window."""
+    frames, per_frame, options = 9, 24, BAOptions(fixed=2, bounds=(80, 60), kernel=Kernel("cauchy", 0.3), check=False)
+    count = frames * per_frame
+    poses = torch.cat([0.05 * torch.rand(1, frames, 3, generator=generator), torch.zeros(1, frames, 3)], 2)
+    poses = torch.cat([poses, torch.ones(1, frames, 1)], 2)
+    place = torch.rand(1, count, 2, 1, 1, generator=generator) * torch.tensor([80.0, 60.0])[:, None, None]
+    patches = torch.cat([place, 0.5 + torch.rand(1, count, 1, 1, 1, generator=generator)], 2).expand(-1, -1, -1, 3, 3)
+    intrinsics = torch.tensor([60.0, 60.0, 40.0, 30.0]).expand(1, frames, 4).contiguous()
+    kk, jj = torch.arange(count).repeat_interleave(frames), torch.arange(frames).repeat(count)
+    targets = patches[:, kk, :2, 1, 1] + torch.rand(1, len(kk), 2, generator=generator)
+    weights = torch.rand(1, len(kk), 2, generator=generator)
+    given = poses, patches.contiguous(), intrinsics, targets, weights, kk // per_frame, jj, kk
+    there = [x.to(device) for x in given]
+    return f"{len(kk)} edges", lambda: bundle_adjust(*there, options).poses_cw
+
+
 KERNELS: dict[str, Callable[[torch.Generator, torch.device], tuple[str, Call]]] = {
     "correlation, level 1": lambda generator, device: edge_correlation(generator, device, 1),
     "correlation, level 4": lambda generator, device: edge_correlation(generator, device, 4),
     "alignment": alignment,
+    "window solver": window_solver,
 }
 """By name: a function of a random generator and a device that returns a description of the size and a call to time,
 which asks :func:`dvo.core.kernels.use_kernels`."""

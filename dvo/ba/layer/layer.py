@@ -30,7 +30,7 @@ from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, Problem, State, StateBlock
 from dvo.core.errors import DvoError
-from dvo.core.kernels import is_transformed, use_kernels
+from dvo.core.kernels import is_transformed, use_device_kernels, use_kernels
 from dvo.core.settings import shown
 from dvo.core.threads import use_threads
 from dvo.geometry.precision import full_precision
@@ -121,6 +121,8 @@ def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
     given = _with_whole_indices(given)
     if options.check is not False:
         check_values(given)
+    if _is_for_device_kernels(given, options):
+        return _by_device_kernels(given, options)
     with full_precision(given.poses_cw.device):
         problem = _solved(make_problem(given, options), options)
         state, patches = problem.state, given.patches
@@ -139,6 +141,32 @@ def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
             cost, inliers = _report(make_problem(now, options, grouped=False))
         further = {name: state[name].value for name in given.blocks}
         return BAResult(poses_cw, patches, intrinsics, cost, inliers, covariance, further)
+
+
+def _is_for_device_kernels(given: PatchProblem, options: BAOptions) -> bool:
+    """The problem of a tracker's window: one camera, nothing but the reprojection, leading poses that stay."""
+    floats = given.poses_cw, given.patches, given.intrinsics, given.targets, given.weights
+    if given.sensors is not None or given.factors or given.blocks or options.refine_intrinsics != "none":
+        return False
+    if options.structure_only or options.motion_only or options.report or options.covariance is not None:
+        return False
+    if not use_device_kernels(*floats) or not isinstance(options.fixed, int) or isinstance(options.fixed, bool):
+        return False
+    from dvo.ba.layer.edgewise_triton import MOST_FRAMES, MOST_FREE
+
+    frames, patches = given.poses_cw.shape[1], given.patches.shape[1]
+    fits = frames <= MOST_FRAMES and options.fixed >= 0 and 0 < frames - options.fixed <= MOST_FREE
+    return fits and min(patches, len(given.ii)) > 0
+
+
+def _by_device_kernels(given: PatchProblem, options: BAOptions) -> BAResult:
+    from dvo.ba.layer.edgewise_triton import take_steps
+
+    assert isinstance(options.fixed, int)
+    measured = given.centres, given.intrinsics, given.targets, given.weights, given.ii, given.jj, given.kk
+    poses_cw, depths = take_steps(given.poses_cw, given.inverse_depths, *measured, options.fixed, options)
+    row = depths[:, :, None, None, None].expand_as(given.patches[:, :, :1])
+    return BAResult(poses_cw, torch.cat((given.patches[:, :, :2], row), 2), given.intrinsics, blocks={})
 
 
 def _solved(problem: Problem, options: BAOptions) -> Problem:

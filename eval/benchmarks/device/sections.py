@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import resource
 import subprocess
@@ -11,11 +12,12 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
+from unittest import mock
 
 import torch
 
 from dvo.core.errors import DvoError
-from dvo.core.kernels import use_device_kernels
+from dvo.core.kernels import CHOICES, VARIABLE, use_device_kernels
 from dvo.core.yaml_files import read_yaml
 from dvo.data.frame import Frame
 from dvo.models.weights import FOLDER, LoadedWeights, load_weights
@@ -171,7 +173,12 @@ def presets(given: Setting) -> Iterator[Row]:
             raise DvoError("no such weights here", file="full")
         return _speed("presets", "full", frames, [_tracker("full", given, 0, {})], seconds, given)
 
-    yield from _cases("presets", given, [*((case, one(case, options)) for case, options in small), ("full", full)])
+    def plain(seconds: float) -> Row:
+        with mock.patch.dict(os.environ, {VARIABLE: CHOICES[1]}):
+            return _speed("presets", "small, no kernels", frames, [_tracker("small", given, 0, {})], seconds, given)
+
+    cases = [(case, one(case, options)) for case, options in small]
+    yield from _cases("presets", given, [*cases, ("small, no kernels", plain), ("full", full)])
 
 
 def videos(given: Setting) -> Iterator[Row]:

@@ -8,10 +8,12 @@ import time
 import pytest
 import torch
 
+from dvo.synth.sequence import make_sequence
 from eval.benchmarks.device import __main__ as command
 from eval.benchmarks.device.rows import Row, append_row, read_rows, table
 from eval.benchmarks.device.sections import SECTIONS, Setting, _cases
 from eval.benchmarks.device.stand_in import DEVICE, stand_in
+from eval.benchmarks.device.waits import waits_of_stand_in
 
 
 def test_rows_of_a_section_that_was_stopped(tmp_path):
@@ -83,6 +85,13 @@ def test_all_sections_on_the_cpu(tmp_path):
     assert command.main(["--device", "cpu", "--quick", "--minutes", "20", "--out", str(out)]) == 0
     rows = [Row(**row) for row in json.loads(out.read_text())["rows"]]
     assert {row.section for row in rows if row.value is not None} == set(SECTIONS)
+
+
+@pytest.mark.slow
+def test_few_waits_of_a_frame():
+    frames = list(make_sequence(1, frames=18, height=96, width=128))
+    value, places = waits_of_stand_in(frames)
+    assert 0 < value < 60 and ".py:" in places
 
 
 def test_the_stand_in_computes_and_refuses_a_mix():

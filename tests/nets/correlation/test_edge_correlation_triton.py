@@ -11,10 +11,12 @@ from tests.support.triton_programs import run
 
 PROGRAM = """
 import torch
+from dvo.core.device_triton import check
 from dvo.nets.correlation import edge_correlation
 from dvo.nets.correlation.edge_correlation import EdgeCorrelation, correlate_edges
 from dvo.nets.correlation.edge_correlation_triton import correlate
 
+check(torch.device("cpu"))
 for seed, (channels, radius, side, edges) in enumerate([(40, 3, 3, 3), (8, 1, 1, 9), (24, 2, 2, 5), (8, 3, 3, 0)]):
     g = torch.Generator().manual_seed(seed)
     level = EdgeCorrelation(1, radius, "cpu")
@@ -36,6 +38,8 @@ for seed, (channels, radius, side, edges) in enumerate([(40, 3, 3, 3), (8, 1, 1,
     print("equal", int(expected.isfinite().sum()))
 """
 COMPILED = """
+from dvo.core.device_triton import _try
+compiled(_try, {"x": "*fp32", "out": "*fp32"}, {})
 from dvo.nets.correlation.edge_correlation_triton import correlate_pixel
 types = {"maps": "*fp32", "features": "*fp32", "at": "*fp32", "kk": "*i64", "frames": "*i64", "out": "*fp32",
          "pixels": "i32", "height": "i32", "width": "i32"}
@@ -50,7 +54,7 @@ def test_values_are_those_of_the_twin(tmp_path):
 
 
 def test_compiles(tmp_path):
-    assert run(COMPILED, interpret=False, kept=tmp_path).splitlines() == ["compiled for 80", "compiled for 90"]
+    assert run(COMPILED, interpret=False, kept=tmp_path).count("compiled for 90") == 2
 
 
 def test_the_cpu_has_kernels_of_its_own():

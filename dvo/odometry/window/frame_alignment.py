@@ -3,8 +3,9 @@
 Patches of the newest keyframes are followed from the frame before (Lucas-Kanade in a pyramid, from where the motion
 model expects them), which gives a first pose, and then aligned with the images of their own keyframes to a fraction of
 a pixel (:mod:`dvo.nets.alignment.alignment`), so that no error adds up. The pose is that of the frame alone; depths and
-keyframes are held. Where the alignments are few, do not agree or lie on one side of the image, the network has to
-measure the frame. (Klein and Murray, "Parallel tracking and mapping", ISMAR 2007, 5; Forster et al., "SVO", ICRA 2014.)
+keyframes are held. Where the alignments are few, do not agree or lie on one side of the image, or the frame is
+brighter, darker or more blurred than the newest keyframe, the network has to measure it. (Klein and Murray, "Parallel
+tracking and mapping", ISMAR 2007, 5; Forster et al., "SVO", ICRA 2014.)
 """
 
 from __future__ import annotations
@@ -27,9 +28,12 @@ KEYFRAMES = 5
 """Newest keyframes whose patches are aligned."""
 MIN_CONFIDENCE = 0.1
 """Mean confidence of a patch in its measurements from which on it is aligned."""
-MIN_TEXTURE = 2.5
-"""Texture of its window (:func:`dvo.nets.alignment.alignment.texture`), grey levels a pixel, from which on it is; where
-surfaces are bare, few are, and the network measures the frame."""
+MIN_TEXTURE, MIN_SIGNAL = 2.5, 1.4
+"""Texture of its window (:func:`dvo.nets.alignment.alignment.texture`), grey levels a pixel, from which on it is, and
+over the noise of the images; where surfaces are bare or it is dark, few are, and the network measures the frame."""
+MAX_BRIGHTER, MAX_BLUR = 1.05, 0.8
+"""Change of the mean grey level since the newest keyframe, as a factor, and share of the sharpness that has to be left,
+for a frame to be aligned with it."""
 MIN_INLIERS, MIN_SHARE, MIN_AGREEMENT = 16, 0.4, 0.6
 """Patches that have to agree with the pose, their share of those in view, textured or not, and of those aligned."""
 INLIER = 0.75
@@ -108,6 +112,7 @@ class FrameAlignment:
         self._poses: torch.Tensor | None = None  # of the window that it goes on from
         self._last: list[_Seen] = []
         self._patches: _Patches
+        self._base: np.ndarray  # brightness and sharpness of the newest keyframe
 
     def align(self, image: np.ndarray, intrinsics: np.ndarray, mask: np.ndarray | None, time: float, limit: float
               ) -> AlignedFrame | None:  # fmt: skip
@@ -133,6 +138,9 @@ class FrameAlignment:
         if not len(patches.kk) or patches.motion(start) > 2 * limit or patches.motion(start, last.matrix) > limit / 2:
             return None
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        brightness, sharpness = _look(grey) / self._base
+        if not (1 / MAX_BRIGHTER <= brightness <= MAX_BRIGHTER and sharpness >= MAX_BLUR):
+            return None
         pose = patches.followed(last, grey, start)
         if pose is None:
             return None
@@ -161,13 +169,15 @@ class FrameAlignment:
         if window.poses_cw is self._poses:
             return
         newest, self._poses = window.frames[-1], window.poses_cw
-        assert self.patch_window.alignment is not None
-        self._patches = _Patches.of(window, intrinsics, self.patch_window.alignment.images, self.options.window)
+        assert newest.image is not None and self.patch_window.alignment is not None
+        grey = cv2.cvtColor(newest.image, cv2.COLOR_RGB2GRAY)
+        self._base = np.maximum(_look(grey), 1e-3)
+        least = max(MIN_TEXTURE, MIN_SIGNAL * noise(grey))
+        self._patches = _Patches.of(window, intrinsics, self.patch_window.alignment.images, self.options.window, least)
         matrices = pose_matrices(window.poses_cw[-2:].cpu().numpy())
         none = np.zeros((0, 0), np.uint8)
         before = [_Seen(none, f.timestamp, m) for f, m in zip(window.frames[-2:-1], matrices[:-1], strict=True)]
-        assert newest.image is not None
-        self._last = [*before, _Seen(cv2.cvtColor(newest.image, cv2.COLOR_RGB2GRAY), newest.timestamp, matrices[-1])]
+        self._last = [*before, _Seen(grey, newest.timestamp, matrices[-1])]
 
     def _refined(
         self, window: Window, patches: _Patches, image: np.ndarray, mask: np.ndarray | None, pose: np.ndarray
@@ -234,7 +244,7 @@ class _Patches:
     newest: np.ndarray
 
     @classmethod
-    def of(cls, window: Window, camera: np.ndarray, images: torch.Tensor, side: int) -> _Patches:
+    def of(cls, window: Window, camera: np.ndarray, images: torch.Tensor, side: int, least: float) -> _Patches:
         m, n, stride = window.per_frame, len(window), ModelConfig.STRIDE
         first = max(0, n - KEYFRAMES)
         middle = window.patches.shape[-1] // 2
@@ -258,8 +268,9 @@ class _Patches:
         points = rays @ to_world[:, :3, :3].transpose(0, 2, 1) + to_world[:, None, :3, 3]
         slots = np.array([frame.map_slot for frame in window.frames])[frames]
         pixels = centres[rows] * stride
-        places = torch.from_numpy(slots), torch.from_numpy(pixels.astype(np.float32))
-        textured = texture(images, *(x.to(images.device) for x in places), side).cpu().numpy() > MIN_TEXTURE
+        centre = torch.from_numpy(pixels.astype(np.float32)).to(images.device)
+        strength = texture(images, torch.from_numpy(slots).to(images.device), centre, side)
+        textured = strength.cpu().numpy() > least
         return cls(rows + first * m, slots, pixels, points, mean[rows], textured, np.asarray(camera, np.float64),
                    poses[-1])  # fmt: skip
 
@@ -387,6 +398,25 @@ def solve_pose_plain(
             if np.abs(step[3:]).max() < TOLERANCE and np.abs(step[:3]).max() * q.max() < TOLERANCE:
                 break
     return pose
+
+
+def noise(grey: np.ndarray) -> float:
+    """Standard deviation of the noise of an image (Immerkaer, CVIU 1996, with a median).
+
+    Args:
+        grey: ``(H, W)`` uint8.
+
+    Returns:
+        Grey levels; more where textures are as fine as noise.
+    """
+    response = cv2.filter2D(grey, cv2.CV_16S, np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32))
+    return float(np.median(np.abs(response[::2, ::2]))) / (0.6745 * 6)
+
+
+def _look(grey: np.ndarray) -> np.ndarray:
+    """Brightness and sharpness of an image."""
+    _, spread = cv2.meanStdDev(cv2.Laplacian(grey, cv2.CV_16S))
+    return np.array([grey.mean(), float(spread[0, 0])])
 
 
 def _predicted(last: list[_Seen], time: float, damping: float) -> np.ndarray:

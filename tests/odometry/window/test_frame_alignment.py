@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,10 +18,10 @@ from dvo.geometry.poses import se3_exp
 from dvo.metrics import evaluate
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions, adjust_segment
 from dvo.odometry.protocol import Status
-from dvo.odometry.window.frame_alignment import solve_pose, solve_pose_plain
+from dvo.odometry.window.frame_alignment import noise, solve_pose, solve_pose_plain
 from dvo.synth.sequence import make_sequence
 
-SETTINGS = {"loops": False, "estimate_readout": False}
+SETTINGS = {"loops": False, "estimate_readout": False, "network_motion": 1.2}
 CAMERA = np.array([300.0, 310.0, 160.0, 120.0])
 
 
@@ -106,6 +107,16 @@ def test_another_picture_is_not_aligned(walk):
         estimate = odometry.track(frame)
         assert estimate.status is same.status and np.array_equal(estimate.pose_wc, same.pose_wc)
     assert odometry.state.initialised
+
+    @torch.inference_mode()
+    def seen(image: np.ndarray):
+        camera = frames[24].camera.intrinsics
+        return odometry.aligner.align(image, camera, None, frames[24].timestamp, limit=5.0)
+
+    image = frames[24].image
+    assert seen(image) is not None
+    assert seen((image * 0.8).astype(np.uint8)) is None and seen(cv2.add(image, (20,) * 3)) is None
+    assert seen(cv2.GaussianBlur(image, (0, 0), 2.0)) is None
     count = len(aligned(odometry))
     for number, view in enumerate(other, 24):
         estimate = odometry.track(Frame(number, frames[number].timestamp, view.image, frames[0].camera))
@@ -134,6 +145,17 @@ def test_saved_and_read_again(walk, tmp_path):
     again = dvo.load_map(tmp_path / "map.dvo")
     assert len(aligned(again)) == len(aligned(odometry))
     np.testing.assert_array_equal(again.current().trajectory.poses_wc, result.trajectory.poses_wc)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31), st.floats(1.0, 12.0))
+def test_the_noise_of_an_image_is_found(seed, deviation):
+    y, x = np.mgrid[:120, :160]
+    smooth = 120 + 30 * np.sin(x / 30) + 0.2 * y + 40 * (x > 80)  # an edge is no noise
+    seen = smooth + np.random.default_rng(seed).normal(0, deviation, smooth.shape)
+    found = noise(seen.round().clip(0, 255).astype(np.uint8))
+    assert 0.85 * deviation < found < 1.15 * deviation + 0.2
+    assert noise(smooth.round().astype(np.uint8)) < 0.5
 
 
 @settings(max_examples=40, deadline=None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from unittest import mock
 
 import torch
@@ -31,7 +32,7 @@ def waits_of_stand_in(frames: list[Frame]) -> tuple[float, str]:
     """
     first = 2 * len(frames) // 3
     with mock.patch.dict(os.environ, {VARIABLE: "torch"}), stand_in() as waits:
-        odometry = build_odometry(load_weights("small"), device=DEVICE, loops=False)
+        odometry = build_odometry(load_weights("small"), device=DEVICE, loops=False, restart=False)
         for number, frame in enumerate(frames):
             if number == first:
                 waits.places.clear()
@@ -42,11 +43,11 @@ def waits_of_stand_in(frames: list[Frame]) -> tuple[float, str]:
     return _per_frame(found, len(frames) - first)
 
 
-def waits_of_device(frames: list[Frame], device: torch.device) -> tuple[float, str]:
+def waits_of_device(walk: Callable[[], list[Frame]], device: torch.device) -> tuple[float, str]:
     """The same as the device itself tells, which has to be one of CUDA.
 
     Args:
-        frames: of a video; the first two thirds fill the window.
+        walk: renders the frames of a video, of which the first two thirds fill the window.
         device: an accelerator.
 
     Returns:
@@ -58,8 +59,9 @@ def waits_of_device(frames: list[Frame], device: torch.device) -> tuple[float, s
     module = getattr(torch, device.type)
     if not hasattr(module, "set_sync_debug_mode"):
         raise DvoError(f"{device.type} does not tell of waits", field="--device", remedy="see the stand-in")
+    frames = walk()
     first = 2 * len(frames) // 3
-    odometry = build_odometry(load_weights("small", device), device=device, loops=False)
+    odometry = build_odometry(load_weights("small", device), device=device, loops=False, restart=False)
     for frame in frames[:first]:
         odometry.track(frame)
     with warnings.catch_warnings(record=True) as seen:

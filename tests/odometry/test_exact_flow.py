@@ -1,6 +1,7 @@
 """The tracker around a perfect network: what it loses then is its own fault."""
 
 import numpy as np
+import pytest
 import torch
 
 from dvo.data.frame import Frame
@@ -63,20 +64,20 @@ def perfect(clip, config):
     return odometry
 
 
-def test_exact_flow_gives_the_exact_trajectory():
-    for index in (0, 2, 6):
-        clip = make_clip(21, index, frames=40, height=96, width=128, flow_range=(2.0, 4.0), sensor=False)
-        fx, fy, cx, cy = clip.intrinsics[0].tolist()
-        camera = Camera(fx, fy, cx, cy, 128, 96)
-        odometry = perfect(clip, CONFIG)
-        states = []
-        for i, image in enumerate(clip.images):
-            frame = Frame(i, 0.1 * i, image.permute(1, 2, 0).contiguous().numpy(), camera)
-            states.append(odometry.track(frame).status)
-        result = odometry.finish()
-        truth = se3.inverse(clip.poses_cw.double()).numpy()
-        m = evaluate(result.trajectory, Trajectory(0.1 * np.arange(40), truth), rpe_gap=1)
-        assert states[-1] is Status.TRACKING
-        assert m.matched == 40
-        assert m.ate_percent < 1.0
-        assert m.rotation_error_ratio < 0.05
+@pytest.mark.parametrize("index", [0, *(pytest.param(index, marks=pytest.mark.slow) for index in (2, 6))])
+def test_exact_flow_gives_the_exact_trajectory(index):
+    clip = make_clip(21, index, frames=40, height=96, width=128, flow_range=(2.0, 4.0), sensor=False)
+    fx, fy, cx, cy = clip.intrinsics[0].tolist()
+    camera = Camera(fx, fy, cx, cy, 128, 96)
+    odometry = perfect(clip, CONFIG)
+    states = []
+    for i, image in enumerate(clip.images):
+        frame = Frame(i, 0.1 * i, image.permute(1, 2, 0).contiguous().numpy(), camera)
+        states.append(odometry.track(frame).status)
+    result = odometry.finish()
+    truth = se3.inverse(clip.poses_cw.double()).numpy()
+    m = evaluate(result.trajectory, Trajectory(0.1 * np.arange(40), truth), rpe_gap=1)
+    assert states[-1] is Status.TRACKING
+    assert m.matched == 40
+    assert m.ate_percent < 1.0
+    assert m.rotation_error_ratio < 0.05

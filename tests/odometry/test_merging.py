@@ -8,7 +8,7 @@ from dvo.cli import main
 from dvo.core.errors import DvoError
 from dvo.odometry.merging import merge_maps
 from tests.support.outcome import content
-from tests.support.recorded_walk import error_of_both, room, street, tracked, way_back
+from tests.support.recorded_walk import error_of_both, map_of_room, room, street, tracked, way_back
 from tests.support.tiny_tracker import frames as wall
 from tests.support.tiny_tracker import network, run, tracker
 
@@ -17,10 +17,10 @@ from tests.support.tiny_tracker import network, run, tracker
 def maps(tmp_path_factory):
     """Files of the walk, of its way back (without loops) and of another place; results of the first two; true poses."""
     folder, (frames, truth) = tmp_path_factory.mktemp("maps"), room()
-    found = [tracked(frames), tracked(way_back(frames), loops=False), tracked(street(12))]
-    for name, odometry in zip(("walk", "back", "street"), found, strict=True):
+    walk, back = map_of_room(folder / "walk.dvo"), tracked(way_back(frames), loops=False)
+    for name, odometry in (("back", back), ("street", tracked(street(12)))):
         odometry.save(folder / f"{name}.dvo")
-    return folder, [odometry.finish() for odometry in found[:2]], truth
+    return folder, [walk, back.finish()], truth
 
 
 def test_two_maps_of_a_place_become_one(maps, tmp_path, capsys):

@@ -57,10 +57,17 @@ def walk(count: int = 40, translate: float = 1.0) -> Trajectory:
 def film() -> Callable[[Trajectory], list[Frame]]:
     """``film(trajectory)``: the frames that a camera on that path sees."""
     scene = Scene()
+    images: dict[bytes, np.ndarray] = {}
+
+    def seen(pose: np.ndarray) -> np.ndarray:
+        key = pose.tobytes()
+        if key not in images:
+            images[key] = scene(pose)
+        return images[key]
 
     def shoot(path: Trajectory) -> list[Frame]:
         poses = zip(path.timestamps, path.poses_wc, strict=True)
-        return [Frame(i, float(t), scene(pose), CAMERA) for i, (t, pose) in enumerate(poses)]
+        return [Frame(i, float(t), seen(pose), CAMERA) for i, (t, pose) in enumerate(poses)]
 
     return shoot
 

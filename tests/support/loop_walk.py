@@ -12,7 +12,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.odometry.loops.options import LoopOptions
 from dvo.synth.sequence import make_sequence
 
-THERE = 40
+THERE = 28
 SHORT = {"keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5}  # keyframes leave the window soon
 OPTIONS = LoopOptions(seconds=1.0, every=2, neighbours=1, steps=4, delay=4)
 

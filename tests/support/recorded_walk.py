@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,6 +16,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.metrics import evaluate
 from dvo.odometry.loops.options import LoopOptions
+from dvo.odometry.protocol import Result
 from dvo.synth.sequence import make_sequence
 
 COUNT = 36
@@ -23,6 +27,7 @@ SHORT = {
 OPTIONS = LoopOptions(every=2, steps=8, delay=2)
 
 
+@cache
 def room() -> tuple[list[Frame], np.ndarray]:
     """Frames of a walk, from 100 s on, and their true poses."""
     walk = make_sequence(
@@ -60,6 +65,22 @@ def tracked(frames: list[Frame], **settings) -> dvo.odometry.patch.tracker.Patch
         odometry.track(frame)
     odometry.finish()
     return odometry
+
+
+@cache
+def _tracked_room() -> tuple[bytes, Result]:
+    odometry = tracked(room()[0])
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "room.dvo"
+        odometry.save(file)
+        return file.read_bytes(), odometry.finish()
+
+
+def map_of_room(file: Path) -> Result:
+    """Write the map of the walk, which is tracked once for all tests; returns its result."""
+    content, result = _tracked_room()
+    file.write_bytes(content)
+    return result
 
 
 def error_of_both(old: Trajectory, new: Trajectory, truth: np.ndarray) -> float:

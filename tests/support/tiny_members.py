@@ -16,7 +16,10 @@ SETTINGS = {
         "initial_motion": 0.0, "initial_parallax": 0.0, "lost_confidence": 0.0, "min_inliers": 0.0,
         "search_inliers": 0.0, "join_inliers": 0.0, "initial_inliers": 0.0, "selection": "random",
     },
-    "droid": {"lost_confidence": 0.0, "filter_flow": 0.0, "warm_up": 4},
+    "droid": {
+        "lost_confidence": 0.0, "filter_flow": 0.0, "warm_up": 4, "initial_updates": 2, "updates": 1,
+        "frame_updates": 1, "restart": False,
+    },
 }  # fmt: skip
 MEMBERS = ("patch_vo", "droid", "tartanvo", "deepvo")
 

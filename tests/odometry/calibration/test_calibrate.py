@@ -24,7 +24,7 @@ FLAT = (Minimum(0.0, math.inf, 0.0),) * 2
 @pytest.fixture(scope="module")
 def clip():
     return list(
-        make_sequence(77, frames=45, height=144, width=192, fps=30.0, family="room", kind="handheld", apart=True)
+        make_sequence(77, frames=38, height=144, width=192, fps=30.0, family="room", kind="handheld", apart=True)
     )
 
 

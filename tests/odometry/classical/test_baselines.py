@@ -86,6 +86,7 @@ def test_null_moves_straight_and_never_turns(film, path):
     assert np.ptp(np.diff(result.trajectory.positions, axis=0), axis=0).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_kitti_under_five_percent(data_root: Path):
     from dvo.data.open import open_source
 

@@ -24,14 +24,19 @@ def walk(scene):
     )
 
 
-def interrupted(scene, after, other=None):
+@cache
+def view(scene, k):
+    return walk(scene).frame(k)
+
+
+def interrupted(scene, after, other=None, lit=LIT, dark=DARK):
     """Frames of a scene, darkness, and frames of the same or another one; and the true trajectory of the scene."""
-    first, second = (list(walk(k)) for k in (scene, scene if other is None else other))
+    first = [view(scene, k) for k in range(lit)]
     black = replace(first[0], image=np.zeros_like(first[0].image))
-    views = [*first[:LIT], *[black] * DARK, *(second[k] for k in after)]
+    views = [*first, *[black] * dark, *(view(scene if other is None else other, k) for k in after)]
     times = np.arange(len(views)) / FPS
     frames = [replace(view, timestamp=float(time)) for view, time in zip(views, times, strict=True)]
-    order = [*range(LIT), *[LIT] * DARK, *after]
+    order = [*range(lit), *[lit] * dark, *after]
     return frames, Trajectory(times, walk(scene).groundtruth.poses_wc[order])
 
 
@@ -100,9 +105,13 @@ def test_other_scenes_are_found_back_as_well(scene):
     assert [segment.joined_to for segment in result.segments] == [None, 0]
 
 
-@pytest.mark.parametrize(("scene", "other"), [(63, 105), pytest.param(105, 103, marks=pytest.mark.slow)])
-def test_another_scene_begins_a_world_of_its_own(scene, other):
-    frames, _ = interrupted(scene, range(30), other)
+@pytest.mark.parametrize(
+    ("scene", "other", "lit", "dark", "after"),
+    [(63, 105, 22, 6, range(18)), pytest.param(63, 105, LIT, DARK, range(30), marks=pytest.mark.slow),
+     pytest.param(105, 103, LIT, DARK, range(30), marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_another_scene_begins_a_world_of_its_own(scene, other, lit, dark, after):
+    frames, _ = interrupted(scene, after, other, lit, dark)
     _, estimates, result = track(frames)
     assert not any(estimate.recovered for estimate in estimates)
     assert [segment.joined_to for segment in result.segments] == [None, None]

@@ -20,7 +20,7 @@ from dvo.odometry.loops.finder import Loop
 from dvo.odometry.protocol import Status
 from tests.support.archived_walk import archived_walk
 from tests.support.outcome import content
-from tests.support.recorded_walk import COUNT, OPTIONS, SHORT, error_of_both, room, street, tracked, way_back
+from tests.support.recorded_walk import COUNT, OPTIONS, SHORT, error_of_both, map_of_room, room, street, way_back
 from tests.support.tiny_tracker import frames as wall
 from tests.support.tiny_tracker import network, run, tracker
 
@@ -31,11 +31,10 @@ def walk():
 
 
 @pytest.fixture(scope="module")
-def old(walk, tmp_path_factory):
+def old(tmp_path_factory):
     """Map file of the walk, and its result."""
-    odometry, file = tracked(walk[0]), tmp_path_factory.mktemp("maps") / "old.dvo"
-    odometry.save(file)
-    return file, odometry.finish()
+    file = tmp_path_factory.mktemp("maps") / "old.dvo"
+    return file, map_of_room(file)
 
 
 def begin(file, **settings):

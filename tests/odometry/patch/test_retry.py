@@ -18,7 +18,7 @@ from tests.support.changed_images import with_images
 from tests.support.outcome import content, told
 from tests.support.saved_maps import FAST
 
-CUT, DARK, END = 16, 6, 32
+CUT, DARK, END = 16, 6, 28
 BACK = CUT + DARK  # first frame after the darkness
 SIZE = {"height": 120, "width": 160, "fps": 15.0, "sensor": False}
 
@@ -70,7 +70,10 @@ def lost_frames(frames, result):
     return np.flatnonzero(~np.isin([frame.timestamp for frame in frames], rows)).tolist()
 
 
-@pytest.mark.parametrize(("weights", "settings"), [("small", {}), ("mamba", {}), ("small", {"preset": "fast"})])
+@pytest.mark.parametrize(
+    ("weights", "settings"),
+    [("small", {}), pytest.param("mamba", {}, marks=pytest.mark.slow), ("small", {"preset": "fast"})],
+)
 def test_the_frame_after_the_dark_gets_a_pose_with_the_next_one(film, dark, monkeypatch, weights, settings):
     first = dark[BACK].timestamp
     refuse(monkeypatch, first)

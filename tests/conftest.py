@@ -21,6 +21,7 @@ from hypothesis import settings
 
 from dvo.data.files.root import data_root as find_data_root
 from dvo.data.trajectory import Trajectory, write_tum
+from tests.support.command_line import without_plots
 from tests.support.fake_odometry import FakeOdometry, curve
 
 
@@ -104,11 +105,13 @@ def fake_odometry() -> Callable[..., FakeOdometry]:
 def given(monkeypatch: pytest.MonkeyPatch, fake_odometry: Callable[..., FakeOdometry]) -> Callable[..., FakeOdometry]:
     """``given(**options)`` makes ``dvo.load`` return a fake odometry with these options, and returns it.
 
-    Its ``asked`` holds the arguments of ``dvo.load``, and is empty before the call.
+    Its ``asked`` holds the arguments of ``dvo.load``, and is empty before the call. Plots are drawn if ``plots``.
     """
 
-    def use(**options: Any) -> FakeOdometry:
+    def use(plots: bool = False, **options: Any) -> FakeOdometry:
         odometry = fake_odometry(**options)
+        if not plots:
+            without_plots(monkeypatch)
 
         def load(weights: str, **asked: Any) -> FakeOdometry:
             odometry.asked = {"weights": weights, **asked}

@@ -82,7 +82,7 @@ def test_no_loops_wins_without_weights_too(given, loops):
 
 
 def test_run_writes_the_results_folder(given, image_folder, tmp_path, capsys):
-    odometry = given()
+    odometry = given(plots=True)
     out = tmp_path / "out"
     assert main(arguments(image_folder, out, "--seed", "5", "--weights", "tiny")) == 0
     assert sorted(path.name for path in out.iterdir()) == FILES

@@ -33,7 +33,7 @@ from dvo.core.errors import DvoError
 from dvo.core.processes import Ending
 from dvo.core.threads import available_cores, share_cores, thread_rule
 from dvo.data.files.output import only_writer
-from tests.support.command_line import errors, names, summary
+from tests.support.command_line import errors, names, summary, without_plots
 from tests.support.fake_odometry import FakeOdometry, curve
 
 FILES = ["frames.csv", "map.ply", "run.json", "summary.html", "trajectory.png", "trajectory.txt"]
@@ -88,6 +88,7 @@ def tracked(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 
     monkeypatch.setitem(vars(dvo), "load", lambda weights, **asked: FakeOdometry(curve))
     monkeypatch.setattr(command, "run_one", run_here)
+    without_plots(monkeypatch)
     return done
 
 

@@ -12,11 +12,13 @@ from dvo.cli import main
 from dvo.commands import camera
 from dvo.data.calibration.focal_guess import guess_from_angle
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
+from tests.support.command_line import without_plots
 
 
 @pytest.fixture(autouse=True)
 def fake(monkeypatch, fake_odometry):
     monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: fake_odometry())
+    without_plots(monkeypatch)
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ def test_a_disk_that_gets_full_midway(given, image_folder, tmp_path, capsys, sma
 
 def test_a_disk_that_is_full_at_the_end(given, image_folder, tmp_path, capsys, small_files):
     """Picture and page do not fit; everything else does, and says that it is not all."""
-    given(at_frame={19: lambda: small_files(8000)})
+    given(plots=True, at_frame={19: lambda: small_files(8000)})
     assert main(arguments(image_folder, tmp_path / "out")) == 2
     (error,) = errors(capsys.readouterr().err)
     assert "trajectory.png" in error and "File too large" in error and "--out" in error
@@ -252,7 +252,7 @@ def test_status_as_text():
 
 def test_the_picture_shows_segments_apart(given, image_folder, tmp_path):
     """Without ground truth a panel each, with it one panel in which every segment has its colour."""
-    given(new_segment=(6, 13))
+    given(plots=True, new_segment=(6, 13))
     truth = str(image_folder.parent / "truth.txt")
     assert main(arguments(image_folder, tmp_path / "a")) == 0
     assert main(arguments(image_folder, tmp_path / "b", "--groundtruth", truth)) == 0

@@ -18,12 +18,12 @@ OPTIONS = LoopOptions(seconds=1.0, every=2, neighbours=1, steps=4, delay=4)
 
 
 @cache
-def there_and_back():
+def there_and_back(there=THERE):
     """Frames of a walk and the same in reverse, with times that go on; and the true trajectory."""
     walk = make_sequence(
-        63, frames=THERE, family="room", kind="handheld", speed=5.0, height=120, width=160, fps=15.0, sensor=False
+        63, frames=there, family="room", kind="handheld", speed=5.0, height=120, width=160, fps=15.0, sensor=False
     )
-    order = [*range(THERE), *range(THERE - 2, -1, -1)]
+    order = [*range(there), *range(there - 2, -1, -1)]
     clip, times = list(walk), np.arange(len(order)) / 15.0
     frames = [replace(clip[k], timestamp=float(t)) for k, t in zip(order, times, strict=True)]
     return frames, Trajectory(times, walk.groundtruth.poses_wc[order])

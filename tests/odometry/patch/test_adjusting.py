@@ -16,7 +16,7 @@ from tests.support.loop_walk import OPTIONS, SHORT, there_and_back, until
 
 @pytest.fixture(scope="module")
 def film():
-    return there_and_back()
+    return there_and_back(40)
 
 
 def kind(loops):

@@ -130,7 +130,7 @@ def test_the_traceback_of_an_unknown_error_holds_no_secret(repository):
     assert "rtsp://admin:Xq9@host'\n" not in done.stderr and "\x1b" not in done.stderr
 
 
-@pytest.mark.parametrize("start", ["x" * 10**6, "x " * 10**5, "a=" * 10**5, "aa:/" * 10**5, "'a:" * 10**5])
+@pytest.mark.parametrize("start", ["x" * 10**5, "x " * 10**5, "a=" * 10**5, "aa:/" * 10**5, "'a:" * 10**5])
 def test_long_texts_come_to_an_end(start):
     """Names and files may be of any length."""
     found = redacted(f"{start} rtsp://admin:Xq9@camera/live")

@@ -185,4 +185,11 @@ def rows(plan: Plan, image_folder: Path, fake_odometry, systems, boom) -> list[R
     return score_all(plan.out, read_manifest(plan.out))
 
 
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports have empty figures: drawing them takes most of the time."""
+    for name in ("plot_axis", "plot_sequence", "plot_speed"):
+        monkeypatch.setattr(f"eval.reporting.report.{name}", lambda *_: "<svg></svg>")
+
+
 __all__ = ["dark", "film", "path", "rendered"]

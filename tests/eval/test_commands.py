@@ -14,7 +14,7 @@ from eval.__main__ import main
 pytest.importorskip("evo", reason="evo is in the extra 'eval'")
 
 
-def test_short_form_is_run(tmp_path, image_folder, suite_file, capsys):
+def test_short_form_is_run(tmp_path, image_folder, suite_file, capsys, no_figures):
     out = tmp_path / "results"
     options = ["--suite", str(suite_file), "--data", str(tmp_path), "--out", str(out), "--systems", "null"]
     assert main([*options, "--threads", "1"]) == 0

@@ -106,7 +106,9 @@ def test_vlad_tells_textures_apart_wherever_they_are():
 
 
 def test_orb_words_and_their_file(tmp_path):
-    images = [make_sequence(seed, frames=1, height=120, width=160, family="room").frame(0).image for seed in range(3)]
+    images = [
+        make_sequence(seed, frames=1, height=120, width=160, family="corridor").frame(0).image for seed in range(3)
+    ]
     rng = np.random.default_rng(0)
     vocabulary = train([rng.integers(0, 256, (60, 32)).astype(np.uint8) for _ in range(4)], 4, 2, 0)
     write_vocabulary(tmp_path / "words.txt", vocabulary)

@@ -77,7 +77,7 @@ def test_system_that_does_not_tell_of_its_loops(plan: Plan, rows: list[Row]) -> 
     assert loop_table(manifest, [on]) == ""
 
 
-def test_file_and_page(plan: Plan, rows: list[Row]) -> None:
+def test_file_and_page(plan: Plan, rows: list[Row], no_figures: None) -> None:
     manifest = read_manifest(plan.out)
     write_tables(plan.out, manifest, rows)
     assert not (plan.out / "loops.md").exists()

@@ -70,7 +70,7 @@ def page(plan, rows) -> str:
     return write_report(plan.out, manifest, rows).read_text(encoding="utf-8")
 
 
-def test_page_is_whole_needs_nothing_else_and_shows_every_system(page):
+def test_page_is_whole_needs_nothing_else_and_shows_every_system(plan, page, tmp_path, capsys):
     outline = Outline()
     outline.feed(page)
     assert not outline.open
@@ -90,9 +90,7 @@ def test_page_is_whole_needs_nothing_else_and_shows_every_system(page):
     assert "8 of 20 frames have a pose" in text and "needs a thing" in text
     assert "null is the zero line" in text and "alignment" in text and "made for a test" in text
 
-
-def test_report_from_the_folder_alone(plan, rows, page, tmp_path, capsys):
-    """Neither images nor ground truth are looked for: everything lies in the folder, and may be moved."""
+    # It is made again from the folder alone: neither images nor ground truth are looked for, and it may be moved.
     (tmp_path / "clip").rename(tmp_path / "gone")
     moved = plan.out.rename(tmp_path / "moved")
     assert main(["report", str(moved)]) == 0
@@ -186,7 +184,7 @@ def test_curves_break_where_there_are_no_frames():
     assert len(with_breaks(curve[:1])) == 1 and len(with_breaks(curve[:0])) == 0
 
 
-def test_tables_and_page_tell_segments_and_false_poses(plan, rows):
+def test_tables_and_page_tell_segments_and_false_poses(plan, rows, no_figures):
     manifest, suite = read_manifest(plan.out), plan.suites[0]
     plain = [replace(row, unseen=0, false_poses=math.nan) for row in rows]
     titles = markdown(manifest, suite, plain).splitlines()[2]

@@ -269,6 +269,10 @@ def _taken_back(
     for at in range(len(path) - 2, -1, -2):
         arguments: tuple[Any, ...] = (path[at], path[at + 1], *measured, *constants, *sums)
         take_back_step(*arguments)
+    # Poses are unit quaternions: what would change their length has no meaning, and the kernel does not compute it.
+    q, d_q = path[0][..., 3:].astype(np.float64), sums[0][..., 3:]
+    square = np.maximum((q * q).sum(-1, keepdims=True), 1e-12)
+    d_q -= q * ((q * d_q).sum(-1, keepdims=True) / square)
     return [torch.from_numpy(x).float() for x in sums]
 
 

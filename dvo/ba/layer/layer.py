@@ -58,8 +58,8 @@ def bundle_adjust(
     """Refine poses and inverse depths so that the patches project onto their targets.
 
     Gradients flow to poses, patches, intrinsics, targets, weights and the parameters of the factors, through all
-    iterations, and may be differentiated again (``create_graph``); kernel weights are constants of every derivative. What
-    a gradient by poses says of the length of a quaternion means nothing, as they are unit quaternions.
+    iterations, and may be differentiated again (``create_graph``); kernel weights are constants of every derivative.
+    What a gradient by poses says of the length of a quaternion means nothing, as they are unit quaternions.
     ``torch.func`` (grad, vjp, jacrev, jvp, jacfwd, hessian, vmap) works: a vmap is a loop over its elements. A
     backward pass raises if indices or tensors have been changed in place since.
 

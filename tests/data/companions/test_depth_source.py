@@ -36,11 +36,11 @@ def test_by_the_numbers_in_the_names_in_any_unit(make):
 def test_paths_beside_the_source(make):
     """Looked up from the working directory, then from the folder of the source, as those of the other options."""
     source = images(make)
-    depth_image(make, "seq/d/1.png", 1, 1000)
+    depth_image(make, "seq/beside-the-source/1.png", 1, 1000)
     make.calib("seq/depth.txt")
-    found = with_depth(source, "../d", calib="../depth.txt")
+    found = with_depth(source, "../beside-the-source", calib="../depth.txt")
     assert depths(found) == [1, None, None] and found.reading.depth_calibration is not None
-    for given in ({"depth": "d"}, {"calib": "depth.txt"}):
+    for given in ({"depth": "beside-the-source"}, {"calib": "depth.txt"}):
         with pytest.raises(DvoError, match="no such file") as caught:
             with_depth(source, **given)
         assert caught.value.field == {"depth": "depth", "calib": "depth-calib"}[next(iter(given))]

@@ -19,6 +19,7 @@ TASKS = Registry(
         "tartanvo": "train.tasks.tartanvo.task:TartanVOTask",
         "droid": "train.tasks.droid.task:DroidTask",
         "selfsup": "train.tasks.selfsup.task:SelfSupervisedTask",
+        "distil": "train.tasks.distil.task:DistilTask",
     },
 )
 """Task name to ``"module:Class"`` of a :class:`train.tasks.task.Task`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings, shown
@@ -40,6 +40,7 @@ class ModelConfig(Sizes):
         self_edges: join patches with their own frame too, as DPVO does.
         selection: of the patches, a name in :data:`dvo.nets.patch.selection.SELECTIONS`.
         update_operator: name in :data:`dvo.nets.update.update.UPDATE_OPERATORS`.
+        encoder: ``residual`` (DPVO's) or ``light``, see :mod:`dvo.nets.patch.encoder`.
 
     Raises:
         DvoError: a size of another type or out of :data:`RANGES`, or an even patch.
@@ -57,6 +58,7 @@ class ModelConfig(Sizes):
     self_edges: bool = True
     selection: str = field(default="random", compare=False)  # no size: a preset stays one
     update_operator: str = "gated"
+    encoder: Literal["residual", "light"] = "residual"
 
     STRIDE = 4  # image pixels to a feature pixel; feature (u, v) is centred on image pixel (4u, 4v)
 
@@ -116,6 +118,8 @@ PRESETS: dict[str, ModelConfig] = {
 
 # The small sizes with the state-space update operator.
 PRESETS["mamba"] = replace(PRESETS["small"], update_operator="mamba")
+# The small sizes with the encoder for slow machines.
+PRESETS["light"] = replace(PRESETS["small"], encoder="light")
 
 
 def preset(name: str) -> ModelConfig:

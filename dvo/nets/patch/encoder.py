@@ -1,10 +1,16 @@
-"""Convolutional encoder at a quarter of the image resolution (DPVO 3.1; layers and names as its ``BasicEncoder4``)."""
+"""Convolutional encoders at a quarter of the image resolution: that of DPVO (3.1; layers and names as its
+``BasicEncoder4``), and a light one for tracking on a CPU."""
 
 from __future__ import annotations
 
+from typing import Literal
+
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+_NOISE = 1e-4  # variance of an image that is no contrast, in units of normalised images (about a grey level)
 
 
 def _norm(channels: int, kind: str) -> nn.Module:
@@ -44,42 +50,13 @@ class ResidualBlock(nn.Module):
         return F.relu(self.downsample(x) + y)
 
 
-class Encoder(nn.Module):
-    """Image to features of stride 4.
+class _StrideFour(nn.Module):
+    """Last layer of an encoder of stride 4, a 1x1 convolution behind :meth:`trunk`."""
 
-    All convolutions are centred, so feature ``(u, v)`` is centred on image pixel ``(4u, 4v)`` and the intrinsics of
-    the feature map are exactly those of the image divided by 4.
-
-    Args:
-        stem, trunk: channels at 1/2 and 1/4 of the image resolution.
-        outputs: channels of the features.
-        norm: see :class:`ResidualBlock`.
-    """
-
-    def __init__(self, stem: int, trunk: int, outputs: int, norm: str) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(3, stem, 7, stride=2, padding=3)
-        self.norm1 = _norm(stem, norm)
-        self.layer1 = nn.Sequential(ResidualBlock(stem, stem, 1, norm), ResidualBlock(stem, stem, 1, norm))
-        self.layer2 = nn.Sequential(ResidualBlock(stem, trunk, 2, norm), ResidualBlock(trunk, trunk, 1, norm))
-        self.conv2 = nn.Conv2d(trunk, outputs, 1)
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-
-    def stem(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n s H2 W2"]:
-        """Layers at half of the image resolution.
-
-        Args:
-            images: normalised images.
-
-        Returns:
-            Stem features, centred on image pixels ``(2u, 2v)``.
-        """
-        return self.layer1(F.relu(self.norm1(self.conv1(images))))
+    conv2: nn.Conv2d
 
     def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
-        """All layers but the last one, a 1x1 convolution that :meth:`head` allows to evaluate at single pixels.
+        """All layers but the last one, which :meth:`head` allows to evaluate at single pixels.
 
         Args:
             images: normalised images.
@@ -87,7 +64,7 @@ class Encoder(nn.Module):
         Returns:
             Trunk features at a quarter of the image resolution.
         """
-        return self.layer2(self.stem(images))
+        raise NotImplementedError
 
     def head(self, outputs: slice) -> tuple[Tensor, Tensor]:
         """Parameters of some output channels of the last layer.
@@ -111,3 +88,117 @@ class Encoder(nn.Module):
             Features at a quarter of the image resolution.
         """
         return self.conv2(self.trunk(images))
+
+    def _draw(self, mode: Literal["fan_in", "fan_out"]) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode=mode, nonlinearity="relu")
+
+
+class Encoder(_StrideFour):
+    """Image to features of stride 4.
+
+    All convolutions are centred, so feature ``(u, v)`` is centred on image pixel ``(4u, 4v)`` and the intrinsics of
+    the feature map are exactly those of the image divided by 4.
+
+    Args:
+        stem, trunk: channels at 1/2 and 1/4 of the image resolution.
+        outputs: channels of the features.
+        norm: see :class:`ResidualBlock`.
+    """
+
+    def __init__(self, stem: int, trunk: int, outputs: int, norm: str) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, stem, 7, stride=2, padding=3)
+        self.norm1 = _norm(stem, norm)
+        self.layer1 = nn.Sequential(ResidualBlock(stem, stem, 1, norm), ResidualBlock(stem, stem, 1, norm))
+        self.layer2 = nn.Sequential(ResidualBlock(stem, trunk, 2, norm), ResidualBlock(trunk, trunk, 1, norm))
+        self.conv2 = nn.Conv2d(trunk, outputs, 1)
+        self._draw("fan_out")
+
+    def stem(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n s H2 W2"]:
+        """Layers at half of the image resolution.
+
+        Args:
+            images: normalised images.
+
+        Returns:
+            Stem features, centred on image pixels ``(2u, 2v)``.
+        """
+        return self.layer1(F.relu(self.norm1(self.conv1(images))))
+
+    def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
+        """See :meth:`_StrideFour.trunk`."""
+        return self.layer2(self.stem(images))
+
+
+def standardise_whole(images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 3 H W"]:
+    """Give each image the mean 0 and the deviation 1, over all of its pixels and colours.
+
+    Args:
+        images: normalised images. An image of one value becomes 0; noise below a grey level is not raised to 1.
+    """
+    mean = images.mean((1, 2, 3), keepdim=True)
+    centred = images - mean
+    variance = centred.square().mean((1, 2, 3), keepdim=True)
+    return centred * torch.rsqrt(variance + _NOISE)
+
+
+class WideBlock(nn.Module):
+    """Depthwise 5x5 convolution, two 1x1 convolutions with twice the channels between them, and a skip (ConvNeXt's
+    order; nothing is normalised).
+
+    Args:
+        channels: of input and output.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.around = nn.Conv2d(channels, channels, 5, padding=2, groups=channels)
+        self.widen = nn.Conv2d(channels, 2 * channels, 1)
+        self.narrow = nn.Conv2d(2 * channels, channels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the block.
+
+        Args:
+            x: ``(n, channels, h, w)``.
+
+        Returns:
+            The same shape.
+        """
+        return x + self.narrow(F.relu(self.widen(self.around(x))))
+
+
+class LightEncoder(_StrideFour):
+    """Image to features of stride 4 by few layers, most of them at a quarter of the resolution and none normalised.
+
+    Centred as :class:`Encoder`. A feature sees 57 pixels a side of the image, there 51.
+
+    Args:
+        stem, trunk: channels at 1/2 and 1/4 of the image resolution.
+        outputs: channels of the features.
+        norm: ``"instance"`` for images standardised as a whole, anything else for images as they are.
+    """
+
+    def __init__(self, stem: int, trunk: int, outputs: int, norm: str) -> None:
+        super().__init__()
+        self.standardised = norm == "instance"
+        self.conv1 = nn.Conv2d(3, stem, 5, stride=2, padding=2)
+        self.down = nn.Conv2d(stem, trunk, 3, stride=2, padding=1)
+        blocks = [WideBlock(trunk) for _ in range(3)]
+        self.blocks = nn.Sequential(*blocks)
+        self.conv2 = nn.Conv2d(trunk, outputs, 1)
+        self._draw("fan_in")
+        for block in blocks:  # nothing is normalised: blocks that begin as the identity keep the scale
+            nn.init.zeros_(block.narrow.weight)
+            if block.narrow.bias is not None:
+                nn.init.zeros_(block.narrow.bias)
+
+    def stem(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n s H2 W2"]:
+        """Layer at half of the image resolution, see :meth:`Encoder.stem`."""
+        return F.relu(self.conv1(standardise_whole(images) if self.standardised else images))
+
+    def trunk(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n t h w"]:
+        """See :meth:`_StrideFour.trunk`."""
+        return self.blocks(F.relu(self.down(self.stem(images))))

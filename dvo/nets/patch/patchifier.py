@@ -10,7 +10,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from dvo.nets.patch.config import ModelConfig
-from dvo.nets.patch.encoder import Encoder
+from dvo.nets.patch.encoder import Encoder, LightEncoder
+
+ENCODERS: dict[str, type[Encoder] | type[LightEncoder]] = {"residual": Encoder, "light": LightEncoder}
+"""Encoders by their names in :class:`dvo.nets.patch.config.ModelConfig`."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +76,11 @@ class Patchifier(nn.Module):
         super().__init__()
         self.config = config
         extra = config.hidden_channels if config.shared_encoder else 0
+        encoder = ENCODERS[config.encoder]
         sizes = (config.stem_channels, config.trunk_channels)
-        self.fnet = Encoder(*sizes, config.feature_channels + extra, "instance")
+        self.fnet = encoder(*sizes, config.feature_channels + extra, "instance")
         if not config.shared_encoder:
-            self.inet = Encoder(*sizes, config.hidden_channels, "none")
+            self.inet = encoder(*sizes, config.hidden_channels, "none")
 
     def encode(self, images: Float[Tensor, "B N 3 H W"]) -> Features:
         """Encode normalised images; matching features are divided by 4 as in DPVO.

@@ -63,6 +63,7 @@ class PatchVOTask(Task):
     """
 
     data_type = Renderings
+    starts_from = ("distil",)
 
     def __init__(
         self,

@@ -1,0 +1,108 @@
+"""Encoders of the patch-flow network: centring, reach, standardised images, sizes and weights of the light one."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from dvo.core.errors import DvoError
+from dvo.models.patch_vo import PatchVO
+from dvo.models.weights import load_weights, save_weights
+from dvo.nets.patch.config import ModelConfig, preset
+from dvo.nets.patch.encoder import Encoder, LightEncoder, standardise_whole
+from dvo.nets.patch.patchifier import ENCODERS
+
+SIZE, PLACE = (160, 192), (20, 24)
+
+
+def influence(encoder, part):
+    """Rows and columns of the image that a feature in the middle depends on, with the weights made positive."""
+    with torch.no_grad():
+        for parameter in encoder.parameters():
+            parameter.abs_().add_(0.01)
+    images = torch.rand(1, 3, *SIZE, dtype=torch.float64, requires_grad=True)
+    row, column = PLACE
+    getattr(encoder.double(), part)(images)[0, :, row, column].sum().backward()
+    seen = images.grad[0].abs().sum(0) > 0
+    return [torch.nonzero(seen.any(axis))[:, 0] for axis in (1, 0)]
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+@pytest.mark.parametrize(("part", "stride"), [("stem", 2), ("trunk", 4)])
+def test_features_are_centred_on_multiples_of_the_stride(name, part, stride):
+    """What a feature depends on reaches equally far to all sides of its image pixel."""
+    for seen, place in zip(influence(ENCODERS[name](4, 8, 6, "none"), part), PLACE, strict=True):
+        assert seen[0] + seen[-1] == 2 * stride * place
+
+
+def test_the_light_encoder_sees_no_less_of_the_image():
+    rows, light = (influence(one(4, 8, 6, "none"), "trunk")[0] for one in (Encoder, LightEncoder))
+    assert len(light) == 57 and len(rows) == 51
+
+
+@pytest.mark.parametrize("norm", ["instance", "none"])
+@pytest.mark.parametrize("name", ENCODERS)
+@pytest.mark.parametrize("size", [(64, 48), (62, 50), (61, 51)])
+def test_sizes_of_the_maps(name, norm, size):
+    encoder = ENCODERS[name](4, 8, 6, norm).eval()
+    images = torch.randn(2, 3, *size)
+    h, w = (-(-side // 4) for side in size)
+    with torch.no_grad():
+        maps = encoder(images)
+        weight, bias = encoder.head(slice(2, 5))
+        part = torch.einsum("ct,nthw->nchw", weight, encoder.trunk(images)) + bias[:, None, None]
+    assert maps.shape == (2, 6, h, w)
+    torch.testing.assert_close(part, maps[:, 2:5], atol=1e-4, rtol=1e-4)
+
+
+def test_light_features_do_not_depend_on_brightness_and_contrast():
+    torch.manual_seed(0)
+    encoder, images = LightEncoder(4, 8, 6, "instance").eval(), torch.rand(1, 3, 48, 64)
+    with torch.no_grad():
+        torch.testing.assert_close(encoder(0.5 * images - 0.3), encoder(images), atol=1e-2, rtol=1e-2)
+        flat = encoder(torch.full((1, 3, 48, 64), 0.7))
+    assert torch.isfinite(flat).all()
+
+
+def test_standardised_images():
+    torch.manual_seed(0)
+    images = torch.randn(2, 3, 20, 30) * torch.tensor([2.0, 0.1])[:, None, None, None] + 0.4
+    found = standardise_whole(images)
+    torch.testing.assert_close(found.mean((1, 2, 3)), torch.zeros(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.std((1, 2, 3)), torch.ones(2), atol=1e-2, rtol=0)
+    assert (standardise_whole(torch.full((1, 3, 8, 8), 0.3)).abs() < 1e-3).all()
+    dark = standardise_whole(torch.rand(1, 3, 20, 30) * 1e-3)
+    assert dark.std() < 0.1
+
+
+# -- sizes and weights -------------------------------------------------------------------------------------------------
+
+
+def test_the_preset():
+    config = preset("light")
+    assert config == replace(preset("small"), encoder="light") != preset("small")
+    assert ModelConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    with pytest.raises(DvoError, match="encoder"):
+        ModelConfig(encoder="heavy")
+
+
+def test_weights_of_the_light_network(tmp_path):
+    torch.manual_seed(0)
+    model = PatchVO(replace(preset("tiny"), encoder="light")).eval()
+    save_weights(tmp_path / "w.safetensors", model, {})
+    loaded = load_weights(tmp_path / "w.safetensors").model
+    images = torch.randint(0, 256, (1, 3, 48, 64), dtype=torch.uint8)
+    with torch.no_grad():
+        for mine, theirs in zip(loaded.encoder(images), model.encoder(images), strict=True):
+            torch.testing.assert_close(mine, theirs, atol=5e-3, rtol=1e-2)  # the file holds half precision
+
+
+def test_sizes_that_name_no_encoder_are_of_the_residual_one(tmp_path):
+    model = PatchVO(preset("tiny"))
+    values = {name: value for name, value in model.config.to_dict().items() if name != "encoder"}
+    save_file(model.state_dict(), tmp_path / "old.safetensors", {"config": json.dumps(values), "card": "{}"})
+    loaded = load_weights(tmp_path / "old.safetensors")
+    assert loaded.preset == "tiny" and isinstance(loaded.model.patchify.fnet, Encoder)
+    assert load_weights("small").preset == "small"

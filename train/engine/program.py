@@ -101,7 +101,8 @@ class TrainingProgram(L.LightningModule):
         self._bad_in_a_row = 0
         self._bad = False
         self._last_good = LastGood()
-        self.provenance = Provenance()
+        origin = task.origin()
+        self.provenance = Provenance() if origin is None else Provenance.of_weights(origin)
         self.new_run = False
         self._clock = time.perf_counter()
         as_network(self.net)

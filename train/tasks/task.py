@@ -10,6 +10,7 @@ import lightning as L
 from torch import Tensor, nn
 
 from dvo.core.errors import DvoError
+from dvo.models.weights import LoadedWeights
 
 Batch = dict[str, Tensor]
 """Clips stacked along the first dimension of every tensor."""
@@ -85,6 +86,10 @@ class Task(Protocol):
         nothing but ``context.buffers`` may be changed here.
         """
         ...
+
+    def origin(self) -> LoadedWeights | None:
+        """Trained weights that :meth:`network` has taken parts of, for the record of what it was trained on."""
+        return None
 
     def accept_loss(self, context: StepContext, found: StepLoss) -> StepLoss:
         """Final loss, after every process has found the one of :meth:`compute_loss` finite.

@@ -54,7 +54,7 @@ def test_the_loss_falls_and_the_update_operator_is_held(tmp_path, runs, teacher)
 def test_the_teacher_itself_has_no_loss(runs, teacher):
     one = DistilTask("tiny", teacher)
     net = one.network()
-    net.load_state_dict(one._teacher_net.state_dict())
+    net.load_state_dict(one.origin().model.state_dict())
     found = one.compute_loss(StepContext(net, 0, {}), runs.batch(0, 1, sizes=[(48, 64)]))
     assert abs(found.loss) < 1e-5 and found.shown["agreement"] == 1
     assert set(found.shown) == {"matching_error", "context_error", "agreement"}
@@ -66,7 +66,7 @@ def test_the_supervised_task_goes_on_with_everything(tmp_path, runs, teacher):
     state = read_state(file)
     assert isinstance(task_of(state), DistilTask)
     start = start_of_task(Start(file, state=state), "patch_vo")
-    assert start.state is None and start.record is not None
+    assert start.state is None and start.record.facts()["started_from"]["name"] == "teacher"
     then = runs.module(model="light")
     then.start_from(start.weights)
     for name, value in one.average.state_dict().items():

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from dvo.core.errors import DvoError
 from dvo.models.patch_vo import PatchVO
-from dvo.models.weights import load_weights
+from dvo.models.weights import LoadedWeights, load_weights
 from dvo.nets.patch.config import preset
 from train.data.augment import Augmentation, augment
 from train.data.clips import Renderings
@@ -51,7 +51,7 @@ class DistilTask(Task):
         self.direction, self.augmentation = direction, augmentation
         if not 0 <= direction <= 1e6:
             raise DvoError(f"{direction} is not from 0 to 1e6", field="model.direction", remedy="give 0 for none")
-        self._teacher_net: PatchVO | None = None
+        self._teacher: LoadedWeights | None = None
 
     def network(self) -> nn.Module:
         """New network with the teacher's parts, all but the encoder held; its last layer begins as the teacher's.
@@ -59,7 +59,8 @@ class DistilTask(Task):
         Raises:
             DvoError: a teacher of another architecture or of other sizes.
         """
-        net, teacher = PatchVO(preset(self.model)), load_weights(self.teacher).model
+        net, self._teacher = PatchVO(preset(self.model)), load_weights(self.teacher)
+        teacher = self._teacher.model
         if not isinstance(teacher, PatchVO):
             remedy = "give weights of the network 'patch_vo', such as small"
             raise DvoError("holds another network", file=self.teacher, field="model.teacher", remedy=remedy)
@@ -70,8 +71,12 @@ class DistilTask(Task):
             last = getattr(teacher.patchify, name).conv2
             if encoder.conv2.weight.shape == last.weight.shape:
                 encoder.conv2.load_state_dict(last.state_dict())
-        self._teacher_net = teacher.requires_grad_(False)
+        teacher.requires_grad_(False)
         return net
+
+    def origin(self) -> LoadedWeights | None:
+        """The teacher."""
+        return self._teacher
 
     def _check_sizes(self, net: PatchVO, teacher: PatchVO) -> None:
         """Check that the maps and the update operators of two networks have the same sizes."""
@@ -91,8 +96,8 @@ class DistilTask(Task):
 
     def compute_loss(self, context: StepContext, batch: Batch) -> StepLoss:
         """Difference of the maps of all frames from the teacher's."""
-        net, teacher = cast(PatchVO, context.net), self._teacher_net
-        assert teacher is not None
+        assert self._teacher is not None
+        net, teacher = cast(PatchVO, context.net), cast(PatchVO, self._teacher.model)
         if self.augmentation is not None:
             batch = augment(batch, self.augmentation, self.seed, context.step)
         images = batch["images"].flatten(0, 1)

@@ -193,7 +193,9 @@ def videos(given: Setting) -> Iterator[Row]:
         def measure(seconds: float) -> Row:
             weights = load_weights("small", given.device)
             trackers = [_build(weights, given, seed, {}) for seed in range(count)]
-            return _speed("videos", f"{count} at once", frames, trackers, seconds, given)
+            # Many take long over a frame: half of the frames, so that the timed ones are reached.
+            few = frames if count == 1 else frames[: len(frames) // 2]
+            return _speed("videos", f"{count} at once", few, trackers, seconds, given)
 
         return measure
 

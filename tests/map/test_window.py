@@ -5,7 +5,8 @@ import torch
 from dvo.geometry import se3
 from dvo.map.window import Keyframe, Window
 from dvo.nets.patch.patchifier import patch_coordinates
-from dvo.odometry.window.motion import flow_magnitude, parallax, predict_pose
+from dvo.odometry.patch.initial_pose import predict_pose
+from dvo.odometry.window.motion import flow_magnitude, parallax
 
 
 def window(count=4, m=2):

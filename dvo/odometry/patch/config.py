@@ -113,8 +113,7 @@ class TrackerConfig:
             below this.
         network_motion: mean flow since the last frame that the network has measured, in feature pixels, up to which a
             frame is aligned with the keyframes instead (:mod:`dvo.odometry.window.frame_alignment`), but not above half
-            of ``keyframe_motion``; 0: the network measures every frame, which is more exact by a few hundredths of a
-            percent. Without an alignment (``align``) it does too.
+            of ``keyframe_motion``; 0: the network measures every frame. Without an alignment (``align``) it does too.
         keyframe_index: position of the keyframe that this test is applied to, counted from the newest.
         motion_damping: factor of the last motion in the prediction of the next pose, in [0, 1].
         initial_pose: see :data:`InitialPose` (:mod:`dvo.odometry.patch.initial_pose`).
@@ -168,7 +167,7 @@ class TrackerConfig:
     initial_parallax: float = 1.0
     initial_inliers: float = 0.1
     keyframe_motion: float = 5.0
-    network_motion: float = 0.0
+    network_motion: float = 0.8
     keyframe_index: int = 4
     motion_damping: float = 0.5
     initial_pose: InitialPose = "motion"
@@ -274,6 +273,7 @@ TRACKER_PRESETS: dict[str, TrackerConfig] = {
         initial_updates=12,
         initial_motion=2.0,
         keyframe_motion=15.0,
+        network_motion=0.0,
     ),  # fmt: skip
 }
 
@@ -287,7 +287,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "optimisation": 7,
         "network_motion": 2.5,
     },
-    "accurate": {"pixels": 448 * 336, "patches": 48, "updates": 2, "align_slope": 0.03},
+    "accurate": {"pixels": 448 * 336, "patches": 48, "updates": 2, "align_slope": 0.03, "network_motion": 0.0},
 }
 """Settings that trade accuracy for speed, on top of those of the weights; ``dvo.load("small", preset="fast")``."""
 

@@ -15,12 +15,12 @@ from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.solve import solve
 from dvo.ba.sparse.global_adjust import GlobalBAOptions
 from dvo.ba.sparse.levenberg import LMOptions
+from dvo.geometry import se3
 from dvo.geometry.projection import reproject
 from dvo.map.window import Window
 from dvo.models.step import recent_depth
 from dvo.odometry.frames.front_end import Observation
 from dvo.odometry.patch.config import InitialPose, TrackerConfig
-from dvo.odometry.window.motion import predict_pose
 
 AGREEMENT = 2.0
 """Distance of a match from its reprojection up to which it agrees with a pose, feature pixels."""
@@ -50,6 +50,28 @@ def first_pose(window: Window, seen: Observation, time: float, config: TrackerCo
     times = [frame.timestamp for frame in window.frames[own:]]
     predicted = predict_pose(window.poses_cw[own:], times, time, config.motion_damping)
     return initial_pose(window, seen, predicted, config.initial_pose) if initialised else predicted
+
+
+def predict_pose(poses_cw: Tensor, times: list[float], time: float, damping: float) -> Tensor:
+    """Damped constant velocity: ``Exp(damping * dt / dt_last * Log(P1 P2^-1)) P1`` (motion model of DPVO).
+
+    Args:
+        poses_cw: ``(n, 7)`` poses ``T_cw`` of the window, the newest last.
+        times: their timestamps, seconds.
+        time: timestamp of the new frame, seconds.
+        damping: factor of the velocity, in [0, 1].
+
+    Returns:
+        ``(7,)`` predicted ``T_cw``: the identity without poses, the last pose with one.
+    """
+    if len(times) == 0:
+        return se3.identity(device=poses_cw.device)
+    if len(times) == 1:
+        return poses_cw[-1]
+    # Bounded, because a dropped keyframe or a gap in the video would extrapolate too far.
+    ratio = min(2.0, max(0.0, (time - times[-1]) / (times[-1] - times[-2])))
+    step = se3.log(se3.relative(poses_cw[-2], poses_cw[-1]))
+    return se3.retract(poses_cw[-1], damping * ratio * step)
 
 
 def first_depth(window: Window, config: TrackerConfig, initialised: bool, measured: Tensor | None = None) -> Tensor:

@@ -99,7 +99,7 @@ class FrameAlignment:
     Args:
         window: keyframes and their images.
         options: of the sub-pixel alignment.
-        damping: of the motion model, see :func:`dvo.odometry.window.motion.predict_pose`.
+        damping: of the motion model, see :func:`dvo.odometry.patch.initial_pose.predict_pose`.
 
     Attributes:
         age: frames that were aligned since the network has measured one.
@@ -420,7 +420,7 @@ def _look(grey: np.ndarray) -> np.ndarray:
 
 
 def _predicted(last: list[_Seen], time: float, damping: float) -> np.ndarray:
-    """Pose ``(4, 4)`` of a frame by the motion model, see :func:`dvo.odometry.window.motion.predict_pose`."""
+    """Pose ``(4, 4)`` of a frame by the motion model, see :func:`dvo.odometry.patch.initial_pose.predict_pose`."""
     newest = last[-1]
     if len(last) == 1:
         return newest.matrix

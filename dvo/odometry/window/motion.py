@@ -1,4 +1,4 @@
-"""Motion of the window: prediction of the next pose, parallax and flow between frames."""
+"""Motion of the window: parallax and flow between frames."""
 
 from __future__ import annotations
 
@@ -13,28 +13,6 @@ from dvo.map.window import Window
 
 LONGEST = 1e3
 """Flow of a patch at most, in the mean flow of a frame pair, feature pixels."""
-
-
-def predict_pose(poses_cw: Tensor, times: list[float], time: float, damping: float) -> Tensor:
-    """Damped constant velocity: ``Exp(damping * dt / dt_last * Log(P1 P2^-1)) P1`` (motion model of DPVO).
-
-    Args:
-        poses_cw: ``(n, 7)`` poses ``T_cw`` of the window, the newest last.
-        times: their timestamps, seconds.
-        time: timestamp of the new frame, seconds.
-        damping: factor of the velocity, in [0, 1].
-
-    Returns:
-        ``(7,)`` predicted ``T_cw``: the identity without poses, the last pose with one.
-    """
-    if len(times) == 0:
-        return se3.identity(device=poses_cw.device)
-    if len(times) == 1:
-        return poses_cw[-1]
-    # Bounded, because a dropped keyframe or a gap in the video would extrapolate too far.
-    ratio = min(2.0, max(0.0, (time - times[-1]) / (times[-1] - times[-2])))
-    step = se3.log(se3.relative(poses_cw[-2], poses_cw[-1]))
-    return se3.retract(poses_cw[-1], damping * ratio * step)
 
 
 def _displacement(window: Window, i: int, j: int, rotation: bool) -> tuple[Tensor, Tensor]:

@@ -99,3 +99,29 @@ def test_without_a_board(folder, tmp_path, capsys, monkeypatch, source, code):
     assert main(["calibrate", str(folder), "--seed", "4", "--out", str(out)]) == code
     assert "201 +-" in capsys.readouterr().out
     assert dvo.open(folder, calib=out / "calib.txt").camera.fx == 201
+
+
+def test_show_tells_how_a_file_is_read(tmp_path, capsys):
+    file = tmp_path / "c.yaml"
+    file.write_text(
+        "Camera.type: KannalaBrandt8\nCamera1.fx: 190.5\nCamera1.fy: 191\nCamera1.cx: 254\nCamera1.cy: 256\n"
+        "Camera1.k1: 0.003\nCamera1.k2: 0.0007\nCamera1.k3: -0.002\nCamera1.k4: 0.0002\nCamera.width: 512\n"
+        "Camera.height: 510\nCamera.fps: 20\nViewer.PointSize:2\n"
+    )
+    assert main(["calibrate", "--show", str(file)]) == 0
+    said = capsys.readouterr().out.splitlines()
+    rows = {line[:13].strip(): line[13:] for line in said}
+    assert rows["dialect"] == "yaml" and rows["model"] == "fisheye" and rows["size"] == "512x510"
+    assert rows["intrinsics"] == "fx 190.5  fy 191  cx 254  cy 256"
+    assert rows["coefficients"] == "k1 0.003  k2 0.0007  k3 -0.002  k4 0.0002"
+    assert "Camera.fps" in rows["ignored"] and "Viewer" in rows["ignored"] and "k1" not in rows["ignored"]
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_show_refuses_what_a_run_would_refuse(tmp_path, capsys):
+    file = tmp_path / "c.yaml"
+    file.write_text("fx: 500\nfy: 500\ncx: 320\ncy: 240\nlens_warp: [0.1, 0.2, 0, 0]\n")
+    assert main(["calibrate", "--show", str(file)]) == 2
+    assert "lens_warp may be lens distortion" in " ".join(capsys.readouterr().err.split())
+    assert main(["calibrate", str(tmp_path), "--show", str(file)]) == 2
+    assert main(["calibrate"]) == 2

@@ -19,10 +19,12 @@ from dvo.commands.camera import CALIBRATION
 from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, say_all, seed_everything, warn
 from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
+from dvo.data.calibration.read import read_calibration
 from dvo.data.files.output import replaced, write_text
 from dvo.data.images.reduction import MAX_PIXELS
 from dvo.data.source import Source
 from dvo.data.streams.capture import is_stream
+from dvo.geometry.lenses import LENSES
 from dvo.odometry.calibration.calibrate import calibrate as self_calibrate
 from dvo.odometry.calibration.camera_estimate import is_foreign
 from dvo.session import results
@@ -43,8 +45,13 @@ def calibrate(arguments: argparse.Namespace) -> int:
         Exit code: 0, or 1 if a scene without a board does not tell the focal length.
 
     Raises:
-        DvoError: invalid source or option, no board, too few views, or views that do not determine the focal length.
+        DvoError: invalid source or option, no board, too few views, views that do not determine the focal length, or a
+            calibration file to show that is not understood.
     """
+    if arguments.show is not None:
+        return _show(arguments)
+    if arguments.source is None:
+        raise DvoError("missing", field="SOURCE", remedy="give a video or a folder of images, or --show FILE")
     if is_stream(arguments.source):
         raise DvoError("a stream cannot be calibrated", file=arguments.source, remedy="record a clip, and give that")
     board = _board(arguments)
@@ -66,6 +73,34 @@ def calibrate(arguments: argparse.Namespace) -> int:
         if board is None:
             return _without_board(source, folder, arguments)
         return _with_board(source, board, options, folder)
+
+
+def _show(arguments: argparse.Namespace) -> int:
+    """Print how a calibration file is read."""
+    if arguments.source is not None:
+        remedy = "leave out one of them"
+        raise DvoError("shows a file and calibrates nothing", field="--show", remedy=remedy)
+    found = read_calibration(arguments.show)
+    lens = LENSES[found.model]
+    values = zip(lens.names, found.coefficients, strict=False)
+    rows = {
+        "file": str(found.file or arguments.show),
+        "dialect": found.dialect,
+        "model": found.model,
+        "intrinsics": f"fx {found.fx:.9g}  fy {found.fy:.9g}  cx {found.cx:.9g}  cy {found.cy:.9g}",
+        "coefficients": "  ".join(f"{name} {value:.9g}" for name, value in values) or "none",
+        "size": f"{found.width}x{found.height}" if found.width and found.height else "not stated",
+        "depth scale": None if found.depth_scale is None else f"{found.depth_scale:g}",
+        "baseline": None if found.baseline is None else f"{found.baseline:g} m",
+        "readout": f"{found.readout:g} s" if found.readout else None,
+        "ignored": ", ".join(found.ignored) or "nothing",
+    }
+    for name, row in rows.items():
+        if row is not None:
+            say(f"{name:<13}{row}")
+    for note in found.notes:
+        warn(note, "note")
+    return OK
 
 
 def _is_ours(file: Path) -> bool:

@@ -18,8 +18,10 @@ def add_calibrate(commands: Any) -> None:
         "calibrate", help="calibrate a camera from a video of a board, or of any scene", epilog=_CODES
     )
     parser.add_argument(
-        "source", metavar="SOURCE", help="video or folder of images of a board; without --board, of any scene"
-    )
+        "source", metavar="SOURCE", nargs="?",
+        help="video or folder of images of a board; without --board, of any scene",
+    )  # fmt: skip
+    parser.add_argument("--show", metavar="FILE", help="print how a calibration file is read, and do nothing else")
     boards = parser.add_mutually_exclusive_group()
     boards.add_argument(
         "--board", type=_grid, metavar="CxR", help="checkerboard with so many inner corners: 10x7 squares have 9x6"

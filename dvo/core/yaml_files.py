@@ -55,12 +55,13 @@ def is_shell_pipe(path: Path) -> bool:
         return False
 
 
-def read_text(file: Path, remedy: str = "fix the file") -> str:
-    """Read a text file in UTF-8, with a byte order mark or without, of :data:`MAX_BYTES` at most.
+def read_text(file: Path, remedy: str = "fix the file", limit: int = MAX_BYTES) -> str:
+    """Read a text file in UTF-8, with a byte order mark or without.
 
     Args:
         file: path.
         remedy: for messages.
+        limit: largest size, bytes.
 
     Raises:
         DvoError: no such file, a larger one, or another encoding.
@@ -69,11 +70,11 @@ def read_text(file: Path, remedy: str = "fix the file") -> str:
         raise DvoError("no such file", file=file, remedy=remedy)
     try:
         with file.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
+            data = stream.read(limit + 1)
     except OSError as error:
         raise DvoError(f"cannot be read ({error.strerror})", file=file, remedy="check the permissions") from error
-    if len(data) > MAX_BYTES:
-        raise DvoError(f"larger than {MAX_BYTES // 1024:,} kB", file=file, remedy=remedy)
+    if len(data) > limit:
+        raise DvoError(f"larger than {limit // 1024:,} kB", file=file, remedy=remedy)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -6,13 +6,13 @@ Pixel centres lie at integer coordinates: the first pixel covers [-0.5, 0.5].
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.geometry.lenses import LENSES, DistortionModel, magnification
 
-DistortionModel = Literal["none", "radtan", "fisheye"]
+__all__ = ["Camera", "DistortionModel"]
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,16 @@ class Camera:
     Attributes:
         fx, fy, cx, cy: intrinsics in pixels of a ``width`` x ``height`` image.
         width, height: image size in pixels.
-        model: ``none``, ``radtan`` (k1 k2 p1 p2 [k3], OpenCV order) or ``fisheye`` (Kannala-Brandt k1 k2 k3 k4).
+        model: ``none``, ``radtan`` (k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], OpenCV order), ``fisheye``
+            (Kannala-Brandt k1 k2 k3 k4), or another one of :mod:`dvo.geometry.lenses`.
         coefficients: distortion coefficients of that model.
         readout: seconds from the first to the last row of a rolling shutter, read from top to bottom: row r is read
             ``(r - (height - 1) / 2) readout / height`` seconds after the time of the frame, which is that of its middle
             row; 0 for a global shutter.
 
     Raises:
-        DvoError: intrinsics that cannot belong to an image of this size, or a readout outside of 0 to 1 s.
+        DvoError: intrinsics that cannot belong to an image of this size, coefficients that the model does not have, or
+            a readout outside of 0 to 1 s.
 
     Example:
         >>> camera = Camera(500.0, 500.0, 319.5, 239.5, 640, 480)
@@ -63,6 +65,7 @@ class Camera:
                 field="intrinsics",
                 remedy="give the calibration of this image size, or scale it",
             )
+        LENSES[self.model].check(self.coefficients, self.model)
         if not 0 <= self.readout <= 1:  # NaN fails too
             raise DvoError(
                 f"must be 0 to 1 s, got {self.readout:g}",
@@ -79,6 +82,12 @@ class Camera:
     def matrix(self) -> np.ndarray:
         """``(3, 3)`` float64 K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Focal lengths at the optical axis, pixels: fx and fy, of some fisheye models times a constant."""
+        factor = magnification(self.model, self.coefficients)
+        return self.fx * factor, self.fy * factor
 
     @property
     def is_distorted(self) -> bool:

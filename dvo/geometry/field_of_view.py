@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from dvo.geometry.camera import Camera
+from dvo.geometry.lenses import undistort_to_rays, widest_angle
 from dvo.geometry.undistort import undistort
 
 _SAMPLES = 96  # of the longer side of an image, to measure areas
 _WORTH_TELLING = 0.1  # share of the pixels
-_STEPS = 4096  # of the angle from the optical axis
 
 
 def viewing_angle(camera: Camera) -> tuple[float, float]:
@@ -77,7 +77,9 @@ def measure_cut(camera: Camera, pinhole: Camera) -> Cut:
     kept = (np.abs(x - (pinhole.width - 1) / 2) <= pinhole.width / 2) & (  # NaN fails too
         np.abs(y - (pinhole.height - 1) / 2) <= pinhole.height / 2
     )
-    return Cut(viewing_angle(camera), viewing_angle(pinhole), 1 - float(kept.mean()), pinhole.fx / camera.fx)
+    return Cut(
+        viewing_angle(camera), viewing_angle(pinhole), 1 - float(kept.mean()), pinhole.fx / camera.focal_lengths[0]
+    )
 
 
 def notice_of_cut(camera: Camera, pinhole: Camera) -> list[str]:
@@ -91,22 +93,18 @@ def notice_of_cut(camera: Camera, pinhole: Camera) -> list[str]:
         One sentence; none for a lens that is no fisheye and loses less than a tenth of its pixels.
     """
     cut = measure_cut(camera, pinhole)
-    if camera.model != "fisheye" and cut.share < _WORTH_TELLING:
+    is_fisheye = camera.model not in ("none", "radtan")
+    if not is_fisheye and cut.share < _WORTH_TELLING:
         return []
-    lens = "a fisheye" if camera.model == "fisheye" else "a wide lens"
+    lens = "a fisheye" if is_fisheye else "a wide lens"
     return [f"images of {lens} are undistorted to a pinhole camera: {cut}"]
 
 
 def _angle(camera: Camera, radius: float, direction: int) -> float:
     """Angle in radians from the axis at a distorted normalised radius, rightwards, downwards, leftwards or upwards."""
-    if camera.model == "fisheye":
-        theta = np.linspace(0, math.pi, _STEPS)
-        k1, k2, k3, k4 = np.pad(np.array(camera.coefficients, float), (0, 4 - len(camera.coefficients)))
-        t2 = theta * theta
-        bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        rising = np.append(np.diff(bent) > 0, False)
-        last = int(np.argmin(rising))  # beyond it the polynomial folds back
-        return float(np.interp(radius, bent[: last + 1], theta[: last + 1]))
     point = np.zeros(2)
     point[direction % 2] = radius if direction < 2 else -radius
-    return math.atan(float(np.linalg.norm(undistort(point, camera))))
+    ray = undistort_to_rays(point, camera.model, camera.coefficients)
+    if np.isfinite(ray).all():
+        return math.atan2(float(np.linalg.norm(ray[:2])), float(ray[2]))
+    return widest_angle(camera.model, camera.coefficients)

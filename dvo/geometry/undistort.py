@@ -1,11 +1,6 @@
 """Lens distortion: functions on points, and the resampling of images to a camera without distortion.
 
-Models (coordinates are normalised, ``x = X/Z``):
-
-* ``radtan``: OpenCV's radial-tangential, ``x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)``,
-  ``y' = y (...) + p1 (r^2 + 2 y^2) + 2 p2 x y``; coefficients ``k1 k2 p1 p2 [k3]`` (Brown 1966; OpenCV calib3d).
-* ``fisheye``: Kannala-Brandt 2006 as in ``cv2.fisheye``, ``theta' = theta (1 + k1 theta^2 + ... + k4 theta^8)`` with
-  ``theta = atan(r)``; coefficients ``k1 k2 k3 k4``.
+The models are those of :mod:`dvo.geometry.lenses`.
 """
 
 from __future__ import annotations
@@ -18,6 +13,16 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera
+from dvo.geometry.lenses import (
+    LENSES,
+    distort_plane,
+    distort_rays,
+    in_range_plane,
+    undistort_plane,
+    undistort_to_rays,
+)
+
+_FAR_OFF = -1e4  # pixels, outside of every image
 
 
 def needs_undistortion(camera: Camera) -> bool:
@@ -28,47 +33,7 @@ def needs_undistortion(camera: Camera) -> bool:
     Args:
         camera: with its model and coefficients.
     """
-    return camera.model == "fisheye" or camera.is_distorted
-
-
-def _padded(camera: Camera, count: int) -> np.ndarray:
-    coefficients = np.zeros(count)
-    coefficients[: len(camera.coefficients)] = camera.coefficients
-    return coefficients
-
-
-def _radtan(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Distorted points ``(..., 2)`` and the Jacobian ``(..., 2, 2)`` with respect to the ideal ones."""
-    k1, k2, p1, p2, k3 = _padded(camera, 5)
-    x, y = points[..., 0], points[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)  # d radial / d r2
-    distorted = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-    off_diagonal = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    jacobian = np.stack(
-        [
-            np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, off_diagonal], -1),
-            np.stack([off_diagonal, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], -1),
-        ],
-        axis=-2,
-    )
-    return distorted, jacobian
-
-
-def _kannala_brandt(theta: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Distorted angle and its derivative, for ideal angles of any shape (radians)."""
-    k1, k2, k3, k4 = _padded(camera, 4)
-    t2 = theta * theta
-    value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-    return value, slope
+    return camera.model not in ("none", "radtan") or camera.is_distorted
 
 
 def distort(points: np.ndarray, camera: Camera) -> np.ndarray:
@@ -84,11 +49,7 @@ def distort(points: np.ndarray, camera: Camera) -> np.ndarray:
     points = np.asarray(points, dtype=np.float64)
     if not needs_undistortion(camera):
         return points.copy()
-    if camera.model == "radtan":
-        return _radtan(points, camera)[0]
-    r = np.linalg.norm(points, axis=-1, keepdims=True)
-    distorted, _ = _kannala_brandt(np.arctan(r), camera)
-    return points * np.where(r > 1e-9, distorted / np.where(r > 1e-9, r, 1.0), 1.0)
+    return distort_plane(points, camera.model, camera.coefficients)
 
 
 def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.ndarray:
@@ -101,39 +62,40 @@ def undistort(points: np.ndarray, camera: Camera, iterations: int = 20) -> np.nd
 
     Returns:
         ``(..., 2)`` ideal normalised coordinates; NaN where no ideal point maps there (outside of the lens model's
-        range: beyond the radius at which the polynomial folds back, or at 90 degrees and more for ``fisheye``).
+        range: beyond the radius at which it folds back, or at 90 degrees and more of a fisheye).
     """
     points = np.asarray(points, dtype=np.float64)
     if not needs_undistortion(camera):
         return points.copy()
-    if camera.model == "fisheye":
-        radius = np.linalg.norm(points, axis=-1)
-        theta = radius.copy()
-        for _ in range(iterations):
-            value, slope = _kannala_brandt(theta, camera)
-            step = (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1e-6)
-            theta = theta - np.clip(step, -0.3, 0.3)  # short steps stay on the first, rising branch
-        value, slope = _kannala_brandt(theta, camera)
-        found = (np.abs(value - radius) < 1e-9) & (slope > 0) & (theta >= 0) & (theta < math.pi / 2 - 1e-6)
-        ratio = np.where(radius > 1e-9, np.tan(np.where(found, theta, 0.0)) / np.where(radius > 1e-9, radius, 1.0), 1.0)
-        return np.where(found[..., None], points * ratio[..., None], np.nan)
-    ideal = points.copy()
-    for _ in range(iterations):
-        value, jacobian = _radtan(ideal, camera)
-        residual = value - points
-        determinant = np.linalg.det(jacobian)
-        safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
-        step = np.stack(
-            [
-                jacobian[..., 1, 1] * residual[..., 0] - jacobian[..., 0, 1] * residual[..., 1],
-                jacobian[..., 0, 0] * residual[..., 1] - jacobian[..., 1, 0] * residual[..., 0],
-            ],
-            axis=-1,
-        )
-        ideal = ideal - np.clip(step / safe[..., None], -0.3, 0.3)
-    value, jacobian = _radtan(ideal, camera)
-    found = (np.abs(value - points).max(axis=-1) < 1e-9) & in_range(ideal, camera)
-    return np.where(found[..., None], ideal, np.nan)
+    return undistort_plane(points, camera.model, camera.coefficients, iterations)
+
+
+def project(rays: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels of rays.
+
+    Args:
+        rays: ``(..., 3)`` of any length, x right, y down, z forward; those behind a wide lens too.
+        camera: camera with its model and coefficients.
+
+    Returns:
+        ``(..., 2)`` float64 pixels, inside of the image or not; NaN for rays outside of the range of the lens model.
+    """
+    distorted = distort_rays(rays, camera.model, camera.coefficients)
+    return distorted * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def unproject(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Rays of pixels, the inverse of :func:`project`.
+
+    Args:
+        pixels: ``(..., 2)``.
+        camera: camera with its model and coefficients.
+
+    Returns:
+        ``(..., 3)`` float64 unit rays, those behind a wide lens too; NaN where no ray maps there.
+    """
+    points = (np.asarray(pixels, dtype=np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return undistort_to_rays(points, camera.model, camera.coefficients)
 
 
 def in_range(points: np.ndarray, camera: Camera) -> np.ndarray:
@@ -148,16 +110,12 @@ def in_range(points: np.ndarray, camera: Camera) -> np.ndarray:
     Returns:
         ``(...)`` bool, True where the distorted radius grows all the way from the centre to the point.
     """
-    r = np.linalg.norm(points, axis=-1)[..., None] * np.linspace(0, 1, 17)
-    if camera.model == "fisheye":
-        return np.asarray((_kannala_brandt(np.arctan(r), camera)[1] > 0).all(axis=-1))
-    k1, k2, _, _, k3 = _padded(camera, 5)
-    r2 = r * r
-    return np.asarray((1 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3)) > 0).all(axis=-1))
+    return in_range_plane(np.asarray(points, dtype=np.float64), camera.model, camera.coefficients)
 
 
 def _scaled(camera: Camera, scale: float) -> Camera:
-    return replace(camera, fx=camera.fx * scale, fy=camera.fy * scale, model="none", coefficients=())
+    fx, fy = camera.focal_lengths
+    return replace(camera, fx=fx * scale, fy=fy * scale, model="none", coefficients=())
 
 
 def _rows_per_row(camera: Camera, target: Camera) -> float:
@@ -226,7 +184,7 @@ def _widest(camera: Camera) -> Camera:
         raise DvoError(
             f"these {camera.model} coefficients fold the {camera.width}x{camera.height} image over itself",
             field="distortion",
-            remedy="check the order (k1 k2 p1 p2 k3), the model (radtan or fisheye) and the focal length",
+            remedy="check the order (radtan: k1 k2 p1 p2 k3), the lens model and the focal length",
         )
     while high - low > 1e-4:
         middle = (low + high) / 2
@@ -267,14 +225,19 @@ class Undistorter:
     def _make_maps(self, kind: int) -> tuple[np.ndarray, np.ndarray]:
         import cv2
 
-        size = (self.source.width, self.source.height)
-        if self.source.model == "fisheye":
-            return cv2.fisheye.initUndistortRectifyMap(
-                self.source.matrix, _padded(self.source, 4), np.eye(3), self.camera.matrix, size, kind
-            )
-        return cv2.initUndistortRectifyMap(
-            self.source.matrix, _padded(self.source, 5), np.eye(3), self.camera.matrix, size, kind
-        )
+        source, new, size = self.source, self.camera, (self.source.width, self.source.height)
+        k = LENSES[source.model].padded(source.coefficients)
+        if source.model == "fisheye":
+            return cv2.fisheye.initUndistortRectifyMap(source.matrix, k, np.eye(3), new.matrix, size, kind)
+        if source.model == "radtan":
+            used = next(count for count in (5, 8, 12) if not k[count:].any())
+            return cv2.initUndistortRectifyMap(source.matrix, k[:used], np.eye(3), new.matrix, size, kind)
+        u, v = np.meshgrid(np.arange(float(new.width)), np.arange(float(new.height)))
+        ideal = np.stack([(u - new.cx) / new.fx, (v - new.cy) / new.fy], axis=-1)
+        real = distort(ideal, source) * [source.fx, source.fy] + [source.cx, source.cy]
+        real = np.where(in_range(ideal, source)[..., None], real, _FAR_OFF).clip(_FAR_OFF, -_FAR_OFF)
+        x, y = np.ascontiguousarray(np.moveaxis(real.astype(np.float32), -1, 0))
+        return (x, y) if kind == cv2.CV_32FC1 else cv2.convertMaps(x, y, kind)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Resample an image of ``source`` to the image of ``camera``, bilinearly.

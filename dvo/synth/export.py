@@ -120,8 +120,8 @@ def export_sequence(
 
 
 def write_calibration(camera: Camera, out: Path, baseline: float = 0.0) -> None:
-    """Write ``calib.txt``, or ``calib.yaml`` for what only that can state: a fisheye model, a rolling shutter, a
-    stereo pair.
+    """Write ``calib.txt``, or ``calib.yaml`` for what only that can state: a fisheye or another wide model, more than
+    five coefficients, a rolling shutter, a stereo pair.
 
     Args:
         camera: of the images.
@@ -131,7 +131,8 @@ def write_calibration(camera: Camera, out: Path, baseline: float = 0.0) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    if camera.model == "fisheye" or camera.readout > 0 or baseline > 0:
+    of_text = camera.model in ("none", "radtan") and len(camera.coefficients) <= 5
+    if not of_text or camera.readout > 0 or baseline > 0:
         rows = {name: f"{value:.9f}" for name, value in zip(("fx", "fy", "cx", "cy"), camera.intrinsics, strict=True)}
         rows |= {"width": str(camera.width), "height": str(camera.height), "model": camera.model}
         rows |= {"coefficients": str(list(camera.coefficients)), "readout": f"{camera.readout:.9f}"}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.geometry.camera import Camera, DistortionModel
+from dvo.geometry.lenses import LENSES, magnification
 
 EXPECTED = "write 'fx fy cx cy [k1 k2 p1 p2 [k3]]' on one line, or a YAML with fx, fy, cx, cy"
 """What a file of a calibration may hold, as the remedy of errors."""
@@ -18,6 +19,14 @@ _TURN = (
     "the images stand upright, the calibration is that of the sensor: turn it too (fx and fy, and cx and cy, change "
     "places)"
 )
+
+_OTHER_SIZE = 0.15  # of the principal point's distance from the corner: more than that of a lens that is off centre
+_SAME_SHAPE = 0.06
+_SIZES = [
+    (320, 240), (640, 360), (640, 480), (752, 480), (800, 600), (848, 480), (960, 540), (960, 720), (1024, 768),
+    (1280, 720), (1280, 960), (1280, 1024), (1440, 1080), (1600, 1200), (1920, 1080), (1920, 1200), (1920, 1440),
+    (2048, 1536), (2560, 1440), (2704, 1520), (3840, 2160), (4000, 3000), (4032, 3024), (4096, 2160),
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,9 @@ class Calibration:
         depth_scale: units of a metre in depth images of integers that belong to the images.
         baseline: metres from the camera to the right camera of a rectified pair with the same intrinsics.
         readout: seconds in which a rolling shutter reads the rows, as in :class:`dvo.geometry.camera.Camera`.
+        dialect: form of the file that it was read from.
+        ignored: keys of the file that were not used.
+        notes: what the user has to know about the file, in sentences; :meth:`doubts` has them too.
     """
 
     fx: float
@@ -46,6 +58,9 @@ class Calibration:
     depth_scale: float | None = None
     baseline: float | None = None
     readout: float = 0.0
+    dialect: str = field(default="", compare=False, repr=False)
+    ignored: tuple[str, ...] = field(default=(), compare=False, repr=False)
+    notes: tuple[str, ...] = field(default=(), compare=False, repr=False)
 
     def camera(self, width: int, height: int) -> Camera:
         """Camera of images of this size.
@@ -65,8 +80,10 @@ class Calibration:
                 field="intrinsics",
                 remedy=_TURN if (self.width, self.height) == (height, width) else remedy,
             )
+        LENSES[self.model].check(self.coefficients, self.model)
+        factor = magnification(self.model, self.coefficients)
         for name, focal in (("fx", self.fx), ("fy", self.fy)):
-            if not 0.1 * width <= focal <= 20 * width:  # NaN fails too
+            if not 0.1 * width <= focal * factor <= 20 * width:  # NaN fails too
                 raise DvoError(
                     f"{name}={focal:g} does not fit an image {width} pixels wide",
                     file=self.file,
@@ -86,17 +103,36 @@ class Calibration:
         upright, turned = (abs(self.cx - w / 2) + abs(self.cy - h / 2) for w, h in ((width, height), (height, width)))
         return width != height and turned < min(0.1 * max(width, height), 0.5 * upright)
 
+    def _other_size(self, width: int, height: int) -> tuple[int, int] | None:
+        """Size whose centre the principal point is, if it is of the same shape as these images and of another size."""
+        scale = (2 * self.cx + 1) / width, (2 * self.cy + 1) / height
+        mean = (scale[0] + scale[1]) / 2
+        if self.width is not None or not (mean > 0 and abs(mean - 1) > _OTHER_SIZE):
+            return None
+        if abs(scale[0] - scale[1]) > _SAME_SHAPE * mean:
+            return None
+        likely = [size for size in _SIZES if abs(size[0] / (mean * width) - 1) < _SAME_SHAPE / 2]
+        fitting = [size for size in likely if abs(size[0] * height / (size[1] * width) - 1) < 0.01]
+        return min(fitting, key=lambda s: abs(s[0] - mean * width), default=(round(mean * width), round(mean * height)))
+
     def doubts(self, width: int, height: int) -> list[str]:
         """Oddities of the calibration for images of this size, in sentences; nothing in it need be wrong.
 
         Args:
             width, height: size of the images in pixels.
         """
-        found = []
+        found = list(self.notes)
+        looks = self._other_size(width, height)
         if self._fits_turned(width, height):
             found.append(
                 f"the principal point ({self.cx:g}, {self.cy:g}) is the centre of {height}x{width} images, but these "
                 f"are {width}x{height}: {_TURN}"
+            )
+        elif looks:
+            found.append(
+                f"the principal point ({self.cx:g}, {self.cy:g}) is the centre of {looks[0]}x{looks[1]} images, but "
+                f"these are {width}x{height}: is the calibration that of {looks[0]}x{looks[1]} images? Then multiply "
+                f"fx, fy, cx + 0.5 and cy + 0.5 by {width / looks[0]:.4g}"
             )
         elif abs(self.cx - width / 2) > width / 4 or abs(self.cy - height / 2) > height / 4:
             found.append(

@@ -17,6 +17,7 @@ from dvo.core.yaml_files import MAX_BYTES, is_shell_pipe
 from dvo.data.calibration.calibration import Calibration, Dialect
 from dvo.data.files.files import is_file, lookups
 from dvo.geometry.camera import DistortionModel
+from dvo.geometry.lenses import LENSES
 
 CORNER = 0.5
 """Coordinates of the centre of the first pixel in COLMAP."""
@@ -37,7 +38,11 @@ _MODELS: dict[str, tuple[int, str]] = {
     "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1"),
     "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
     "THIN_PRISM_FISHEYE": (10, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (11, "fx fy cx cy k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4"),
 }
+_LENSES: dict[str, DistortionModel] = {
+    "FOV": "fov", "THIN_PRISM_FISHEYE": "thin_prism_fisheye", "RAD_TAN_THIN_PRISM_FISHEYE": "fisheye624",
+}  # fmt: skip
 _NAMES = {number: name for name, (number, _) in _MODELS.items()}
 
 
@@ -100,8 +105,7 @@ def colmap_calibration(path: Path, text: str, identifier: int | None = None) -> 
         Calibration with the size of the images, whose focal lengths are not checked.
 
     Raises:
-        DvoError: malformed file, several cameras and no number, no camera of that number, or a model that dvo does not
-            have.
+        DvoError: malformed file, several cameras and no number, no camera of that number, or an unknown model.
     """
     entries = _read_binary(path) if path.suffix.lower() == ".bin" else _read_text(text, path)
     if not entries:
@@ -129,34 +133,20 @@ def _is_list(text: str) -> bool:
 
 
 def _calibration(entry: _Entry, path: Path) -> Calibration:
-    field = f"camera {entry.identifier}"
     named = dict(zip(_MODELS[entry.model][1].split(), entry.values, strict=True))
-    if entry.model in ("FOV", "THIN_PRISM_FISHEYE") or any(named.get(key) for key in ("k5", "k6")):
-        raise _not_expressible(entry.model, path, field)
-    model: DistortionModel
-    keys: tuple[str, ...]
-    if "FISHEYE" in entry.model:
-        model, keys = "fisheye", ("k1", "k2", "k3", "k4")
+    model = _LENSES.get(entry.model) or ("fisheye" if "FISHEYE" in entry.model else "radtan")
+    if model in _LENSES.values():
+        coefficients = entry.values[4:]
     else:
-        if named.pop("k4", 0):
-            raise _not_expressible(entry.model, path, field)
-        model, keys = "radtan", ("k1", "k2", "p1", "p2") + (("k3",) if named.get("k3") else ())
-    coefficients = tuple(named.get(key, 0.0) for key in keys)
-    if model == "radtan" and not any(coefficients):
+        coefficients = tuple(named.get(key, 0.0) for key in LENSES[model].names[:8])
+    if model == "radtan":
+        used = next(count for count in (4, 5, 8) if not any(coefficients[count:]))
+        coefficients = coefficients[:used]
+    if model in ("radtan", "fov") and not any(coefficients):
         model, coefficients = "none", ()
     fx, fy = (named.get(key, named.get("f", 0.0)) for key in ("fx", "fy"))
     cx, cy = named["cx"] - CORNER, named["cy"] - CORNER
     return Calibration(fx, fy, cx, cy, model, coefficients, entry.width, entry.height, path)
-
-
-def _not_expressible(model: str, path: Path, field: str) -> DvoError:
-    detail = " with k4, k5 or k6" if model == "FULL_OPENCV" else ""
-    return DvoError(
-        f"dvo has no lens model for {model}{detail}",
-        file=path,
-        field=field,
-        remedy="use OPENCV or OPENCV_FISHEYE in COLMAP, or undistort the images with colmap image_undistorter",
-    )
 
 
 def _read_text(text: str, path: Path) -> list[_Entry]:

@@ -9,8 +9,8 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import read_text
 from dvo.data.calibration.calibration import StereoRig
+from dvo.data.calibration.documents import load_yaml
 from dvo.data.calibration.read import read_calibration
-from dvo.data.calibration.values import load_yaml
 from dvo.data.files.files import MAX_NUMBER, is_file
 from dvo.geometry.poses import compose_poses, invert_poses, poses_from_matrices
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dvo.core.errors import DvoError
 
-NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 def read_named_values(text: str, path: Path, remedy: str) -> list[float] | None:
@@ -19,7 +19,8 @@ def read_named_values(text: str, path: Path, remedy: str) -> list[float] | None:
         remedy: another form, for messages.
 
     Returns:
-        Nine values in the order of :data:`NAMES`, 0 for distortion that is not named; None for text of another form.
+        Nine or twelve values in the order of :data:`NAMES`, 0 for distortion that is not named; None for text
+        of another form.
 
     Raises:
         DvoError: another name, a name twice, a value that is no number, or no ``fx``, ``fy``, ``cx`` or ``cy``.
@@ -46,4 +47,5 @@ def read_named_values(text: str, path: Path, remedy: str) -> list[float] | None:
             field="intrinsics",
             remedy="add them, in pixels; cx and cy of most cameras are near (width - 1) / 2 and (height - 1) / 2",
         )
-    return [found.get(name, 0.0) for name in NAMES]
+    values = [found.get(name, 0.0) for name in NAMES]
+    return values if any(values[9:]) else values[:9]

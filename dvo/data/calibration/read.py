@@ -2,46 +2,57 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
-from dvo.core.yaml_files import is_shell_pipe, read_text
+from dvo.core.yaml_files import MAX_BYTES, is_shell_pipe, read_text
 from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
 from dvo.data.calibration.colmap_cameras import split_camera
 from dvo.data.files.files import MAX_NUMBER, is_file
+from dvo.geometry.lenses import LENSES
 
 _BUILT_IN = {
     "colmap": "dvo.data.calibration.colmap_cameras:DIALECT",
+    "dso": "dvo.data.calibration.dso:DIALECT",
+    "kitti raw": "dvo.data.calibration.kitti_raw:DIALECT",
+    "transforms": "dvo.data.calibration.transforms:DIALECT",
+    "ost": "dvo.data.calibration.values:OST",
+    "xml": "dvo.data.calibration.values:XML",
+    "json": "dvo.data.calibration.values:JSON",
     "yaml": "dvo.data.calibration.values:DIALECT",
     "text": "dvo.data.calibration.text:DIALECT",
 }
 DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUILT_IN))
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
-_NUMBERED = "colmap"  # the only dialect of the package whose files number their cameras
+_NUMBERED = frozenset(["colmap", "kitti raw", "json", "yaml", "xml"])  # those whose files may have several cameras
+_LARGEST = 64 * 1024**2  # of a JSON file, which may list thousands of images beside the camera
 
 
 def read_calibration(path: Path | str) -> Calibration:
     """Read a calibration file.
 
-    Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3]]`` (radial-tangential) separated by blanks or commas, ``#`` comments;
-    the same by name, ``fx=525 fy=525 cx=320 cy=240``; or a 3x3 matrix K on three lines. YAML: ``fx, fy, cx, cy`` with
-    optional ``width, height, model: none|radtan|fisheye, coefficients``; EuRoC ``sensor.yaml``; Kalibr camchain (its
-    ``cam0``); KITTI's ``calib.txt``, if all its cameras have the same intrinsics; ROS camera_info and OpenCV's
-    ``camera_matrix``; ORB-SLAM's ``Camera.fx`` keys. A YAML may state ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``)
-    and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too; and ``readout``, the
-    seconds from the first to the last row of a rolling shutter (0, a global one, if it is left out; Kalibr's
-    ``line_delay`` is not read). COLMAP's ``cameras.txt`` and ``cameras.bin``, with ``:ID`` after the name if there are
-    several cameras, see :mod:`dvo.data.calibration.colmap_cameras`.
+    docs/inputs.md has the table of dialects and lens models. Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5
+    k6]]]`` (radial-tangential) separated by blanks or commas, ``#`` comments; the same by name, ``fx=525 fy=525 cx=320
+    cy=240``; or a matrix K of 3x3, 3x4 or 4x4 numbers; ROS's ``ost.txt``; the text of DSO; KITTI's ``calib.txt``, if
+    all its cameras have the same intrinsics, and ``calib_cam_to_cam.txt``. YAML, JSON and OpenCV's XML: ``fx, fy, cx,
+    cy`` with optional ``width, height, model, coefficients``, at the top or in a mapping within; EuRoC, Kalibr, ROS,
+    OpenCV, ORB-SLAM, VINS, basalt, nerfstudio. These may state ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``) and
+    ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too; and ``readout``, the seconds
+    from the first to the last row of a rolling shutter (0, a global one, if it is left out; Kalibr's ``line_delay`` is
+    not read). COLMAP's ``cameras.txt`` and ``cameras.bin``. Of a file of several cameras the first or the left one is
+    read, or that of the number in ``FILE:NUMBER``; COLMAP's have no first one.
 
     Args:
-        path: text, YAML or COLMAP file.
+        path: of the file.
 
     Raises:
-        DvoError: missing or malformed file, an unknown distortion model, or a wrong number of coefficients.
+        DvoError: missing or malformed file, an unknown distortion model, a wrong number of coefficients, or an entry
+            that looks like lens distortion and is not understood.
 
     Example:
         >>> from pathlib import Path
@@ -52,16 +63,23 @@ def read_calibration(path: Path | str) -> Calibration:
     path, camera = split_camera(Path(path))
     if not (is_file(path) or is_shell_pipe(path)):
         raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
-    text = "" if path.suffix.lower() == ".bin" else read_text(path, EXPECTED)
+    suffix = path.suffix.lower()
+    limit = _LARGEST if suffix == ".json" else MAX_BYTES
+    text = "" if suffix == ".bin" else read_text(path, EXPECTED, limit)
     names = [*(name for name in DIALECTS if name not in _BUILT_IN), *_BUILT_IN]
     dialects: dict[str, Dialect] = {name: DIALECTS.resolve(name) for name in names}
     name = next(name for name, dialect in dialects.items() if dialect.matches(path, text))
-    if camera is not None and name in _BUILT_IN and name != _NUMBERED:
-        raise DvoError("no cameras of COLMAP in it", file=path, field="calibration", remedy=f"leave out :{camera}")
+    if camera is not None and name in _BUILT_IN and name not in _NUMBERED:
+        raise DvoError("no numbered cameras in it", file=path, field="calibration", remedy=f"leave out :{camera}")
     calibration = dialects[name].read(path, text, camera)
+    calibration = replace(calibration, dialect=calibration.dialect or name)
     values = [calibration.fx, calibration.fy, calibration.cx, calibration.cy, *calibration.coefficients]
     if not (np.abs(values) <= MAX_NUMBER).all():  # NaN fails too
         raise DvoError("not a finite number", file=path, field="intrinsics", remedy=EXPECTED)
     if calibration.fx <= 0 or calibration.fy <= 0:
         raise DvoError("focal length must be positive", file=path, field="intrinsics", remedy=EXPECTED)
+    try:
+        LENSES[calibration.model].check(calibration.coefficients, calibration.model)
+    except DvoError as error:
+        raise DvoError(error.message, file=path, field=error.field, remedy=error.remedy or EXPECTED) from None
     return calibration

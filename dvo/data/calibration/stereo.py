@@ -10,9 +10,10 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import read_text
 from dvo.data.calibration.calibration import Calibration, StereoRig
+from dvo.data.calibration.documents import load_yaml
 from dvo.data.calibration.euroc import read_rig
 from dvo.data.calibration.kitti import projection_rig, read_projections
-from dvo.data.calibration.values import from_values, load_yaml
+from dvo.data.calibration.values import from_values
 from dvo.data.extrinsics import pose_of_numbers
 from dvo.data.files.files import is_file
 from dvo.geometry.poses import compose_poses, invert_poses

@@ -1,7 +1,9 @@
-"""Calibrations of named values: the YAML of EuRoC, Kalibr, ROS, OpenCV, ORB-SLAM and dvo itself."""
+"""Calibrations of named values: the YAML, JSON and XML of EuRoC, Kalibr, ROS, OpenCV, ORB-SLAM, VINS and dvo itself."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,136 +11,237 @@ from typing import Any
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.core.yaml_files import parse_yaml
+from dvo.data.calibration import entries as fields
 from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
+from dvo.data.calibration.documents import is_ost, load_documents, load_json, load_ost, load_xml
+from dvo.data.calibration.entries import Entries
+from dvo.data.calibration.lens_names import PINHOLE, bare, is_flag, model_of, says_nothing
 from dvo.geometry.camera import DistortionModel
+from dvo.geometry.lenses import LENSES
 
-_MODELS: dict[str, DistortionModel] = {
-    "": "none",
-    "none": "none",
-    "pinhole": "none",
-    "radtan": "radtan",
-    "radial-tangential": "radtan",
-    "radialtangential": "radtan",
-    "plumb_bob": "radtan",
-    "opencv": "radtan",
-    "brown": "radtan",
-    "fisheye": "fisheye",
-    "equidistant": "fisheye",
-    "kannala-brandt": "fisheye",
-    "kannalabrandt8": "fisheye",
-    "kannala_brandt": "fisheye",
-    "opencv_fisheye": "fisheye",
-}
+_SKEW = 1e-6
+"""Skew over focal length that is taken for rounding."""
+_COEFFICIENTS = (
+    "coefficients", "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distcoefs", "distcoef",
+    "distortioncoeff", "distortioncoefs", "distortioncoef", "distortioncoefficient", "distcoefficients",
+    "distcoefficient", "dist", "d", "distortion", "distortions", "distortionparameters", "distortionparams",
+    "distparams", "distparameters", "distortionvector", "distortiondata", "distortionvalues", "coeffs", "coefs",
+    "coeff", "kc", "lensdistortion", "lensdistortioncoefficients", "radialdistortion", "distortionk",
+    "distcoefficientsmatrix", "dcoeffs", "lenscoefficients", "lenscoeffs", "fisheyecoefficients", "fisheyecoeffs",
+    "lens", "radtan", "intrinsicdist", "distortionmatrix", "kd", "distvec", "distortioncoeffients",
+)  # fmt: skip
+_MODEL_KEYS = (
+    "distortionmodel", "distortiontype", "distmodel", "disttype", "lensmodel", "lenstype", "lens", "distortion",
+    "projectionmodel", "projectiontype", "projection", "cameramodel", "modeltype", "cameratype", "model", "cammodel",
+    "intrinsicstype", "intrinsicsmodel", "cameramodeltype",
+)  # fmt: skip
+_FISHEYE_FLAGS = ("fisheyemodel", "isfisheye", "fisheye", "usefisheye", "bfisheye")
+_RADTAN_FLAT = LENSES["radtan"].names
+_FIRST = ("cam0", "camera0", "camera", "camera1", "left", "leftcamera", "cameraleft", "camleft", "0", "l", "1", "color",
+          "colour", "rgb", "rgbcamera", "cam", "cam1", "camleftrect", "leftcam", "00", "02")  # fmt: skip
+_BRACE = re.compile(r'\s*\{\s*"')
+_SUFFIX = re.compile(r"(.+?)_?(left|right|l|r|[0-2]|0[0-3])")
 
 
 def from_matrix(matrix: np.ndarray, path: Path) -> Calibration:
-    """Calibration of a matrix K.
+    """Calibration of a matrix K, or of the K in a 3x4 or 4x4 matrix; also column by column.
 
     Args:
         matrix: K of a pinhole camera without skew.
         path: file that it comes from, for messages.
 
     Raises:
-        DvoError: not a ``(3, 3)`` matrix of that form.
+        DvoError: not a matrix of that form, or one with skew.
     """
-    if matrix.shape != (3, 3) or matrix[1, 0] != 0 or (matrix[2] != [0, 0, 1]).any() or matrix[0, 1] != 0:
+    if matrix.shape in ((3, 4), (4, 4)):
+        is_square = matrix.shape == (4, 4)
+        outside = [*matrix[:3, 3], *(matrix[3, :3] if is_square else [])]
+        matrix = matrix[:3, :3] if not any(outside) and (not is_square or matrix[3, 3] == 1) else np.zeros((0, 0))
+    if matrix.shape == (3, 3) and not matrix[:2, 2].any() and matrix[2, :2].all() and matrix[2, 2] == 1:
+        matrix = matrix.T  # Open3D, ARKit and MATLAB write columns
+    if matrix.shape != (3, 3) or matrix[1, 0] != 0 or (matrix[2] != [0, 0, 1]).any():
         raise DvoError("not a pinhole matrix K", file=path, field="intrinsics", remedy=EXPECTED)
+    _refuse_skew(float(matrix[0, 1]), float(matrix[0, 0]), path, "intrinsics")
     return Calibration(float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]), file=path)
 
 
-def load_yaml(text: str, path: Path) -> Any:
-    """Parse a YAML document, also with OpenCV's ``%YAML:1.0`` head and its ``!!opencv-matrix`` tags. Plain data only.
+def _refuse_skew(skew: float, focal: float, path: Path, field: str) -> None:
+    if not abs(skew) <= _SKEW * abs(focal):  # NaN fails too
+        raise DvoError(
+            f"dvo has no camera with skew ({skew:g})",
+            file=path,
+            field=field,
+            remedy="calibrate without skew, which cameras of today do not have",
+        )
+
+
+def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration:
+    """Calibration of the entries of one of the dialects of :func:`dvo.data.calibration.read.read_calibration`.
 
     Args:
-        text: the document.
-        path: file that it comes from, for messages.
-
-    Raises:
-        DvoError: not valid YAML, see :func:`dvo.core.yaml_files.parse_yaml`.
-    """
-    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
-    if lines and lines[0].strip() == "---":
-        lines = lines[1:]
-    return parse_yaml("\n".join(lines), path, remedy=EXPECTED)
-
-
-def _numbers(value: Any, path: Path, field: str) -> np.ndarray:
-    if isinstance(value, dict):  # {rows, cols, data}
-        value = value.get("data")
-    try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise DvoError("not numbers", file=path, field=field, remedy=EXPECTED) from None
-
-
-def _find(data: dict[str, Any], *keys: str) -> Any:
-    return next((data[key] for key in keys if data.get(key) is not None), None)
-
-
-def from_values(data: Any, path: Path) -> Calibration:
-    """Calibration of the entries of one of the YAML dialects of :func:`read_calibration`.
-
-    Args:
-        data: dictionary of the entries.
+        data: dictionary of the entries, or a list of such documents.
         path: file that they come from, for messages.
+        camera: number of the camera in a file of several; None for the first or the left one.
 
     Raises:
-        DvoError: as :func:`read_calibration`; the signs of the focal lengths are not checked.
+        DvoError: as :func:`dvo.data.calibration.read.read_calibration`; the signs of the focal lengths are not checked.
     """
-    if isinstance(data, dict) and "cam0" in data:
-        data = data["cam0"]
-    if not isinstance(data, dict):
+    documents = [fields.plain(document) for document in (data if isinstance(data, list) else [data])]
+    mappings = [document for document in documents if isinstance(document, dict)]
+    if not mappings:
         raise DvoError("no keys in it", file=path, field="intrinsics", remedy=EXPECTED)
-    calibration = _yaml_intrinsics(data, path)
-    resolution = _find(data, "resolution", "image_size")
-    width = _find(data, "width", "image_width", "Camera.width") if resolution is None else None
-    height = _find(data, "height", "image_height", "Camera.height") if resolution is None else None
-    pair = resolution if resolution is not None else [width or 0, height or 0]
-    size = _numbers(pair, path, "resolution")
+    found = [fields.cameras(document, path) for document in mappings]
+    if not any(found):
+        found = [fields.cameras(_split(document), path) for document in mappings]
+    read = [_calibration(_choose(named, camera, path), path) for named in found if named]
+    if not read:
+        raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=EXPECTED)
+    if any(other != read[0] for other in read[1:]):
+        message = f"{len(read)} documents with different cameras in it"
+        raise DvoError(message, file=path, field="intrinsics", remedy="leave one of them")
+    return read[0]
+
+
+def _missing(mappings: Sequence[dict[str, Any]]) -> str:
+    keys = [str(key)[:40] for mapping in mappings for key in mapping]
+    named = f": {', '.join(keys[:8])}{', ...' if len(keys) > 8 else ''}" if keys else ""
+    return f"no fx, fy, cx, cy in it, nor a camera matrix{named}"
+
+
+def _split(mapping: dict[str, Any]) -> dict[str, Any]:
+    """``K_left`` and ``D_left``, or ``M1`` and ``D1``, as entries of ``left`` and ``1``."""
+    found: dict[str, Any] = {}
+    for key, value in mapping.items():
+        parts = _SUFFIX.fullmatch(str(key).lower())
+        if parts and isinstance(value, list):
+            found.setdefault(parts[2], {})[parts[1]] = value
+        else:
+            found[key] = value
+    return found
+
+
+def _choose(named: list[tuple[str, Entries]], camera: int | None, path: Path) -> Entries:
+    """Entries of the camera of that number, of the only one, or of the first one by name."""
+    if camera is not None:
+        numbers = [re.search(r"(\d+)\D*$", name) for name, _ in named]
+        chosen = [named[i][1] for i, number in enumerate(numbers) if number and int(number[1]) == camera]
+        if len(chosen) == 1:
+            return chosen[0]
+    elif len(named) == 1:
+        return named[0][1]
+    else:
+        last = [_last(name) for name, _ in named]
+        for first in _FIRST:
+            if last.count(first) == 1:
+                return named[last.index(first)][1]
+    names = ", ".join(name or "the file itself" for name, _ in named[:8])
+    if camera is not None:
+        remedy = f"leave out :{camera}, or give the number of one of {names}"
+        raise DvoError(f"no camera {camera} in it", file=path, field="calibration", remedy=remedy)
+    raise DvoError(
+        f"{len(named)} cameras in it: {names}",
+        file=path,
+        field="calibration",
+        remedy="write the one of the images into a file of its own",
+    )
+
+
+def _last(name: str) -> str:
+    part = re.split(r"[.\[]", name)[-1] if name else ""
+    return bare(part)
+
+
+def _calibration(entries: Entries, path: Path) -> Calibration:
+    calibration, before = _intrinsics(entries, path)
+    width, height = _size(entries, path)
+    calibration = replace(calibration, width=width, height=height)
+    calibration = _with_sensors(calibration, entries, path)
+    model, coefficients = _lens(entries, before, path)
+    skew = entries.numbers("skew", "s", "alphac", "cameraskew", "skewness", "k12", shape="scalar")
+    if skew is not None:
+        _refuse_skew(float(skew.ravel()[0]), 1.0, path, "skew")
+    if model != "none":
+        entries.take("distorted", "isdistorted", "hasdistortion")
+    entries.refuse_unread()
+    return replace(calibration, model=model, coefficients=coefficients, ignored=entries.ignored, notes=_notes(entries))
+
+
+def _notes(entries: Entries) -> tuple[str, ...]:
+    """ORB-SLAM2's stereo files state the cameras as recorded as LEFT and RIGHT, and the rectified one as Camera."""
+    others = [name for name in entries.elsewhere if name in ("LEFT", "RIGHT")]
+    if "LEFT" not in others:
+        return ()
+    return (
+        "the calibration is that of rectified images (Camera.fx); LEFT.K and LEFT.D of the same file are those of the "
+        "images as recorded, and were not used",
+    )
+
+
+def _intrinsics(entries: Entries, path: Path) -> tuple[Calibration, list[float]]:
+    """Intrinsics, and what some models of Kalibr have before them."""
+    found = [entries.numbers(*names, shape="scalar") for names in (fields.FX, fields.FY, fields.CX, fields.CY)]
+    focal = entries.numbers(*fields.FOCAL) if found[0] is None and found[1] is None else None
+    if focal is not None and focal.size in (1, 2):
+        found[0], found[1] = focal.ravel()[0], focal.ravel()[-1]
+    centre = entries.numbers(*fields.CENTRE) if found[2] is None and found[3] is None else None
+    if centre is not None and centre.size == 2:
+        found[2], found[3] = centre.ravel()
+    if all(value is not None for value in found):
+        fx, fy, cx, cy = (float(np.ravel(value)[0]) for value in found if value is not None)
+        return Calibration(fx, fy, cx, cy, file=path), []
+    entry = fields.matrix_entry(entries)
+    if entry is None:
+        names = [name for name, value in zip(("fx", "fy", "cx", "cy"), found, strict=True) if value is None]
+        raise DvoError(f"no {', '.join(names)} in it", file=path, field="intrinsics", remedy=EXPECTED)
+    entry.used = True
+    numbers = fields.as_numbers(entry.value, path, "intrinsics")
+    if numbers.size in (9, 12, 16):
+        return from_matrix(numbers.reshape(-1, 3) if numbers.size == 9 else numbers.reshape(-1, 4), path), []
+    if numbers.ndim != 1 or numbers.size not in (4, 5, 6):
+        raise DvoError("expected 4 numbers or a 3x3 matrix", file=path, field="intrinsics", remedy=EXPECTED)
+    *before, fx, fy, cx, cy = (float(number) for number in numbers)
+    return Calibration(fx, fy, cx, cy, file=path), before
+
+
+def _size(entries: Entries, path: Path) -> tuple[int | None, int | None]:
+    entry = entries.entry(
+        "resolution", "imagesize", "imagedimension", "imageresolution", "imgsize", "imsize", "framesize", "size",
+        "imagedimensions", "sensorresolution", "imageresolutionpx", "dims", shape="list",
+    ) or entries.entry("resolution", "imagesize", "imageresolution", "size")  # fmt: skip
+    pair: Any
+    if entry is None:
+        width = entries.take("width", "imagewidth", "cols", "w", "imgwidth", "imwidth", "xres", "resolutionx",
+                             shape="scalar")  # fmt: skip
+        height = entries.take("height", "imageheight", "rows", "h", "imgheight", "imheight", "yres", "resolutiony",
+                              shape="scalar")  # fmt: skip
+        pair = [width or 0, height or 0]
+    else:
+        pair = entry.value
+        if isinstance(pair, str):
+            pair = re.split(r"[x*, ]+", pair.strip("()[] "))
+        if entries.index is not None and isinstance(pair, list) and pair and isinstance(pair[0], list):
+            pair = pair[entries.index] if entries.index < len(pair) else pair  # basalt: one for each camera
+    size = fields.as_numbers(pair, path, "resolution")
+    size = size.ravel() if size.shape in ((1, 2), (2, 1)) else size
     if size.shape != (2,) or not ((size >= 0) & (size <= 1e6) & (size == np.rint(size))).all():
         raise DvoError("expected width and height", file=path, field="resolution", remedy="give two whole numbers")
-    calibration = replace(calibration, width=int(size[0]) or None, height=int(size[1]) or None)
-    calibration = _with_sensors(calibration, data, path)
-    return _with_distortion(calibration, data, path)
+    return int(size[0]) or None, int(size[1]) or None
 
 
-def _yaml_intrinsics(data: dict[str, Any], path: Path) -> Calibration:
-    for prefix in ("", "Camera.", "Camera1."):
-        found = [data.get(prefix + name) for name in ("fx", "fy", "cx", "cy")]
-        if all(value is not None for value in found):
-            numbers = _numbers(found, path, "intrinsics")
-            break
-    else:
-        numbers = _other_intrinsics(data, path)
-    if numbers.size == 9:
-        return from_matrix(numbers.reshape(3, 3), path)
-    if numbers.shape != (4,):
-        raise DvoError("expected 4 numbers or a 3x3 matrix", file=path, field="intrinsics", remedy=EXPECTED)
-    fx, fy, cx, cy = (float(number) for number in numbers)
-    return Calibration(fx, fy, cx, cy, file=path)
-
-
-def _other_intrinsics(data: dict[str, Any], path: Path) -> np.ndarray:
-    value = _find(data, "intrinsics", "camera_matrix", "K", "Camera matrix")
-    if value is None:
-        raise DvoError("no fx, fy, cx, cy in it", file=path, field="intrinsics", remedy=EXPECTED)
-    return _numbers(value, path, "intrinsics")
-
-
-def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:
+def _with_sensors(calibration: Calibration, entries: Entries, path: Path) -> Calibration:
     found: dict[str, float | None] = {}
     keys: dict[str, tuple[str, ...]] = {
-        "depth_scale": ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor"),
-        "baseline": ("baseline", "Stereo.b"),
+        "depth_scale": ("depthscale", "depthmapfactor", "rgbddepthmapfactor", "pngdepthscale"),
+        "baseline": ("baseline", "stereob"),
         "readout": ("readout",),
     }
     for name, names in keys.items():
-        value = _find(data, *names)
-        if value is None and name == "baseline" and data.get("Camera.bf") is not None:
-            product = _numbers(data["Camera.bf"], path, "Camera.bf")
-            value = product / calibration.fx if calibration.fx else product  # fx of 0 is refused later
-        number = None if value is None else _numbers(value, path, name)
+        value: Any = entries.numbers(*names)
+        if value is None and name == "baseline":
+            value = entries.numbers("bf")
+            if value is not None:
+                value = value / calibration.fx if calibration.fx else value  # fx of 0 is refused later
+        number = None if value is None else np.asarray(value)
         low, high, expected = (0, 1, "seconds, 0 to 1") if name == "readout" else (1e-6, 1e6, "one positive number")
         if number is not None and (number.shape != () or not low <= number <= high):
             raise DvoError(f"expected {expected}", file=path, field=name, remedy="give a number, or leave it out")
@@ -147,43 +250,145 @@ def _with_sensors(calibration: Calibration, data: dict[str, Any], path: Path) ->
     return replace(calibration, depth_scale=scale, baseline=baseline, readout=readout)
 
 
-def _with_distortion(calibration: Calibration, data: dict[str, Any], path: Path) -> Calibration:
-    name = _find(data, "distortion_model", "model", "Camera.type", "camera_model")
-    value = _find(data, "coefficients", "distortion_coefficients", "distortion_coeffs", "dist_coeffs", "D")
-    if value is None:  # ORB-SLAM writes them one by one
-        is_fisheye = _MODELS.get(str(name).lower()) == "fisheye"
-        named = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3")
-        for prefix in ("", "Camera.", "Camera1."):
-            if data.get(f"{prefix}k1") is not None:
-                value = [data.get(prefix + key) or 0 for key in named]
-                break
-    coefficients = _numbers([] if value is None else value, path, "coefficients").ravel()
-    key = str(name if name is not None else ("radtan" if len(coefficients) else "none")).lower().replace(" ", "_")
-    if key == "pinhole" and len(coefficients):
-        key = "radtan"
-    if key not in _MODELS:
-        raise DvoError(
-            f"unknown distortion model {str(name)[:60]!r}",
-            file=path,
-            field="model",
-            remedy="use none, radtan or fisheye",
-        )
-    model = _MODELS[key]
-    allowed = {"none": (0,), "radtan": (0, 4, 5), "fisheye": (0, 4)}[model]
-    most = max(allowed)
-    if len(coefficients) > most and not coefficients[most:].any():
-        coefficients = coefficients[:most]  # zeros that OpenCV and ROS append
-    if len(coefficients) not in allowed:
-        raise DvoError(
-            f"{len(coefficients)} coefficients for the model {model}",
-            file=path,
-            field="coefficients",
-            remedy="radtan has k1 k2 p1 p2 [k3], fisheye k1 k2 k3 k4",
-        )
-    if model == "radtan" and not coefficients.any():
-        model = "none"
-    kept = () if model == "none" else tuple(float(coefficient) for coefficient in coefficients)
-    return replace(calibration, model=model, coefficients=kept)
+def _model(entries: Entries, path: Path) -> DistortionModel | None:
+    """Lens model by name, ``none`` included; None where the file names none, or a pinhole camera."""
+    named: dict[str, str] = {}
+    for key in _MODEL_KEYS:
+        for entry in entries.found:
+            if key not in entry.calls or isinstance(entry.value, list) or entry.value is None:
+                continue
+            if key in ("lens", "distortion", "projection") and not isinstance(entry.value, str):
+                continue
+            model = model_of(entry.value)
+            if model is None:
+                raise DvoError(
+                    f"unknown distortion model {str(entry.value)[:60]!r}",
+                    file=path,
+                    field=entry.name if entry.key != "model" else "model",
+                    remedy=f"use one of {', '.join(LENSES)}",
+                )
+            entry.used = True
+            named.setdefault(model, entry.name)
+    flag = entries.entry(*_FISHEYE_FLAGS, shape="scalar")
+    is_wide = any(name not in ("none", "radtan", PINHOLE) for name in named)
+    if flag is not None and not says_nothing(flag.value) and not is_wide:
+        model = "fisheye" if is_flag(flag.value) else model_of(flag.value)
+        if model is None:
+            raise DvoError(f"unknown distortion model {str(flag.value)[:60]!r}", file=path, field=flag.name,
+                           remedy=f"use one of {', '.join(LENSES)}")  # fmt: skip
+        named.setdefault(model, flag.name)
+    kind = entries.take("type", shape="scalar")
+    if isinstance(kind, str) and not named and model_of(kind) is not None:
+        named[str(model_of(kind))] = "type"
+    pinhole = named.pop(PINHOLE, None)
+    if len(named) > 1 and "none" in named and set(named) & {"ucm", "mei", "eucm", "double_sphere", "fov"}:
+        del named["none"]
+    if set(named) == {"mei", "radtan"}:
+        del named["radtan"]
+    if len(named) > 1 or (pinhole and set(named) & {"ucm", "mei", "eucm", "double_sphere"}):
+        told = " and ".join([*(f"{model} ({key})" for model, key in named.items()), *([pinhole] if pinhole else [])])
+        raise DvoError(f"two lens models: {told}", file=path, field="model", remedy="leave the one of the camera")
+    return next(iter(named), None)  # type: ignore[arg-type]
+
+
+def _lens(entries: Entries, before: list[float], path: Path) -> tuple[DistortionModel, tuple[float, ...]]:
+    model = _model(entries, path)
+    listed = entries.entry(*_COEFFICIENTS, shape="list") or _single(entries)
+    if model is None:
+        model = _wide_by_keys(entries)
+    values = [] if listed is None else fields.as_numbers(listed.value, path, "coefficients").ravel().tolist()
+    if model == "mei":
+        xi = before[:1] or _scalars(entries, path, "xi")
+        return "mei", _trimmed("mei", [*xi, *(values or _flat_radtan(entries, path))], path)
+    if model in ("ucm", "eucm", "double_sphere", "fov"):
+        names = LENSES[model].names
+        keyed = _scalars(entries, path, *(("omega", "w", "fov") if model == "fov" else names), only=len(names))
+        if any(values[len(names) :]) or (before and any(values)) or (keyed and any(values)):
+            raise _wrong_count(len(values), model, path)
+        return model, _trimmed(model, before or keyed or values[: len(names)], path)
+    if before:
+        raise DvoError(f"{4 + len(before)} intrinsics of the model {model or 'pinhole'}", file=path, field="intrinsics",
+                       remedy=EXPECTED)  # fmt: skip
+    if model in ("thin_prism_fisheye", "fisheye624"):
+        keyed = [] if values else _scalars(entries, path, *LENSES[model].names, zeros=True)
+        return model, _trimmed(model, values or keyed, path)
+    if model == "fisheye":
+        return "fisheye", _trimmed("fisheye", values or _flat_fisheye(entries, path), path)
+    if model == "none":
+        return "none", _trimmed("none", values, path)
+    kept = _trimmed("radtan", values or _flat_radtan(entries, path), path)
+    return ("radtan", kept) if any(kept) else ("none", ())
+
+
+def _single(entries: Entries) -> Any:
+    """A lone number under a name of coefficients, a list of one."""
+    entry = entries.entry(*(name for name in _COEFFICIENTS if name not in ("lens", "distortion")), shape="scalar")
+    return None if entry is None or isinstance(entry.value, str | bool) else entry
+
+
+def _wide_by_keys(entries: Entries) -> DistortionModel | None:
+    """Model of a file that names none but has the parameters of one."""
+    has = {name for name in ("xi", "alpha", "beta") for entry in entries.found
+           if name in entry.calls and not says_nothing(entry.value)}  # fmt: skip
+    models: dict[frozenset[str], DistortionModel] = {
+        frozenset(["xi"]): "mei", frozenset(["xi", "alpha"]): "double_sphere", frozenset(["alpha", "beta"]): "eucm",
+    }  # fmt: skip
+    return models.get(frozenset(has))
+
+
+def _scalars(entries: Entries, path: Path, *names: str, only: int = 0, zeros: bool = False) -> list[float]:
+    """Numbers of these names, the first so many that are there; 0 for one that is missing if that is allowed."""
+    found: list[float] = []
+    if zeros and all(entries.entry(name, shape="scalar") is None for name in names):
+        return found
+    for name in names:
+        value = entries.numbers(name, shape="scalar")
+        if value is not None or zeros:
+            found.append(0.0 if value is None else float(value.ravel()[0]))
+        if only and len(found) == only:
+            break
+    return found
+
+
+def _flat_fisheye(entries: Entries, path: Path) -> list[float]:
+    """``k1`` to ``k4``; VINS and camodocal call them k2 to k5 of the projection."""
+    shifted = [entries.numbers(f"projectionparametersk{n}") for n in range(2, 6)]
+    if shifted[0] is not None and shifted[3] is not None:
+        return [0.0 if value is None else float(value.ravel()[0]) for value in shifted]
+    return _scalars(entries, path, "k1", "k2", "k3", "k4", zeros=True)
+
+
+def _flat_radtan(entries: Entries, path: Path) -> list[float]:
+    """Coefficients by name; those of rpg_svo are called d0 to d4."""
+    values = _scalars(entries, path, *_RADTAN_FLAT, zeros=True)
+    if not any(values):
+        values = _scalars(entries, path, "d0", "d1", "d2", "d3", "d4")
+        return values + [0.0] * (4 - len(values)) if values else []
+    used = next(count for count in (4, 5, 8, 12) if not any(values[count:]))
+    return values[:used]
+
+
+def _trimmed(model: DistortionModel, values: Sequence[float], path: Path) -> tuple[float, ...]:
+    """Coefficients of a model without the zeros that OpenCV and ROS append."""
+    counts = {"none": (0,), "radtan": (0, 4, 5, 8, 12), "fisheye": (0, 4)}.get(model, LENSES[model].counts)
+    kept = list(values)
+    few = {"radtan": 5, "mei": 6}.get(model, max(counts))  # what files of this model usually have
+    if len(kept) > few:
+        kept = kept[: next((n for n in counts if n >= few and not any(kept[n:])), len(kept))]
+    if len(kept) not in counts:
+        raise _wrong_count(len(kept), model, path)
+    try:
+        LENSES[model].check(tuple(kept), model)
+    except DvoError as error:
+        raise DvoError(error.message, file=path, field=error.field, remedy=error.remedy or EXPECTED) from None
+    return tuple(float(value) for value in kept)
+
+
+def _wrong_count(count: int, model: DistortionModel, path: Path) -> DvoError:
+    remedy = f"{model} has {' '.join(LENSES[model].names) or 'none'}"
+    if model == "radtan":
+        remedy = "radtan has k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], fisheye k1 k2 k3 k4"
+    return DvoError(f"{count} coefficients for the model {model}", file=path, field="coefficients", remedy=remedy)
 
 
 def is_yaml(path: Path, text: str) -> bool:
@@ -196,4 +401,15 @@ def is_yaml(path: Path, text: str) -> bool:
     return path.suffix.lower() in (".yaml", ".yml") or text.startswith("%YAML")
 
 
-DIALECT = Dialect(is_yaml, lambda path, text, camera: from_values(load_yaml(text, path), path))
+DIALECT = Dialect(is_yaml, lambda path, text, camera: from_values(load_documents(text, path), path, camera))
+JSON = Dialect(
+    lambda path, text: path.suffix.lower() == ".json" or _BRACE.match(text) is not None,
+    lambda path, text, camera: from_values(load_json(text, path), path, camera),
+)
+XML = Dialect(
+    lambda path, text: path.suffix.lower() == ".xml" or text.lstrip().startswith("<?xml"),
+    lambda path, text, camera: from_values(load_xml(text, path), path, camera),
+)
+OST = Dialect(
+    lambda path, text: is_ost(text), lambda path, text, camera: from_values(load_ost(text, path), path, camera)
+)

@@ -85,7 +85,7 @@ def test_rectified_images_have_the_projection_matrix(make):
     ("info", "warning"),
     [
         ({"k": [0.0] * 9}, "not calibrated"),
-        ({"model": "rational_polynomial", "d": [0.1] * 8}, "unknown distortion model"),
+        ({"model": "f_theta", "d": [0.1] * 8}, "unknown distortion model"),
     ],
 )
 def test_calibrations_that_cannot_be_used(make, info, warning):

@@ -1,0 +1,559 @@
+"""Calibration files as other programs write them: what is read of each, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from dvo.core.errors import DvoError
+from dvo.data import read_calibration
+from dvo.geometry.undistort import project
+
+KC = (0.1, -0.2, 0.003, 0.004)
+FIVE = (*KC, 0.05)
+EIGHT = (*FIVE, 0.06, 0.07, 0.08)
+MATRIX = "[500, 0, 320, 0, 510, 240, 0, 0, 1]"
+ROWS = "[[500, 0, 320], [0, 510, 240], [0, 0, 1]]"
+PINHOLE = "fx: 500\nfy: 510\ncx: 320\ncy: 240\n"
+SLAM = """%YAML:1.0
+
+#--------------------------------------------------------------------------------------------
+# Camera Parameters. Adjust them!
+#--------------------------------------------------------------------------------------------
+
+# Camera calibration and distortion parameters (OpenCV)
+Camera.fx: 500.0
+Camera.fy: 510.0
+Camera.cx: 320.0
+Camera.cy: 240.0
+Camera.k1: 0.1
+Camera.k2: -0.2
+Camera.p1: 0.003
+Camera.p2: 0.004
+Camera.k3: 0.05
+Camera.width: 640
+Camera.height: 480
+Camera.fps: 30.0
+Camera.RGB: 1
+ThDepth: 40.0
+DepthMapFactor: 5000.0
+ORBextractor.nFeatures: 1000
+ORBextractor.scaleFactor: 1.2
+Viewer.KeyFrameSize: 0.05
+Viewer.PointSize:2
+Viewer.CameraSize:\t0.08
+"""
+STEREO = """
+LEFT.height: 480
+LEFT.width: 640
+LEFT.D: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data:[-0.28, 0.07, 0.0002, 1.8e-05, 0.0]
+LEFT.K: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [458.654, 0.0, 367.215, 0.0, 457.296, 248.375, 0.0, 0.0, 1.0]
+RIGHT.D: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data:[-0.28, 0.07, 0.0002, 1.8e-05, 0.0]
+RIGHT.K: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [457.587, 0.0, 379.999, 0.0, 456.134, 255.238, 0.0, 0.0, 1]
+"""
+SLAM3 = """%YAML:1.0
+File.version: "1.0"
+Camera.type: "KannalaBrandt8"
+Camera1.fx: 190.9
+Camera1.fy: 190.8
+Camera1.cx: 254.9
+Camera1.cy: 256.8
+Camera1.k1: 0.003
+Camera1.k2: 0.0007
+Camera1.k3: -0.002
+Camera1.k4: 0.0002
+Camera2.fx: 190.4
+Camera2.fy: 190.3
+Camera2.cx: 252.5
+Camera2.cy: 254.9
+Camera2.k1: 0.003
+Camera2.k2: 0.001
+Camera2.k3: -0.002
+Camera2.k4: 0.0003
+Stereo.T_c1_c2: !!opencv-matrix
+  rows: 4
+  cols: 4
+  dt: f
+  data: [1.0, 0, 0, -0.1, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]
+Camera.width: 512
+Camera.height: 512
+IMU.T_b_c1: !!opencv-matrix
+  rows: 4
+  cols: 4
+  dt: f
+  data: [1.0, 0, 0, -0.1, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0]
+IMU.NoiseGyro: 0.00016
+"""
+RECTIFIED = """%YAML:1.0
+Camera.type: "Rectified"
+Camera1.fx: 500.
+Camera1.fy: 510.
+Camera1.cx: 320.
+Camera1.cy: 240.
+Camera.width: 640
+Camera.height: 480
+Camera.newWidth: 600
+Camera.newHeight: 350
+Stereo.ThDepth: 40.0
+Stereo.b: 0.0745
+"""
+VSLAM = """Camera:
+  name: "EuRoC monocular"
+  setup: "monocular"
+  model: "{}"
+  fx: 500
+  fy: 510
+  cx: 320
+  cy: 240
+  k1: 0.1
+  k2: -0.2
+  {}
+  fps: 20.0
+  cols: 640
+  rows: 480
+  color_order: "Gray"
+Feature:
+  name: "default ORB feature extraction setting"
+  scale_factor: 1.2
+Preprocessing:
+  min_size: 800
+"""
+VINS = """%YAML:1.0
+---
+model_type: {}
+camera_name: camera
+image_width: 640
+image_height: 480
+{}
+"""
+VINS_PINHOLE = VINS.format("PINHOLE", """distortion_parameters:
+   k1: 0.1
+   k2: -0.2
+   p1: 0.003
+   p2: 0.004
+projection_parameters:
+   fx: 500
+   fy: 510
+   cx: 320
+   cy: 240
+fisheye: 0
+min_dist: 30 # min distance between two features""")  # fmt: skip
+VINS_MEI = VINS.format("MEI", """mirror_parameters:
+   xi: 1.9
+distortion_parameters:
+   k1: 0.1
+   k2: -0.2
+   p1: 0.003
+   p2: 0.004
+projection_parameters:
+   gamma1: 900
+   gamma2: 910
+   u0: 320
+   v0: 240
+fisheye: 1""")  # fmt: skip
+VINS_KB = VINS.format("KANNALA_BRANDT", """projection_parameters:
+   k2: 0.01
+   k3: -0.02
+   k4: 0.003
+   k5: 0.004
+   mu: 300
+   mv: 301
+   u0: 320
+   v0: 240""")  # fmt: skip
+OST = """# oST version 5.0 parameters
+
+
+[image]
+
+width
+640
+
+height
+480
+
+[narrow_stereo]
+
+camera matrix
+500.000000 0.000000 320.000000
+0.000000 510.000000 240.000000
+0.000000 0.000000 1.000000
+
+distortion
+0.1 -0.2 0.003 0.004 0.05
+
+rectification
+1.000000 0.000000 0.000000
+0.000000 1.000000 0.000000
+0.000000 0.000000 1.000000
+
+projection
+480.000000 0.000000 320.000000 0.000000
+0.000000 490.000000 240.000000 0.000000
+0.000000 0.000000 1.000000 0.000000
+"""
+XML = """<?xml version="1.0"?>
+<opencv_storage>
+<calibration_time>"Mon 5 May"</calibration_time>
+<image_width>640</image_width>
+<image_height>480</image_height>
+<flags>0</flags>
+{}<camera_matrix type_id="opencv-matrix">
+  <rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>500. 0. 320. 0. 510. 240. 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix">
+  <rows>{}</rows><cols>1</cols><dt>d</dt>
+  <data>
+    {}</data></distortion_coefficients>
+<avg_reprojection_error>1.9e-01</avg_reprojection_error>
+<per_view_reprojection_errors type_id="opencv-matrix">
+  <rows>4</rows><cols>1</cols><dt>f</dt><data>0.1 0.2 0.3 0.4</data></per_view_reprojection_errors>
+</opencv_storage>
+"""
+INFO = """header: {{seq: 0, stamp: {{secs: 1, nsecs: 2}}, frame_id: "camera"}}
+height: 480
+width: 640
+distortion_model: "{}"
+{}: {}
+{}: [500.0, 0.0, 320.0, 0.0, 510.0, 240.0, 0.0, 0.0, 1.0]
+{}: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+{}: [480.0, 0.0, 320.0, 0.0, 0.0, 490.0, 240.0, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+roi: {{x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: False}}
+---
+"""
+OKVIS = """%YAML:1.0
+cameras:
+     - {T_SC: [1.0, 0, 0, 0.1, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0],
+        image_dimension: [640, 480],
+        distortion_coefficients: [0.1, -0.2, 0.003, 0.004],
+        distortion_type: radialtangential,
+        focal_length: [500, 510],
+        principal_point: [320, 240]}
+     - {T_SC: [1.0, 0, 0, 0.2, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0],
+        image_dimension: [640, 480],
+        distortion_coefficients: [0, 0, 0, 0],
+        distortion_type: radialtangential,
+        focal_length: [1, 1],
+        principal_point: [1, 1]}
+camera_params:
+     camera_rate: 20
+"""
+NCAMERA = """label: "rig"
+cameras:
+- camera:
+    label: cam0
+    image_height: 480
+    image_width: 640
+    type: pinhole
+    intrinsics:
+      cols: 1
+      rows: 4
+      data: [500, 510, 320, 240]
+    distortion:
+      type: equidistant
+      parameters:
+        cols: 1
+        rows: 4
+        data: [0.1, -0.2, 0.003, 0.004]
+  T_B_C:
+    cols: 4
+    rows: 4
+    data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+"""
+KITTI_RAW = """calib_time: 09-Jan-2012 13:57:47
+corner_dist: 9.950000e-02
+S_00: 1.392000e+03 5.120000e+02
+K_00: 9.842439e+02 0 6.900000e+02 0 9.808141e+02 2.331966e+02 0 0 1
+D_00: -3.728755e-01 2.037299e-01 2.219027e-03 1.383707e-03 -7.233722e-02
+R_00: 1 0 0 0 1 0 0 0 1
+S_rect_00: 1.242000e+03 3.750000e+02
+P_rect_00: 7.215377e+02 0 6.095593e+02 0 0 7.215377e+02 1.728540e+02 0 0 0 1 0
+"""
+
+
+def basalt(kind, **intrinsics):
+    camera = {"camera_type": kind, "intrinsics": {"fx": 158.0, "fy": 157.0, "cx": 254.0, "cy": 256.0, **intrinsics}}
+    other = {"camera_type": kind, "intrinsics": {"fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 2.0, **intrinsics}}
+    value = {"T_imu_cam": [{"px": 0.1, "py": 0, "pz": 0, "qx": 0, "qy": 0, "qz": 0, "qw": 1}] * 2,
+             "intrinsics": [camera, other], "resolution": [[512, 512], [640, 480]],
+             "calib_accel_bias": [0.1] * 9, "imu_update_rate": 200.0, "vignette": []}  # fmt: skip
+    return json.dumps({"value0": value})
+
+
+def transforms(frames=({},), **values):
+    rows = [{"file_path": f"images/{n}.png", "transform_matrix": np.eye(4).tolist(), **frame}
+            for n, frame in enumerate(frames)]  # fmt: skip
+    return json.dumps({**values, "aabb_scale": 16, "frames": rows})
+
+
+NUMBERS = (500, 510, 320, 240)
+FULL = {"fl_x": 500, "fl_y": 510, "cx": 320.5, "cy": 240.5, "w": 640, "h": 480}
+READ = [
+    ("slam2.yaml", SLAM, NUMBERS, "radtan", FIVE, (640, 480)),
+    ("slam2_stereo.yaml", SLAM + STEREO, NUMBERS, "radtan", FIVE, (640, 480)),
+    ("slam3.yaml", SLAM3, (190.9, 190.8, 254.9, 256.8), "fisheye", (0.003, 0.0007, -0.002, 0.0002), (512, 512)),
+    ("rectified.yaml", RECTIFIED, NUMBERS, "none", (), (640, 480)),
+    ("vslam.yaml", VSLAM.format("perspective", "p1: 0.003\n  p2: 0.004"), NUMBERS, "radtan", KC, (640, 480)),
+    ("vslam_fisheye.yaml", VSLAM.format("fisheye", "k3: 0.003\n  k4: 0.004"), NUMBERS, "fisheye", KC, (640, 480)),
+    ("flat8.yaml", SLAM + "Camera.k4: 0.06\nCamera.k5: 0.07\nCamera.k6: 0.08\n", NUMBERS, "radtan", EIGHT, (640, 480)),
+    ("vins.yaml", VINS_PINHOLE, NUMBERS, "radtan", KC, (640, 480)),
+    ("vins_mei.yaml", VINS_MEI, (900, 910, 320, 240), "mei", (1.9, *KC), (640, 480)),
+    ("vins_kb.yaml", VINS_KB, (300, 301, 320, 240), "fisheye", (0.01, -0.02, 0.003, 0.004), (640, 480)),
+    ("ost.txt", OST, NUMBERS, "radtan", FIVE, (640, 480)),
+    ("cal.ini", OST.replace("narrow_stereo", "camera"), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("ros1.yaml", INFO.format("rational_polynomial", "D", list(EIGHT), *"KRP"), NUMBERS, "radtan", EIGHT, (640, 480)),
+    ("ros2.yaml", INFO.format("equidistant", "d", list(KC), *"krp") * 2, NUMBERS, "fisheye", KC, (640, 480)),
+    ("zeros.yaml", INFO.format("rational_polynomial", "D", [0.0] * 8, *"KRP"), NUMBERS, "none", (), (640, 480)),
+    ("cv.xml", XML.format("", 5, "0.1 -0.2 0.003 0.004 0.05"), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("cv_fisheye.xml", XML.format("<fisheye_model>1</fisheye_model>", 4, "0.1 -0.2 0.003 0.004"), NUMBERS, "fisheye",
+     KC, (640, 480)),
+    ("cv_fisheye.yml", f"%YAML:1.0\n---\nfisheye_model: 1\ncamera_matrix: {ROWS}\n"
+     f"distortion_coefficients: {list(KC)}\n", NUMBERS, "fisheye", KC, (None, None)),
+    ("cv_omni.yml", f"%YAML:1.0\n---\nxi: 1.9\ncamera_matrix: {ROWS}\nD: {list(KC)}\n", NUMBERS, "mei", (1.9, *KC),
+     (None, None)),
+    ("cv_stereo.yml", f"%YAML:1.0\n---\nM1: {ROWS}\nD1: {list(FIVE)}\nM2: {ROWS}\nD2: [1, 1, 1, 1, 1]\n", NUMBERS,
+     "radtan", FIVE, (None, None)),
+    ("okvis.yaml", OKVIS, NUMBERS, "radtan", KC, (640, 480)),
+    ("ncamera.yaml", NCAMERA, NUMBERS, "fisheye", KC, (640, 480)),
+    ("svo.yaml", "cam_model: Pinhole\ncam_width: 640\ncam_height: 480\ncam_fx: 500\ncam_fy: 510\ncam_cx: 320\n"
+     "cam_cy: 240\ncam_d0: 0.1\ncam_d1: -0.2\ncam_d2: 0.003\ncam_d3: 0.004\n", NUMBERS, "radtan", KC, (640, 480)),
+    ("omni.yaml", "cam0: {camera_model: omni, intrinsics: [1.9, 500, 510, 320, 240], distortion_model: radtan, "
+     f"distortion_coeffs: {list(KC)}, resolution: [640, 480]}}", NUMBERS, "mei", (1.9, *KC), (640, 480)),
+    ("ds.yaml", "cam0: {camera_model: ds, intrinsics: [-0.2, 0.59, 500, 510, 320, 240], distortion_model: none, "
+     "distortion_coeffs: [], resolution: [640, 480]}", NUMBERS, "double_sphere", (-0.2, 0.59), (640, 480)),
+    ("eucm.yaml", "cam0: {camera_model: eucm, intrinsics: [0.6, 1.1, 500, 510, 320, 240], distortion_model: none, "
+     "distortion_coeffs: []}", NUMBERS, "eucm", (0.6, 1.1), (None, None)),
+    ("fov.yaml", "cam0: {camera_model: pinhole, intrinsics: [500, 510, 320, 240], distortion_model: fov, "
+     "distortion_coeffs: [0.93]}", NUMBERS, "fov", (0.93,), (None, None)),
+    ("ds.json", basalt("ds", xi=-0.2, alpha=0.59), (158, 157, 254, 256), "double_sphere", (-0.2, 0.59), (512, 512)),
+    ("kb4.json", basalt("kb4", k1=0.1, k2=-0.2, k3=0.003, k4=0.004), (158, 157, 254, 256), "fisheye", KC, (512, 512)),
+    ("ucm.json", basalt("ucm", alpha=0.6), (158, 157, 254, 256), "ucm", (0.6,), (512, 512)),
+    ("eucm.json", basalt("eucm", alpha=0.6, beta=1.1), (158, 157, 254, 256), "eucm", (0.6, 1.1), (512, 512)),
+    ("radtan8.json", basalt("pinhole-radtan8", k1=0.1, k2=-0.2, p1=0.003, p2=0.004, k3=0.05, k4=0.06, k5=0.07, k6=0.08,
+     rpmax=2.7), (158, 157, 254, 256), "radtan", EIGHT, (512, 512)),
+    ("transforms.json", transforms(**FULL, k1=0.1, k2=-0.2, p1=0.003, p2=0.004, camera_model="OPENCV"), NUMBERS,
+     "radtan", KC, (640, 480)),
+    ("fish.json", transforms(**FULL, k1=0.1, k2=-0.2, k3=0.003, k4=0.004, camera_model="OPENCV_FISHEYE"), NUMBERS,
+     "fisheye", KC, (640, 480)),
+    ("ngp.json", transforms(**FULL, k1=0.1, k2=-0.2, k3=0.003, k4=0.004, is_fisheye=True, camera_angle_x=1.1), NUMBERS,
+     "fisheye", KC, (640, 480)),
+    ("each.json", transforms([FULL, FULL]), NUMBERS, "none", (), (640, 480)),
+    ("blender.json", transforms(camera_angle_x=math.pi / 2, w=640, h=480), (320, 320, 319.5, 239.5), "none", (),
+     (640, 480)),
+    ("realsense.json", json.dumps({"width": 640, "height": 480, "ppx": 320, "ppy": 240, "fx": 500, "fy": 510,
+     "model": "distortion.brown_conrady", "coeffs": [*FIVE]}), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("open3d.json", json.dumps({"width": 640, "height": 480, "intrinsic_matrix": [500, 0, 0, 0, 510, 0, 320, 240, 1]}),
+     NUMBERS, "none", (), (640, 480)),
+    ("replica.json", json.dumps({"camera": {"w": 640, "h": 480, "fx": 500, "fy": 510, "cx": 320, "cy": 240,
+     "scale": 6553.5}}), NUMBERS, "none", (), (640, 480)),
+    ("nice.yaml", "cam:\n  H: 480\n  W: 640\n  fx: 500\n  fy: 510\n  cx: 320\n  cy: 240\n  png_depth_scale: 5000.\n"
+     "  distortion: [0.1, -0.2, 0.003, 0.004, 0.05]\nmapping: {bound: [[-1, 1], [2, 3]]}\n", NUMBERS, "radtan", FIVE,
+     (640, 480)),
+    ("monogs.yaml", "Dataset:\n  type: tum\n  Calibration:\n    fx: 500\n    fy: 510\n    cx: 320\n    cy: 240\n"
+     "    k1: 0.1\n    k2: -0.2\n    p1: 0.003\n    p2: 0.004\n    k3: 0.05\n    width: 640\n    height: 480\n"
+     "    depth_scale: 5000.0\n    distorted: True\n", NUMBERS, "radtan", FIVE, (640, 480)),
+    ("nested.yaml", f"calibration:\n  camera_matrix: {ROWS}\n  dist: {list(FIVE)}\n  size: [640, 480]\n", NUMBERS,
+     "radtan", FIVE, (640, 480)),
+    ("parts.yaml", "intrinsics: {fx: 500, fy: 510, cx: 320, cy: 240}\ndistortion: {model: radtan, k1: 0.1, k2: -0.2,"
+     " p1: 0.003, p2: 0.004}\nresolution: {width: 640, height: 480}\n", NUMBERS, "radtan", KC, (640, 480)),
+    ("around.yaml", f"K: {ROWS}\ncamera: {{model: fisheye}}\nimage_size: 640x480\nfisheye_coeffs: {list(KC)}\n",
+     NUMBERS, "fisheye", KC, (640, 480)),
+    ("documents.yaml", f"made_by: someone\n---\n{PINHOLE}k1: 0.1\nk2: -0.2\np1: 0.003\np2: 0.004\n...\n", NUMBERS,
+     "radtan", KC, (None, None)),
+    ("comment.yaml", f"# made by someone\n\n--- # here it comes\n{PINHOLE}", NUMBERS, "none", (), (None, None)),
+    ("ros_params.yaml", f"/**:\n  ros__parameters:\n    camera:\n      K: {MATRIX}\n      D: {list(KC)}\n", NUMBERS,
+     "radtan", KC, (None, None)),
+    ("wide_matrix.yaml", "K: [[500, 0, 320, 0], [0, 510, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n", NUMBERS, "none", (),
+     (None, None)),
+    ("matrix.txt", "500 0 320 0\n0 510 240 0\n0 0 1 0\n0 0 0 1\n", NUMBERS, "none", (), (None, None)),
+    ("row.txt", "500 0 320 0 510 240 0 0 1\n", NUMBERS, "none", (), (None, None)),
+    ("rational.txt", "500 510 320 240 .1 -.2 .003 .004 .05 .06 .07 .08\n", NUMBERS, "radtan", EIGHT, (None, None)),
+    ("projection.txt", "500 0 320 0\n0 510 240 0\n0 0 1 0\n", NUMBERS, "none", (), (None, None)),
+    ("dso.txt", "RadTan 500 510 320 240 .1 -.2 .003 .004\n640 480\ncrop\n640 480\n", NUMBERS, "radtan", KC, (640, 480)),
+    ("dso_kb.txt", "KannalaBrandt 500 510 320 240 .1 -.2 .003 .004\n640 480\nfull\n640 480\n", NUMBERS, "fisheye", KC,
+     (640, 480)),
+    ("dso_equi.txt", "EquiDistant 500 510 320 240 .1 -.2 .003 .004\n640 480\n0.4 0.5 0.5 0.5 0\n640 480\n", NUMBERS,
+     "fisheye", KC, (640, 480)),
+    ("dso_fov.txt", "FOV 0.5 0.625 0.5 0.5 0.93\n640 480\ncrop\n640 480\n", (320, 300, 319.5, 239.5), "fov", (0.93,),
+     (640, 480)),
+    ("dso_five.txt", "500 510 320 240 0.93\n640 480\ncrop\n640 480\n", NUMBERS, "fov", (0.93,), (640, 480)),
+    ("dso_none.txt", "Pinhole 500 510 320 240 0\n640 480\nnone\n640 480\n", NUMBERS, "none", (), (640, 480)),
+    ("calib_cam_to_cam.txt", KITTI_RAW, (721.5377, 721.5377, 609.5593, 172.854), "none", (), (1242, 375)),
+    ("kitti_recorded.txt", KITTI_RAW.replace("_rect", "_left"), (984.2439, 980.8141, 690, 233.1966), "radtan",
+     (-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722), (1392, 512)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "numbers", "model", "coefficients", "size"), READ, ids=[row[0] for row in READ]
+)
+def test_what_is_read(make, name, text, numbers, model, coefficients, size):
+    found = read_calibration(make.text(name, text))
+    assert (found.fx, found.fy, found.cx, found.cy) == pytest.approx(numbers)
+    assert (found.model, found.coefficients) == (model, pytest.approx(coefficients))
+    assert (found.width, found.height) == size
+    assert found.dialect
+
+
+NAMES = [
+    "dist_coeffs", "dist_coeff", "dist", "d", "D", "distortion", "Distortion_Coefficients", "coeffs", "distCoeffs",
+    "distortion_parameters", "distortion coefficients", "kc", "distortion_coefs", "lens_distortion", "dist_params",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("key", NAMES)
+def test_names_of_coefficients(make, key):
+    found = read_calibration(make.text("c.yaml", f"camera_matrix: {ROWS}\n{key}: {list(FIVE)}\n"))
+    assert (found.model, found.coefficients) == ("radtan", FIVE)
+
+
+@pytest.mark.parametrize(
+    "size",
+    [
+        "image_width: 640\nimage_height: 480", "cols: 640\nrows: 480", "w: 640\nh: 480", "W: 640\nH: 480",
+        "resolution: [640, 480]", "size: [640, 480]", "image_size: [640, 480]", "imageSize: {width: 640, height: 480}",
+        "img_width: 640\nimg_height: 480", "Camera.width: 640\nCamera.height: 480", "resolution: 640x480",
+    ],
+)  # fmt: skip
+def test_names_of_sizes(make, size):
+    found = read_calibration(make.text("c.yaml", f"{PINHOLE}{size}\n"))
+    assert (found.width, found.height) == (640, 480)
+
+
+LENS_KEYS = [
+    "lens_warp: [-0.28, 0.07, 0.0002, 0.0, 0.0]", "barrel: -0.28", "optical_aberration: [0.1, 0.2]", "k9: 0.1",
+    "fisheye_parameters: [0.1, 0.2, 0.3]", "mystery: [-0.28, 0.07, 0.0002, 0.0, 0.0]", "xi: 1.2", "skew: 0.5",
+    "radial: [0.1, 0.2]", "Glass: {k1: 0.1}", "k1: [0.1, 0.2]", "tangential_distortion: [0.1, 0.2]", "tau_x: 0.1",
+    "distorted: true",
+    "poly_parameters: {p0: 1.0, p1: 2.0}", "Camera.kappa: 0.3", "inner: {distortion_coefficients: [0.1, 0, 0, 0]}",
+    "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("line", LENS_KEYS)
+def test_a_lens_that_is_not_understood_is_refused_by_name(make, line):
+    known = line.split(":")[0].split(".")[-1]
+    body = PINHOLE + "model: radtan\ncoefficients: [0.1, 0, 0, 0]\n" if line.startswith("xi") else PINHOLE
+    file = make.text("c.yaml", f"{body}{line}\n")
+    with pytest.raises(DvoError, match=known) as caught:
+        read_calibration(file)
+    assert caught.value.file == file and caught.value.field and caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "distortion: []", "skew: 0", "distortion_model: none", "fisheye: 0", "undistort: true", "min_dist: 30",
+        "rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}", "T_cam_imu: [1, 2, 3, 4]",
+        "camera_name: lens 4", "per_view_errors: [0.1, 0.2, 0.3, 0.4]", "distortion_model: ''", "k1: 0.0",
+        "roi: [1, 2, 3, 4]",
+        "quaternion: [0, 0, 0, 1]", "distance: 4", "serial: abc", "P1: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]",
+    ],
+)  # fmt: skip
+def test_entries_of_other_matters_are_ignored(make, line):
+    found = read_calibration(make.text("c.yaml", f"{PINHOLE}{line}\n"))
+    assert found.model == "none" and found.fx == 500
+
+
+REFUSED = [
+    ("c.yaml", VSLAM.format("equirectangular", ""), "unknown distortion model 'equirectangular'"),
+    ("c.yaml", VSLAM.format("radial_division", ""), "unknown distortion model"),
+    ("c.yaml", VSLAM.format("fisheye", "p1: 0.1"), "Camera.p1"),
+    ("c.yaml", VINS.format("SCARAMUZZA", "fx: 1\nfy: 1\ncx: 1\ncy: 1"), "unknown distortion model 'SCARAMUZZA'"),
+    ("c.yaml", "K: [[500, 2, 320], [0, 510, 240], [0, 0, 1]]\n", "skew"),
+    ("c.txt", "500 2 320\n0 510 240\n0 0 1\n", "skew"),
+    ("c.yaml", RECTIFIED + "Camera1.k1: 0.1\n", "Camera1.k1"),
+    ("c.yaml", f"{PINHOLE}model: fisheye\ndistortion_model: plumb_bob\n", "two lens models"),
+    ("c.yaml", f"{PINHOLE}D: {[0.1] * 14}\n", "14 coefficients"),
+    ("c.yaml", f"{PINHOLE}model: ucm\nalpha: 1.5\n", "alpha=1.5"),
+    ("c.yaml", f"{PINHOLE}model: eucm\nalpha: 0.5\n", "1 coefficients"),
+    ("c.yaml", f"left: {{{PINHOLE.replace(chr(10), ', ')}}}\nfront: {{fx: 1, fy: 1, cx: 1, cy: 1}}\n"
+     "left_2: 3\n".replace("left:", "back:"), "2 cameras in it: "),
+    ("c.yaml", f"{PINHOLE}---\n{PINHOLE.replace('500', '400')}", "2 documents with different cameras"),
+    ("c.yaml", "fx: 500\nfy: 510\n", "no cx, cy in it"),
+    ("c.yaml", "camera: {exposure: 3}\nname: x\n", "no fx, fy, cx, cy in it, nor a camera matrix: camera, name"),
+    ("c.json", "{", "not valid JSON"),
+    ("c.json", '{"fx": 1, "fx": 2}', "a key twice"),
+    ("c.json", "[" * 100_000, "not valid JSON"),
+    ("c.xml", "<?xml version='1.0'?><a><b></a>", "not valid XML"),
+    ("c.xml", "<?xml version='1.0'?><!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", "XML with declarations"),
+    ("ost.txt", OST.replace("distortion", "lens warp"), "lens warp"),
+    ("ost.txt", OST.replace("0.1 -0.2", "0.1 minus"), "not understood"),
+    ("t.json", transforms(**FULL, k1=0.1, k4=0.1, camera_model="OPENCV"), "k4"),
+    ("t.json", transforms(camera_angle_x=1.0), "angle of view without the size"),
+    ("t.json", transforms([FULL, {**FULL, "fl_x": 400}]), "frames of different cameras"),
+    ("t.json", transforms(**FULL, camera_model="EQUIRECTANGULAR"), "unknown distortion model"),
+    ("dso.txt", "Pinhole 500 510 320 240 0.5\n640 480\ncrop\n640 480\n", "a distortion of 0.5"),
+    ("dso.txt", "RadTan 500 510 320 240 0.5\n640 480\ncrop\n640 480\n", "5 numbers of the model RadTan"),
+    ("calib_cam_to_cam.txt", KITTI_RAW.replace("P_rect_00: 7", "P_rect_00: x"), "not a number"),
+    ("realsense.json", json.dumps({"fx": 500, "fy": 510, "ppx": 320, "ppy": 240, "model": "inverse_brown_conrady",
+     "coeffs": [0.1] * 5}), "inverse_brown_conrady"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "text", "match"), REFUSED, ids=[f"{n}-{row[0]}" for n, row in enumerate(REFUSED)])
+def test_what_is_refused(make, name, text, match):
+    file = make.text(name, text)
+    with pytest.raises(DvoError, match=match) as caught:
+        read_calibration(file)
+    assert caught.value.file == file and caught.value.remedy
+
+
+def test_a_camera_of_several_by_its_number(make):
+    file = make.text("camchain.yaml", "cam0: {intrinsics: [1, 2, 3, 4]}\ncam1: {intrinsics: [5, 6, 7, 8]}\n")
+    assert read_calibration(file).fx == 1 and read_calibration(f"{file}:1").fx == 5
+    with pytest.raises(DvoError, match="no camera 2 in it"):
+        read_calibration(f"{file}:2")
+    other = KITTI_RAW + KITTI_RAW.replace("_00", "_02").replace("7.215", "7.315")
+    raw = make.text("calib_cam_to_cam.txt", other)
+    assert read_calibration(f"{raw}:2").fx == 731.5377
+    with pytest.raises(DvoError, match="2 cameras in it: 0, 2"):
+        read_calibration(raw)
+
+
+def test_stereo_files_of_orb_slam_say_which_camera_is_read(make):
+    (said,) = read_calibration(make.text("c.yaml", SLAM + STEREO)).doubts(640, 480)
+    assert "rectified" in said and "LEFT.K" in said
+
+
+def test_depth_scale_and_baseline_are_found_in_their_mappings(make):
+    assert read_calibration(make.text("a.yaml", SLAM)).depth_scale == 5000
+    assert read_calibration(make.text("b.yaml", SLAM.replace("DepthMap", "RGBD.DepthMap"))).depth_scale == 5000
+    assert read_calibration(make.text("c.yaml", RECTIFIED)).baseline == 0.0745
+    assert read_calibration(make.text("d.yaml", SLAM + "Camera.bf: 50.0\n")).baseline == 0.1
+
+
+def test_the_mei_model_of_a_file_gives_its_pixels(make):
+    """As camodocal's CataCamera projects: onto the sphere, then distorted, then to pixels."""
+    camera = read_calibration(make.text("c.yaml", VINS_MEI)).camera(640, 480)
+    X, Y, Z = 0.3, -0.2, 1.0
+    z = Z + 1.9 * math.sqrt(X * X + Y * Y + Z * Z)
+    x, y = X / z, Y / z
+    r2, (k1, k2, p1, p2) = x * x + y * y, KC
+    u = x * (1 + k1 * r2 + k2 * r2 * r2) + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * (1 + k1 * r2 + k2 * r2 * r2) + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    assert project(np.array([X, Y, Z]), camera) == pytest.approx([900 * u + 320, 910 * v + 240], abs=1e-9)
+
+
+def test_a_large_transforms_file(make):
+    text = transforms([{"sharpness": 31.123456789} for _ in range(12_000)], **FULL)
+    assert len(text) > 1024**2 and read_calibration(make.text("transforms.json", text)).fx == 500

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.files import listed_files
+from dvo.data.files.listing import listed_files
 from dvo.data.files.stamps import times_from_names
 from dvo.data.images.images import list_images
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Selection

@@ -155,8 +155,8 @@ class Source:
 
     @property
     def skipped(self) -> int:
-        """Number of images that could not be decoded on the last pass so far."""
-        return len(self._log.unreadable)
+        """Number of images that could not be decoded, or were not there, on the last pass so far."""
+        return len(self._log.unreadable) + len(self._log.missing)
 
     @property
     def timestamps(self) -> np.ndarray | None:

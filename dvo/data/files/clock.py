@@ -26,6 +26,7 @@ _USUAL = (1e-5, 10.0)  # seconds between images or poses on such a clock
 _DECIMAL_SECONDS = 8.0  # interval of decimal numbers from which they are milliseconds: 125 images a second
 _WHOLE_SECONDS = 5.0  # of whole numbers that do not all have the same interval
 _POSE_SECONDS = 1000.0  # of poses, which may be those of keyframes
+_EVEN = 0.25  # share of the usual interval that a camera keeps
 _SLOWEST = 2.0  # seconds: an interval above it is one of a finer unit
 _COUNTER = 10.0  # largest interval of numbers that count images
 _DIGITS = 19  # of an integer of 64 bits
@@ -188,7 +189,8 @@ def unit_of(values: Sequence[int | float], *, poses: bool = False) -> str:
         longest = np.inf if _is_epoch(size, 1) else _DECIMAL_SECONDS
     else:
         longest = _WHOLE_SECONDS if (steps == steps[0]).all() else _SLOWEST
-    if step < longest:
+    is_even = float(np.quantile(steps, 0.1)) >= _EVEN * step  # frames that are dropped make intervals longer only
+    if step < longest or (step < _POSE_SECONDS and not is_even):
         return "s"
     return next((unit for unit in ("ms", "us") if step / PARTS[unit] < _SLOWEST), "ns")
 

@@ -45,6 +45,18 @@ def is_folder(path: Path) -> bool:
         return False
 
 
+def exists(path: Path) -> bool:
+    """True for a file of any kind or a link to one; False for what cannot be looked up.
+
+    Args:
+        path: any.
+    """
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def lookups(path: Path) -> Iterator[None]:
     """Turn errors of the file system into one :class:`DvoError`.

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import in_seconds, parse_time, unit_of
+from dvo.data.files.clock import in_seconds, is_time_name, parse_time, unit_of
 from dvo.data.files.files import is_file, read_lines
 
 
@@ -73,7 +73,7 @@ def listed_files(
         try:
             time, name = parse_time(fields[0]), fields[1].strip()
         except (ValueError, IndexError):
-            if not times and number == 1 and len(fields) > 1 and fields[0][:1].isalpha():
+            if not times and len(fields) > 1 and is_time_name(fields[0]):
                 continue  # names of the columns
             raise DvoError(
                 "not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row"

@@ -118,6 +118,24 @@ def _values(before: str, blank: str) -> re.Pattern[str]:
 _VALUES = {whole: (_values("?&", blank), _values("?&;#/_", blank)) for whole, blank in ((False, r"\s"), (True, ""))}
 
 
+def in_utf8(text: str) -> str:
+    """Text that can be written in UTF-8: bytes of a file's name that are no text become U+FFFD.
+
+    Args:
+        text: any, such as a name as the file system gives it.
+
+    Example:
+        >>> in_utf8("caf\\udce9")
+        'caf\ufffd'
+    """
+    return text.encode("utf-8", "surrogateescape" if _is_escaped(text) else "replace").decode("utf-8", "replace")
+
+
+def _is_escaped(text: str) -> bool:
+    """True unless there are surrogates that stand for no byte."""
+    return not any("\ud800" <= c <= "\udfff" and not "\udc80" <= c <= "\udcff" for c in text)
+
+
 def visible(text: str, *, lines: bool = False) -> str:
     """Text in which characters that steer a terminal, or that nobody sees, are written as escapes.
 

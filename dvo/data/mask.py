@@ -50,7 +50,8 @@ def read_mask(file: Path, invert: bool = False) -> np.ndarray:
 
     Args:
         file: image of any format that OpenCV reads. Pixels other than black are used; of a JPEG file those brighter
-            than mid-grey, because compression leaves no exact black.
+            than mid-grey, because compression leaves no exact black. Of an image with transparent pixels these are
+            ignored, and its colours count only if they are black and white.
         invert: the other way round.
 
     Returns:
@@ -62,9 +63,18 @@ def read_mask(file: Path, invert: bool = False) -> np.ndarray:
     image = decode(file)
     if image is None:
         raise DvoError("cannot be read as an image", file=file, field="mask", remedy=_REMEDY)
-    levels = image if image.ndim == 2 else image[..., : min(3, image.shape[2])].max(axis=2)
+    levels = image if image.ndim == 2 else _levels(image)
     least = _HALF if file.suffix.lower() in (".jpg", ".jpeg") else 1e-12
     return (levels >= least) != invert
+
+
+def _levels(image: np.ndarray) -> np.ndarray:
+    """Grey levels of an image with channels; what is transparent is black, and alone decides beside colours."""
+    colours = image[..., : min(3, image.shape[2])].max(axis=2)
+    if image.shape[2] != 4 or image[..., 3].all():
+        return colours
+    is_drawn = len(np.unique(colours)) == 2 and colours.min() == 0  # black and white, besides
+    return np.minimum(colours, image[..., 3]) if is_drawn else image[..., 3]
 
 
 class Masks:

@@ -77,8 +77,13 @@ def first_frame(recording: Recording) -> RawFrame:
     log = Log()
     found = next(islice(recording.frames(log), 1), None)
     if found is None:
+        if log.missing and not log.unreadable:
+            remedy = "mend the links, or the names in the list"
+            raise DvoError(f"none of the {len(log.missing)} images is there", file=recording.path, remedy=remedy)
+        count = len(log.unreadable)
+        absent = f"; {len(log.missing)} others are not there" if log.missing else ""
         raise DvoError(
-            f"none of the {len(log.unreadable)} images decodes",
+            f"none of the {count} images decodes{absent}",
             file=recording.path,
             remedy="check that the files are images that other programs can show",
         )

@@ -5,22 +5,26 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration, StereoRig
+from dvo.data.files.files import exists
 from dvo.data.frame import InertialSamples
-from dvo.data.images.images import read_image
+from dvo.data.images.images import converted, decode, read_image, used_bits
 from dvo.data.images.orientation import common_orientation, turn
 from dvo.data.images.reduction import Reduction
 from dvo.data.interval import Interval
 from dvo.data.sensors.depth import read_depth
 from dvo.data.sensors.sensors import Sensors
 from dvo.data.trajectory import Trajectory
+
+_LOOKED_AT = 7  # images of 16 bits whose largest values are compared
 
 
 @dataclass(frozen=True)
@@ -87,11 +91,13 @@ class Log:
         unreadable: names of the images that could not be decoded.
         notes: other sentences.
         without: names of depth and right images that could not be decoded; their frames are kept.
+        missing: names of listed images, or of links, without a file.
     """
 
     unreadable: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     without: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
 
     def messages(self) -> list[str]:
         """Sentences for people."""
@@ -100,6 +106,10 @@ class Log:
             count = len(self.unreadable)
             what = "1 image could not be read and was" if count == 1 else f"{count} images could not be read and were"
             found.insert(0, f"{what} skipped: {_few(self.unreadable)}")
+        if self.missing:
+            count = len(self.missing)
+            what = "1 image is" if count == 1 else f"{count} images are"
+            found.append(f"{what} not there (a broken link, or a name in a list): {_few(self.missing)}")
         if self.without:
             count = len(self.without)
             found.append(f"{count} depth or right image{'s' * (count > 1)} could not be read: {_few(self.without)}")
@@ -107,7 +117,7 @@ class Log:
 
 
 def _few(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return ", ".join(map(visible, names[:3])) + (", ..." if len(names) > 3 else "")
 
 
 @runtime_checkable
@@ -255,6 +265,7 @@ class ImageRecording:
         self.images: list[Path] = [image for image, keep in zip(images, later, strict=True) if keep]
         self.timestamps: np.ndarray = np.asarray(timestamps, dtype=np.float64)[later]
         self.frame_count: int | None = len(self.images)
+        self._is_transparent = False
         has_others = self.sensors.depth is not None or self.sensors.right is not None
         self.orientation = 1 if has_others else common_orientation(self.images, self.warnings)
 
@@ -273,13 +284,37 @@ class ImageRecording:
         """Degrees clockwise by which images are turned to stand upright, as their EXIF data ask for."""
         return turn(self.orientation)
 
+    @cached_property
+    def bits(self) -> int:
+        """Bits that images of 16 bits use, by some of them."""
+        some = sorted({round(k * (len(self.images) - 1) / (_LOOKED_AT - 1)) for k in range(_LOOKED_AT)})
+        decoded = (decode(self.images[index]) for index in some)
+        first = next((image for image in decoded if image is not None), None)
+        if first is None or first.dtype != np.uint16:
+            return 16
+        bits = used_bits(decode(self.images[index]) for index in some)
+        if bits < 16:
+            factor = 2 ** (bits - 8)
+            self.warnings.append(f"the images of 16 bits hold {bits} bits: they are divided by {factor}, not by 257")
+        return bits
+
+    def _look_through(self, decoded: np.ndarray) -> None:
+        """Warn once of transparent pixels."""
+        if not self._is_transparent and (decoded[..., 3] == 0).any():
+            self._is_transparent = True
+            self.warnings.append(
+                "the images have transparent pixels, which are read as they are coloured: to leave them out, give the "
+                f"images as masks too (--mask {visible(str(self.images[0].parent))})"
+            )
+
     def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """See :class:`Recording`."""
         numbered, interval = enumerate(self.timestamps.tolist()), selection.interval
         for index, _ in interval.select(numbered, lambda item: item[1], selection.stride, self.path):
             frame = self.frame(index, log, selection.reduction)
             if frame is None:
-                log.unreadable.append(self.images[index].name)
+                file = self.images[index]
+                (log.unreadable if exists(file) else log.missing).append(file.name)
             else:
                 yield frame
 
@@ -295,9 +330,12 @@ class ImageRecording:
             The frame, or None if its image is corrupt.
         """
         file = self.images[index]
-        image = read_image(file, reduction, self.orientation)
-        if image is None:
+        decoded = decode(file, reduction, self.orientation)
+        if decoded is None:
             return None
+        if decoded.ndim == 3 and decoded.shape[2] == 4:
+            self._look_through(decoded)
+        image = converted(decoded, file, self.bits if decoded.dtype == np.uint16 else 16)
         depth = partial(self._depth, file, log) if self.sensors.depth else None
         right = partial(self._right, file, log) if self.sensors.right else None
         return RawFrame(index, float(self.timestamps[index]), image, str(file), depth, right)
@@ -311,7 +349,7 @@ class ImageRecording:
 
     def _right(self, image: Path, log: Log) -> np.ndarray | None:
         file = self.sensors.right(image) if self.sensors.right else None
-        right = read_image(file, None, self.orientation) if file else None
+        right = read_image(file, None, self.orientation, self.bits) if file else None
         if file and right is None:
             log.without.append(file.name)
         return right

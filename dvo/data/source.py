@@ -11,6 +11,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.text import in_utf8
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.focal_guess import FocalGuess
 from dvo.data.frame import Frame, InertialSamples, StereoView
@@ -105,7 +106,8 @@ class Source:
     def __init__(self, recording: Recording, reading: Reading) -> None:
         self.recording, self.reading = recording, reading
         self._log = Log()
-        self.name, self.kind, self.path, self.turned = recording.name, recording.kind, recording.path, recording.turned
+        self.name = in_utf8(recording.name)
+        self.kind, self.path, self.turned = recording.kind, recording.path, recording.turned
         self.recorded_camera, self.groundtruth = reading.recorded_camera, reading.groundtruth
         self.calibration, self.guess, self.masks = reading.calibration, reading.guess, reading.masks
         self.stride, self.reduction = reading.selection.stride, reading.selection.reduction
@@ -155,8 +157,8 @@ class Source:
 
     @property
     def skipped(self) -> int:
-        """Number of images that could not be decoded on the last pass so far."""
-        return len(self._log.unreadable)
+        """Number of images that could not be decoded, or were not there, on the last pass so far."""
+        return len(self._log.unreadable) + len(self._log.missing)
 
     @property
     def timestamps(self) -> np.ndarray | None:

@@ -12,6 +12,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.files.files import parse_number, read_rows
 from dvo.data.files.output import replaced, write_text
+from dvo.data.files.pose_table import read_pose_table
 from dvo.geometry.poses import pose_matrices, poses_from_matrices, slerp
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world)\n"
@@ -103,6 +104,9 @@ def tum_row(values: Iterable[float]) -> str:
 def read_tum(path: Path | str) -> Trajectory:
     """Read a trajectory in TUM's format: rows ``timestamp tx ty tz qx qy qz qw``, ``#`` comments.
 
+    Times in nanoseconds (or milli- or microseconds) are recognised, a header that names the columns is followed, and
+    rows of NaN are left out, see :func:`dvo.data.files.pose_table.read_pose_table`.
+
     Args:
         path: the file; blanks or commas between the numbers.
 
@@ -120,19 +124,20 @@ def read_tum(path: Path | str) -> Trajectory:
         array([[1., 2., 3., 0., 0., 0., 1.]])
     """
     path = Path(path)
-    table, numbers = read_numbers(path, 8, "TUM row", "timestamp tx ty tz qx qy qz qw")
-    late = np.flatnonzero(np.diff(table[:, 0]) < 0)
+    clock, poses, numbers = read_pose_table(path)
+    times = clock.seconds
+    late = np.flatnonzero(np.diff(times) < 0)
     if len(late):
         row = int(late[0]) + 1
         raise DvoError(
-            f"times must not decrease, but {table[row, 0]:.9f} follows {table[row - 1, 0]:.9f}",
+            f"times must not decrease, but {times[row]:.9f} follows {times[row - 1]:.9f}",
             file=path,
             field=f"line {numbers[row]}",
             remedy="sort the rows",
         )
-    table[:, 4:] = unit_quaternions(table[:, 4:], path, numbers)
-    first = np.diff(table[:, 0], prepend=-np.inf) > 0  # TUM's own ground truth repeats some rows
-    return Trajectory(table[first, 0], table[first, 1:])
+    poses[:, 3:] = unit_quaternions(poses[:, 3:], path, numbers)
+    first = np.diff(times, prepend=-np.inf) > 0  # TUM's own ground truth repeats some rows
+    return Trajectory(times[first], poses[first])
 
 
 def read_numbers(path: Path, columns: int, row: str, header: str) -> tuple[np.ndarray, list[int]]:

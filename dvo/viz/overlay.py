@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.output import begin_part, check_place, drop_part, end_part
+from dvo.data.files.output import begin_part, check_place, drop_part, end_part, spelled_in_text
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Odometry, Status
 from dvo.session.observer import graph_of, window_view
@@ -62,7 +62,8 @@ class OverlayVideo:
             self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2  # codecs want even sizes
             codec = cv2.VideoWriter.fourcc(*("MJPG" if self.file.suffix.lower() == ".avi" else "mp4v"))
             self._part = begin_part(self.file)
-            self._writer = cv2.VideoWriter(str(self._part), codec, RATE, self._size)
+            with spelled_in_text(self._part) as name:
+                self._writer = cv2.VideoWriter(name, codec, RATE, self._size)
             if not self._writer.isOpened():
                 raise self._error("no codec for this kind of video")
         self._writer.write(np.ascontiguousarray(picture[: self._size[1], : self._size[0], ::-1]))

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from dvo.core.text import in_utf8
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import quaternion_to_matrix
 from dvo.session.frame_table import SKIPPED, FrameRow
@@ -101,7 +102,7 @@ def write_page(path: Path, page: RunPage) -> None:
     scripts = "\n".join((ASSETS / f"{name}.js").read_text(encoding="utf-8") for name in ("view", "charts", "page"))
     facts = (f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>\n" for name, value in page.facts)
     data = json.dumps(page_data(page), separators=(",", ":"), allow_nan=False)
-    path.write_text(
+    text = in_utf8(
         template.substitute(
             title=escape(page.title),
             subtitle=escape(page.subtitle),
@@ -111,9 +112,9 @@ def write_page(path: Path, page: RunPage) -> None:
             style=(ASSETS / "page.css").read_text(encoding="utf-8"),
             script=scripts,
             data=data.replace("<", "\\u003c"),  # a text may hold "</script>"
-        ),
-        encoding="utf-8",
+        )
     )
+    path.write_text(text, encoding="utf-8")
 
 
 def page_data(page: RunPage) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.files import listed_files
+from dvo.data.files.listing import listed_files
 from dvo.data.files.stamps import times_from_names
-from dvo.data.images.images import list_images
+from dvo.data.images.images import list_images, natural_key
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Selection
-from dvo.data.sensors.sensors import Finder, NearestInTime, SameNumbers
+from dvo.data.sensors.sensors import Finder, Listed, NearestInTime, numbers_of
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,6 @@ class CompanionKind:
     option: str
     form: str
     arrays: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class _InOrder:
-    """File of the same place in the order."""
-
-    files: dict[Path, Path]
-
-    def __call__(self, image: Path) -> Path | None:
-        return self.files.get(image)
 
 
 @dataclass(frozen=True)
@@ -145,8 +135,11 @@ def companions_of_frames(path: Path | None, frames: int | None, kind: CompanionK
     return files
 
 
-def _files(folder: Path, kind: CompanionKind) -> list[Path]:
-    files = list_images(folder) or sorted(file for file in folder.iterdir() if file.suffix in kind.arrays)
+def _files(folder: Path, kind: CompanionKind, others: Collection[Path] = ()) -> list[Path]:
+    """Files of a folder in natural order, without ``others``: a folder may hold two streams."""
+    files = [file for file in list_images(folder) if file not in others] or sorted(
+        (file for file in folder.iterdir() if file.suffix in kind.arrays), key=lambda file: natural_key(file.name)
+    )
     if not files:
         remedy = f"give a folder of {kind.form}"
         raise DvoError(f"no {kind.noun} in it", file=folder, field=kind.option, remedy=remedy)
@@ -154,17 +147,19 @@ def _files(folder: Path, kind: CompanionKind) -> list[Path]:
 
 
 def _of_folder(folder: Path, recording: ImageRecording, kind: CompanionKind) -> Finder:
-    files, images = _files(folder, kind), recording.images
+    images = recording.images
+    files = _files(folder, kind, set(images))
     stamps = times_from_names(files)
     if stamps is not None:
         nearest = _nearest(files, stamps, recording)
         if any(nearest(image) for image in images):
             return nearest
-    names = SameNumbers(folder)
-    if files[0].suffix not in kind.arrays and sum(names(image) is not None for image in images) == len(files):
-        return names
+    by_numbers = {numbers_of(file): file for file in files}
+    named = {image: by_numbers[numbers_of(image)] for image in images if numbers_of(image) in by_numbers}
+    if len(named) == len(files):
+        return Listed(named)
     if len(files) == len(images):
-        return _InOrder(dict(zip(images, files, strict=True)))
+        return Listed(dict(zip(images, files, strict=True)))
     raise _mismatch(folder, len(files), f"{len(images)} images", kind)
 
 

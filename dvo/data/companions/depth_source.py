@@ -14,10 +14,9 @@ from dvo.data.opening import locate
 from dvo.data.readers.tum import DEPTH_SCALE
 from dvo.data.recording import ImageRecording
 from dvo.data.sensors.depth import read_depth
+from dvo.data.sensors.sensors import MILLIMETRES
 from dvo.data.source import Source
 
-MILLIMETRES = 1000.0
-"""Units of a metre in 16-bit depth images of a folder, unless it is a list in the layout of TUM RGB-D."""
 _KIND = CompanionKind("depth images", "--depth", "16-bit PNG files", (".npy", ".npz"))
 
 

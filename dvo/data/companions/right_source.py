@@ -67,7 +67,8 @@ def with_right(source: Source, right: Path | str | None = None, baseline: float 
     path = None if right is None else locate(right, source.path, "right")
     recording, stages = source.recording, source.reading.stages
     orientation = recording.orientation if isinstance(recording, ImageRecording) else 1
-    read = partial(read_image, reduction=None, orientation=orientation)
+    bits = recording.bits if isinstance(recording, ImageRecording) else 16
+    read = partial(read_image, reduction=None, orientation=orientation, bits=bits)
     if not isinstance(recording, ImageRecording) and is_video(path):
         stages = (*stages, CompanionVideo.of(recording, path))
     elif isinstance(recording, ImageRecording) and path is None and recording.sensors.right is None:

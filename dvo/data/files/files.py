@@ -1,13 +1,11 @@
-"""Files within bounds: tables row by row, image files whole, numbers that are times, and names in lists of files."""
+"""Files within bounds: tables row by row, image files whole, and numbers that are times."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath, PureWindowsPath
-
-import numpy as np
+from pathlib import Path
 
 from dvo.core.errors import DvoError
 
@@ -47,6 +45,18 @@ def is_folder(path: Path) -> bool:
         return False
 
 
+def exists(path: Path) -> bool:
+    """True for a file of any kind or a link to one; False for what cannot be looked up.
+
+    Args:
+        path: any.
+    """
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def lookups(path: Path) -> Iterator[None]:
     """Turn errors of the file system into one :class:`DvoError`.
@@ -82,9 +92,18 @@ def read_rows(path: Path, remedy: str, field: str | None = None) -> Iterator[tup
             :data:`MAX_LINE` or no UTF-8.
     """
     for number, line in read_lines(path, remedy, field):
-        fields = line.split("#", 1)[0].replace(",", " ").replace(";", " ").split()
+        fields = fields_of(line)
         if fields:
             yield number, fields
+
+
+def fields_of(line: str) -> list[str]:
+    """Fields of a row, see :func:`read_rows`.
+
+    Args:
+        line: the row.
+    """
+    return line.split("#", 1)[0].replace(",", " ").replace(";", " ").split()
 
 
 def read_lines(
@@ -138,65 +157,6 @@ def read_image_file(path: Path) -> bytes | None:
         return path.read_bytes()
     except OSError:
         return None
-
-
-def listed_file(listing: Path, folder: Path, name: str, line: int) -> Path:
-    """File that a list of files names.
-
-    Links are followed when it is read; the name itself must not lead out of the folder.
-
-    Args:
-        listing: the list, for messages.
-        folder: that the names are relative to.
-        name: as listed.
-        line: number of its line.
-
-    Returns:
-        The file, which need not exist.
-
-    Raises:
-        DvoError: an absolute name, or one with ``..``.
-    """
-    outside = any(
-        pure.is_absolute() or pure.drive or ".." in pure.parts for pure in (PurePosixPath(name), PureWindowsPath(name))
-    )
-    if outside or "\0" in name:
-        raise DvoError(
-            f"{name[:200]!r} is not a file of this folder",
-            file=listing,
-            field=f"line {line}",
-            remedy="list names relative to the folder, without '..'",
-        )
-    return folder / name
-
-
-def listed_files(listing: Path, what: str = "images") -> tuple[list[Path], np.ndarray]:
-    """Files and times of a list in the layout of TUM RGB-D, such as ``rgb.txt``: ``timestamp filename`` a row.
-
-    Args:
-        listing: text file; what follows a ``#`` is left out.
-        what: it lists, for messages.
-
-    Returns:
-        Files, which need not exist, and their times ``(N,)`` in seconds, sorted by time.
-
-    Raises:
-        DvoError: the file cannot be read, or a row that is none, with the number of its line.
-    """
-    rows: list[tuple[float, Path]] = []
-    for number, line in read_lines(listing, f"give a list of {what}"):
-        fields = line.split("#")[0].split(maxsplit=1)
-        if not fields:
-            continue
-        try:
-            time, name = parse_number(fields[0]), fields[1].strip()
-        except (ValueError, IndexError):
-            raise DvoError(
-                "not 'timestamp filename'", file=listing, field=f"line {number}", remedy="correct the row"
-            ) from None
-        rows.append((time, listed_file(listing, listing.parent, name, number)))
-    rows.sort(key=lambda row: row[0])
-    return [path for _, path in rows], np.array([time for time, _ in rows])
 
 
 def parse_number(text: str) -> float:

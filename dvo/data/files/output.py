@@ -11,12 +11,14 @@ import re
 import secrets
 import shutil
 import stat
+import tempfile
 import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 from dvo.core.errors import DvoError
+from dvo.core.text import in_utf8
 
 PART = ".part-"
 """Prefix of a file or folder that is being written: host, process and number of the part follow, and the final name."""
@@ -72,7 +74,34 @@ def write_text(path: Path | str, text: str) -> None:
         OSError: it cannot be written.
     """
     with replaced(path) as part:
-        part.write_text(text, encoding="utf-8", newline="\n")
+        part.write_text(in_utf8(text), encoding="utf-8", newline="\n")
+
+
+@contextlib.contextmanager
+def spelled_in_text(path: Path) -> Iterator[str]:
+    """Name of a file for libraries that take text alone; OpenCV ends the process at one that is no UTF-8.
+
+    Args:
+        path: to read or to write.
+
+    Yields:
+        The path itself, or a link to it that goes away at the end.
+
+    Raises:
+        DvoError: the link cannot be made.
+    """
+    text = str(path)
+    if in_utf8(text) == text:
+        yield text
+        return
+    with tempfile.TemporaryDirectory(prefix="dvo-") as folder:
+        link = Path(folder) / f"file{path.suffix if path.suffix.isascii() else ''}"
+        try:
+            link.symlink_to(path.absolute())
+        except OSError:
+            message, remedy = "a name that is no text in UTF-8", "rename the file"
+            raise DvoError(message, file=path, remedy=remedy) from None
+        yield str(link)
 
 
 def begin_part(path: Path | str) -> Path:

@@ -9,36 +9,23 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.files import is_file, is_nanoseconds, parse_nanoseconds, parse_number, read_rows
+from dvo.data.files.clock import clock_of_names, clock_of_rows, read_table
+from dvo.data.files.files import MAX_NUMBER, is_file
 
 NOMINAL_FPS = 30.0
 RATES = (1e-5, 1e6)
 """Slowest and fastest images a second: one a day, and more than any camera takes."""
-_SECONDS = re.compile(r"[0-9]{1,12}\.[0-9]+")
 
 
-def parse_stamp(text: str) -> float | None:
-    """Parse a time stamp: a decimal number of seconds, or an integer of 16 to 19 digits (nanoseconds).
-
-    Args:
-        text: stem of a file name.
-
-    Returns:
-        Seconds; None for anything else. A frame number (``000123``) is no stamp, so that it never passes for seconds.
-    """
-    if is_nanoseconds(text):
-        return parse_nanoseconds(text) / 1e9 if int(text) < 2**63 else None
-    return float(text) if _SECONDS.fullmatch(text) else None
-
-
-def read_times(path: Path, count: int | None) -> np.ndarray:
-    """Read the first column of a text or CSV file: seconds, one row per image (integers of 16 digits: nanoseconds).
+def read_times(path: Path, count: int | None, notes: list[str] | None = None) -> np.ndarray:
+    """Read the times of a text or CSV file, one row per image: see :func:`dvo.data.files.clock.clock_of_rows`.
 
     ``#`` starts a comment; a first row of words is a header.
 
     Args:
         path: the file.
         count: number of rows that there must be; None for any.
+        notes: receives a sentence if the times are no plain seconds.
 
     Returns:
         ``(N,)`` float64 seconds, strictly increasing.
@@ -47,30 +34,25 @@ def read_times(path: Path, count: int | None) -> np.ndarray:
         DvoError: missing or malformed file, no number where one is expected or one beyond
             :data:`dvo.data.files.files.MAX_NUMBER`, another number of rows, times that do not increase.
     """
-    times: list[float] = []
-    is_first = True
-    for number, fields in read_rows(path, "give a file with one time per image", "times"):
-        try:
-            value = parse_nanoseconds(fields[0]) / 1e9 if is_nanoseconds(fields[0]) else parse_number(fields[0])
-        except ValueError:
-            if is_first and not _is_number(fields[0]):  # the names of the columns
-                is_first = False
-                continue
+    table = read_table(path, "give a file with one time per image", "times")
+    clock = clock_of_rows(table.rows, table.header)
+    times = clock.seconds
+    for row, value in enumerate(times.tolist()):
+        if not abs(value) <= MAX_NUMBER:  # NaN fails too
+            fields = table.rows[row]
             raise DvoError(
-                f"{fields[0][:40]!r} is no time",
+                f"{fields[min(clock.column, len(fields) - 1)][:40]!r} is no time",
                 file=path,
-                field=f"line {number}",
+                field=f"line {table.lines[row]}",
                 remedy="put seconds first in each row",
-            ) from None
-        is_first = False
-        if times and value <= times[-1]:
+            )
+        if row and value <= times[row - 1]:
             raise DvoError(
-                f"times must increase, but {value:.9g} follows {times[-1]:.9g}",
+                f"times must increase, but {value:.9g} follows {times[row - 1]:.9g}",
                 file=path,
-                field=f"line {number}",
+                field=f"line {table.lines[row]}",
                 remedy="sort the rows, and remove duplicates together with their images",
             )
-        times.append(value)
     if count is not None and len(times) != count:
         raise DvoError(
             f"{len(times)} rows for {count} images",
@@ -78,32 +60,30 @@ def read_times(path: Path, count: int | None) -> np.ndarray:
             field="times",
             remedy="give one row per image, or another file with --times",
         )
-    return np.array(times, dtype=np.float64)
+    note = clock.note(str(path))
+    if note is not None and notes is not None:
+        notes.append(f"{note} (a header such as 'time [s]' says what they are)")
+    return times
 
 
-def _is_number(text: str) -> bool:
-    """True also for what is not finite."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def times_from_names(paths: list[Path]) -> np.ndarray | None:
+def times_from_names(paths: list[Path], notes: list[str] | None = None) -> np.ndarray | None:
     """Read times from file names.
 
     Args:
         paths: ``N`` files.
+        notes: receives a sentence if the times are no plain seconds or nanoseconds.
 
     Returns:
-        ``(N,)`` float64 seconds if every stem is a stamp (``1305031102.175304``, ``1403636579763555584[_0]``), else
-        None.
+        ``(N,)`` float64 seconds if every stem is a stamp (``1305031102.175304``, ``left_1403636579763555584``,
+        ``IMG_20240131_235959123``), see :func:`dvo.data.files.clock.clock_of_names`; else None.
     """
-    times = [parse_stamp(re.sub(r"(?<=[0-9]{16})_0$", "", path.stem)) for path in paths]
-    if not paths or any(time is None for time in times):
+    clock = clock_of_names([re.sub(r"(?<=[0-9]{16})_[01]$", "", path.stem) for path in paths])
+    if clock is None:
         return None
-    return np.array(times, dtype=np.float64)
+    note = clock.note("the file names") if clock.unit not in ("s", "ns") else None
+    if note is not None and notes is not None:
+        notes.append(note)
+    return clock.seconds
 
 
 def checked_rate(fps: float | None, field: str = "fps") -> float | None:
@@ -130,6 +110,11 @@ def checked_rate(fps: float | None, field: str = "fps") -> float | None:
     return rate
 
 
+def _beside(folder: Path) -> list[Path]:
+    """Lists of times by their usual names, beside images and one level up."""
+    return [place / name for place in (folder, folder.parent) for name in ("times.txt", "timestamps.txt")]
+
+
 def choose_times(
     paths: list[Path],
     folder: Path,
@@ -141,8 +126,8 @@ def choose_times(
 ) -> np.ndarray:
     """Choose the times of the images of a folder.
 
-    The first of these that there is: ``times``, ``times.txt`` beside the images or one level up, names that are stamps,
-    ``fallback()``, ``fps``, and last an assumed rate, with a warning.
+    The first of these that there is: ``times``, ``times.txt`` or ``timestamps.txt`` beside the images or one level up,
+    names that are stamps, ``fallback()``, ``fps``, and last an assumed rate, with a warning.
 
     Args:
         paths: the images, in order.
@@ -160,13 +145,13 @@ def choose_times(
     """
     fps = checked_rate(fps)
     if times is not None:
-        return read_times(times, len(paths))
+        return read_times(times, len(paths), warnings)
     found, origin = None, ""
-    beside = next((path for path in (folder / "times.txt", folder.parent / "times.txt") if is_file(path)), None)
+    beside = next((path for path in _beside(folder) if is_file(path)), None)
     if beside is not None:
-        found, origin = read_times(beside, len(paths)), str(beside)
+        found, origin = read_times(beside, len(paths), warnings), str(beside)
     if found is None:
-        found, origin = times_from_names(paths), "the file names"
+        found, origin = times_from_names(paths, warnings), "the file names"
     if found is None:
         found, origin = fallback(), "the ground truth"
     if found is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,12 @@ from dvo.data.images.reduction import Reduction
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
+UNREAD = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".exr", ".hdr", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf",
+     ".rw2", ".gif"}
+)  # fmt: skip
+"""Endings of images that are not read: of phones, of cameras, and moving ones."""
+
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key that puts ``img_2`` before ``img_10``.
@@ -24,19 +31,32 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     """
     parts = re.split(r"([0-9]+)", name)
     # "²" is a digit to str.isdigit, but no number to int
-    return [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part.lower()) for part in parts if part]
+    key = [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part.lower()) for part in parts if part]
+    return [*key, (2, 0, name)]  # 1.png and 01.png have one place, whatever the order of the folder
 
 
-def list_images(folder: Path) -> list[Path]:
+def list_images(folder: Path, warnings: list[str] | None = None) -> list[Path]:
     """List the image files directly in a folder, in natural order; hidden ones left out.
 
     Args:
         folder: need not exist.
+        warnings: receives a sentence about images of formats that are not read, beside others.
+
+    Raises:
+        DvoError: with ``warnings``, images of such formats alone.
     """
     if not folder.is_dir():
         return []
-    found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")]
-    return sorted(found, key=lambda path: natural_key(path.name))
+    files = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    found = sorted((path for path in files if path.suffix.lower() in SUFFIXES), key=lambda path: natural_key(path.name))
+    unread = [] if warnings is None else [path for path in files if path.suffix.lower() in UNREAD]
+    if unread and warnings is not None:
+        kinds = ", ".join(sorted({path.suffix.lower()[1:].upper() for path in unread}))
+        message = f"{len(unread)} images of a format that is not read ({kinds})"
+        if not found:
+            raise DvoError(message, file=folder, remedy="convert them to JPEG or PNG, in the order of their names")
+        warnings.append(f"{message} are left out")
+    return found
 
 
 def has_images(folder: Path) -> bool:
@@ -50,13 +70,27 @@ def has_images(folder: Path) -> bool:
     )
 
 
-def to_rgb8(image: np.ndarray) -> np.ndarray:
+def used_bits(images: Iterable[np.ndarray | None]) -> int:
+    """Bits that images of 16 bits use: cameras write 10, 12 or 14 of them into the lower ones.
+
+    Args:
+        images: some of a recording, as decoded; None and others are passed over.
+
+    Returns:
+        10, 12, 14 or 16; the fewest that hold every pixel.
+    """
+    largest = max((int(image.max()) for image in images if image is not None and image.dtype == np.uint16), default=0)
+    return next((bits for bits in (10, 12, 14) if 0 < largest < 2**bits), 16)
+
+
+def to_rgb8(image: np.ndarray, bits: int = 16) -> np.ndarray:
     """Convert an image as OpenCV decodes it.
 
     Grey is repeated, alpha dropped, 16 bit divided by 257 (a fixed factor: brightness stays comparable over frames).
 
     Args:
         image: ``(H, W)`` or ``(H, W, 1|3|4)`` uint8 or uint16, BGR order.
+        bits: that pixels of uint16 use; fewer than 16 have a smaller factor, and what is brighter is white.
 
     Returns:
         ``(H, W, 3)`` uint8 RGB.
@@ -65,7 +99,10 @@ def to_rgb8(image: np.ndarray) -> np.ndarray:
         DvoError: another type of pixel (a depth map in float, say).
     """
     if image.dtype == np.uint16:
-        image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        if bits < 16:
+            image = np.minimum(image >> (bits - 8), 255).astype(np.uint8)
+        else:
+            image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if image.dtype != np.uint8:
         raise DvoError(f"pixels of type {image.dtype}", remedy="convert the images to 8 bit")
     if image.ndim == 2 or image.shape[2] == 1:
@@ -73,7 +110,9 @@ def to_rgb8(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image[..., 2::-1])
 
 
-def read_image(path: Path, reduction: Reduction | None = None, orientation: int = 1) -> np.ndarray | None:
+def read_image(
+    path: Path, reduction: Reduction | None = None, orientation: int = 1, bits: int = 16
+) -> np.ndarray | None:
     """Decode an image file.
 
     Args:
@@ -81,6 +120,7 @@ def read_image(path: Path, reduction: Reduction | None = None, orientation: int 
         reduction: of the image, after it is turned; None for none.
         orientation: by which it is turned, see :func:`dvo.data.images.orientation.oriented`; that of its own EXIF data
             is not looked at.
+        bits: see :func:`to_rgb8`.
 
     Returns:
         ``(H, W, 3)`` uint8 RGB, or None if the file is missing, corrupt or cut short.
@@ -90,10 +130,25 @@ def read_image(path: Path, reduction: Reduction | None = None, orientation: int 
             that are no colours (float).
     """
     image = decode(path, reduction, orientation)
-    if image is None:
-        return None
+    return None if image is None else converted(image, path, bits)
+
+
+def converted(image: np.ndarray, path: Path, bits: int = 16) -> np.ndarray:
+    """Convert the decoded image of a file, see :func:`to_rgb8`.
+
+    Args:
+        image: as OpenCV decodes it.
+        path: of the file, for messages.
+        bits: see :func:`to_rgb8`.
+
+    Returns:
+        ``(H, W, 3)`` uint8 RGB.
+
+    Raises:
+        DvoError: pixels that are no colours (float).
+    """
     try:
-        return to_rgb8(image)
+        return to_rgb8(image, bits)
     except DvoError as error:
         raise DvoError(error.message, file=path, remedy=error.remedy) from None
 
@@ -169,15 +224,15 @@ def is_complete(data: bytes) -> bool:
     """True if the end mark of a PNG or JPEG file is there, and every chunk of a PNG lies inside the file.
 
     The decoders return a cut file with its lower part grey, and no error; OpenCV allocates what a chunk states as its
-    length.
+    length. What follows the end mark is ignored: phones append videos, recorders the rest of their buffers.
 
     Args:
         data: the bytes of an image file; of other formats any byte will do.
     """
     if data.startswith(b"\x89PNG"):
-        return b"IEND" in data[-4096:] and _chunks_inside(data)
-    if data.startswith(b"\xff\xd8"):  # the first half may hold a thumbnail with its own end mark
-        return b"\xff\xd9" in data[len(data) // 2 :]
+        return _chunks_inside(data)
+    if data.startswith(b"\xff\xd8"):
+        return _has_end(data)
     return len(data) > 0
 
 
@@ -186,4 +241,26 @@ def _chunks_inside(data: bytes) -> bool:
     while kind != b"IEND" and at < len(data):
         kind = data[at + 4 : at + 8]
         at += int.from_bytes(data[at : at + 4], "big") + 12
-    return at <= len(data)
+    return kind == b"IEND" and at <= len(data)
+
+
+def _has_end(data: bytes) -> bool:
+    """True if a JPEG file has an end mark behind its scans; segments, which may hold a thumbnail, are passed over."""
+    at, is_scan = 2, False
+    for _ in range(_SEGMENTS):
+        found = (_MARK_IN_SCAN if is_scan else _MARK).search(data, at)
+        if found is None:
+            return False
+        kind, at = data[found.end() - 1], found.end()
+        if kind == 0xD9:
+            return is_scan
+        if kind in _BARE:
+            continue
+        at += max(int.from_bytes(data[at : at + 2], "big"), 2)
+        is_scan = is_scan or kind == 0xDA
+    return False
+
+
+_MARK, _MARK_IN_SCAN = re.compile(rb"\xff[^\x00\xff]", re.DOTALL), re.compile(rb"\xff[^\x00\xff\xd0-\xd7]", re.DOTALL)
+_BARE = (0x01, *range(0xD0, 0xD9))  # marks without a segment
+_SEGMENTS = 2**14

@@ -18,12 +18,12 @@ from dvo.data.calibration.calibration import Calibration
 from dvo.data.calibration.euroc import read_extrinsics, read_rig
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import (
-    listed_file,
     parse_nanoseconds,
     parse_number,
     read_lines,
     read_rows,
 )
+from dvo.data.files.listing import listed_file
 from dvo.data.files.stamps import choose_times, read_times
 from dvo.data.frame import InertialSamples
 from dvo.data.readers.folder import camera_images

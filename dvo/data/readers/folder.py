@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dvo.data.files.stamps import choose_times, times_from_names
 from dvo.data.images.images import list_images
+from dvo.data.readers.groups import Streams, split_streams
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-
-_STEREO_NAME = re.compile(r"[0-9]{16,19}_[01]")
+from dvo.data.sensors.sensors import MILLIMETRES, Sensors
 
 
 def matches(path: Path) -> bool:
@@ -26,25 +26,37 @@ def matches(path: Path) -> bool:
 def camera_images(folder: Path, warnings: list[str]) -> list[Path]:
     """List the images of one camera: in natural order, or by time if the names are stamps.
 
-    A folder of stereo pairs named ``<nanoseconds>_0`` and ``<nanoseconds>_1`` gives the left ones.
-
     Args:
         folder: of the images.
         warnings: receives a sentence if images were left out.
 
     Returns:
         Files; empty if there are none.
+
+    Raises:
+        DvoError: several streams of images, see :func:`dvo.data.readers.groups.split_streams`.
     """
-    images = list_images(folder)
-    if images and all(_STEREO_NAME.fullmatch(image.stem) for image in images):
-        left = [image for image in images if image.stem.endswith("_0")]
-        if left and len(left) < len(images):
-            warnings.append(f"stereo pairs: reading the {len(left)} left images (names ending in _0)")
-            images = left
+    return camera_streams(folder, warnings).images
+
+
+def camera_streams(folder: Path, warnings: list[str]) -> Streams:
+    """Images of one camera, see :func:`camera_images`, and depth or right images among them.
+
+    Args:
+        folder: of the images.
+        warnings: receives a sentence if images were left out.
+
+    Raises:
+        DvoError: as :func:`camera_images`.
+    """
+    streams = split_streams(list_images(folder, warnings), folder)
+    if streams.note is not None:
+        warnings.append(streams.note)
+    images = streams.images
     times = times_from_names(images)
     if times is not None:  # 1.5 is later than 1.25, which natural order does not know
         images = [images[i] for i in np.argsort(times, kind="stable")]
-    return images
+    return replace(streams, images=images)
 
 
 def open_folder(path: Path, request: Request) -> Recording:
@@ -55,14 +67,15 @@ def open_folder(path: Path, request: Request) -> Recording:
         request: options of the user.
 
     Raises:
-        DvoError: no images, or times that do not fit them.
+        DvoError: no images, several streams of them, or times that do not fit them.
     """
     warnings: list[str] = []
-    images = camera_images(path, warnings)
-    if not images:  # before a times file can complain about their number
+    streams = camera_streams(path, warnings)
+    if not streams.images:  # before a times file can complain about their number
         return ImageRecording("folder", path, [], np.zeros(0))
-    times = choose_times(images, path, times=request.times, fps=request.fps, warnings=warnings)
-    return ImageRecording("folder", path, images, times, warnings=warnings)
+    times = choose_times(streams.images, path, times=request.times, fps=request.fps, warnings=warnings)
+    sensors = Sensors(depth=streams.depth, depth_scale=MILLIMETRES, right=streams.right)
+    return ImageRecording("folder", path, streams.images, times, warnings=warnings, sensors=sensors)
 
 
 READER = Reader("folder", matches, open_folder)

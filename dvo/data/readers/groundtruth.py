@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.files.clock import PARTS
 from dvo.data.files.files import read_rows
 from dvo.data.readers.icl_nuim import read_counted_poses
 from dvo.data.readers.tartanair import read_ned_poses
@@ -19,7 +20,7 @@ def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
     ============================  ================================================================================
     row                           format
     ============================  ================================================================================
-    8 numbers                     TUM: ``timestamp tx ty tz qx qy qz qw``
+    8 numbers, or a header        TUM: ``timestamp tx ty tz qx qy qz qw``; see :func:`dvo.data.trajectory.read_tum`
     8 numbers, ``*.freiburg``     ICL-NUIM: as TUM, but the stamp counts images from 1
     12 numbers                    KITTI: a row-major 3x4 matrix, one row per image
     7 numbers                     TartanAir: ``tx ty tz qx qy qz qw`` of the NED camera frame, one row per image
@@ -44,12 +45,26 @@ def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
             raise _no_times(len(poses), times, file)
         return Trajectory(np.asarray(times[numbers[inside]]), poses[inside])
     if columns not in (7, 12):
-        return read_tum(file)
+        return _on_clock(read_tum(file), timestamps)
     poses = read_kitti_poses(file) if columns == 12 else read_ned_poses(file)
     times = np.zeros(0) if timestamps is None else timestamps
     if len(times) != len(poses):
         raise _no_times(len(poses), times, file)
     return Trajectory(np.asarray(times), poses)
+
+
+def _on_clock(found: Trajectory, timestamps: np.ndarray | None) -> Trajectory:
+    """The trajectory in the unit in which its times are those of the images, if they are not in seconds."""
+    if timestamps is None or len(timestamps) < 2 or len(found) < 2:
+        return found
+    first, last = float(timestamps[0]), float(timestamps[-1])
+    span = last - first
+    for parts in PARTS.values():
+        start, end = found.timestamps[0] / parts, found.timestamps[-1] / parts
+        common = min(end, last) - max(start, first)
+        if common > 0.5 * span and common > 0.1 * (end - start):
+            return found if parts == 1 else Trajectory(found.timestamps / parts, found.poses_wc)
+    return found
 
 
 def _columns(file: Path) -> int:

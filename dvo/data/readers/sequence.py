@@ -15,9 +15,10 @@ from dvo.data.calibration.calibration import Calibration, rectified
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import choose_times
 from dvo.data.images.images import has_images
-from dvo.data.readers.folder import camera_images
+from dvo.data.readers.folder import camera_streams
+from dvo.data.readers.groups import Streams
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-from dvo.data.sensors.sensors import SameName, SameNumbers, Sensors
+from dvo.data.sensors.sensors import MILLIMETRES, Finder, SameName, SameNumbers, Sensors
 from dvo.data.trajectory import Trajectory, read_tum
 
 IMAGE_FOLDERS = (
@@ -104,7 +105,8 @@ def open_sequence(path: Path, request: Request) -> Recording:
     if folder is None:
         return ImageRecording("sequence", path, [], np.zeros(0))
     warnings: list[str] = []
-    images = camera_images(folder, warnings)
+    streams = camera_streams(folder, warnings)
+    images = streams.images
     groundtruth = find_groundtruth(path)
 
     def times_of_groundtruth() -> np.ndarray | None:
@@ -116,20 +118,22 @@ def open_sequence(path: Path, request: Request) -> Recording:
     calibration = find_calibration(path)
     return ImageRecording(
         "sequence", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
-        sensors=_sensors(path, folder, request.calibration or calibration),
+        sensors=_sensors(path, folder, request.calibration or calibration, streams),
     )  # fmt: skip
 
 
-def _sensors(path: Path, folder: Path, calibration: Calibration | None) -> Sensors:
-    if calibration is None:
-        return Sensors()
-    depth = SameNumbers(path / "depth") if calibration.depth_scale and (path / "depth").is_dir() else None
-    right, rig = None, None
+def _sensors(path: Path, folder: Path, calibration: Calibration | None, streams: Streams) -> Sensors:
+    scale = None if calibration is None else calibration.depth_scale
+    baseline = None if calibration is None else calibration.baseline
+    depth: Finder | None = streams.depth
+    right: Finder | None = streams.right
     other = RIGHT_OF.get(folder.relative_to(path).as_posix())
-    if calibration.baseline and other and (path / other).is_dir():
+    if depth is None and scale and (path / "depth").is_dir():
+        depth = SameNumbers(path / "depth")
+    if right is None and baseline and other and (path / other).is_dir():
         right = SameName(path / other)
-        rig = rectified(calibration, calibration.baseline)
-    return Sensors(depth=depth, depth_scale=calibration.depth_scale, right=right, stereo=rig)
+    rig = rectified(calibration, baseline) if right is not None and calibration is not None and baseline else None
+    return Sensors(depth=depth, depth_scale=scale or (MILLIMETRES if streams.depth else None), right=right, stereo=rig)
 
 
 READER = Reader("sequence", matches, open_sequence)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dvo.data.calibration.calibration import Calibration, rectified
-from dvo.data.files.files import listed_files
+from dvo.data.files.listing import listed_files
 from dvo.data.files.stamps import choose_times, read_times, times_from_names
 from dvo.data.images.images import has_images, list_images
 from dvo.data.readers.folder import camera_images

@@ -14,6 +14,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import is_file, lookups
+from dvo.data.files.output import spelled_in_text
 from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.frame import InertialSamples
 from dvo.data.images.image_header import MAX_PIXELS
@@ -58,7 +59,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     try:
         # FFmpeg only: OpenCV's other backends would read foo_01.png as a video of all its siblings
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * _SECONDS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * _SECONDS]
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, limits)
+        with spelled_in_text(path) as name:
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, limits)
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:

@@ -19,6 +19,9 @@ from dvo.data.files.files import is_file
 from dvo.data.frame import InertialSamples
 from dvo.data.images.images import list_images
 
+MILLIMETRES = 1000.0
+"""Units of a metre in 16-bit depth images of a folder, unless it is a list in the layout of TUM RGB-D."""
+
 Finder = Callable[[Path], Path | None]
 """Image file of the (left) camera to the file that belongs to it, None if there is none."""
 
@@ -40,6 +43,20 @@ class Sensors:
     right: Finder | None = None
     stereo: Callable[[], StereoRig | None] | None = None
     inertial: Callable[[], InertialSamples] | None = None
+
+
+@dataclass(frozen=True)
+class Listed:
+    """File that belongs to an image by a table.
+
+    Attributes:
+        files: file of each image that has one.
+    """
+
+    files: dict[Path, Path]
+
+    def __call__(self, image: Path) -> Path | None:
+        return self.files.get(image)
 
 
 @dataclass(frozen=True)
@@ -73,13 +90,21 @@ class SameNumbers:
 
     @cached_property
     def _files(self) -> dict[tuple[str, ...], Path]:
-        return {_numbers(file): file for file in list_images(self.folder)}
+        return {numbers_of(file): file for file in list_images(self.folder)}
 
     def __call__(self, image: Path) -> Path | None:
-        return self._files.get(_numbers(image))
+        return self._files.get(numbers_of(image))
 
 
-def _numbers(file: Path) -> tuple[str, ...]:
+def numbers_of(file: Path) -> tuple[str, ...]:
+    """Numbers in the name of a file, by which files of two sensors belong to each other.
+
+    Args:
+        file: any.
+
+    Returns:
+        As they are written; the stem, if there are none.
+    """
     return tuple(re.findall(r"[0-9]+", file.stem)) or (file.stem,)
 
 

@@ -12,12 +12,12 @@ from dvo.data.files.files import (
     MAX_TABLE,
     is_file,
     is_nanoseconds,
-    listed_file,
     parse_nanoseconds,
     parse_number,
     read_image_file,
     read_rows,
 )
+from dvo.data.files.listing import listed_file
 
 
 def rows(path):

@@ -1,0 +1,136 @@
+"""Tables of poses with times: which columns hold what, and in which unit the times are."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.files.clock import Clock, in_seconds, is_time_name, parse_time, read_table, unit_of, unit_of_name
+from dvo.data.files.files import MAX_NUMBER, parse_number
+
+HEADER = "timestamp tx ty tz qx qy qz qw"
+_NUMBERS = 8
+_LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+_OTHERS = re.compile(r"v|vel|velocity|a|acc|accel|b|w|gyr|gyro|omega|lin|linear|ang|angular|bias|cov|sigma|std")
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Places of the parts of a pose in a row.
+
+    Attributes:
+        time: column.
+        unit: of the times, if the header states it.
+        pose: columns of ``tx ty tz qx qy qz qw``.
+        length: metres of a unit of the positions.
+    """
+
+    time: int
+    unit: str | None
+    pose: tuple[int, ...]
+    length: float = 1.0
+
+
+_TUM = _Columns(0, None, tuple(range(1, _NUMBERS)))
+_EUROC = _Columns(0, "ns", (1, 2, 3, 5, 6, 7, 4))  # state_groundtruth_estimate0/data.csv: velocity and biases follow
+_EUROC_NUMBERS = 17
+
+
+def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
+    """Read rows of a time and a pose.
+
+    A header that names the columns is followed: in any order, with ``q_w`` before or behind ``q_x``, and further
+    columns besides. Without one a row is ``timestamp tx ty tz qx qy qz qw``, or one of 17 numbers of EuRoC. Rows whose
+    position or quaternion is NaN throughout are left out: there is no pose at that time.
+
+    Args:
+        path: text or CSV file.
+
+    Returns:
+        Times, ``(N, 7)`` float64 ``tx ty tz qx qy qz qw`` (not normalised), and the lines of the rows.
+
+    Raises:
+        DvoError: missing or malformed file, no rows, a header without what makes a pose, or a row of other numbers.
+    """
+    table = read_table(path, f"give a file of rows '{HEADER}'")
+    if not table.rows:
+        raise DvoError("no poses in it", file=path, remedy=f"give a file of rows '{HEADER}'")
+    columns = None if table.header is None else _named(table.header)
+    if columns is None and table.header is not None and not table.is_comment:
+        names = ", ".join(table.header)[:200]
+        raise DvoError(
+            f"the header '{names}' does not name a time, a position and a quaternion",
+            file=path, field="header", remedy=f"name the columns as in '{HEADER}'",
+        )  # fmt: skip
+    width = len(table.rows[0])
+    named = width if columns is None else len(table.header or ())
+    if named != width:  # an empty field would shift the others
+        message = f"the header names {named} columns, this row has {width}"
+        raise DvoError(message, file=path, field=f"line {table.lines[0]}", remedy="give each column a name and a value")
+    columns = columns or (_EUROC if width == _EUROC_NUMBERS else _TUM)
+    expected = width if columns is not _TUM else _NUMBERS
+    times: list[int | float] = []
+    poses, lines = [], []
+    for line, fields in zip(table.lines, table.rows, strict=True):
+        if len(fields) != expected:
+            raise _no_row(path, line)
+        try:
+            texts = [fields[k] for k in columns.pose]
+            if all(text.lower() == "nan" for text in texts[:3]) or all(text.lower() == "nan" for text in texts[3:]):
+                parse_time(fields[columns.time])
+                continue
+            pose = [parse_number(text) for text in texts]
+            times.append(parse_time(fields[columns.time]))
+        except (ValueError, IndexError):
+            raise _no_row(path, line) from None
+        poses.append(pose)
+        lines.append(line)
+    if not poses:
+        raise DvoError("no poses in it, all rows are NaN", file=path, remedy=f"give a file of rows '{HEADER}'")
+    unit = columns.unit or unit_of(times, poses=True)
+    seconds, values = in_seconds(times, unit), np.array(poses, dtype=np.float64)
+    beyond = np.flatnonzero(~(np.abs(seconds) <= MAX_NUMBER))
+    if len(beyond):
+        raise _no_row(path, lines[int(beyond[0])])
+    values[:, :3] *= columns.length
+    return Clock(seconds, unit, columns.time), values, lines
+
+
+def _no_row(path: Path, line: int) -> DvoError:
+    return DvoError("not a TUM row", file=path, field=f"line {line}", remedy=f"use '{HEADER}'")
+
+
+def _named(header: Sequence[str]) -> _Columns | None:
+    """Columns that a header names; None if it does not name all."""
+    time, found, length = None, dict[str, int](), 1.0
+    for k, cell in enumerate(header):
+        name = re.sub(r"[\[(].*?[\])]", "", cell.lower()).strip()
+        part = _part(name)
+        if part is not None:
+            found.setdefault(part, k)
+            unit = re.search(r"[\[(]\s*(mm|cm|m)\s*[\])]", cell.lower())
+            length = _LENGTHS[unit[1]] if unit and part == "tx" else length
+        elif time is None and is_time_name(cell):
+            time = k
+    if time is None or len(found) < _NUMBERS - 1:
+        return None
+    pose = tuple(found[part] for part in ("tx", "ty", "tz", "qx", "qy", "qz", "qw"))
+    return _Columns(time, unit_of_name(header[time]), pose, length)
+
+
+def _part(name: str) -> str | None:
+    """Part of a pose that a column holds, such as ``p_RS_R_x``, ``pose.orientation.w`` or ``tz``."""
+    axis = re.fullmatch(r"(.*?)[_. ]?([wxyz])", name)
+    if axis is None:
+        return None
+    head = axis[1]
+    words = re.split(r"[^a-z]+", head)
+    if any(word.startswith(("q", "orient", "quat", "rot")) for word in words) or (axis[2] == "w" and not head):
+        return f"q{axis[2]}"
+    is_other = axis[2] == "w" or _OTHERS.fullmatch(words[0]) or {"linear", "angular", "velocity"} & set(words)
+    return None if is_other else f"t{axis[2]}"

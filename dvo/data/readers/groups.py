@@ -1,0 +1,183 @@
+"""Several streams of images in one folder, told apart by their names: colour and depth, left and right."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+from dvo.data.images.images import decode
+from dvo.data.sensors.sensors import Listed
+
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_ROLES = {
+    "right": {"right", "r", "rgt"},
+    "depth": {"depth", "depths", "depthmap", "d", "disp", "disparity", "range", "zmap"},
+    "other": {
+        "mask", "masks", "seg", "semantic", "semantics", "label", "labels", "instance", "normal", "normals", "flow",
+        "ir", "infra", "infrared", "conf", "confidence", "uncertainty", "albedo", "alpha", "thumb", "aligned",
+    },
+    "left": {"left", "l", "lft"},
+    "colour": {"color", "colour", "rgb", "image", "images", "img", "im", "frame", "col", "c"},
+}  # fmt: skip
+_CAMERA = re.compile(r"(cam|camera|image|img|view|c)[_-]?$", re.IGNORECASE)
+_FEW = 8  # cameras whose numbers stand in names
+_LEAST = 2  # images of a stream
+_COMMON = 0.5  # of the numbers of the smaller stream, that the other has too
+_REMEDY = "put the images of one stream into a folder of their own"
+
+
+@dataclass(frozen=True)
+class Streams:
+    """Images of the stream that is tracked, and of those beside it.
+
+    Attributes:
+        images: of the stream, in the order given.
+        depth, right: files that belong to the images; None for none.
+        note: sentence about the choice; None if there is one stream.
+    """
+
+    images: list[Path]
+    depth: Listed | None = None
+    right: Listed | None = None
+    note: str | None = None
+
+
+@dataclass
+class _Group:
+    pattern: str
+    role: str
+    files: list[Path] = field(default_factory=list)
+    numbers: list[tuple[str, ...]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        return f"{self.pattern} ({len(self.files)})"
+
+
+def split_streams(images: Sequence[Path], folder: Path) -> Streams:
+    """Tell the streams of a folder apart.
+
+    Images whose names differ in words or endings beside the same numbers (``frame000001.jpg`` and ``depth000001.png``,
+    ``left_001.png`` and ``right_001.png``), or in the number of a camera (``001_0.png`` and ``001_1.png``), are
+    different streams. That of colour, the left one and the camera of the lowest number are tracked.
+
+    Args:
+        images: of one folder, in order.
+        folder: for messages.
+
+    Raises:
+        DvoError: several streams, none of which is the one to track.
+    """
+    groups = _by_words(images) or _by_camera(images)
+    if len(groups) < 2:
+        return Streams(list(images))
+    candidates = [group for group in groups if group.role in ("left", "colour", "plain")]
+    if len(candidates) > 1:
+        candidates = _by_content(candidates)
+    if len(candidates) != 1:
+        named = ", ".join(map(str, groups))
+        raise DvoError(f"several streams of images in one folder: {named}", file=folder, remedy=_REMEDY)
+    chosen = candidates[0]
+    found: dict[str, Listed] = {}
+    parts = []
+    for group in groups:
+        if group is chosen:
+            continue
+        files = _pairs(chosen, group) if group.role in ("depth", "right") and group.role not in found else {}
+        if files:
+            found[group.role] = Listed(files)
+        option = "--depth, with --depth-scale UNITS" if group.role == "depth" else f"--{group.role}"
+        parts.append(f"{group}" + (f" for {option}" if files else ", which are not used"))
+    which = "the left one, " if chosen.role == "left" else ""
+    note = f"several streams of images: reading {which}{chosen}; beside them are {'; '.join(parts)}"
+    return Streams(chosen.files, found.get("depth"), found.get("right"), note)
+
+
+def _by_words(images: Sequence[Path]) -> list[_Group]:
+    """Groups of names that differ in words or endings, if they share numbers or their words tell what they are."""
+    groups: dict[str, _Group] = {}
+    for image in images:
+        pattern = re.sub(r"[0-9]+(?:\.[0-9]+)?", "*", image.stem) + image.suffix
+        group = groups.setdefault(pattern, _Group(pattern, _role(image.stem)))
+        group.files.append(image)
+        group.numbers.append(tuple(re.findall(r"[0-9]+", image.stem)))
+    found = list(groups.values())
+    if len(found) < 2 or len(found) > _FEW or any(len(group.files) < _LEAST for group in found):
+        return []
+    if {group.role for group in found} in ({"left", "right"}, {"colour", "depth"}, {"plain", "depth"}):
+        return found
+    first = max(found, key=lambda group: len(group.files))
+    numbers = set(first.numbers)
+    shared = (
+        len(numbers & set(group.numbers)) >= _COMMON * min(len(numbers), len(group.files))
+        for group in found
+        if group is not first
+    )
+    return found if all(shared) else []
+
+
+def _by_camera(images: Sequence[Path]) -> list[_Group]:
+    """Groups of names that differ in the number of a camera, at the end (``001_0``) or behind a word (``cam0_001``)."""
+    fields = [re.findall(r"[0-9]+", image.stem) for image in images]
+    shapes = {re.sub(r"[0-9]+", "*", image.stem) + image.suffix for image in images}
+    if len(images) < 2 * _LEAST or len(shapes) != 1 or len(fields[0]) < 2:
+        return []
+    texts = re.split(r"[0-9]+", images[0].stem)
+    last = len(fields[0]) - 1
+    for k in (last, *range(last)):
+        values = sorted({row[k] for row in fields}, key=int)
+        is_end = k == last and texts[-1] == "" and texts[k] in ("_", "-") and values in (["0", "1"], ["1", "2"])
+        if not 2 <= len(values) <= _FEW or not (is_end or _CAMERA.search(texts[k])):
+            continue
+        groups = {value: _Group(_with(texts, k, value) + images[0].suffix, "plain") for value in values}
+        for image, row in zip(images, fields, strict=True):
+            groups[row[k]].files.append(image)
+            groups[row[k]].numbers.append((*row[:k], *row[k + 1 :]))
+        found = list(groups.values())
+        numbers = [set(group.numbers) for group in found]
+        if all(len(numbers[0] & other) >= _COMMON * min(len(numbers[0]), len(other)) for other in numbers[1:]):
+            found[0].role, found[1].role = "left", "right"
+            for group in found[2:]:
+                group.role = "other"
+            return found
+    return []
+
+
+def _with(texts: list[str], k: int, value: str) -> str:
+    """Pattern of the names of a camera."""
+    marks = ["*"] * (len(texts) - 1)
+    marks[k] = value
+    return "".join(text + mark for text, mark in zip(texts, [*marks, ""], strict=True))
+
+
+def _role(stem: str) -> str:
+    words = {word.lower() for word in _WORD.findall(re.sub(r"[0-9]+", " ", stem))}
+    return next((role for role, names in _ROLES.items() if words & names), "plain")
+
+
+def _by_content(candidates: list[_Group]) -> list[_Group]:
+    """Candidates that are no depth by their pixels: one channel of more than 8 bits beside others of 8 bits."""
+    images = [decode(group.files[0]) for group in candidates]
+    is_deep = [image is not None and image.ndim == 2 and image.dtype != np.uint8 for image in images]
+    if any(is_deep) and not all(is_deep):
+        for group, deep in zip(candidates, is_deep, strict=True):
+            group.role = "depth" if deep else group.role
+        return [group for group, deep in zip(candidates, is_deep, strict=True) if not deep]
+    return candidates
+
+
+def _pairs(images: _Group, others: _Group) -> dict[Path, Path]:
+    """Files of the same numbers, else those of the same place in the order."""
+    by_numbers = dict(zip(others.numbers, others.files, strict=True))
+    pairs = {
+        image: by_numbers[numbers]
+        for image, numbers in zip(images.files, images.numbers, strict=True)
+        if numbers in by_numbers
+    }
+    if not pairs and len(images.files) == len(others.files):
+        return dict(zip(images.files, others.files, strict=True))
+    return pairs

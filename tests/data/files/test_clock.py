@@ -1,0 +1,124 @@
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from dvo.core.errors import DvoError
+from dvo.data import read_tum
+from dvo.data.files.clock import PARTS, clock_of_names, clock_of_rows
+from dvo.data.files.stamps import read_times
+from dvo.data.readers.groundtruth import read_groundtruth
+
+
+@given(
+    st.sampled_from(["ms", "us", "ns"]), st.floats(8, 200), st.sampled_from([0.0, 12.5, 4000.0, 1.3e9, 1.7e9]),
+    st.integers(2, 40),
+)  # fmt: skip
+@example("us", 30.0, 1.3e9, 60)
+@example("ms", 30.0, 0.0, 60)
+def test_whole_numbers_of_any_unit_and_clock(unit, rate, start, count):
+    seconds = start + np.arange(count) / rate
+    texts = [str(round(value * PARTS[unit])) for value in seconds.tolist()]
+    found = clock_of_rows([[text] for text in texts])
+    assert found.unit == unit
+    np.testing.assert_allclose(found.seconds, seconds, atol=0.6e-3)
+
+
+@given(st.floats(0.2, 1000), st.sampled_from([0.0, 7.25, 1.3e9, 1.7e9]), st.integers(2, 40))
+def test_decimal_seconds_stay_seconds(rate, start, count):
+    seconds = start + np.arange(count) / rate
+    found = clock_of_rows([[f"{value:.6f}"] for value in seconds.tolist()])
+    assert found.unit == "s"
+    np.testing.assert_allclose(found.seconds, seconds, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("00000 1305031102.175304 4.1\n00001 1305031102.211214 4.0\n", [0, 0.03591]),  # DSO, TUM-mono
+        ("a.png,1305031102175\nb.png,1305031102211\n", [0, 0.036]),
+        ("#frame exposure_ms stamp_us\n1 4 1000\n2 5 34000\n", [0, 0.033]),
+        ("time [ms]\n0\n2\n4\n", [0, 0.002, 0.004]),
+        ("time [s]\n0\n40\n80\n", [0, 40, 80]),
+        ("2011-09-26 13:02:25.594360375\n2011-09-26 13:02:25.697\n", [0, 0.10264]),  # KITTI raw
+        ("secs,nsecs\n5,900000000\n6,5\n", [0, 0.1]),
+        ("1305031102 90000000\n1305031102 190000000\n", [0, 0.1]),
+        ("0.000\n16.683\n33.367\n", [0, 0.01668, 0.03337]),
+        ("33333333\n66666667\n", [0, 0.03333]),
+        ("0\n1\n2\n", [0, 1, 2]),
+    ],
+)
+def test_columns_headers_and_units(make, text, expected):
+    times = read_times(make.text("t.csv", text), None)
+    np.testing.assert_allclose(times - times[0], expected, atol=1e-5)
+
+
+def test_what_is_not_plain_seconds_is_said(make):
+    notes = []
+    read_times(make.text("t.csv", "0\n33333\n66667\n"), 3, notes)
+    assert "microseconds" in notes[0] and "30 a second" in notes[0] and "t.csv" in notes[0]
+    notes.clear()
+    read_times(make.text("t.csv", "0.5\n0.6\n"), 2, notes)
+    assert notes == []
+
+
+@pytest.mark.parametrize("stems", [["1", "2", "3"], ["000010", "000020"], ["a", "b"], ["clip2_0001", "clip2_0002"], []])
+def test_numbers_of_frames_are_no_times(stems):
+    assert clock_of_names(stems) is None
+
+
+HEADERS = {
+    "#timestamp [ns], p_x, p_y, p_z, q_w, q_x, q_y, q_z": "33333333,1,2,3,.9,.1,.2,.3",
+    "qw,qx,qy,qz,x,y,z,t": ".9,.1,.2,.3,1,2,3,.033333333",
+    "time_us tx[mm] ty[mm] tz[mm] qx qy qz qw": "33333.333 1000 2000 3000 .1 .2 .3 .9",
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1]":
+        "33333333,1,2,3,.9,.1,.2,.3,8",
+    "%time,field.pose.position.x,field.pose.position.y,field.pose.position.z,field.pose.orientation.x,"
+    "field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w": "33333333,1,2,3,.1,.2,.3,.9",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_poses_under_a_header(make, header):
+    later = HEADERS[header].replace("33333333,", "66666667,").replace(".033333333", ".066666667")
+    later = later.replace("33333.333", "66666.667")
+    found = read_tum(make.text("t.csv", f"{header}\n{HEADERS[header]}\n{later}\n"))
+    np.testing.assert_allclose(found.timestamps, [1 / 30, 2 / 30], atol=1e-8)
+    quaternion = np.array([0.1, 0.2, 0.3, 0.9]) / np.sqrt(0.95)
+    np.testing.assert_allclose(found.poses_wc, [[1, 2, 3, *quaternion]] * 2, atol=1e-12)
+
+
+def test_truths_of_droid_in_nanoseconds(make):
+    rows = [f"{1.403636580838555648e18 + 5e6 * i:.6f} {i} 0 0 0 0 0 1\n" for i in range(4)]
+    found = read_tum(make.text("a.txt", "".join(rows)))
+    np.testing.assert_allclose(found.timestamps, 1403636580.838555648 + 0.005 * np.arange(4), atol=1e-6)
+    rows = [f"{1.403636580838555648e18 + 5e6 * i:.18e} {i} 0 0 0 0 0 1\n" for i in range(4)]
+    np.testing.assert_array_equal(read_tum(make.text("b.txt", "".join(rows))).timestamps, found.timestamps)
+
+
+def test_rows_of_nan_have_no_pose(make):
+    nan = " ".join(["nan"] * 7)
+    file = make.text("t.txt", f"0.0 0 0 0 0 0 0 1\n0.1 {nan}\n0.2 NaN NaN NaN 0 0 0 1\n0.3 3 0 0 0 0 0 1\n")
+    assert read_tum(file).timestamps.tolist() == [0, 0.3]
+    with pytest.raises(DvoError, match="line 2: not a TUM row"):
+        read_tum(make.text("t.txt", "0.0 0 0 0 0 0 0 1\n0.1 nan 0 0 0 0 0 1\n"))
+    with pytest.raises(DvoError, match="all rows are NaN"):
+        read_tum(make.text("t.txt", f"0.1 {nan}\n"))
+
+
+@pytest.mark.parametrize("header", ["time,roll,pitch,yaw,x,y,z,w_x", "frame,tx,ty,tz,qx,qy,qz,qw", "a,b,c,d,e,f,g,h"])
+def test_headers_without_a_pose_are_named(make, header):
+    with pytest.raises(DvoError, match="header: the header .* does not name a time, a position and a quaternion"):
+        read_tum(make.text("t.csv", f"{header}\n1,2,3,4,5,6,7,8\n"))
+
+
+def test_an_empty_field_shifts_no_columns(make):
+    file = make.text("t.csv", "time,frame,x,y,z,qx,qy,qz,qw\n1,,1,2,3,0,0,0,1\n")
+    with pytest.raises(DvoError, match="names 9 columns, this row has 8"):
+        read_tum(file)
+
+
+def test_relative_milliseconds_of_a_truth_follow_the_images(make):
+    file = make.text("t.txt", "".join(f"{round(1000 * i / 30)} {i} 0 0 0 0 0 1\n" for i in range(10)))
+    found = read_groundtruth(file, np.arange(10) / 30)
+    np.testing.assert_allclose(found.timestamps, np.arange(10) / 30, atol=1e-3)

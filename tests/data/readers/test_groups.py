@@ -1,0 +1,167 @@
+"""Several streams in one folder."""
+
+import cv2
+import numpy as np
+import pytest
+
+import dvo
+from dvo.core.errors import DvoError
+from dvo.data.companions.depth_source import with_depth
+from dvo.data.companions.right_source import with_right
+from dvo.data.images.images import is_complete, list_images
+from dvo.data.mask import read_mask
+
+DEEP = (np.indices((48, 64))[0] * 10 + 500).astype(np.uint16)
+
+
+def write(make, folder, *patterns, count=4):
+    path = make.root / folder
+    path.mkdir()
+    for pattern in patterns:
+        for i in range(count):
+            is_deep = "depth" in pattern or "range" in pattern or pattern.endswith(".tif")
+            assert cv2.imwrite(str(path / pattern.format(i)), DEEP if is_deep else make.image(i))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("patterns", "option"),
+    [
+        (("{:04d}.rgb.jpg", "{:04d}.depth.png"), "depth"),
+        (("rgb_{}.png", "range_{}.png", "mask_{}.png"), "depth"),
+        (("{:03d}.jpg", "{:03d}.tif"), "depth"),  # told apart by their pixels
+        (("imgL_{}.png", "imgR_{}.png"), "right"),
+        (("cam0_{:03d}.png", "cam1_{:03d}.png"), "right"),
+        (("{:03d}-1.png", "{:03d}-2.png"), "right"),
+        (("left-{}.png", "right-{}.png", "disparity_{}.png"), "right"),
+    ],
+)
+def test_the_stream_of_colour_or_the_left_one_is_tracked(make, patterns, option):
+    folder = write(make, "clip", *patterns)
+    source = dvo.open(folder, calib=make.calib(), fps=10)
+    assert [path.name for path in source.recording.images] == [patterns[0].format(i) for i in range(4)]
+    assert len(source.warnings) == 1 and f"--{option}" in source.warnings[0]
+    for place in (None, folder):
+        if option == "depth":
+            if place is not None and len(patterns) > 2:
+                continue
+            frame = next(iter(with_depth(source, place)))
+            assert np.nanmean(frame.depth) == pytest.approx(DEEP.mean() / 1000)
+        elif place is None or len(patterns) == 2:
+            frames = list(with_right(source, place, 0.1))
+            assert np.array_equal(frames[2].right.image, make.image(2)[..., ::-1])
+
+
+def test_streams_of_left_and_right_stamps(make):
+    names = [f"{side}_{1305031102175304 + 33000 * i + late}.png" for side, late in (("left", 0), ("right", 7)) for i in
+             range(3)]  # fmt: skip
+    source = dvo.open(make.images("clip", names), calib=make.calib())
+    assert len(source) == 3 and np.diff(source.timestamps) == pytest.approx(0.033, abs=1e-6)
+
+
+@pytest.mark.parametrize("patterns", [("a_{}.png", "b_{}.png"), ("left_depth_{}.png", "right_depth_{}.png")])
+def test_streams_without_one_to_track_are_listed(make, patterns):
+    folder = write(make, "clip", *patterns)
+    with pytest.raises(DvoError, match=r"several streams .*\(4\), .*\(4\).*folder of their own") as caught:
+        dvo.open(folder, calib=make.calib())
+    assert caught.value.file == folder
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["GOPR0001.jpg", "GOPR0002.jpg", "IMG_0003.jpg", "IMG_0004.jpg"],  # two files numbers, no pairs
+        ["0_000.png", "0_001.png", "1_000.png", "1_001.png"],
+        ["1.png", "2.jpg", "3.png", "4.jpg"],
+        ["12_30_0.png", "12_30_1.png", "12_31_0.png", "12_32_7.png"],
+    ],
+)
+def test_one_stream_under_several_names(make, names):
+    assert len(dvo.open(make.images("clip", names), calib=make.calib(), fps=10)) == 4
+
+
+def test_order_of_names_with_and_without_zeros(make):
+    names = ["frame10.png", "frame010.png", "frame2.png", "frame02.png", "frame1.png"]
+    found = [path.name for path in list_images(make.images("clip", names))]
+    assert found == ["frame1.png", "frame02.png", "frame2.png", "frame010.png", "frame10.png"]
+
+
+@pytest.mark.parametrize("bits", [10, 14])
+def test_few_bits_of_16(make, bits):
+    folder = make.root / "deep"
+    folder.mkdir()
+    for i in range(3):
+        grey = make.image(i)[..., 1].copy()
+        grey[0, 0] = 255
+        cv2.imwrite(str(folder / f"{i}.png"), grey.astype(np.uint16) << (bits - 8))
+    source = dvo.open(folder, calib=make.calib(), fps=10)
+    frame = list(source)[2]
+    grey[0, 0] = 255
+    assert np.array_equal(frame.image[..., 0], grey)
+    assert len(source.warnings) == 1 and f"hold {bits} bits" in source.warnings[0]
+
+
+def test_what_follows_the_end_of_an_image():
+    picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    for code in (
+        cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes(),
+        cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_RST_INTERVAL, 2])[1].tobytes(),
+        cv2.imencode(".png", picture)[1].tobytes(),
+    ):
+        for trailer in (bytes(5 * len(code)), b"\xff" * 5 * len(code), b"\0\0\0\x18ftypmp42" + code[: len(code) // 2]):
+            assert is_complete(code + trailer)
+        assert not is_complete(code[: len(code) * 6 // 10])
+    # a thumbnail that ends within the first segments is no end
+    inner = cv2.imencode(".jpg", picture)[1].tobytes()
+    segment = b"\xff\xe1" + (len(inner) + 2).to_bytes(2, "big") + inner
+    assert is_complete(inner[:2] + segment + inner[2:])
+    assert not is_complete(inner[:2] + segment + inner[2 : len(inner) // 2])
+
+
+def test_images_of_phones_that_are_not_read_are_said(make):
+    (make.root / "phone").mkdir()
+    for name in ("a.heic", "b.HEIC"):
+        (make.root / "phone" / name).write_bytes(b"\0\0\0\x18ftypheic")
+    with pytest.raises(DvoError, match=r"2 images of a format that is not read \(HEIC\).*convert|Convert"):
+        dvo.open(make.root / "phone", calib=make.calib())
+    make.images("phone", ["1.png", "2.png"])
+    assert (
+        "2 images of a format that is not read (HEIC)" in dvo.open(make.root / "phone", fps=1, guess=True).warnings[0]
+    )
+
+
+def test_links_without_a_file(make):
+    folder = make.images("clip", ["0.png", "2.png"])
+    (folder / "1.png").symlink_to("nowhere.png")
+    source = dvo.open(folder, calib=make.calib(), fps=10)
+    assert [frame.index for frame in source] == [0, 2] and source.skipped == 1
+    assert any("1 image is not there" in warning and "1.png" in warning for warning in source.warnings)
+    (make.root / "broken").mkdir()
+    (make.root / "broken" / "1.png").symlink_to("nowhere.png")
+    with pytest.raises(DvoError, match="none of the 1 images is there"):
+        dvo.open(make.root / "broken", calib=make.calib(), fps=10)
+
+
+def test_masks_in_the_alpha_channel(make):
+    folder = make.root / "clear"
+    folder.mkdir()
+    alpha = np.full((48, 64), 255, np.uint8)
+    alpha[:20] = 0
+    for i in range(3):
+        cv2.imwrite(str(folder / f"{i}.png"), np.dstack([make.image(i), alpha]))
+    source = dvo.open(folder, calib=make.calib(), fps=10)
+    assert len(list(source)) == 3 and "transparent" in source.warnings[0] and "--mask" in source.warnings[0]
+    frame = next(iter(dvo.open(folder, calib=make.calib(), fps=10, mask=folder)))
+    assert np.array_equal(frame.mask, alpha > 0)
+    cv2.imwrite(str(make.root / "m.png"), np.dstack([np.zeros((48, 64, 3), np.uint8), alpha]))
+    assert np.array_equal(read_mask(make.root / "m.png"), alpha > 0)
+    white = np.zeros((48, 64, 3), np.uint8)
+    white[:, :30] = 255
+    cv2.imwrite(str(make.root / "m.png"), np.dstack([white, alpha]))
+    assert np.array_equal(read_mask(make.root / "m.png"), (alpha > 0) & (white[..., 0] > 0))
+
+
+def test_backslashes_in_lists(make):
+    make.images("s/rgb", ["1.png", "2.png"])
+    make.text("s/rgb.txt", "timestamp filename\n1.0 rgb\\1.png\n1.5 rgb\\2.png\n")
+    assert len(list(dvo.open(make.root / "s", calib=make.calib()))) == 2

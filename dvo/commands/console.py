@@ -216,7 +216,7 @@ class TrackingProgress:
 
 
 def describe_status(estimate: Estimate) -> str:
-    """Describe the state of the tracker, with the cause of a loss and the segment from the second one on.
+    """Describe the state of the tracker, with the cause of it and the segment from the second one on.
 
     Args:
         estimate: of the last frame.
@@ -225,6 +225,6 @@ def describe_status(estimate: Estimate) -> str:
         Text such as ``lost: black image, segment 1``, as rich markup.
     """
     text = estimate.status.value
-    if estimate.status is Status.LOST and estimate.reason:
+    if estimate.reason:
         text += f": {escape(printable(estimate.reason))}"
     return f"{text}, segment {estimate.segment}" if estimate.segment else text

@@ -235,6 +235,9 @@ class _Feeding:
         self.reasons: dict[float, str] = {}
         self.interruptions: dict[float, str] = {}
         self.interruption = ""  # of the frames skipped since the last tracked one
+        self.silence = 0.0  # longest interval since then, see Frame.silence
+        self.silence_told = False  # whether images were dropped since then
+        self.previous: float | None = None  # time of the last frame
         self.pending: Frame | None = None  # last skipped frame, tracked after all if the source ends with it
 
     @property
@@ -244,6 +247,10 @@ class _Feeding:
     def take(self, frame: Frame) -> None:
         frame = checked_frame(frame)
         self.interruption = frame.interruption or self.interruption
+        interval = 0.0 if self.previous is None else frame.timestamp - self.previous
+        self.silence = max(self.silence, interval if frame.silence is None else frame.silence)
+        self.silence_told |= frame.silence is not None
+        self.previous = frame.timestamp
         if self.frames_read % self.stride:
             self.pending = frame
             self.skipped.append(frame.timestamp)
@@ -265,6 +272,9 @@ class _Feeding:
                 frame = copy.copy(frame)
                 object.__setattr__(frame, "interruption", self.interruption)
             self.interruptions[frame.timestamp], self.interruption = self.interruption, ""
+        if self.silence_told and self.silence != frame.silence:
+            frame = frame.with_silence(self.silence)
+        self.silence, self.silence_told = 0.0, False
         started = time.perf_counter()
         estimate = self.odometry.track(frame)
         self.frame_seconds.append(time.perf_counter() - started)

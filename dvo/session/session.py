@@ -16,7 +16,7 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
-from dvo.odometry.protocol import Break, Estimate, Odometry, Result
+from dvo.odometry.protocol import Break, Estimate, Interim, Odometry, Result
 from dvo.odometry.segments import find_breaks
 from dvo.session.second_run import compare_again, is_due
 
@@ -59,6 +59,7 @@ def run(
     stride: int = 1,
     on_frame: FrameCallback | None = None,
     should_stop: Callable[[], bool] | None = None,
+    in_haste: Callable[[], bool] | None = None,
     strict: bool = False,
     again: Callable[[], Odometry] | None = None,
 ) -> Run:
@@ -76,6 +77,8 @@ def run(
         on_frame: called after each frame, outside the timings; the estimate is None for a skipped frame.
         should_stop: called before each frame; True ends tracking. With it the caller handles Ctrl-C; without it a
             KeyboardInterrupt ends tracking too.
+        in_haste: asked when tracking has been stopped; True takes the result so far in place of the final optimisation,
+            from an odometry that has one (:class:`dvo.odometry.protocol.Interim`), with a warning.
         strict: raise errors and interruptions instead.
         again: builds the odometry with another seed. Where the result leaves doubt, and the source can be read again,
             its beginning is tracked a second time, backward, and compared (:mod:`dvo.session.second_run`).
@@ -121,7 +124,11 @@ def run(
         raise DvoError("no frames", file=getattr(source, "name", None), remedy="give a video or a folder with images")
 
     started = time.perf_counter()
-    result = odometry.finish()
+    if interrupted and in_haste is not None and in_haste() and isinstance(odometry, Interim):
+        result = odometry.current()
+        warnings.append("there was no time for the final optimisation: poses are those of tracking")
+    else:
+        result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
     if again is not None and not interrupted and is_due(result, source):
         started = time.perf_counter()

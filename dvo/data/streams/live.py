@@ -21,7 +21,7 @@ from dvo.data.trajectory import Trajectory
 
 T = TypeVar("T")
 
-JOIN_TIMEOUT = 2.0
+JOIN_TIMEOUT = 0.5
 """Seconds to wait for the thread at the end; one that hangs in a driver dies with the process."""
 LONGEST = 1_000_000
 """Longest queue, frames."""

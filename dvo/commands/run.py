@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(folders)
         _check_outputs(arguments, folder)
-        observers = stack.enter_context(open_observers(arguments, source.name))
+        observers = stack.enter_context(open_observers(arguments, source.name, folder))
         observers += base_observers(arguments, folder, source.path)
         observers += scale_observers(arguments, folder)
         odometry = early or load_odometry(arguments, device)

@@ -17,7 +17,7 @@ from types import FrameType
 from typing import NoReturn
 
 from dvo import __version__
-from dvo.commands import BAD_INPUT, HUNG_UP, INTERRUPTED, OK, Terminated, ending_signals
+from dvo.commands import BAD_INPUT, HUNG_UP, INTERRUPTED, OK, TERMINATED, Terminated, ending_signals
 from dvo.commands.calibrate_options import add_calibrate
 from dvo.commands.kernels import compiled_meanwhile
 from dvo.commands.run_options import add_batch_options, add_folder_options, add_run_options, add_tracking_options
@@ -201,7 +201,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     with _terminable() as received:
         code = _run(argv, received)
-    return _flush(code)
+    code = _flush(code)
+    if argv is None and code == TERMINATED:  # a thread may be in the midst of work that nobody waits for any more
+        os._exit(code)
+    return code
 
 
 def _run(argv: Sequence[str] | None, received: Sequence[KeyboardInterrupt]) -> int:

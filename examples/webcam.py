@@ -3,7 +3,7 @@
     python examples/webcam.py webcam:0 --calib calib.txt
     python examples/webcam.py rtsp://192.168.1.20/stream --calib calib.txt
 
-A thread receives the images; frames that arrive while one is tracked are dropped but for the newest two. Ctrl-C ends.
+A thread receives the images; frames that arrive while one is tracked are dropped but for the newest. Ctrl-C ends.
 """
 
 import argparse

@@ -21,6 +21,7 @@ from dvo.commands import run as command
 from dvo.core.errors import DvoError
 from dvo.data.trajectory import read_tum
 from tests.support.command_line import arguments, errors, names, summary
+from tests.support.fake_odometry import FakeOdometry, curve
 
 # A program that is `dvo` with an odometry that knows the answer, several times over in processes of their own: imports
 # take longer than all runs. Each logs a line when the odometry is asked for a frame, at which moment the frame before
@@ -165,6 +166,43 @@ def test_a_signal_before_tracking_leaves_no_folder(number, code, said, monkeypat
     assert main(arguments(image_folder, tmp_path / "out")) == code
     assert not (tmp_path / "out").exists()
     assert errors(capsys.readouterr().err) == [f"dvo: {said}"]
+
+
+class Hasty(FakeOdometry):
+    """Whose final optimisation takes long."""
+
+    def current(self):
+        return super().finish()
+
+    def finish(self):
+        raise AssertionError("there is no time for it")
+
+
+def test_sigterm_writes_what_there_is(monkeypatch, image_folder, tmp_path, capsys):
+    """Within two seconds, if plots take longer; a container is killed in ten."""
+    term = {8: lambda: os.kill(os.getpid(), signal.SIGTERM)}
+    monkeypatch.setitem(vars(dvo), "load", lambda *args, **options: Hasty(curve, at_frame=term))
+    monkeypatch.setattr("dvo.commands.console.GRACE", 0.2)
+    monkeypatch.setattr("dvo.commands.run.draw", lambda *args, **options: time.sleep(60))
+    assert main(arguments(image_folder, tmp_path / "out")) == 143
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 9
+    written = summary(tmp_path / "out")
+    assert written["interrupted"] is True and written["finished"] is True
+    assert any("no time for the final optimisation" in text for text in written["warnings"])
+    assert names(tmp_path / "out") == ["frames.csv", "map.ply", "run.json", "trajectory.txt"]
+    assert "summary.html" not in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+
+
+def test_sigterm_ends_a_frame_that_takes_long(given, image_folder, tmp_path, monkeypatch, capsys):
+    def stuck():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+
+    given(at_frame={8: stuck})
+    monkeypatch.setattr("dvo.commands.console.GRACE", 0.2)
+    assert main(arguments(image_folder, tmp_path / "out")) == 143
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == 8 and not summary(tmp_path / "out")["finished"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])

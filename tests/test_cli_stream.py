@@ -83,7 +83,7 @@ def test_ctrl_c_ends_a_camera_that_sends_nothing_more(given, monkeypatch, calib,
     camera.wake.set()
     written = summary(tmp_path / "out")
     live, frames = written["live"], written["frames"]
-    assert live["received"] == 500 == live["dropped"] + frames["fed"] and frames["tracked"] == frames["fed"] >= 3
+    assert live["received"] == 500 == live["dropped"] + frames["fed"] and frames["tracked"] == frames["fed"] >= 2
     assert written["finished"] is True and written["interrupted"] is True and written["clock"]["times"] == "arrival"
     assert len(read_tum(tmp_path / "out" / "trajectory.txt")) == frames["fed"]
     said = capsys.readouterr()

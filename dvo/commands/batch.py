@@ -137,6 +137,9 @@ def _sources(videos: Sequence[str]) -> list[str]:
 
 def _check_options(arguments: argparse.Namespace, options: Mapping[str, Any]) -> None:
     """Refuse options that make no sense for many videos."""
+    if options.get("rerun_connect") is not None:
+        remedy = "give a file for each, such as --rerun {name}.rrd"
+        raise DvoError("a viewer shows one run", field="--rerun-connect", remedy=remedy)
     for name in OUTPUTS:
         text, flag = options.get(name), f"--{name.replace('_', '-')}"
         if text is None:

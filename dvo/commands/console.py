@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from types import FrameType, TracebackType
-from typing import Any
+from typing import Any, NoReturn
 
 import cv2
 import torch
@@ -26,6 +26,8 @@ from dvo.core.text import print_line, printable
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Result, Status
 
+GRACE = 1.5
+"""Seconds after SIGTERM in which a frame is finished and results are written."""
 _COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red"}
 
 
@@ -111,7 +113,8 @@ class InterruptSwitch:
     KeyboardInterrupt. A SIGHUP or SIGTERM that is ignored, as by ``nohup``, stays ignored.
 
     An interrupt in the middle of an update would leave the tracker in an inconsistent state; the caller checks
-    :attr:`pressed` between frames instead.
+    :attr:`pressed` between frames instead. After SIGTERM there are :data:`GRACE` seconds, for a frame and for the
+    results, until :meth:`release`; then KeyboardInterrupt is raised as by a second signal: who sends it kills soon.
 
     Args:
         on_press: called at the first signal, in its handler.
@@ -124,15 +127,31 @@ class InterruptSwitch:
         self.on_press = on_press
         self.pressed: signal.Signals | None = None
         self._before: dict[signal.Signals, Any] = {}
+        self._limited = hasattr(signal, "setitimer")
 
     def __enter__(self) -> InterruptSwitch:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, *ending_signals()):
                 if number is signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
                     self._before[number] = signal.signal(number, self._press)
+            self._limited = self._limited and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+            if self._limited:
+                self._before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._end)
         return self
 
+    @property
+    def in_haste(self) -> bool:
+        """SIGTERM was the first signal."""
+        return self.pressed == signal.SIGTERM
+
+    def release(self) -> None:
+        """End the time limit: what matters is written."""
+        if self._limited and threading.current_thread() is threading.main_thread():
+            self._limited = False
+            signal.setitimer(signal.ITIMER_REAL, 0)
+
     def __exit__(self, *_: object) -> None:
+        self.release()
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
@@ -140,8 +159,13 @@ class InterruptSwitch:
         if self.pressed is not None:
             raise KeyboardInterrupt if number == signal.SIGINT else Terminated(number)
         self.pressed = signal.Signals(number)
+        if self.in_haste and self._limited:
+            signal.setitimer(signal.ITIMER_REAL, GRACE)
         if self.on_press is not None:
             self.on_press()
+
+    def _end(self, number: int, frame: FrameType | None) -> NoReturn:
+        raise Terminated
 
 
 class StderrConsole(Console):
@@ -216,7 +240,7 @@ class TrackingProgress:
 
 
 def describe_status(estimate: Estimate) -> str:
-    """Describe the state of the tracker, with the cause of a loss and the segment from the second one on.
+    """Describe the state of the tracker, with the cause of it and the segment from the second one on.
 
     Args:
         estimate: of the last frame.
@@ -225,6 +249,6 @@ def describe_status(estimate: Estimate) -> str:
         Text such as ``lost: black image, segment 1``, as rich markup.
     """
     text = estimate.status.value
-    if estimate.status is Status.LOST and estimate.reason:
+    if estimate.reason:
         text += f": {escape(printable(estimate.reason))}"
     return f"{text}, segment {estimate.segment}" if estimate.segment else text

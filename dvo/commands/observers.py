@@ -12,6 +12,7 @@ from dvo.commands.view_options import VIEWER
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.session.observer import Observer
+from dvo.session.results import RECORDING
 from dvo.session.session import Run
 
 
@@ -77,12 +78,13 @@ class GuardedObserver:
 
 
 @contextlib.contextmanager
-def open_observers(arguments: argparse.Namespace, name: str) -> Iterator[list[Observer]]:
+def open_observers(arguments: argparse.Namespace, name: str, folder: Path) -> Iterator[list[Observer]]:
     """Open the observers for the time of a run.
 
     Args:
         arguments: of the command line.
         name: of the clip.
+        folder: of the results; ``--rerun`` without a display writes there.
 
     Yields:
         Observers, closed at the end; a failure of one is a warning.
@@ -97,10 +99,18 @@ def open_observers(arguments: argparse.Namespace, name: str) -> Iterator[list[Ob
             found.append(GuardedObserver(observer, option))
             stack.callback(found[-1].close)
 
-        if arguments.rerun is not None:
+        if arguments.rerun_connect is not None:
             from dvo.viz.rerun_log import RerunLog
 
-            add(RerunLog(None if arguments.rerun == VIEWER else Path(arguments.rerun), name), "--rerun")
+            add(RerunLog(None, name, arguments.rerun_connect), "--rerun-connect")
+        if arguments.rerun is not None:
+            from dvo.viz.rerun_log import RerunLog, has_display
+
+            file = None if arguments.rerun == VIEWER else Path(arguments.rerun)
+            if file is None and not has_display():
+                file = folder / RECORDING
+                warn(f"there is no display for the viewer: the run is written to {file}, for `rerun FILE`", "note")
+            add(RerunLog(file, name), "--rerun")
         if arguments.overlay is not None:
             from dvo.viz.overlay import OverlayVideo
 

@@ -208,7 +208,8 @@ def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = (
         wrong = "" if scores.scale is None else f", scale wrong by {100 * abs(1 / scores.scale - 1):.2f} %"
         longest = " of the longest segment" if several else ""
         say(f"{error_text(metrics)} after {group} alignment{longest}, {relative}{wrong}")
-    files = [results.TRAJECTORY, results.MAP, results.PICTURE, results.PAGE, results.FRAMES, results.SUMMARY]
+    views = [name for name in (results.PICTURE, results.PAGE) if (folder / name).exists()]  # without them after SIGTERM
+    files = [results.TRAJECTORY, results.MAP, *views, results.FRAMES, results.SUMMARY]
     files += [*more, *(name for name in (results.CLOUD, results.MESH, results.BASE) if (folder / name).exists())]
     if several:
         last = len(result.segments) - 1

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 
 import dvo
-from dvo.commands import NOTHING_TRACKED, OK
+from dvo.commands import NOTHING_TRACKED, OK, Terminated
 from dvo.commands.base_frame import base_observers
 from dvo.commands.camera import CALIBRATION, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
@@ -33,9 +33,9 @@ from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings, read_settings
 from dvo.data.files.output import check_place
 from dvo.data.frame import Frame
-from dvo.data.streams.capture import shown
+from dvo.data.streams.capture import is_stream, shown
 from dvo.data.trajectory import Trajectory
-from dvo.export.formats import check_formats, export_run
+from dvo.export.formats import TRAJECTORY_FORMATS, check_formats, export_run
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
@@ -84,6 +84,10 @@ def run(arguments: argparse.Namespace) -> int:
     """
     check_formats(arguments.export)
     device = device_for(arguments)
+    early: Odometry | None = None
+    if is_stream(arguments.source):  # frames arrive from its opening on
+        seed_everything(arguments.seed)
+        early = load_odometry(arguments, device)
     source = dvo.open(
         arguments.source,
         calib=arguments.calib,
@@ -118,10 +122,10 @@ def run(arguments: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(folders)
         _check_outputs(arguments, folder)
-        observers = stack.enter_context(open_observers(arguments, source.name))
+        observers = stack.enter_context(open_observers(arguments, source.name, folder))
         observers += base_observers(arguments, folder, source.path)
         observers += scale_observers(arguments, folder)
-        odometry = load_odometry(arguments, device)
+        odometry = early or load_odometry(arguments, device)
         check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
         facts["map"] = arguments.map
@@ -237,8 +241,9 @@ def track(
     """Track a clip, fill the results folder and print a summary.
 
     Results are written from the first frame on (:class:`dvo.session.recorder.Recorder`) and replaced at the end. The
-    first Ctrl-C, SIGTERM or SIGHUP ends tracking and still writes all results; a second one aborts, and what the
-    recorder has written stays.
+    first Ctrl-C or SIGHUP ends tracking and still writes all results. SIGTERM, after which a container is killed in
+    10 s, writes what there is within two: no final optimisation, plot, page and maps for other programs. A second
+    signal aborts, and what the recorder has written stays.
 
     Args:
         odometry: newly built.
@@ -275,7 +280,7 @@ def track(
             try:
                 done = session.run(
                     odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None,
-                    again=again,
+                    in_haste=lambda: switch.in_haste, again=again,
                 )  # fmt: skip
             except KeyboardInterrupt:
                 recorder.stop(interrupted=True, reason=_ABORTED)
@@ -292,10 +297,19 @@ def track(
             scores = score(done, clip.groundtruth)
             writer = None if save_map is None else partial(_save, odometry, save_map)
             pages = Pages(clip.name, done, table, odometry, clip.groundtruth)
-            _write(folder, done, scores, clip, facts, writer, pages)
+            hasty = done.interrupted and switch.in_haste
+            views = True
+            if hasty:
+                views = _write_in_haste(folder, done, scores, clip, facts, pages)
+            switch.release()
+            if not hasty or writer is not None:
+                _write(folder, done, scores, clip, facts, writer, pages, views=views)
             for observer in observers:
                 observer.finish(done)
-            pages.add_warnings(folder, [text for observer in observers for text in getattr(observer, "warnings", ())])
+            if views:
+                pages.add_warnings(
+                    folder, [text for observer in observers for text in getattr(observer, "warnings", ())]
+                )
             progress.finish(done.result)
         for warning in new_warnings:
             warn(warning)
@@ -307,6 +321,9 @@ def track(
                 say(f"{getattr(observer, 'option', '').removeprefix('--')} in {file}")
         if save_map is not None:
             say(f"map in {save_map}")
+        if hasty and (left := [name for name in export if name not in TRAJECTORY_FORMATS]):
+            warn(f"{', '.join(left)}: not exported, there was no time for the final optimisation")
+            export = [name for name in export if name not in left]
         if export:
             _export(odometry, done, folder / results.EXPORT, export)
     if done.interrupted:
@@ -330,6 +347,19 @@ def _save(odometry: Odometry, file: Path) -> dict[str, Any]:
     return {"map_file": str(file.resolve())}
 
 
+def _write_in_haste(
+    folder: Path, done: session.Run, scores: Scores, clip: Clip, facts: dict[str, Any], pages: Pages
+) -> bool:
+    """Write what matters at once, and plot and page if there is time for them; True if there was."""
+    _write(folder, done, scores, clip, facts, None, pages, views=False)
+    try:
+        _write(folder, done, scores, clip, facts, None, pages)
+    except Terminated:
+        _write(folder, done, scores, clip, facts, None, pages, views=False)
+        return False
+    return True
+
+
 def _write(
     folder: Path,
     done: session.Run,
@@ -338,8 +368,10 @@ def _write(
     facts: dict[str, Any],
     save_map: Callable[[], dict[str, Any]] | None,
     pages: Pages,
+    views: bool = True,
 ) -> None:
-    """Replace the files of the recorder with the final ones, and write the map file, which run.json names."""
+    """Replace the files of the recorder with the final ones, and write the map file, which run.json names; ``views``:
+    plot and page too."""
     facts = {**facts, "map_file": None, "metrics": None if scores.longest is None else asdict(scores.longest)}
 
     def picture(path: Path) -> None:
@@ -357,9 +389,9 @@ def _write(
             folder,
             done,
             facts,
-            draw=picture,
+            draw=picture if views else None,
             more={results.FRAMES: pages.frames},
-            page=pages.page,
+            page=pages.page if views else None,
             segment_facts=scores.segment_facts,
             also=save_map,
         )

@@ -15,7 +15,7 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
         "--queue",
         type=_length,
         metavar="N",
-        help="of a stream, frames that may wait, older ones are dropped; 0: none is dropped (default: 2 if live)",
+        help="of a stream, frames that may wait, older ones are dropped; 0: none is dropped (default: 1 if live)",
     )
 
 

@@ -13,13 +13,19 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
     Args:
         parser: of the command.
     """
-    parser.add_argument(
+    viewer = parser.add_mutually_exclusive_group()
+    viewer.add_argument(
         "--rerun",
         nargs="?",
         const=VIEWER,
         type=_recording,
         metavar="FILE.rrd",
         help="log images, patches, edges and poses for the viewer Rerun: into FILE, or start the viewer (dvo[viz])",
+    )
+    viewer.add_argument(
+        "--rerun-connect",
+        metavar="ADDRESS",
+        help="log for a viewer that runs on another machine, as HOST:PORT (there: rerun; dvo[viz] here)",
     )
     parser.add_argument(
         "--overlay", type=_video, metavar="FILE.mp4", help="video of the frames with the tracked patches"

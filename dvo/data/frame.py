@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -138,6 +139,9 @@ class Frame:
         mask: ``(H, W)`` bool or uint8, 0 (False) for pixels of ``image`` to ignore; None: all are used.
         interruption: why the time since the frame before it is not known, such as a clock that was set back; empty
             where it is.
+        silence: where images between the frame before it and this one were received and dropped, the longest time in
+            which none was received, seconds: a camera that goes on has no gap. None: none was dropped, and it is the
+            time since the frame before it.
 
     Example:
         >>> import numpy as np
@@ -158,3 +162,14 @@ class Frame:
     inertial: Lazy[InertialSamples] = Lazy()
     mask: np.ndarray | None = None
     interruption: str = ""
+    silence: float | None = None
+
+    def with_silence(self, seconds: float) -> Frame:
+        """The frame after images that were dropped; depth, right image and inertial samples are not read for it.
+
+        Args:
+            seconds: see :attr:`silence`.
+        """
+        told = copy.copy(self)  # dataclasses.replace would load what is read at its first use
+        object.__setattr__(told, "silence", seconds)
+        return told

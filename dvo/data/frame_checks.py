@@ -43,9 +43,9 @@ def checked_frame(frame: Frame) -> Frame:
 
     Raises:
         DvoError: an object that is not a frame; an index that is not a whole number; a time that is not a finite
-            number; an interruption that is no text; an image of another form or type, without pixels, or with
-            values not finite or out of range; no camera, or one of another image size; a mask of another type or
-            size. Names the frame and the field.
+            number; an interruption that is no text, or a silence that is no number of seconds; an image of another
+            form or type, without pixels, or with values not finite or out of range; no camera, or one of another
+            image size; a mask of another type or size. Names the frame and the field.
 
     Example:
         >>> import numpy as np
@@ -65,6 +65,8 @@ def checked_frame(frame: Frame) -> Frame:
         raise DvoError(
             f"expected a text, got {_kind(frame.interruption)}", field=f"{name}: interruption", remedy=remedy
         )
+    if frame.silence is not None and _seconds(frame.silence, f"{name}: silence") < 0:
+        raise DvoError(f"{frame.silence} is negative", field=f"{name}: silence", remedy="give seconds, or None")
     timestamp = _seconds(frame.timestamp, f"{name}: timestamp")
     image = checked_image(frame.image, frame.camera, name)
     mask = checked_mask(frame.mask, image.shape[0], image.shape[1], f"{name}: mask")

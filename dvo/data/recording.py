@@ -73,6 +73,7 @@ class RawFrame:
         origin: file name or frame number, for messages.
         depth: loads the depth image of this frame: ``(H, W)`` float32 metres with nan for unknown, or None.
         right: loads the right image of this frame: ``(H, W, 3)`` uint8 RGB, or None.
+        silence: of a stream, see :attr:`dvo.data.frame.Frame.silence`.
     """
 
     index: int
@@ -81,6 +82,7 @@ class RawFrame:
     origin: str
     depth: Callable[[], np.ndarray | None] | None = None
     right: Callable[[], np.ndarray | None] | None = None
+    silence: float | None = None
 
 
 @dataclass

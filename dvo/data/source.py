@@ -223,7 +223,7 @@ class Source:
         if previous is not None and self.recording.inertial is not None:
             inertial = partial(self._inertial, previous, raw.timestamp)
         mask = self.masks(raw.index, self._undistorter) if self.masks else None
-        return Frame(raw.index, raw.timestamp, image, self.camera, depth, right, inertial, mask)
+        return Frame(raw.index, raw.timestamp, image, self.camera, depth, right, inertial, mask, silence=raw.silence)
 
     def _depth(self, load: Callable[[], np.ndarray | None], origin: str) -> np.ndarray | None:
         depth = load()

@@ -41,7 +41,8 @@ class Estimate:
             other odometries comparable within one run only.
         segment: number of the segment that the pose belongs to, from 0. Poses of two segments have different worlds and
             different scales.
-        reason: cause of the status ``lost``, such as ``"black image"``; empty otherwise.
+        reason: cause of the status ``lost``, such as ``"black image"``, or what an odometry that is ``initialising``
+            waits for, such as ``"too little motion"``; empty otherwise.
         recovered: the first pose after the segment was joined to an earlier world (of an earlier segment, or of a map):
             this pose and those after it are in that world and scale, earlier ones of the segment were not.
         covariance: ``(6, 6)`` float64 of the error ``xi`` of ``pose_wc`` relative to the pose of the reference, which

@@ -37,7 +37,8 @@ TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png
 FRAMES, PAGE = "frames.csv", "summary.html"
 BASE = "trajectory_base.txt"
 CLOUD, MESH = "cloud.ply", "mesh.ply"
-FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, CLOUD, MESH, SUMMARY, BASE)
+RECORDING = "run.rrd"  # of --rerun without a display
+FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, CLOUD, MESH, SUMMARY, BASE, RECORDING)
 VIEWS = (PICTURE, FRAMES, PAGE)
 """Files that show what the others hold; an error in drawing one costs no other file."""
 SEGMENT_FILE = re.compile(r"trajectory-\d+\.txt")

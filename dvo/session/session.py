@@ -16,7 +16,7 @@ from dvo.core.errors import DvoError
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
-from dvo.odometry.protocol import Break, Estimate, Odometry, Result
+from dvo.odometry.protocol import Break, Estimate, Interim, Odometry, Result
 from dvo.odometry.segments import find_breaks
 from dvo.session.second_run import compare_again, is_due
 
@@ -59,6 +59,7 @@ def run(
     stride: int = 1,
     on_frame: FrameCallback | None = None,
     should_stop: Callable[[], bool] | None = None,
+    in_haste: Callable[[], bool] | None = None,
     strict: bool = False,
     again: Callable[[], Odometry] | None = None,
 ) -> Run:
@@ -76,6 +77,8 @@ def run(
         on_frame: called after each frame, outside the timings; the estimate is None for a skipped frame.
         should_stop: called before each frame; True ends tracking. With it the caller handles Ctrl-C; without it a
             KeyboardInterrupt ends tracking too.
+        in_haste: asked when tracking has been stopped; True takes the result so far in place of the final optimisation,
+            from an odometry that has one (:class:`dvo.odometry.protocol.Interim`), with a warning.
         strict: raise errors and interruptions instead.
         again: builds the odometry with another seed. Where the result leaves doubt, and the source can be read again,
             its beginning is tracked a second time, backward, and compared (:mod:`dvo.session.second_run`).
@@ -121,7 +124,11 @@ def run(
         raise DvoError("no frames", file=getattr(source, "name", None), remedy="give a video or a folder with images")
 
     started = time.perf_counter()
-    result = odometry.finish()
+    if interrupted and in_haste is not None and in_haste() and isinstance(odometry, Interim):
+        result = odometry.current()
+        warnings.append("there was no time for the final optimisation: poses are those of tracking")
+    else:
+        result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
     if again is not None and not interrupted and is_due(result, source):
         started = time.perf_counter()
@@ -235,6 +242,9 @@ class _Feeding:
         self.reasons: dict[float, str] = {}
         self.interruptions: dict[float, str] = {}
         self.interruption = ""  # of the frames skipped since the last tracked one
+        self.silence = 0.0  # longest interval since then, see Frame.silence
+        self.silence_told = False  # whether images were dropped since then
+        self.previous: float | None = None  # time of the last frame
         self.pending: Frame | None = None  # last skipped frame, tracked after all if the source ends with it
 
     @property
@@ -244,6 +254,10 @@ class _Feeding:
     def take(self, frame: Frame) -> None:
         frame = checked_frame(frame)
         self.interruption = frame.interruption or self.interruption
+        interval = 0.0 if self.previous is None else frame.timestamp - self.previous
+        self.silence = max(self.silence, interval if frame.silence is None else frame.silence)
+        self.silence_told |= frame.silence is not None
+        self.previous = frame.timestamp
         if self.frames_read % self.stride:
             self.pending = frame
             self.skipped.append(frame.timestamp)
@@ -265,6 +279,9 @@ class _Feeding:
                 frame = copy.copy(frame)
                 object.__setattr__(frame, "interruption", self.interruption)
             self.interruptions[frame.timestamp], self.interruption = self.interruption, ""
+        if self.silence_told and self.silence != frame.silence:
+            frame = frame.with_silence(self.silence)
+        self.silence, self.silence_told = 0.0, False
         started = time.perf_counter()
         estimate = self.odometry.track(frame)
         self.frame_seconds.append(time.perf_counter() - started)

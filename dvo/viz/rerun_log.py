@@ -7,13 +7,19 @@ frames; the tracker is not changed.
 
 from __future__ import annotations
 
+import os
+import socket
+import sys
+import threading
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit, urlunsplit
 
 import cv2
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 from dvo.data.files.output import begin_part, check_place, drop_part, end_part
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Odometry, Result, Status
@@ -23,9 +29,51 @@ from dvo.viz.marks import pixels, shade
 from dvo.viz.plot import COLOURS
 
 APPLICATION = "dvo"
+PORT = 9876  # of a viewer
+VIEWER_LIMIT, FILE_LIMIT = 2.0, 60.0  # seconds to wait for a viewer, and for a file
 CHUNK = 100  # poses of a piece of the trajectory; the last piece is logged again with each frame
 ARCHIVED_EVERY, POINTS_EVERY = 25, 5  # frames between two versions of the archived edges, and of the window's points
 _IMAGE_QUALITY = 80
+
+
+def has_display() -> bool:
+    """True if a window can be opened, or a viewer that runs on this machine takes the run."""
+    if sys.platform in ("win32", "darwin") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        return True
+    return _answers("127.0.0.1", PORT)
+
+
+def reached(address: str) -> str:
+    """Address of a viewer in the form that rerun wants, if something answers there.
+
+    Args:
+        address: ``HOST:PORT``, ``HOST`` (port 9876), or ``rerun+http://HOST:PORT/proxy``.
+
+    Raises:
+        DvoError: no address, or nothing answers.
+    """
+    url = address if "://" in address else f"rerun+http://{address}/proxy"
+    remedy = "start `rerun` on that machine, and give its HOST:PORT, such as 192.168.1.5:9876"
+    try:
+        parts = urlsplit(url)
+        scheme, host, port = parts.scheme, parts.hostname, parts.port or PORT
+    except ValueError:
+        scheme = host = ""
+    if not host or scheme not in ("rerun", "rerun+http", "rerun+https"):
+        raise DvoError(f"no address: {shown(address)}", field="--rerun-connect", remedy=remedy)
+    if not _answers(host, port):
+        raise DvoError(f"no viewer answers at {shown(address)}", field="--rerun-connect", remedy=remedy)
+    return urlunsplit(
+        (scheme, parts.netloc if parts.port else f"{parts.netloc}:{PORT}", parts.path or "/proxy", "", "")
+    )
+
+
+def _answers(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=VIEWER_LIMIT).close()
+    except (OSError, UnicodeError):
+        return False
+    return True
 
 
 def import_rerun() -> Any:
@@ -52,25 +100,38 @@ class RerunLog:
     An odometry without a keyframe graph gives poses and images only.
 
     Args:
-        file: ``.rrd`` file to write; None starts the viewer.
+        file: ``.rrd`` file to write; None starts the viewer, or connects to one.
         name: of the run, in the viewer.
+        address: of a viewer that runs, maybe on another machine: ``HOST:PORT``, ``HOST``, or ``rerun+http://...``; None
+            for a new one on this machine.
+
+    Attributes:
+        file: as given.
 
     Raises:
-        DvoError: rerun is not installed, the file cannot be written, or the viewer cannot be started.
+        DvoError: rerun is not installed, the file cannot be written, the viewer cannot be started (without a display),
+            or none answers at the address.
     """
 
-    def __init__(self, file: Path | None, name: str) -> None:
+    def __init__(self, file: Path | None, name: str, address: str | None = None) -> None:
         self._rr = rr = import_rerun()
+        url = None if address is None else reached(address)
+        if file is None and url is None and not has_display():
+            remedy = "write a file with --rerun FILE.rrd, or show it on another machine with --rerun-connect ADDRESS"
+            raise DvoError("there is no display for the viewer", field="--rerun", remedy=remedy)
         self._stream = rr.RecordingStream(APPLICATION)
-        self.file = file
+        self.file, self._limit = file, FILE_LIMIT if file is not None else VIEWER_LIMIT
         self._part: Path | None = None
+        self._closed = False
         self._odometry: Odometry | None = None
         self._path: list[np.ndarray] = []
         self._piece = self._segment = self._count = 0
         self._start: float | None = None
         self._status = ""
         try:
-            if file is None:
+            if url is not None:
+                self._stream.connect_grpc(url, default_blueprint=self._layout())
+            elif file is None:
                 self._stream.spawn(default_blueprint=self._layout())
             else:
                 check_place(file, "--rerun")  # rerun only prints an error if it cannot write the file
@@ -114,7 +175,7 @@ class RerunLog:
         self._count += 1
 
     def finish(self, run: Run) -> None:
-        """Log the result, at the time of the last frame.
+        """Log the result, at the time of the last frame, and close the log.
 
         Args:
             run: record of the session.
@@ -133,20 +194,39 @@ class RerunLog:
         graph = None if self._odometry is None else graph_of(self._odometry)
         if graph is not None and result.longest is not None:
             self._lines("final/edges", archived_lines(graph, result.longest), [120, 130, 145])
+        self.close()
 
     def close(self) -> None:
-        """Write what is buffered, and close the file, which takes the place of an earlier one."""
+        """Write what is buffered, and close the file, which takes the place of an earlier one. A viewer that takes
+        nothing more is left after two seconds."""
+        if self._closed:
+            return
+        self._closed = True
         part, self._part = self._part, None
         try:
-            self._stream.flush()
+            self._flush()
         finally:
-            self._stream.disconnect()
+            self._disconnect()
             if self.file is not None and part is not None:
                 try:
                     end_part(part, self.file)
                 except OSError:
                     drop_part(part)
                     raise
+
+    def _flush(self) -> None:
+        try:
+            self._stream.flush(timeout_sec=self._limit)
+        except TypeError:  # before rerun 0.26 there is no limit
+            self._stream.flush(blocking=self.file is not None)
+
+    def _disconnect(self) -> None:
+        """Close the connection in a thread: for a viewer that is gone, rerun waits without a limit."""
+        closing = threading.Thread(target=self._stream.disconnect, name="dvo closes rerun", daemon=True)
+        closing.start()
+        closing.join(self._limit)
+        if closing.is_alive():
+            self._rr.unregister_shutdown()  # which would wait at the end of the program
 
     # -- parts of a frame ----------------------------------------------------------------------------------------------
 

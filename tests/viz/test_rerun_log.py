@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -67,9 +69,57 @@ def test_an_odometry_without_a_graph_logs_poses_and_images(rerun, given, image_f
 
 def test_a_file_that_cannot_be_written(rerun, given, image_folder, tmp_path, capsys):
     odometry = given()
-    assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(tmp_path / "none" / "a.rrd"))) == 2
+    assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(image_folder.parent / "calib.txt" / "a.rrd"))) == 2
     (line,) = errors(capsys.readouterr().err)
     assert "a.rrd" in line and "--rerun" in line and not odometry.asked
+
+
+@pytest.fixture
+def without_display(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("dvo.viz.rerun_log._answers", lambda host, port: False)
+
+
+def test_without_a_display_the_run_is_written(rerun, without_display, given, image_folder, tmp_path, capsys):
+    given()
+    assert main(arguments(image_folder, tmp_path / "out", "--rerun")) == 0
+    said = capsys.readouterr().err
+    assert "no display" in said and "run.rrd" in said
+    assert "run.rrd" in names(tmp_path / "out") and "/world/camera" in entities(tmp_path / "out" / "run.rrd")
+    assert main(arguments(image_folder, tmp_path / "out", "--overwrite")) == 0
+    assert "run.rrd" not in names(tmp_path / "out"), "it was of the run before"
+
+
+def test_where_no_viewer_answers(rerun, given, image_folder, tmp_path, capsys):
+    odometry = given()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        closed = f"127.0.0.1:{free.getsockname()[1]}"
+    for address, said in ((closed, "no viewer answers"), ("http://a:1", "no address"), ("a:b:c", "no address")):
+        assert main(arguments(image_folder, tmp_path / "out", "--rerun-connect", address)) == 2
+        (line,) = errors(capsys.readouterr().err)
+        assert said in line and "--rerun-connect" in line and not odometry.asked
+
+
+def test_a_viewer_that_takes_nothing_does_not_hold_the_run(rerun, given, image_folder, tmp_path, capsys, monkeypatch):
+    """It is connected, and reads nothing: rerun would wait for it without a limit."""
+    given()
+    monkeypatch.setattr("dvo.viz.rerun_log.VIEWER_LIMIT", 0.3)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen(5)
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        began = time.monotonic()
+        assert main(arguments(image_folder, tmp_path / "out", "--rerun-connect", address)) == 0
+        assert time.monotonic() - began < 30, "it would never end"
+    assert (tmp_path / "out" / "trajectory.txt").exists()
+
+
+def test_both_ways_to_a_viewer_are_refused(image_folder, capsys):
+    assert main(["run", str(image_folder), "--rerun", "a.rrd", "--rerun-connect", "a:1"]) == 2
+    assert "not allowed with" in capsys.readouterr().err
 
 
 def test_loops_join_the_positions_of_both_visits(fake_odometry):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import os
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
 from dvo.core.errors import DvoError
@@ -156,6 +158,20 @@ class Capture:
 
 
 def _open(address: str, name: str) -> cv2.VideoCapture:
+    """Open it in a thread: OpenCV waits many seconds for a camera that is off, and a signal would wait with it."""
+    opened: Future[cv2.VideoCapture] = Future()
+
+    def work() -> None:
+        try:
+            opened.set_result(_open_here(address, name))
+        except BaseException as error:
+            opened.set_exception(error)
+
+    threading.Thread(target=work, name=f"dvo opens {name}", daemon=True).start()
+    return opened.result()
+
+
+def _open_here(address: str, name: str) -> cv2.VideoCapture:
     import cv2
 
     webcam = WEBCAM.fullmatch(address)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
+import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from numbers import Real
 from types import GeneratorType
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
+from dvo.data.frame import Frame
 from dvo.data.trajectory import Trajectory
 
 T = TypeVar("T")
 
-JOIN_TIMEOUT = 2.0
+JOIN_TIMEOUT = 0.5
 """Seconds to wait for the thread at the end; one that hangs in a driver dies with the process."""
 LONGEST = 1_000_000
 """Longest queue, frames."""
@@ -37,6 +41,38 @@ class StreamCounts:
     dropped: int = 0
 
 
+@dataclass(frozen=True)
+class Reception:
+    """What was received since the element before one.
+
+    Attributes:
+        dropped: elements between them, which were dropped.
+        silence: longest time in which none was received, seconds, by the times of the elements (``timestamp``, or the
+            first of a pair), or else of their arrival.
+    """
+
+    dropped: int = 0
+    silence: float = 0.0
+
+    def then(self, silence: float, dropped: int = 0) -> Reception:
+        """After more of them.
+
+        Args:
+            silence: seconds before the next element.
+            dropped: how many are dropped.
+        """
+        return Reception(self.dropped + dropped, max(self.silence, silence))
+
+
+NOTHING = Reception()
+
+
+@dataclass(frozen=True)
+class _Entry(Generic[T]):
+    item: T
+    silence: float  # since the element received before it
+
+
 @dataclass(eq=False)
 class _Queue(Generic[T]):
     """What the thread and the consumer share. The thread refers to nothing else, so that it does not keep the
@@ -52,6 +88,7 @@ class _Queue(Generic[T]):
         ended, stopping: the thread has ended; it shall end.
         error: that ended the thread.
         process: that the thread runs in; None before its start.
+        since: what was received, and not taken, since the element that was taken last.
     """
 
     size: int
@@ -59,14 +96,16 @@ class _Queue(Generic[T]):
     interrupt: Callable[[], object] | None
     counts: StreamCounts = field(default_factory=StreamCounts)
     changed: threading.Condition = field(default_factory=threading.Condition)
-    waiting: deque[T] = field(init=False)
+    waiting: deque[_Entry[T]] = field(init=False)
+    since: Reception = NOTHING
     ended: bool = False
     stopping: bool = False
     error: Exception | None = None
     process: int | None = None
+    _received: float | None = None  # time of the last element
 
     def __post_init__(self) -> None:
-        self.waiting = deque(maxlen=self.size)
+        self.waiting = deque()
 
     @property
     def is_elsewhere(self) -> bool:
@@ -94,10 +133,26 @@ class _Queue(Generic[T]):
             if self.stopping:
                 return False
             self.counts.received += 1
-            self.counts.dropped += len(self.waiting) >= self.size
-            self.waiting.append(item)  # drops the oldest if need be
+            seconds = _seconds(item)
+            silence = 0.0 if self._received is None else max(seconds - self._received, 0.0)
+            self._received = seconds
+            if len(self.waiting) >= self.size:
+                self.counts.dropped += 1
+                self.since = self.since.then(self.waiting.popleft().silence, dropped=1)
+            self.waiting.append(_Entry(item, silence))
             self.changed.notify_all()
             return True
+
+    def take(self) -> tuple[T, Reception]:
+        """Take the oldest element, with the lock held.
+
+        Raises:
+            IndexError: there is none.
+        """
+        entry = self.waiting.popleft()
+        since, self.since = self.since.then(entry.silence), NOTHING
+        self.changed.notify_all()
+        return entry.item, since
 
     def read(self, frames: Iterable[T]) -> None:
         """Body of the thread."""
@@ -116,12 +171,22 @@ class _Queue(Generic[T]):
                 self.changed.notify_all()
 
 
+def _seconds(item: Any) -> float:
+    """Time of an element: its own, or else that of its arrival."""
+    own = item[0] if isinstance(item, tuple) and len(item) == 2 else getattr(item, "timestamp", None)
+    if isinstance(own, Real) and math.isfinite(own):
+        return float(own)
+    return time.monotonic()
+
+
 class LiveFrames(Generic[T]):
     """Elements of a stream for a consumer that may be slower than the stream.
 
     A thread of its own reads ``frames`` without a pause, and puts them into a queue. If the queue is full, the oldest
     element in it is dropped: the newest is always kept, and the consumer is never more than ``queue`` elements behind.
-    With ``drop=False`` the thread waits instead, and every element is processed. Neither side polls.
+    With ``drop=False`` the thread waits instead, and every element is processed. Neither side polls. A
+    :class:`dvo.Frame` behind dropped ones says so (``silence``), and so do those that :func:`dvo.stream` makes: where
+    frames were received there is no gap in time.
 
     An error of ``frames`` is raised in the consumer, after the elements before it. It can be iterated once; the end of
     the iteration, or leaving it early, ends the thread, and so does the last reference to it and its iterator. A
@@ -142,6 +207,7 @@ class LiveFrames(Generic[T]):
         kind: ``"stream"``.
         frame_count: None, the number is not known.
         counts: received and dropped elements.
+        reception: what was received since the element before the one that the iteration has given last.
 
     Raises:
         DvoError: a queue of less than one element.
@@ -159,7 +225,7 @@ class LiveFrames(Generic[T]):
     def __init__(
         self,
         frames: Iterable[T],
-        queue: int = 2,
+        queue: int = 1,
         *,
         drop: bool = True,
         name: str = "stream",
@@ -173,6 +239,7 @@ class LiveFrames(Generic[T]):
         self._frames, self._queue = frames, _Queue[T](queue, drop, interrupt)
         self._thread: threading.Thread | None = None
         self._iterated = False
+        self.reception = NOTHING
         # It asks the thread to end, and does not wait for that: it may run in any thread, whatever this one holds.
         weakref.finalize(self, self._queue.stop).atexit = False
 
@@ -217,7 +284,7 @@ class LiveFrames(Generic[T]):
         with self._queue.changed:
             in_time = self._wait(timeout)
             if self._queue.waiting:
-                return self._queue.waiting[0]
+                return self._queue.waiting[0].item
             if self._queue.error is not None:
                 raise self._queue.error
         problem = "ends without an image" if in_time else f"no image within {timeout:g} s"
@@ -230,9 +297,8 @@ class LiveFrames(Generic[T]):
             item: the same object.
         """
         with self._queue.changed:
-            if self._queue.waiting and self._queue.waiting[0] is item:
-                self._queue.waiting.popleft()
-                self._queue.changed.notify_all()
+            if self._queue.waiting and self._queue.waiting[0].item is item:
+                _, self._queue.since = self._queue.take()
 
     def __iter__(self) -> Iterator[T]:
         """Elements in order of arrival.
@@ -280,10 +346,11 @@ class LiveFrames(Generic[T]):
                             raise error
                         return
                     try:
-                        item = self._queue.waiting.popleft()
+                        item, self.reception = self._queue.take()
                     except IndexError:  # a signal handler has called stop since the line above
                         return
-                    self._queue.changed.notify_all()
+                if isinstance(item, Frame) and self.reception.dropped:
+                    item = cast(T, item.with_silence(max(self.reception.silence, item.silence or 0.0)))
                 yield item
         finally:
             self.close()

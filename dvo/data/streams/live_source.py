@@ -30,7 +30,7 @@ from dvo.data.recording import EVERYTHING, Log, RawFrame, Selection
 from dvo.data.source import Reading, Source
 from dvo.data.streams.capture import STANDARD_INPUT, Capture, StreamClock, is_stream, shown
 from dvo.data.streams.image_pipe import pipe_reader, split_images
-from dvo.data.streams.live import LONGEST, LiveFrames, StreamCounts
+from dvo.data.streams.live import LONGEST, NOTHING, LiveFrames, StreamCounts
 from dvo.data.trajectory import Trajectory
 
 
@@ -50,8 +50,8 @@ class Timed(Protocol):
 
 T = TypeVar("T", bound=Timed)
 
-QUEUE = 2
-"""Frames that wait by default: one while another is tracked, and one that arrives in the meantime."""
+QUEUE = 1
+"""Frames that wait by default: the newest."""
 _FIRST = 15.0  # seconds to wait for the first image of a camera or an address
 _DAMAGED = 30  # images that may be damaged before the first good one: a stream that is joined in its midst
 
@@ -112,14 +112,23 @@ class LiveRecording(Generic[T]):
 
     def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; the stride counts frames that were not dropped."""
-        numbered = enumerate(self.live)
         interval, reduction = selection.interval, selection.reduction
-        for _, item in interval.select(numbered, lambda item: item[1].timestamp, selection.stride, self.live.name):
+        since = NOTHING  # what was received since the last frame, those that the stride leaves out among them
+
+        def numbered() -> Iterator[tuple[int, T]]:
+            nonlocal since
+            for number, item in enumerate(self.live):
+                since = since.then(self.live.reception.silence)
+                yield number, item
+
+        for _, item in interval.select(numbered(), lambda item: item[1].timestamp, selection.stride, self.live.name):
             raw = self.decode(item)
             if raw is None:
                 log.unreadable.append(f"image {item.index}")
             else:
-                yield raw if reduction is None else replace(raw, image=reduction(raw.image))
+                image = raw.image if reduction is None else reduction(raw.image)
+                yield replace(raw, image=image, silence=since.silence)
+                since = NOTHING
         dropped = self.live.counts.dropped
         self.live.stop()  # at the end of an interval the stream goes on
         self.live.counts.dropped = dropped  # what waits lies behind the interval
@@ -194,7 +203,7 @@ def open_stream(
         calib: calibration; without one, the usual angle of view is assumed, with a warning.
         fps: images a second, for the times. Otherwise times are those of a served video file, those of an RTSP stream,
             or those of arrival (``time.monotonic()``).
-        queue: frames that may wait, older ones are dropped; 0: none is dropped. None: 2 for a live stream, 0 for a
+        queue: frames that may wait, older ones are dropped; 0: none is dropped. None: 1 for a live stream, 0 for a
             recording.
         stride: every how many-th of the frames that were not dropped.
         undistort: resample images to a pinhole camera.

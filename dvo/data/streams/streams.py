@@ -16,6 +16,7 @@ from dvo.core.errors import DvoError
 from dvo.data.files.stamps import checked_rate
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_image
+from dvo.data.streams.live import NOTHING, LiveFrames
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.geometry.undistort import Undistorter, needs_undistortion
@@ -139,8 +140,9 @@ def stream(
             pairs ``(seconds, image)``; or of :class:`Frame`, which is passed on as it is. Read once, one element at a
             time.
         camera: camera of the images; needed unless the elements are frames.
-        timestamps: seconds of the images, in the same order; may be endless.
-        fps: images a second, if there are no times.
+        timestamps: seconds of the images, in the same order; may be endless. Those of images that a
+            :class:`dvo.LiveFrames` has dropped are passed over.
+        fps: images a second, if there are no times; dropped images count.
         name: for the results folder.
         groundtruth: camera-to-world poses on the clock of the images.
         undistort: resample to a pinhole camera; otherwise frames carry the distorted camera.
@@ -169,23 +171,31 @@ def stream(
         raise _not_iterable(images, name, "images")
 
     def frames() -> Iterator[Frame]:
-        for index, item in enumerate(_iterator(images, name, "images")):
+        index = -1  # of the image, dropped ones counted
+        previous: float | None = None
+        for item in _iterator(images, name, "images"):
+            reception = images.reception if isinstance(images, LiveFrames) else NOTHING
+            index += 1 + reception.dropped
             if isinstance(item, Frame):
                 yield item
                 continue
             time, image = item if isinstance(item, tuple) and len(item) == 2 else (None, item)
+            longest = reception.silence
             if times is not None:
-                time = next(times, None)
+                passed = [_seconds(next(times, None), index, name) for _ in range(reception.dropped + 1)]
+                time = passed[-1]
+                longest = max(np.diff(passed if previous is None else [previous, *passed]), default=0.0)
             elif time is None and fps is not None:
-                time = index / fps
-            seconds = _seconds(time, index, name)
+                time, longest = index / fps, 1 / fps
+            previous = seconds = _seconds(time, index, name)
+            silence = max(float(longest), 0.0) if reception.dropped else None
             if camera is None:
                 raise DvoError("no camera", file=name, field="camera", remedy="give the camera of the images")
             pixels = _checked(image, camera, index, name)
             if undistorter is None:
-                yield Frame(index, seconds, pixels, camera)
+                yield Frame(index, seconds, pixels, camera, silence=silence)
             else:
-                yield Frame(index, seconds, undistorter(pixels), undistorter.camera)
+                yield Frame(index, seconds, undistorter(pixels), undistorter.camera, silence=silence)
 
     return FrameStream(frames(), name, groundtruth)
 

@@ -9,6 +9,8 @@ MATCHED = 0.15
 """Least share of matched corners of two images of the same scene."""
 
 NO_MATCH = "no match with the frames before"
+TOO_LITTLE_MOTION, TOO_FEW, NO_FIT = "too little motion", "too few keyframes", "no motion fits the images"
+"""Reasons of an odometry that is initialising."""
 MASK_MARGIN = 12
 """Distance from ignored pixels within which nothing is measured: the size of a patch of three feature pixels, at a
 quarter of the resolution."""

@@ -25,6 +25,7 @@ from dvo.odometry.frames.working_image import working_image, working_size
 
 RECENT = 30
 """Number of intervals that the usual one is the median of."""
+_REPEATED = 2  # intervals at least half as long, among the recent ones, that make a long one usual
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,10 @@ class FrameSequence:
     """Order, size and intervals of the frames of a sequence.
 
     Args:
-        max_gap: time between two images above which they are separated by a gap, in medians of the recent intervals.
+        max_gap: time without an image above which two images are separated by a gap, in medians of the recent
+            intervals. Time in which images were received and dropped (:attr:`dvo.data.frame.Frame.silence`) is none,
+            and neither is an interval as there have been two lately: frames are taken at irregular times, or the rate
+            has changed.
 
     Attributes:
         required: size of the working images, if a map demands one.
@@ -128,12 +132,13 @@ class FrameSequence:
             self.required.check(frame)
         self._size = size
 
-    def tick(self, time: float, interruption: str = "") -> Gap | None:
+    def tick(self, time: float, interruption: str = "", silence: float | None = None) -> Gap | None:
         """Record a frame with a new image.
 
         Args:
             time: seconds.
             interruption: why the time since the frame before is not known; empty where it is.
+            silence: longest time since the frame before without an image, seconds, where some were dropped.
 
         Returns:
             Gap since the image before it was first seen; None if there is none.
@@ -144,22 +149,30 @@ class FrameSequence:
         if interruption:
             return Gap(time - last, frozen=False, reason=interruption)
         usual = median(self._intervals) if len(self._intervals) > 1 else None
-        long = usual is not None and time - last > self.max_gap * usual
-        if not long:
-            self._intervals.append(time - last)
-        if usual is None or time - new <= self.max_gap * usual:
+        quiet, frozen = _quiet(time - last, silence), last - new
+        alike = sum(2 * interval >= quiet for interval in self._intervals)
+        self._intervals.append(quiet)
+        if usual is None or quiet + frozen <= self.max_gap * usual:
             return None
-        return Gap(time - last, frozen=False) if long else Gap(last - new, frozen=True)
+        if quiet > self.max_gap * usual and alike < _REPEATED:
+            return Gap(quiet, frozen=False)
+        return Gap(frozen, frozen=True) if frozen > 0 else None
 
-    def repeat(self, time: float) -> None:
+    def repeat(self, time: float, silence: float | None = None) -> None:
         """Record a frame with the image of the frame before it.
 
         Args:
             time: seconds.
+            silence: as of :meth:`tick`.
         """
         if self._last is not None:
-            self._intervals.append(time - self._last)
+            self._intervals.append(_quiet(time - self._last, silence))
         self._last = time
+
+
+def _quiet(interval: float, silence: float | None) -> float:
+    """Time without an image between two frames."""
+    return interval if silence is None else min(max(silence, 0.0), interval)
 
 
 @dataclass(frozen=True)
@@ -196,7 +209,7 @@ class Gate:
     Args:
         pixels: of the working image, see :func:`dvo.odometry.frames.working_image.working_size`; None for the image as
             it is given.
-        max_gap: time between two images above which they are separated by a gap, in medians of the recent intervals.
+        max_gap: see :class:`FrameSequence`.
         masks: whether the odometry uses masks; otherwise a frame with one is refused.
 
     Attributes:
@@ -248,9 +261,9 @@ class Gate:
         self.sequence.check(frame)
         repeated, gap = self._last is not None and np.array_equal(image, self._last[0]), None
         if repeated:
-            self.sequence.repeat(frame.timestamp)
+            self.sequence.repeat(frame.timestamp, frame.silence)
         else:
-            gap = self.sequence.tick(frame.timestamp, frame.interruption)
+            gap = self.sequence.tick(frame.timestamp, frame.interruption, frame.silence)
             self._last = image, missing_content(image, mask)
         assert self._last is not None
         try:

@@ -29,7 +29,7 @@ from dvo.nets.patch.masks import visible_features
 from dvo.odometry.depth.depth_factor import MEASURED_SHARE, measured_share
 from dvo.odometry.depth.patch_depth import measure_depth
 from dvo.odometry.exclusive import exclusive
-from dvo.odometry.frames.content import NO_MATCH, missing_content
+from dvo.odometry.frames.content import NO_FIT, NO_MATCH, TOO_FEW, TOO_LITTLE_MOTION, missing_content
 from dvo.odometry.frames.front_end import View, observe
 from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.global_ba.graph_adjustment import AdjustmentRecord
@@ -342,7 +342,7 @@ class PatchOdometry:
                 self.patch_window.store(revision)
                 self.graph.drop(len(window) - 1, still=True)
                 record.place(identifier, self.graph.segment)
-                return self._estimate(record, None, Status.INITIALISING)
+                return self._estimate(record, None, Status.INITIALISING, reason=TOO_LITTLE_MOTION)
         record.place(identifier, self.graph.segment)
         if len(window) >= config.initial_frames:
             beside = self.loops.maintenance.helper
@@ -352,8 +352,10 @@ class PatchOdometry:
                 if config.restart:
                     state.ambiguous = measured_share(window.measured) < MEASURED_SHARE  # until it is tried
         self._reduce()
-        pose_wc = self._pose_wc(len(window) - 1) if state.initialised else None
-        return self._estimate(record, pose_wc, Status.INITIALISING if pose_wc is None else Status.TRACKING)
+        if state.initialised:
+            return self._estimate(record, self._pose_wc(len(window) - 1), Status.TRACKING)
+        reason = TOO_FEW if len(window) < config.initial_frames else NO_FIT
+        return self._estimate(record, None, Status.INITIALISING, reason=reason)
 
     def _without_fixed(self, image: np.ndarray, mask: np.ndarray | None) -> np.ndarray | None:
         """Mask of a frame without the pixels that are fixed to it, in which measurements of the window end too."""
@@ -437,10 +439,15 @@ class PatchOdometry:
         self.loops.advance(self.state.adjustable)
 
     def _estimate(
-        self, record: FrameRecord, pose_wc: np.ndarray | None, status: Status, seen: WindowMeasurements | None = None
+        self,
+        record: FrameRecord,
+        pose_wc: np.ndarray | None,
+        status: Status,
+        seen: WindowMeasurements | None = None,
+        reason: str = "",
     ) -> Estimate:
         """Estimate of a frame; ``seen``: measurements that its pose is the newest of, None for those of the window."""
-        graph, state, reason = self.graph, self.state, record.reason if status is Status.LOST else ""
+        graph, state, reason = self.graph, self.state, record.reason if status is Status.LOST else reason
         recovered = pose_wc is not None and state.enter(graph.segment, graph.world_of(graph.segment))
         segment = graph.segment - graph.recording.segment
         if pose_wc is None:

@@ -91,7 +91,7 @@ def test_an_error_comes_after_the_frames_before_it():
         yield 2
         raise DvoError("unplugged")
 
-    found = iter(LiveFrames(camera()))
+    found = iter(LiveFrames(camera(), queue=2))
     until(lambda: gone("dvo stream"))
     assert [next(found), next(found)] == [1, 2]
     with pytest.raises(DvoError, match="unplugged"):

@@ -62,6 +62,30 @@ def test_an_interruption_is_a_gap_whatever_its_length():
     assert sequence.tick(0.7) is None and sequence.tick(5.7).reason == ""
 
 
+@pytest.mark.parametrize("rate", [20, 30])
+@pytest.mark.parametrize("taken", ["every second", "one of three"])
+def test_dropped_frames_of_which_nothing_is_told_are_a_gap_twice_at_most(rate, taken):
+    """After a start with close frames; each of the many others would cost a break."""
+    numbers = np.arange(300)
+    kept = (numbers % 2 == 0) if taken == "every second" else np.random.default_rng(1).random(300) < 1 / 3
+    kept[:5] = True
+    assert sum(gap is not None for gap in ticks(numbers[kept] / rate)) <= (0 if taken == "every second" else 2)
+
+
+def test_a_rate_that_falls_is_a_gap_twice_at_most():
+    found = [gap is not None for gap in ticks([0.0, 0.05, 0.1, *np.arange(1, 20, 0.4)])]
+    assert 1 <= sum(found) <= 2 and not any(found[6:])
+
+
+def test_what_was_received_is_no_gap():
+    sequence = FrameSequence(4.5)
+    assert [sequence.tick(0.05 * i) for i in range(10)] == [None] * 10
+    assert sequence.tick(1.5, silence=0.06) is None
+    assert str(sequence.tick(4.5, silence=2.0)) == "gap of 2.00 s"
+    sequence.repeat(5.5, silence=0.05)
+    assert sequence.tick(5.55).frozen, "an old image for a second"
+
+
 def test_order_and_size():
     def frame(time, width=64):
         image = np.zeros((48, width, 3), np.uint8)

@@ -37,6 +37,7 @@ def test_is_an_odometry_with_a_pose_for_every_frame():
     assert np.isfinite(result.trajectory.poses_wc).all()
     np.testing.assert_allclose(np.linalg.norm(result.trajectory.poses_wc[:, 3:], axis=1), 1)
     assert estimates[0].status is Status.INITIALISING
+    assert all(bool(e.reason) is (e.pose_wc is None) for e in estimates), "what it waits for"
     assert estimates[-1].status is Status.TRACKING
     assert result.map.points.shape == result.map.colors.shape
     assert len(result.map.points) > 0

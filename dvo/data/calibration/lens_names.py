@@ -13,7 +13,7 @@ PINHOLE = "pinhole"
 """A projection without a word about distortion."""
 
 _NAMES: dict[DistortionModel, str] = {
-    "none": "none rectified linear undistorted nodistortion ideal",
+    "none": "none pinholenodistortion rectified linear undistorted nodistortion ideal",
     "radtan": "radtan radtan4 radtan5 radtan8 radialtangential radialtangential8 plumbbob opencv fullopencv brown "
     "brownconrady rationalpolynomial rational pinholeradtan pinholeradtan8 pinholeradialtangential thinprism "
     "rationalthinprism radial simpleradial",
@@ -23,7 +23,7 @@ _NAMES: dict[DistortionModel, str] = {
     "mei": "mei omni omnidirectional cata catadioptric omniradtan omnidir unifiedprojection",
     "eucm": "eucm extendedunified enhancedunified enhancedunifiedcameramodel extendedunifiedcameramodel",
     "double_sphere": "ds doublesphere",
-    "fov": "fov atan pinholefov fieldofview",
+    "fov": "fov atan pinholeatan pinholefov fieldofview",
     "thin_prism_fisheye": "thinprismfisheye",
     "fisheye624": "fisheye624 radtanthinprismfisheye fisheyeradtanthinprism",
 }
@@ -141,6 +141,7 @@ def looks_like_a_lens(key: str, value: Any) -> bool:
     if says_nothing(value):
         return False
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key).lower().replace("-", "_").replace(" ", "_").replace(".", "_")
+    name = re.sub(r"^(?:cam|camera)_?\d*_(?=.)", "", name)
     if _OTHER.search(name):
         return False
     parts = name.split("_")

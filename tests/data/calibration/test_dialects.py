@@ -336,6 +336,13 @@ READ = [
     ("ncamera.yaml", NCAMERA, NUMBERS, "fisheye", KC, (640, 480)),
     ("svo.yaml", "cam_model: Pinhole\ncam_width: 640\ncam_height: 480\ncam_fx: 500\ncam_fy: 510\ncam_cx: 320\n"
      "cam_cy: 240\ncam_d0: 0.1\ncam_d1: -0.2\ncam_d2: 0.003\ncam_d3: 0.004\n", NUMBERS, "radtan", KC, (640, 480)),
+    ("svo_equi.yaml", "cam0:\n  cam_model: PinholeEquidistant\n  cam_width: 640\n  cam_height: 480\n  cam_fx: 500\n"
+     "  cam_fy: 510\n  cam_cx: 320\n  cam_cy: 240\n  cam_d0: 0.1\n  cam_d1: -0.2\n  cam_d2: 0.003\n  cam_d3: 0.004\n",
+     NUMBERS, "fisheye", KC, (640, 480)),
+    ("svo_atan.yaml", "cam_model: PinholeAtan\ncam_width: 640\ncam_height: 480\ncam_fx: 0.5\ncam_fy: 0.625\n"
+     "cam_cx: 0.5\ncam_cy: 0.5\ncam_d0: 0.93\n", (320, 300, 319.5, 239.5), "fov", (0.93,), (640, 480)),
+    ("ncamera2.yaml", NCAMERA + NCAMERA.split("cameras:\n")[1].replace("cam0", "cam1").replace("500", "600"), NUMBERS,
+     "fisheye", KC, (640, 480)),
     ("omni.yaml", "cam0: {camera_model: omni, intrinsics: [1.9, 500, 510, 320, 240], distortion_model: radtan, "
      f"distortion_coeffs: {list(KC)}, resolution: [640, 480]}}", NUMBERS, "mei", (1.9, *KC), (640, 480)),
     ("ds.yaml", "cam0: {camera_model: ds, intrinsics: [-0.2, 0.59, 500, 510, 320, 240], distortion_model: none, "
@@ -446,6 +453,7 @@ LENS_KEYS = [
     "distorted: true",
     "poly_parameters: {p0: 1.0, p1: 2.0}", "Camera.kappa: 0.3", "inner: {distortion_coefficients: [0.1, 0, 0, 0]}",
     "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
+    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1",
 ]  # fmt: skip
 
 
@@ -532,7 +540,13 @@ def test_a_camera_of_several_by_its_number(make):
 
 def test_stereo_files_of_orb_slam_say_which_camera_is_read(make):
     (said,) = read_calibration(make.text("c.yaml", SLAM + STEREO)).doubts(640, 480)
-    assert "rectified" in said and "LEFT.K" in said
+    assert "rectified" in said and "LEFT" in said
+    text = VSLAM.format("perspective", "").replace("0.1", "0").replace("-0.2", "0") + (
+        "StereoRectifier:\n  K_left: [458, 0, 367, 0, 457, 248, 0, 0, 1]\n  D_left: [-0.28, 0.07, 0.0002, 0, 0]\n"
+        "  K_right: [457, 0, 379, 0, 456, 255, 0, 0, 1]\n  D_right: [-0.28, 0.07, 0.0002, 0, 0]\n"
+    )
+    found = read_calibration(make.text("d.yaml", text))
+    assert (found.fx, found.model) == (500, "none") and "StereoRectifier.left" in found.doubts(640, 480)[0]
 
 
 def test_depth_scale_and_baseline_are_found_in_their_mappings(make):

@@ -115,8 +115,8 @@ def _split(value: Any) -> Any:
     if not isinstance(value, dict):
         return value
     found: dict[str, Any] = {}
-    paired = {parts[2] for key, item in value.items()
-              if isinstance(item, list) and len(item) in (3, 4, 9) and (parts := _PAIRED.fullmatch(str(key).lower()))}  # fmt: skip
+    matrices = [str(key).lower() for key, item in value.items() if isinstance(item, list) and len(item) in (3, 4, 9)]
+    paired = {parts[2] for key in matrices if (parts := _PAIRED.fullmatch(key))}
     for key, item in value.items():
         parts = _SUFFIX.fullmatch(str(key).lower())
         if parts and isinstance(item, list) and parts[2] in paired and not isinstance(found.get(parts[2], {}), list):

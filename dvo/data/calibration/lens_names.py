@@ -20,9 +20,9 @@ _NAMES: dict[DistortionModel, str] = {
     "fisheye": "fisheye equidistant equi kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8 opencvfisheye "
     "pinholeequidistant pinholeequi pinholefisheye equidistantfisheye kannala",
     "ucm": "ucm unified unifiedcameramodel",
-    "mei": "mei omni omnidirectional cata catadioptric omniradtan omnidir unifiedprojection",
-    "eucm": "eucm extendedunified enhancedunified enhancedunifiedcameramodel extendedunifiedcameramodel",
-    "double_sphere": "ds doublesphere",
+    "mei": "mei omninone omni omnidirectional cata catadioptric omniradtan omnidir unifiedprojection",
+    "eucm": "eucm eucmnone extendedunified enhancedunified enhancedunifiedcameramodel extendedunifiedcameramodel",
+    "double_sphere": "ds dsnone doublesphere",
     "fov": "fov atan pinholeatan pinholefov fieldofview",
     "thin_prism_fisheye": "thinprismfisheye",
     "fisheye624": "fisheye624 radtanthinprismfisheye fisheyeradtanthinprism",

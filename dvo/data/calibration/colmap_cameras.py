@@ -47,7 +47,8 @@ _MODELS: dict[str, tuple[int, str]] = {
     "EQUIRECTANGULAR": (17, "w h"),
 }
 _LENSES: dict[str, DistortionModel] = {
-    "FOV": "fov", "EUCM": "eucm", "THIN_PRISM_FISHEYE": "thin_prism_fisheye", "RAD_TAN_THIN_PRISM_FISHEYE": "fisheye624",
+    "FOV": "fov", "EUCM": "eucm",
+    "THIN_PRISM_FISHEYE": "thin_prism_fisheye", "RAD_TAN_THIN_PRISM_FISHEYE": "fisheye624",
 }  # fmt: skip
 _NAMES = {number: name for name, (number, _) in _MODELS.items()}
 

@@ -336,7 +336,10 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
 def _single(entries: Entries) -> Any:
     """A lone number under a name of coefficients, a list of one."""
     entry = entries.entry(*(name for name in _COEFFICIENTS if name not in ("lens", "distortion")), shape="scalar")
-    return None if entry is None or isinstance(entry.value, str | bool) else entry
+    if entry is not None and isinstance(entry.value, str | bool):
+        entry.used = False
+        return None
+    return entry
 
 
 def _wide_by_keys(entries: Entries) -> DistortionModel | None:

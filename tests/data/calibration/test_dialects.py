@@ -421,6 +421,12 @@ def test_what_is_read(make, name, text, numbers, model, coefficients, size):
     assert found.dialect
 
 
+@pytest.mark.parametrize("text", ["'0.1 -0.2 0.003 0.004'", '"[0.1, -0.2, 3e-3, 4.e-3]"', "(.1, -.2, .003, .004)"])
+def test_coefficients_written_as_a_text(make, text):
+    found = read_calibration(make.text("c.yaml", f"{PINHOLE}distortion_coefficients: {text}\n"))
+    assert (found.model, found.coefficients) == ("radtan", KC)
+
+
 NAMES = [
     "dist_coeffs", "dist_coeff", "dist", "d", "D", "distortion", "Distortion_Coefficients", "coeffs", "distCoeffs",
     "distortion_parameters", "distortion coefficients", "kc", "distortion_coefs", "lens_distortion", "dist_params",
@@ -453,6 +459,7 @@ LENS_KEYS = [
     "distorted: true",
     "poly_parameters: {p0: 1.0, p1: 2.0}", "Camera.kappa: 0.3", "inner: {distortion_coefficients: [0.1, 0, 0, 0]}",
     "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
+    "mapping: equisolid", "optics_kind: stereographic", "wide_angle: true", "distortion_coefficients: some",
     "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1",
 ]  # fmt: skip
 
@@ -566,6 +573,11 @@ def test_the_mei_model_of_a_file_gives_its_pixels(make):
     u = x * (1 + k1 * r2 + k2 * r2 * r2) + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * (1 + k1 * r2 + k2 * r2 * r2) + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
     assert project(np.array([X, Y, Z]), camera) == pytest.approx([900 * u + 320, 910 * v + 240], abs=1e-9)
+
+
+def test_a_size_that_is_no_size_is_left_out(make):
+    found = read_calibration(make.text("calib_cam_to_cam.txt", KITTI_RAW.replace("1.242000e+03", "1e400")))
+    assert found.width is None and found.fx == 721.5377
 
 
 def test_a_large_transforms_file(make):

@@ -39,9 +39,16 @@ _MODELS: dict[str, tuple[int, str]] = {
     "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
     "THIN_PRISM_FISHEYE": (10, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
     "RAD_TAN_THIN_PRISM_FISHEYE": (11, "fx fy cx cy k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4"),
+    "SIMPLE_DIVISION": (12, "f cx cy k"),
+    "DIVISION": (13, "fx fy cx cy k"),
+    "SIMPLE_FISHEYE": (14, "f cx cy"),
+    "FISHEYE": (15, "fx fy cx cy"),
+    "EUCM": (16, "fx fy cx cy alpha beta"),
+    "EQUIRECTANGULAR": (17, "w h"),
 }
 _LENSES: dict[str, DistortionModel] = {
-    "FOV": "fov", "THIN_PRISM_FISHEYE": "thin_prism_fisheye", "RAD_TAN_THIN_PRISM_FISHEYE": "fisheye624",
+    "FOV": "fov", "EUCM": "eucm",
+    "THIN_PRISM_FISHEYE": "thin_prism_fisheye", "RAD_TAN_THIN_PRISM_FISHEYE": "fisheye624",
 }  # fmt: skip
 _NAMES = {number: name for name, (number, _) in _MODELS.items()}
 
@@ -133,6 +140,13 @@ def _is_list(text: str) -> bool:
 
 
 def _calibration(entry: _Entry, path: Path) -> Calibration:
+    if entry.model in ("SIMPLE_DIVISION", "DIVISION", "EQUIRECTANGULAR"):
+        raise DvoError(
+            f"dvo has no lens model for {entry.model}",
+            file=path,
+            field=f"camera {entry.identifier}",
+            remedy="use OPENCV or OPENCV_FISHEYE in COLMAP, or undistort the images with colmap image_undistorter",
+        )
     named = dict(zip(_MODELS[entry.model][1].split(), entry.values, strict=True))
     model = _LENSES.get(entry.model) or ("fisheye" if "FISHEYE" in entry.model else "radtan")
     if model in _LENSES.values():

@@ -63,6 +63,8 @@ FOCAL = ("f", "focal", "focallength", "fl", "fc", "focallengths", "focalpx", "fo
 CENTRE = ("principalpoint", "pp", "cc", "c", "principal", "centre", "center", "opticalcenter")
 
 
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?"
+_ROW = re.compile(rf"[\[(]?\s*{_NUMBER}(?:(?:\s*[,;]\s*|\s+){_NUMBER})+\s*[\])]?")  # a list written as a text
 _OF_MATRICES = frozenset(["rows", "cols", "dt", "data", "type_id", "size", "sizes", "step"])
 
 
@@ -174,13 +176,15 @@ def _has_shape(value: Any, shape: str) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """The tree with matrices ``{rows, cols, data}`` as lists, and with ``Camera.fx`` as ``fx`` of ``Camera``.
+    """The tree with matrices ``{rows, cols, data}`` and texts of numbers as lists, and ``Camera.fx`` within ``Camera``.
 
     Args:
         value: documents of a file.
     """
     if isinstance(value, list):
         return [plain(item) for item in value]
+    if isinstance(value, str) and _ROW.fullmatch(value):
+        return [float(word) for word in re.split(r"[,;\s]+", value.strip(" []()"))]
     if not isinstance(value, dict):
         return value
     if "data" in value and set(map(str, value)) <= _OF_MATRICES:

@@ -56,7 +56,7 @@ def _camera(rows: dict[tuple[str, int], np.ndarray], kind: str, number: int, pat
     if len(values) != (12 if is_rectified else 9):
         raise DvoError(f"{len(values)} numbers", file=path, field=f"{kind}_{number:02}", remedy=_REMEDY)
     read = from_matrix(values.reshape(3, -1)[:, :3], path)
-    whole = size is not None and len(size) == 2 and (size == np.rint(size)).all() and (size > 0).all()
+    whole = size is not None and len(size) == 2 and (size == np.rint(size)).all() and ((size > 0) & (size <= 1e6)).all()
     width, height = (int(side) for side in size) if whole and size is not None else (None, None)
     d = rows.get(("D", number), np.zeros(0))
     is_bent = not is_rectified and bool(d.any())

@@ -13,17 +13,17 @@ PINHOLE = "pinhole"
 """A projection without a word about distortion."""
 
 _NAMES: dict[DistortionModel, str] = {
-    "none": "none rectified linear undistorted nodistortion ideal",
+    "none": "none pinholenodistortion rectified linear undistorted nodistortion ideal",
     "radtan": "radtan radtan4 radtan5 radtan8 radialtangential radialtangential8 plumbbob opencv fullopencv brown "
     "brownconrady rationalpolynomial rational pinholeradtan pinholeradtan8 pinholeradialtangential thinprism "
     "rationalthinprism radial simpleradial",
     "fisheye": "fisheye equidistant equi kannalabrandt kannalabrandt4 kannalabrandt8 kb kb4 kb8 opencvfisheye "
     "pinholeequidistant pinholeequi pinholefisheye equidistantfisheye kannala",
     "ucm": "ucm unified unifiedcameramodel",
-    "mei": "mei omni omnidirectional cata catadioptric omniradtan omnidir unifiedprojection",
-    "eucm": "eucm extendedunified enhancedunified enhancedunifiedcameramodel extendedunifiedcameramodel",
-    "double_sphere": "ds doublesphere",
-    "fov": "fov atan pinholefov fieldofview",
+    "mei": "mei omninone omni omnidirectional cata catadioptric omniradtan omnidir unifiedprojection",
+    "eucm": "eucm eucmnone extendedunified enhancedunified enhancedunifiedcameramodel extendedunifiedcameramodel",
+    "double_sphere": "ds dsnone doublesphere",
+    "fov": "fov atan pinholeatan pinholefov fieldofview",
     "thin_prism_fisheye": "thinprismfisheye",
     "fisheye624": "fisheye624 radtanthinprismfisheye fisheyeradtanthinprism",
 }
@@ -34,7 +34,7 @@ _FLAGS = frozenset(["true", "false", "yes", "no", "on", "off", "0", "1"])
 _WORDS = re.compile(
     r"(distor|fisheye|lens|skew|radial|tangential|prism|kannala|coef|mirror|poly|omni|rational|warp|barrel|pincushion|"
     r"aberration|curvature|kappa|brown|conrady|anamorph|shear|optic|nonlinear|deform|bend|tilt|division|squeeze|"
-    r"equidist|radtan|plumb|scaramuzza|equirect)"
+    r"equidist|radtan|plumb|scaramuzza|equirect|wide_?angle)"
 )
 _WHOLE = frozenset(
     [
@@ -60,6 +60,10 @@ _WHOLE = frozenset(
     ]
 )
 _SCALAR = re.compile(r"(k|p|s|d|b|t|r|xi|tau|kc|lambda|mu|nu|a|e)_?\d{1,2}")  # k1, p2, d0; not matrices P1 or D2
+_KIND = re.compile(
+    r"(fisheye|equisolid|equidistant|stereographic|orthographic|equirect|panoram|kannala|brown.?conrady|plumb.?bob|"
+    r"radial.?tangential|radtan|cubemap|catadioptric)"
+)
 _OTHER = re.compile(  # keys that speak of something else though they have such a word
     r"(undist|rectif|error|flag|name|file|path|topic|mask|serial|facing|distance|iter|thresh|min_|max_|uncert|std|stdev|"
     r"covar|sigma|weight|optical_?flow|optimi|criteria|aspect|rms|imu|gyro|acc)"
@@ -141,8 +145,11 @@ def looks_like_a_lens(key: str, value: Any) -> bool:
     if says_nothing(value):
         return False
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", key).lower().replace("-", "_").replace(" ", "_").replace(".", "_")
+    name = re.sub(r"^(?:cam|camera)_?\d*_(?=.)", "", name)
     if _OTHER.search(name):
         return False
+    if isinstance(value, str) and _KIND.search(value.lower()):
+        return True
     parts = name.split("_")
     if _WORDS.search(name) or name in _WHOLE or bare(name) in _WHOLE or "dist" in parts or "dist" in parts[-1][:4]:
         return True

@@ -13,6 +13,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.calibration import entries as fields
 from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
+from dvo.data.calibration.colmap_cameras import CORNER
 from dvo.data.calibration.documents import is_ost, load_documents, load_json, load_ost, load_xml
 from dvo.data.calibration.entries import Entries
 from dvo.data.calibration.lens_names import PINHOLE, bare, is_flag, model_of, says_nothing
@@ -40,6 +41,7 @@ _RADTAN_FLAT = LENSES["radtan"].names
 _FIRST = ("cam0", "camera0", "camera", "camera1", "left", "leftcamera", "cameraleft", "camleft", "0", "l", "1", "color",
           "colour", "rgb", "rgbcamera", "cam", "cam1", "camleftrect", "leftcam", "00", "02")  # fmt: skip
 _BRACE = re.compile(r'\s*\{\s*"')
+_PAIRED = re.compile(r"(k|m|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)_?(left|right|l|r|[0-2]|0[0-3])")
 _SUFFIX = re.compile(r"(.+?)_?(left|right|l|r|[0-2]|0[0-3])")
 
 
@@ -90,9 +92,7 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
     mappings = [document for document in documents if isinstance(document, dict)]
     if not mappings:
         raise DvoError("no keys in it", file=path, field="intrinsics", remedy=EXPECTED)
-    found = [fields.cameras(document, path) for document in mappings]
-    if not any(found):
-        found = [fields.cameras(_split(document), path) for document in mappings]
+    found = [fields.cameras(_split(document), path) for document in mappings]
     read = [_calibration(_choose(named, camera, path), path) for named in found if named]
     if not read:
         raise DvoError(_missing(mappings), file=path, field="intrinsics", remedy=EXPECTED)
@@ -108,15 +108,21 @@ def _missing(mappings: Sequence[dict[str, Any]]) -> str:
     return f"no fx, fy, cx, cy in it, nor a camera matrix{named}"
 
 
-def _split(mapping: dict[str, Any]) -> dict[str, Any]:
-    """``K_left`` and ``D_left``, or ``M1`` and ``D1``, as entries of ``left`` and ``1``."""
+def _split(value: Any) -> Any:
+    """The tree with ``K_left`` and ``D_left``, or ``M1`` and ``D1``, as entries of ``left`` and ``1``."""
+    if isinstance(value, list):
+        return [_split(item) for item in value]
+    if not isinstance(value, dict):
+        return value
     found: dict[str, Any] = {}
-    for key, value in mapping.items():
+    matrices = [str(key).lower() for key, item in value.items() if isinstance(item, list) and len(item) in (3, 4, 9)]
+    paired = {parts[2] for key in matrices if (parts := _PAIRED.fullmatch(key))}
+    for key, item in value.items():
         parts = _SUFFIX.fullmatch(str(key).lower())
-        if parts and isinstance(value, list):
-            found.setdefault(parts[2], {})[parts[1]] = value
+        if parts and isinstance(item, list) and parts[2] in paired and not isinstance(found.get(parts[2], {}), list):
+            found.setdefault(parts[2], {})[parts[1]] = item
         else:
-            found[key] = value
+            found[key] = _split(item)
     return found
 
 
@@ -134,6 +140,9 @@ def _choose(named: list[tuple[str, Entries]], camera: int | None, path: Path) ->
         for first in _FIRST:
             if last.count(first) == 1:
                 return named[last.index(first)][1]
+        heads = [entries for _, entries in named if entries.index == 0]
+        if len(heads) == 1:
+            return heads[0]
     names = ", ".join(name or "the file itself" for name, _ in named[:8])
     if camera is not None:
         remedy = f"leave out :{camera}, or give the number of one of {names}"
@@ -157,6 +166,11 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
     calibration = replace(calibration, width=width, height=height)
     calibration = _with_sensors(calibration, entries, path)
     model, coefficients = _lens(entries, before, path)
+    if model == "fov" and width and height and 0 < calibration.cx < 1 and 0 < calibration.cy < 1:  # PTAM, vikit
+        calibration = replace(
+            calibration, fx=calibration.fx * width, fy=calibration.fy * height,
+            cx=calibration.cx * width - CORNER, cy=calibration.cy * height - CORNER,
+        )  # fmt: skip
     skew = entries.numbers("skew", "s", "alphac", "cameraskew", "skewness", "k12", shape="scalar")
     if skew is not None:
         _refuse_skew(float(skew.ravel()[0]), 1.0, path, "skew")
@@ -167,13 +181,12 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
 
 
 def _notes(entries: Entries) -> tuple[str, ...]:
-    """ORB-SLAM2's stereo files state the cameras as recorded as LEFT and RIGHT, and the rectified one as Camera."""
-    others = [name for name in entries.elsewhere if name in ("LEFT", "RIGHT")]
-    if "LEFT" not in others:
-        return ()
-    return (
-        "the calibration is that of rectified images (Camera.fx); LEFT.K and LEFT.D of the same file are those of the "
-        "images as recorded, and were not used",
+    """Stereo files of ORB-SLAM2 and OpenVSLAM state the cameras as recorded too, and the rectified one as Camera."""
+    left = [name for name in entries.elsewhere if name in ("LEFT", "StereoRectifier.left")]
+    return tuple(
+        f"the calibration is that of rectified images (Camera); {name} in the same file is that of the images as "
+        "recorded, and was not used"
+        for name in left
     )
 
 
@@ -302,7 +315,7 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
         return "mei", _trimmed("mei", [*xi, *(values or _flat_radtan(entries, path))], path)
     if model in ("ucm", "eucm", "double_sphere", "fov"):
         names = LENSES[model].names
-        keyed = _scalars(entries, path, *(("omega", "w", "fov") if model == "fov" else names), only=len(names))
+        keyed = _scalars(entries, path, *(("omega", "w", "d0") if model == "fov" else names), only=len(names))
         if any(values[len(names) :]) or (before and any(values)) or (keyed and any(values)):
             raise _wrong_count(len(values), model, path)
         return model, _trimmed(model, before or keyed or values[: len(names)], path)
@@ -323,7 +336,10 @@ def _lens(entries: Entries, before: list[float], path: Path) -> tuple[Distortion
 def _single(entries: Entries) -> Any:
     """A lone number under a name of coefficients, a list of one."""
     entry = entries.entry(*(name for name in _COEFFICIENTS if name not in ("lens", "distortion")), shape="scalar")
-    return None if entry is None or isinstance(entry.value, str | bool) else entry
+    if entry is not None and isinstance(entry.value, str | bool):
+        entry.used = False
+        return None
+    return entry
 
 
 def _wide_by_keys(entries: Entries) -> DistortionModel | None:
@@ -355,7 +371,9 @@ def _flat_fisheye(entries: Entries, path: Path) -> list[float]:
     shifted = [entries.numbers(f"projectionparametersk{n}") for n in range(2, 6)]
     if shifted[0] is not None and shifted[3] is not None:
         return [0.0 if value is None else float(value.ravel()[0]) for value in shifted]
-    return _scalars(entries, path, "k1", "k2", "k3", "k4", zeros=True)
+    return _scalars(entries, path, "k1", "k2", "k3", "k4", zeros=True) or _scalars(
+        entries, path, "d0", "d1", "d2", "d3", zeros=True
+    )
 
 
 def _flat_radtan(entries: Entries, path: Path) -> list[float]:

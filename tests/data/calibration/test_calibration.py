@@ -168,6 +168,18 @@ def test_doubts_about_a_calibration_of_another_resolution():
     assert "stretched" in Calibration(500, 1000, 320, 240).doubts(640, 480)[0]
 
 
+@pytest.mark.parametrize("scale", [0.5, 0.75, 1.25, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (1280, 720), (1920, 1080)])
+def test_a_calibration_of_another_resolution_names_it(width, height, scale):
+    other = round(width * scale), round(height * scale)
+    for cx, cy in (((width - 1) / 2, (height - 1) / 2), (0.487 * width, 0.51 * height)):
+        found = Calibration(0.8 * width, 0.8 * width, cx, cy)
+        assert found.doubts(width, height) == []
+        assert any(f"{width}x{height} images" in doubt for doubt in found.doubts(*other))
+        stated = Calibration(0.8 * width, 0.8 * width, cx, cy, width=other[0], height=other[1])
+        assert not any("is the centre of" in doubt for doubt in stated.doubts(*other))
+
+
 @pytest.mark.parametrize("text", [EUROC, KALIBR.replace("cam1:", "  readout: 0.02\ncam1:"), OPENCV, ROS, ORB])
 def test_readout_of_a_rolling_shutter(make, text):
     text = text if "readout" in text else text + "readout: 0.02\n"

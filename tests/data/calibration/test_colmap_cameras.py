@@ -42,6 +42,9 @@ MODELS = {
         11, (500, 510, 320, 240, *(0.001 * n for n in range(12))), (500, 510, 319.5, 239.5), "fisheye624",
         tuple(0.001 * n for n in range(12)),
     ),
+    "SIMPLE_FISHEYE": (14, (500, 320, 240), (500, 500, 319.5, 239.5), "fisheye", (0, 0, 0, 0)),
+    "FISHEYE": (15, (500, 510, 320, 240), (500, 510, 319.5, 239.5), "fisheye", (0, 0, 0, 0)),
+    "EUCM": (16, (500, 510, 320, 240, 0.6, 1.1), (500, 510, 319.5, 239.5), "eucm", (0.6, 1.1)),
     "SIMPLE_RADIAL_FISHEYE": (8, (500, 320, 240, 0.1), (500, 500, 319.5, 239.5), "fisheye", (0.1, 0, 0, 0)),
     "RADIAL_FISHEYE": (9, (500, 320, 240, 0.1, 0.02), (500, 500, 319.5, 239.5), "fisheye", (0.1, 0.02, 0, 0)),
 }  # fmt: skip
@@ -121,6 +124,8 @@ def test_a_camera_by_its_number(make):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
+        ("1 DIVISION 640 480 500 500 320 240 0.1", "no lens model for DIVISION"),
+        ("1 EQUIRECTANGULAR 640 480 640 480", "no lens model for EQUIRECTANGULAR"),
         ("1 FOV 640 480 500 500 320 240 3.9", "w=3.9 is no coefficient of the model fov"),
         ("1 MAGIC 640 480 500 500 320 240", "line 1: unknown camera model 'MAGIC'"),
         ("1 PINHOLE 640 480 500 500 320", "5 numbers after PINHOLE, expected width height fx fy cx cy"),

@@ -336,6 +336,13 @@ READ = [
     ("ncamera.yaml", NCAMERA, NUMBERS, "fisheye", KC, (640, 480)),
     ("svo.yaml", "cam_model: Pinhole\ncam_width: 640\ncam_height: 480\ncam_fx: 500\ncam_fy: 510\ncam_cx: 320\n"
      "cam_cy: 240\ncam_d0: 0.1\ncam_d1: -0.2\ncam_d2: 0.003\ncam_d3: 0.004\n", NUMBERS, "radtan", KC, (640, 480)),
+    ("svo_equi.yaml", "cam0:\n  cam_model: PinholeEquidistant\n  cam_width: 640\n  cam_height: 480\n  cam_fx: 500\n"
+     "  cam_fy: 510\n  cam_cx: 320\n  cam_cy: 240\n  cam_d0: 0.1\n  cam_d1: -0.2\n  cam_d2: 0.003\n  cam_d3: 0.004\n",
+     NUMBERS, "fisheye", KC, (640, 480)),
+    ("svo_atan.yaml", "cam_model: PinholeAtan\ncam_width: 640\ncam_height: 480\ncam_fx: 0.5\ncam_fy: 0.625\n"
+     "cam_cx: 0.5\ncam_cy: 0.5\ncam_d0: 0.93\n", (320, 300, 319.5, 239.5), "fov", (0.93,), (640, 480)),
+    ("ncamera2.yaml", NCAMERA + NCAMERA.split("cameras:\n")[1].replace("cam0", "cam1").replace("500", "600"), NUMBERS,
+     "fisheye", KC, (640, 480)),
     ("omni.yaml", "cam0: {camera_model: omni, intrinsics: [1.9, 500, 510, 320, 240], distortion_model: radtan, "
      f"distortion_coeffs: {list(KC)}, resolution: [640, 480]}}", NUMBERS, "mei", (1.9, *KC), (640, 480)),
     ("ds.yaml", "cam0: {camera_model: ds, intrinsics: [-0.2, 0.59, 500, 510, 320, 240], distortion_model: none, "
@@ -414,6 +421,12 @@ def test_what_is_read(make, name, text, numbers, model, coefficients, size):
     assert found.dialect
 
 
+@pytest.mark.parametrize("text", ["'0.1 -0.2 0.003 0.004'", '"[0.1, -0.2, 3e-3, 4.e-3]"', "(.1, -.2, .003, .004)"])
+def test_coefficients_written_as_a_text(make, text):
+    found = read_calibration(make.text("c.yaml", f"{PINHOLE}distortion_coefficients: {text}\n"))
+    assert (found.model, found.coefficients) == ("radtan", KC)
+
+
 NAMES = [
     "dist_coeffs", "dist_coeff", "dist", "d", "D", "distortion", "Distortion_Coefficients", "coeffs", "distCoeffs",
     "distortion_parameters", "distortion coefficients", "kc", "distortion_coefs", "lens_distortion", "dist_params",
@@ -446,6 +459,8 @@ LENS_KEYS = [
     "distorted: true",
     "poly_parameters: {p0: 1.0, p1: 2.0}", "Camera.kappa: 0.3", "inner: {distortion_coefficients: [0.1, 0, 0, 0]}",
     "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
+    "mapping: equisolid", "optics_kind: stereographic", "wide_angle: true", "distortion_coefficients: some",
+    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1",
 ]  # fmt: skip
 
 
@@ -532,7 +547,13 @@ def test_a_camera_of_several_by_its_number(make):
 
 def test_stereo_files_of_orb_slam_say_which_camera_is_read(make):
     (said,) = read_calibration(make.text("c.yaml", SLAM + STEREO)).doubts(640, 480)
-    assert "rectified" in said and "LEFT.K" in said
+    assert "rectified" in said and "LEFT" in said
+    text = VSLAM.format("perspective", "").replace("0.1", "0").replace("-0.2", "0") + (
+        "StereoRectifier:\n  K_left: [458, 0, 367, 0, 457, 248, 0, 0, 1]\n  D_left: [-0.28, 0.07, 0.0002, 0, 0]\n"
+        "  K_right: [457, 0, 379, 0, 456, 255, 0, 0, 1]\n  D_right: [-0.28, 0.07, 0.0002, 0, 0]\n"
+    )
+    found = read_calibration(make.text("d.yaml", text))
+    assert (found.fx, found.model) == (500, "none") and "StereoRectifier.left" in found.doubts(640, 480)[0]
 
 
 def test_depth_scale_and_baseline_are_found_in_their_mappings(make):
@@ -552,6 +573,11 @@ def test_the_mei_model_of_a_file_gives_its_pixels(make):
     u = x * (1 + k1 * r2 + k2 * r2 * r2) + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * (1 + k1 * r2 + k2 * r2 * r2) + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
     assert project(np.array([X, Y, Z]), camera) == pytest.approx([900 * u + 320, 910 * v + 240], abs=1e-9)
+
+
+def test_a_size_that_is_no_size_is_left_out(make):
+    found = read_calibration(make.text("calib_cam_to_cam.txt", KITTI_RAW.replace("1.242000e+03", "1e400")))
+    assert found.width is None and found.fx == 721.5377
 
 
 def test_a_large_transforms_file(make):

@@ -1,6 +1,7 @@
 """The distillation of an encoder: the loss falls, the rest is held, and training goes on with everything."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,13 +11,14 @@ from dvo.core.errors import DvoError
 from dvo.models.patch_vo import PatchVO
 from dvo.models.weights import save_weights
 from dvo.nets.patch.config import PRESETS, preset
-from tests.train.conftest import CONFIGS
 from train.data.augment import Augmentation
 from train.engine.build import make_program
 from train.engine.checkpoint import read_state, task_of
 from train.engine.run import Start, start_of_task
 from train.tasks.distil.task import DistilTask, agreeing_share, relative_error
 from train.tasks.task import StepContext
+
+CONFIGS = Path(__file__).parents[3] / "configs" / "train"
 
 
 @pytest.fixture

@@ -65,6 +65,23 @@ def with_calibration(
     return source, facts if found is None else facts | {"seconds": {"calibrating": time.perf_counter() - began}}
 
 
+def calibration_origin(source: Source, calib: str | None) -> str | None:
+    """Where the calibration of a source comes from, for run.json.
+
+    Args:
+        source: newly opened.
+        calib: value of ``--calib``.
+
+    Returns:
+        The value of ``--calib``, else the file that the data set has, or that its published values are used; None
+        without a calibration.
+    """
+    if calib is not None or source.guess is not None or source.calibration is None:
+        return calib
+    file = source.calibration.file
+    return f"published with the data ({source.kind})" if file is None else str(file)
+
+
 def _is_given(file: Path, source: Source, calib: str | None) -> bool:
     """True if a file is the one that ``--calib`` names, from the working directory or the source's folder."""
     if calib is None or not file.exists():

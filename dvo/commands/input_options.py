@@ -47,6 +47,26 @@ def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"start": arguments.start, "end": arguments.end, **masks, **pixels}
 
 
+def input_notes(source: Any) -> list[str]:
+    """Sentences about a source, for a person who compares them with what was recorded.
+
+    Args:
+        source: newly opened.
+
+    Returns:
+        Number of images, duration and rate, where the times are known before the images are read; and inertial samples
+        that are there, and are not used.
+    """
+    notes = []
+    times = getattr(source, "timestamps", None)
+    if times is not None and len(times) > 1:
+        span = float(times[-1] - times[0])
+        notes.append(f"{len(times)} images in {span:.4g} s, {(len(times) - 1) / span:.4g} a second")
+    if getattr(getattr(source, "recording", None), "inertial", None) is not None:
+        notes.append("there are inertial samples beside the images; they are not used")
+    return notes
+
+
 def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:
     """Entries of run.json about the options.
 

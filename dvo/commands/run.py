@@ -16,9 +16,9 @@ import torch
 import dvo
 from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.base_frame import base_observers
-from dvo.commands.camera import CALIBRATION, with_calibration
+from dvo.commands.camera import CALIBRATION, calibration_origin, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
-from dvo.commands.input_options import input_facts, input_settings
+from dvo.commands.input_options import input_facts, input_notes, input_settings
 from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
@@ -95,13 +95,13 @@ def run(arguments: argparse.Namespace) -> int:
         **input_settings(arguments),
     )
     source = scaled_source(source, arguments)
-    for warning in source.warnings:
+    for warning in (*source.warnings, *input_notes(source)):
         warn(warning, "note")
     facts = {
         "source": shown(str(arguments.source)),
         "kind": getattr(source, "kind", None),
         **stream_facts(source),
-        "calibration": arguments.calib,
+        "calibration": calibration_origin(source, arguments.calib),
         "readout": source.camera.readout,
         "groundtruth": arguments.groundtruth,
         "weights": arguments.weights if arguments.system is None else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 from numbers import Integral
 from pathlib import Path
@@ -90,16 +91,17 @@ def first_frame(recording: Recording) -> RawFrame:
     return found
 
 
-def no_calibration(path: Path) -> DvoError:
+def no_calibration(path: Path, reasons: Sequence[str] = ()) -> DvoError:
     """Error of a source without a calibration, with the name of one that lies near.
 
     Args:
         path: file or folder that is opened.
+        reasons: why the one that it has is not used.
     """
     nearby = [option for option in (path / "calib.txt", path.parent / "calib.txt") if option.is_file()]
     hint = f" (is it {nearby[0]}?)" if nearby else ""
     return DvoError(
-        "no calibration",
+        f"no calibration{f' ({reasons[0]})' if reasons else ''}",
         file=path,
         field="calib",
         remedy=f"give --calib FILE{hint}: a text file with 'fx fy cx cy [k1 k2 p1 p2 [k3]]' in pixels, or a YAML; or "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import Any
 
 
@@ -47,24 +48,31 @@ def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     return {"start": arguments.start, "end": arguments.end, **masks, **pixels}
 
 
-def input_notes(source: Any) -> list[str]:
-    """Sentences about a source, for a person who compares them with what was recorded.
+def print_input(source: Any) -> None:
+    """Print what a person compares with what was recorded, to stderr.
+
+    Number of images, duration and rate, where the times are known before the images are read, of a video as its file
+    states them; and a note of inertial samples that are there and not used.
 
     Args:
         source: newly opened.
-
-    Returns:
-        Number of images, duration and rate, where the times are known before the images are read; and inertial samples
-        that are there, and are not used.
     """
-    notes = []
-    times = getattr(source, "timestamps", None)
+    from dvo.commands.console import warn
+    from dvo.core.text import print_line
+
+    recording = getattr(source, "recording", None)
+    times, count = getattr(source, "timestamps", None), getattr(recording, "frame_count", None)
+    text, rate = None, getattr(recording, "rate", None)
     if times is not None and len(times) > 1:
         span = float(times[-1] - times[0])
-        notes.append(f"{len(times)} images in {span:.4g} s, {(len(times) - 1) / span:.4g} a second")
-    if getattr(getattr(source, "recording", None), "inertial", None) is not None:
-        notes.append("there are inertial samples beside the images; they are not used")
-    return notes
+        text = f"{len(times)} images in {span:.4g} s, {(len(times) - 1) / span:.4g} a second"
+    elif count is not None and rate is not None:
+        text = f"{count} frames of a video, {rate:.4g} a second: {count / rate:.4g} s"
+    if text is not None:
+        with contextlib.suppress(OSError):
+            print_line(text, error=True)
+    if getattr(recording, "inertial", None) is not None:
+        warn("there are inertial samples beside the images; they are not used", "note")
 
 
 def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:

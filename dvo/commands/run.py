@@ -18,7 +18,7 @@ from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.base_frame import base_observers
 from dvo.commands.camera import CALIBRATION, calibration_origin, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
-from dvo.commands.input_options import input_facts, input_notes, input_settings
+from dvo.commands.input_options import input_facts, input_settings, print_input
 from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
         **input_settings(arguments),
     )
     source = scaled_source(source, arguments)
-    for warning in (*source.warnings, *input_notes(source)):
+    for warning in source.warnings:
         warn(warning, "note")
     facts = {
         "source": shown(str(arguments.source)),
@@ -127,6 +127,7 @@ def run(arguments: argparse.Namespace) -> int:
         facts["map"] = arguments.map
         if arguments.map is not None and isinstance(odometry, Saveable):
             facts["weights"] = getattr(odometry, "weights", "") or arguments.weights
+        print_input(source)  # behind what may fail, so that an error is one line
         source, camera = with_calibration(source, odometry, arguments, device, folder)
         code = track(
             odometry,

@@ -162,5 +162,6 @@ def depth_camera(recording: BagRecording, topic: str, calibration: Calibration |
     scale = float(info.width) / width if width and info.width else 1.0
     if not (other[:2] > 0).all() or np.abs(other - own * scale).max() <= 0.02 * own[0] * scale:
         return None
-    size = (int(info.width) or None, int(info.height) or None)
-    return Calibration(*other.tolist(), width=size[0], height=size[1], file=recording.path)
+    fx, fy, cx, cy = other.tolist()
+    size = {"width": int(info.width) or None, "height": int(info.height) or None}
+    return Calibration(fx, fy, cx, cy, file=recording.path, **size)

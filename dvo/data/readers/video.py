@@ -143,6 +143,7 @@ class VideoRecording:
         request: options of the user.
 
     Attributes:
+        rate: frames a second that the file states, or the user; None with a list of times.
         turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
             rows of the sensor in the order in which it reads them.
 
@@ -188,6 +189,7 @@ class VideoRecording:
         self._times = self._read_times(request.times) if request.times is not None else None
         self._use_container = bool(request.fps is None and (np.diff(first) > 0).all() and np.isfinite(first).all())
         self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
+        self.rate = self._fps if self._times is None else None
         if self._times is None and not self._use_container and request.fps is None:
             known = "the stated" if self._fps == rate else "a guessed"
             self.warnings.append(

@@ -21,14 +21,14 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=OWN,
         metavar="PATH",
-        help="depth images: a folder of 16-bit PNG files, or a list as depth.txt (default: those of the data set)",
+        help="depth images: a folder of 16-bit PNG files, a list as depth.txt or a topic (default: of the data set)",
     )
     source.add_argument(
         "--right",
         nargs="?",
         const=OWN,
         metavar="PATH",
-        help="right images of a stereo pair: a folder, a list, a second video (default: those of the data set)",
+        help="right images of a stereo pair: a folder, list, second video or topic (default: those of the data set)",
     )
     source.add_argument("--height", type=_metres, metavar="METRES", help="of the camera over the ground")
     source.add_argument(

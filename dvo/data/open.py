@@ -59,7 +59,7 @@ def open_source(
         source: path to a file or folder.
         calib: calibration that wins over the dataset's own; see
             :func:`dvo.data.calibration.read.read_calibration`.
-        times: file with the time of every image in its first column.
+        times: file with the time of every image, see :func:`dvo.data.files.clock.clock_of_rows`.
         fps: frames a second, where nothing else gives times; for a video it overrides the container.
         stride: read every ``stride``-th frame.
         groundtruth: TUM trajectory (camera to world), or a format without times for the images of a folder, see

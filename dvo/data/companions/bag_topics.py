@@ -163,5 +163,5 @@ def depth_camera(recording: BagRecording, topic: str, calibration: Calibration |
     if not (other[:2] > 0).all() or np.abs(other - own * scale).max() <= 0.02 * own[0] * scale:
         return None
     fx, fy, cx, cy = other.tolist()
-    size = {"width": int(info.width) or None, "height": int(info.height) or None}
-    return Calibration(fx, fy, cx, cy, file=recording.path, **size)
+    size = int(info.width) or None, int(info.height) or None
+    return Calibration(fx, fy, cx, cy, "none", (), *size, file=recording.path)

@@ -22,7 +22,7 @@ from dvo.commands.calibrate_options import add_calibrate
 from dvo.commands.kernels import compiled_meanwhile
 from dvo.commands.run_options import add_batch_options, add_folder_options, add_run_options, add_tracking_options
 from dvo.commands.stream_options import add_stream_options
-from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed
+from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed, whole
 from dvo.core.errors import DvoError
 from dvo.core.limits import LOADING, TRACKING, check_limits, limit_error
 from dvo.core.text import print_line, print_traceback
@@ -169,7 +169,7 @@ def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
 
 
 def _count(text: str) -> int:
-    value = int(text)
+    value = whole(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be 0 or more, got {text[:60]}")
     return value

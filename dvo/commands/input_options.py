@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from dvo.core.command_line import whole
+
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
     """Add the options.
@@ -25,7 +27,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-pixels",
         metavar="N",
-        type=int,
+        type=whole,
         help="images with more pixels are reduced when they are read (4000000); 0: never",
     )
     parser.add_argument(

@@ -36,6 +36,7 @@ from dvo.data.frame import Frame
 from dvo.data.streams.capture import is_stream, shown
 from dvo.data.trajectory import Trajectory
 from dvo.export.formats import TRAJECTORY_FORMATS, check_formats, export_run
+from dvo.odometry.load import check_early
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
@@ -84,6 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     check_formats(arguments.export)
     device = device_for(arguments)
+    check_settings_early(arguments)
     early: Odometry | None = None
     if is_stream(arguments.source):  # frames arrive from its opening on
         seed_everything(arguments.seed)
@@ -188,6 +190,35 @@ def device_for(arguments: argparse.Namespace) -> torch.device:
     return torch.device("cpu")
 
 
+def check_settings_early(arguments: argparse.Namespace) -> None:
+    """Check preset and settings of weights before the source is opened.
+
+    Args:
+        arguments: of the command line.
+
+    Raises:
+        DvoError: no such preset, or an unknown or invalid setting.
+    """
+    settings = _settings(arguments)
+    if arguments.system is None and arguments.map is None:
+        check_early(arguments.weights, None, settings)
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Settings of ``--config``, ``--set``, ``--preset``, ``--no-loops`` and the scale; the later ones win."""
+    settings = read_settings(arguments.config) if arguments.config else {}
+    settings |= parse_settings(arguments.set)
+    if arguments.preset is not None:
+        settings["preset"] = arguments.preset
+    if arguments.no_loops and (arguments.system is None or "loops" in settings):
+        settings["loops"] = False
+    settings |= scale_settings(arguments)
+    reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
+    if reserved:
+        raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")
+    return settings
+
+
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
     """Load the odometry of ``--weights`` with the settings of ``--preset``, ``--config``, ``--set`` and ``--no-loops``.
 
@@ -203,16 +234,7 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     Raises:
         DvoError: no such weights, or an unknown or invalid setting.
     """
-    settings = read_settings(arguments.config) if arguments.config else {}
-    settings |= parse_settings(arguments.set)
-    if arguments.preset is not None:
-        settings["preset"] = arguments.preset
-    if arguments.no_loops and (arguments.system is None or "loops" in settings):
-        settings["loops"] = False
-    settings |= scale_settings(arguments)
-    reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
-    if reserved:
-        raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")
+    settings = _settings(arguments)
     if getattr(arguments, "map", None) is not None:
         if arguments.system is not None:
             raise DvoError("a map is tracked in by weights", field="--system", remedy="leave out --system or --map")

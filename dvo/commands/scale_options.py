@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from dvo.core.command_line import number
+
 OWN = ""  # value of --depth and --right without a path: those of the data set itself
 
 
@@ -34,7 +36,7 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
     source.add_argument(
         "--distance",
         nargs=3,
-        type=float,
+        type=number,
         action="append",
         metavar=("T0", "T1", "METRES"),
         help="straight distance between the camera at two times, seconds; repeatable",
@@ -62,7 +64,7 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _metres(text: str) -> float:
-    value = float(text)
+    value = number(text)
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"must be more than 0, got {text[:60]}")
     return value

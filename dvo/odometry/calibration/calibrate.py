@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from dvo.core.arguments import checked_arguments
+from dvo.core.context import in_own_context
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
@@ -91,6 +92,7 @@ class CalibrationOptions:
 
 
 @partial(checked_arguments, skip=("seed",))
+@in_own_context
 def calibrate(
     frames: Iterable[Frame],
     guess: FocalGuess | None = None,

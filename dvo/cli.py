@@ -81,6 +81,22 @@ def build_parser() -> argparse.ArgumentParser:
     summary.add_argument("--out", metavar="FILE", help="file to write (default: RESULTS/summary.html)")
     summary.set_defaults(run="dvo.commands.summary:summary")
 
+    evaluate = commands.add_parser("evaluate", help="compare trajectories with a reference, without a run")
+    evaluate.add_argument("reference", metavar="REFERENCE", help="ground truth: TUM file, or a results folder")
+    evaluate.add_argument("estimates", metavar="ESTIMATE", nargs="+", help="TUM files, or results folders")
+    evaluate.add_argument(
+        "--align", choices=("sim3", "se3", "scale", "none"), default="sim3", help="fitted first (default: %(default)s)"
+    )
+    evaluate.add_argument(
+        "--max-dt",
+        type=positive_float,
+        default=0.01,
+        metavar="S",
+        help="largest difference of matched times in seconds (default: %(default)s)",
+    )
+    evaluate.add_argument("--out", metavar="FILE", help="picture of all of them, .png, .pdf, .svg or .jpg")
+    evaluate.set_defaults(run="dvo.commands.evaluate:evaluate")
+
     merge = commands.add_parser("merge", help="join two maps of one place", epilog=_MERGE_CODES)
     merge.add_argument("first", metavar="FIRST", help="map file (.dvo), which keeps its world and scale")
     merge.add_argument("second", metavar="SECOND", help="map file (.dvo) of a single recording")

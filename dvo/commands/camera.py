@@ -48,8 +48,11 @@ def with_calibration(
     if source.guess is not None:
         warn(_announcement(source), "note")
         weights = odometry.weights or arguments.weights if isinstance(odometry, PatchOdometry) else "small"
-        with TrackingProgress(None) as progress:
-            found = calibrate(source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update)
+        with TrackingProgress(None, "calibrating") as progress:
+            found = calibrate(
+                source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update,
+                on_round=progress.begin_round,
+            )  # fmt: skip
         seed_everything(arguments.seed)  # the same bytes as a run with the calibration file
         say_all(found)
         written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)

@@ -23,7 +23,7 @@ from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
 from dvo.commands.places import check_outputs
-from dvo.commands.report import Scores, headline, print_report, score
+from dvo.commands.report import Scores, describe_seconds, headline, print_report, score
 from dvo.commands.request import request_facts
 from dvo.commands.run_options import INPUTS
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
@@ -302,7 +302,7 @@ def track(
             try:
                 done = session.run(
                     odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None,
-                    in_haste=lambda: switch.in_haste, again=again,
+                    in_haste=lambda: switch.in_haste, on_phase=progress.name, again=again,
                 )  # fmt: skip
             except KeyboardInterrupt:
                 recorder.stop(interrupted=True, reason=_ABORTED)
@@ -343,6 +343,7 @@ def track(
                 say(f"{getattr(observer, 'option', '').removeprefix('--')} in {file}")
         if save_map is not None:
             say(f"map in {save_map}")
+        say(describe_seconds(done.seconds))
         if hasty and (left := [name for name in export if name not in TRAJECTORY_FORMATS]):
             warn(f"{', '.join(left)}: not exported, there was no time for the final optimisation")
             export = [name for name in export if name not in left]

@@ -108,7 +108,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("source", metavar="SOURCE", help="results folder of dvo run or dvo demo, or map file (.dvo)")
     export.add_argument("out", metavar="OUT", help="new folder")
     export.add_argument(
-        "--to", metavar="NAME", required=True, help="format: tum, kitti or euroc; of a map also colmap, ..."
+        "--to", metavar="NAME", required=True, help="format: tum, kitti, euroc, colmap, colmap-text or nerfstudio"
     )
     export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
     export.set_defaults(run="dvo.commands.export:export")

@@ -22,7 +22,7 @@ from dvo.commands.calibrate_options import add_calibrate
 from dvo.commands.kernels import compiled_meanwhile
 from dvo.commands.run_options import add_batch_options, add_folder_options, add_run_options, add_tracking_options
 from dvo.commands.stream_options import add_stream_options
-from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed
+from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed, whole
 from dvo.core.errors import DvoError
 from dvo.core.limits import LOADING, TRACKING, check_limits, limit_error
 from dvo.core.text import print_line, print_traceback
@@ -81,6 +81,22 @@ def build_parser() -> argparse.ArgumentParser:
     summary.add_argument("--out", metavar="FILE", help="file to write (default: RESULTS/summary.html)")
     summary.set_defaults(run="dvo.commands.summary:summary")
 
+    evaluate = commands.add_parser("evaluate", help="compare trajectories with a reference, without a run")
+    evaluate.add_argument("reference", metavar="REFERENCE", help="ground truth: TUM file, or a results folder")
+    evaluate.add_argument("estimates", metavar="ESTIMATE", nargs="+", help="TUM files, or results folders")
+    evaluate.add_argument(
+        "--align", choices=("sim3", "se3", "scale", "none"), default="sim3", help="fitted first (default: %(default)s)"
+    )
+    evaluate.add_argument(
+        "--max-dt",
+        type=positive_float,
+        default=0.01,
+        metavar="S",
+        help="largest difference of matched times in seconds (default: %(default)s)",
+    )
+    evaluate.add_argument("--out", metavar="FILE", help="picture of all of them, .png, .pdf, .svg or .jpg")
+    evaluate.set_defaults(run="dvo.commands.evaluate:evaluate")
+
     merge = commands.add_parser("merge", help="join two maps of one place", epilog=_MERGE_CODES)
     merge.add_argument("first", metavar="FIRST", help="map file (.dvo), which keeps its world and scale")
     merge.add_argument("second", metavar="SECOND", help="map file (.dvo) of a single recording")
@@ -92,7 +108,7 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("source", metavar="SOURCE", help="results folder of dvo run or dvo demo, or map file (.dvo)")
     export.add_argument("out", metavar="OUT", help="new folder")
     export.add_argument(
-        "--to", metavar="NAME", required=True, help="format: tum, kitti or euroc; of a map also colmap, ..."
+        "--to", metavar="NAME", required=True, help="format: tum, kitti, euroc, colmap, colmap-text or nerfstudio"
     )
     export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
     export.set_defaults(run="dvo.commands.export:export")
@@ -169,7 +185,7 @@ def _rendering_options(parser: argparse.ArgumentParser, size: str) -> None:
 
 
 def _count(text: str) -> int:
-    value = int(text)
+    value = whole(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be 0 or more, got {text[:60]}")
     return value

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from dvo.cli import main
+from dvo.data.frame import Frame
 from dvo.data.readers.euroc import read_state_groundtruth
-from dvo.data.trajectory import read_kitti_poses, read_tum
+from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
+from dvo.export.recorded import reconstruct_recorded
+from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices
+from dvo.odometry.protocol import SparseMap
 from tests.support.command_line import arguments, errors, names, summary
 from tests.support.tiny_tracker import frames, tracker
 
@@ -90,8 +94,7 @@ def test_the_only_segment_has_the_number_0(given, image_folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [(["--to", "colmap"], "a results folder holds no keyframes, which 'colmap' needs. Track again with dvo run"),
-     (["--to", "obj"], "no trajectory format 'obj'. Use one of tum, kitti, euroc"),
+    [(["--to", "obj"], "no trajectory format 'obj'. Use one of tum, kitti, euroc"),
      (["--to", "tum", "--segment", "2"], "no segment 2"), (["--to", "tum", "--segment", "-1"], "must be 0 or more"),
      ([], "--to")],
 )  # fmt: skip
@@ -126,3 +129,31 @@ def test_export_of_a_map_file(tmp_path, capsys):
     for options, match in wrong:
         assert main(["export", str(file), str(tmp_path / "new"), *options]) == 2
         assert match in capsys.readouterr().err and not (tmp_path / "new").exists()
+
+
+def test_a_map_after_the_run(given, image_folder, tmp_path, capsys):
+    """Poses and images are there: images of the source, points of the map without observations."""
+    given(lost=(4, 5))
+    out = tmp_path / "out"
+    assert main(arguments(image_folder, out)) == 0
+    assert main(["export", str(out), str(tmp_path / "colmap"), "--to", "colmap-text"]) == 0
+    assert "18 images of the source, 10 points" in capsys.readouterr().out
+    assert len(names(tmp_path / "colmap" / "images")) == 18
+    camera = (tmp_path / "colmap" / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
+    assert camera[2:4] == ["64", "48"] and [float(x) for x in camera[4:]] == [50, 50, 32, 24]
+    assert main(["export", str(out), str(tmp_path / "nerf"), "--to", "nerfstudio"]) == 0
+    assert main(["export", str(out), str(tmp_path / "nerf"), "--to", "nerfstudio"]) == 2, "not empty"
+    image_folder.rename(image_folder.parent / "moved")
+    capsys.readouterr()
+    assert main(["export", str(out), str(tmp_path / "again"), "--to", "colmap"]) == 2
+    assert "the source of the run is not there" in capsys.readouterr().err and not (tmp_path / "again").exists()
+
+
+def test_the_sharpest_image_of_each_stretch():
+    draw, camera = np.random.default_rng(0), Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
+    noise, sharp = draw.integers(0, 255, (48, 64, 3), np.uint8), (2, 5, 8)
+    clip = [Frame(k, 0.1 * k, noise if k in sharp else noise // 4, camera) for k in range(9)]
+    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (9, 1))
+    poses[:, 0] = np.arange(9)
+    found = reconstruct_recorded(clip, Trajectory(0.1 * np.arange(9), poses), SparseMap(), most=3)
+    assert found.identifiers.tolist() == list(sharp) and found.T_cw[:, 0, 3].tolist() == [-2.0, -5.0, -8.0]

@@ -117,3 +117,41 @@ def test_large_images_are_reduced(given, images, tmp_path):
         assert odometry.frames[0].camera.fx == (50 if limit == 0 else 25)
         written.append((tmp_path / str(number) / "trajectory.txt").read_bytes())
     assert written[0] == written[1]
+
+
+def test_span_rate_and_origin_of_the_calibration(given, images, tmp_path, capsys):
+    given()
+    (images.parent / "times.txt").write_text("".join(f"{i:03d} {100 * i + 7} 4.{i}\n" for i in range(20)))
+    assert main(["run", str(images.parent), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().err
+    assert "20 images in 1.9 s, 10 a second" in said and "taken for milliseconds" in said
+    assert summary(tmp_path / "out")["calibration"] == str(images.parent / "calib.txt")
+
+
+def test_a_folder_whose_name_is_no_utf8(given, images, tmp_path, capsys):
+    given()
+    odd = images.rename(images.parent / b"caf\xe9".decode("utf-8", "surrogateescape"))
+    (odd / b"00\xe9.png".decode("utf-8", "surrogateescape")).write_bytes(b"no image")
+    out = tmp_path / "out"
+    assert main(arguments(odd, out, "--calib", "../calib.txt", "--times", str(_times(tmp_path)))) == 0
+    assert (out / "summary.html").exists() and (out / "trajectory.png").exists()
+    assert any("00\\xe9.png" in text for text in summary(out)["warnings"])
+
+
+def _times(folder):
+    file = folder / "t.txt"
+    file.write_text("".join(f"{0.1 * i}\n" for i in range(21)))
+    return file
+
+
+def test_inertial_samples_that_are_not_used_are_named(given, images, tmp_path, capsys):
+    given()
+    data = tmp_path / "s" / "mav0" / "cam0" / "data"
+    data.parent.mkdir(parents=True)
+    images.rename(data)
+    images.parent.joinpath("times.txt").unlink()
+    (data.parent.parent / "imu0").mkdir()
+    (data.parent.parent / "imu0" / "data.csv").write_text("1,0,0,0,0,0,9.8\n")
+    calib = str(images.parent / "calib.txt")
+    assert main(["run", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--calib", calib, "--fps", "10"]) == 0
+    assert sum("inertial samples" in line for line in errors(capsys.readouterr().err)) == 1

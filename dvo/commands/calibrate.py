@@ -171,10 +171,11 @@ def _facts(found: BoardCalibration, source: str) -> dict[str, Any]:
 def _without_board(source: Source, folder: Path, arguments: argparse.Namespace) -> int:
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
-    with TrackingProgress(None) as progress:
+    with TrackingProgress(None, "calibrating") as progress:
         found = self_calibrate(
-            source, weights=arguments.weights, device=device, seed=arguments.seed, on_frame=progress.update
-        )
+            source, weights=arguments.weights, device=device, seed=arguments.seed, on_frame=progress.update,
+            on_round=progress.begin_round,
+        )  # fmt: skip
     say_all(found)
     file = folder / CALIBRATION
     found.write(file)

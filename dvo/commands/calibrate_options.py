@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from dvo.core.command_line import number, whole
+
 _CODES = "exit codes: 0 done, 1 the motion does not tell the focal length (without a board), 2 bad input"
 
 
@@ -28,17 +30,19 @@ def add_calibrate(commands: Any) -> None:
     )
     boards.add_argument("--charuco", type=_grid, metavar="CxR", help="ChArUco board of so many squares")
     parser.add_argument(
-        "--square", type=float, default=1.0, metavar="M", help="side of a square in metres (default: 1)"
+        "--square", type=number, default=1.0, metavar="M", help="side of a square in metres (default: 1)"
     )
     parser.add_argument(
-        "--marker", type=float, default=0.0, metavar="M", help="ChArUco: side of a marker (default: 0.75 of a square)"
+        "--marker", type=number, default=0.0, metavar="M", help="ChArUco: side of a marker (default: 0.75 of a square)"
     )
     parser.add_argument(
         "--dictionary", metavar="NAME", default="4X4_50", help="ChArUco: OpenCV's name (default: %(default)s)"
     )
     parser.add_argument("--fisheye", action="store_true", help="lens model of fisheyes; writes calib.yaml")
     parser.add_argument("--k3", action="store_true", help="third radial coefficient")
-    parser.add_argument("--frames", type=int, default=300, metavar="N", help="frames to search (default: %(default)s)")
+    parser.add_argument(
+        "--frames", type=whole, default=300, metavar="N", help="frames to search (default: %(default)s)"
+    )
     parser.add_argument("--out", metavar="DIR", help="results folder (default: runs/NAME-TIME)")
     parser.add_argument("--overwrite", action="store_true", help="replace an earlier calibration in --out")
     parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="without a board (default: small)")
@@ -57,7 +61,7 @@ def _grid(text: str) -> tuple[int, int]:
 
 
 def _seed(text: str) -> int:
-    value = int(text)
+    value = whole(text)
     if not 0 <= value < 2**63:
         raise argparse.ArgumentTypeError(f"must be 0 or more and below 2^63, got {text[:60]}")
     return value

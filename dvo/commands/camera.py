@@ -48,8 +48,11 @@ def with_calibration(
     if source.guess is not None:
         warn(_announcement(source), "note")
         weights = odometry.weights or arguments.weights if isinstance(odometry, PatchOdometry) else "small"
-        with TrackingProgress(None) as progress:
-            found = calibrate(source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update)
+        with TrackingProgress(None, "calibrating") as progress:
+            found = calibrate(
+                source, weights=weights, device=device, seed=arguments.seed, on_frame=progress.update,
+                on_round=progress.begin_round,
+            )  # fmt: skip
         seed_everything(arguments.seed)  # the same bytes as a run with the calibration file
         say_all(found)
         written = (not file.exists() or CALIBRATION in files_of_run(folder)) and found.write(file)
@@ -63,6 +66,23 @@ def with_calibration(
     facts: dict[str, Any] = {"camera": camera, "self_calibration": None if found is None else _facts(found)}
     facts["calibration_file"] = CALIBRATION if written else None
     return source, facts if found is None else facts | {"seconds": {"calibrating": time.perf_counter() - began}}
+
+
+def calibration_origin(source: Source, calib: str | None) -> str | None:
+    """Where the calibration of a source comes from, for run.json.
+
+    Args:
+        source: newly opened.
+        calib: value of ``--calib``.
+
+    Returns:
+        The value of ``--calib``, else the file that the data set has, or that its published values are used; None
+        without a calibration.
+    """
+    if calib is not None or source.guess is not None or source.calibration is None:
+        return calib
+    file = source.calibration.file
+    return f"published with the data ({source.kind})" if file is None else str(file)
 
 
 def _is_given(file: Path, source: Source, calib: str | None) -> bool:

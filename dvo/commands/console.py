@@ -26,6 +26,8 @@ from dvo.core.text import print_line, printable
 from dvo.data.frame import Frame
 from dvo.odometry.protocol import Estimate, Result, Status
 
+PLAIN_INTERVAL = 10.0
+"""Seconds between two lines about the progress where there is no terminal."""
 GRACE = 1.5
 """Seconds after SIGTERM in which a frame is finished and results are written."""
 _COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red"}
@@ -180,38 +182,97 @@ class StderrConsole(Console):
 
 
 class TrackingProgress:
-    """Progress bar on stderr, with the rate over the last frames and the state of the tracker.
+    """Progress bar on stderr: the phase, the rate over the last frames, the time left and the state of the tracker.
 
-    A failure of stderr (closed pipe, full disk) ends the display, not the run.
+    Without a terminal there is a plain line every :data:`PLAIN_INTERVAL` seconds. A failure of stderr (closed pipe,
+    full disk) ends the display, not the run.
 
     Args:
         total: number of frames, or None if unknown.
+        phase: what is done with them.
     """
 
-    def __init__(self, total: int | None) -> None:
+    def __init__(self, total: int | None, phase: str = "tracking") -> None:
+        console = StderrConsole()
+        self._name, self._total, self._done, self._rate = phase, total, 0, 0.0
+        self._began = time.perf_counter()
+        self._plain = not console.is_terminal
+        self._ended = threading.Event()
         self._progress = Progress(
             SpinnerColumn(),
-            TextColumn("[bold]tracking"),
+            TextColumn("[bold]{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]:5.1f} frames/s"),
             TextColumn("{task.fields[status]}"),
             TimeRemainingColumn(),
-            console=StderrConsole(),
+            console=console,
         )
-        self._task = self._progress.add_task("", total=total, rate=0.0, status="")
+        self._task = self._progress.add_task(phase, total=total, rate=0.0, status="")
         self._moments: deque[float] = deque([time.perf_counter()], maxlen=30)
 
     def __enter__(self) -> TrackingProgress:
         with contextlib.suppress(OSError):
             self._progress.start()
+        if self._plain:
+            threading.Thread(target=self._tell, name="dvo progress", daemon=True).start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._ended.set()
         with contextlib.suppress(OSError):
             self._progress.stop()
+
+    def begin(self, phase: str, total: int | None = None) -> None:
+        """Begin another phase.
+
+        Args:
+            phase: in words, such as ``adjusting``.
+            total: number of frames; None if unknown, or where there are none to count.
+        """
+        self._name, self._total, self._done, self._rate = phase, total, 0, 0.0
+        self._began = time.perf_counter()
+        self._moments.clear()
+        self._moments.append(self._began)
+        with contextlib.suppress(OSError):
+            self._progress.reset(self._task, total=total, description=phase, rate=0.0, status="")
+
+    def name(self, phase: str) -> None:
+        """Name what is done after the last frame; the counts stay.
+
+        Args:
+            phase: in words, such as ``adjusting``.
+        """
+        self._name, self._done, self._began = phase, 0, time.perf_counter()
+        with contextlib.suppress(OSError):
+            self._progress.update(self._task, description=phase)
+
+    def begin_round(self, number: int, most: int, frames: int) -> None:
+        """Begin a round of a self-calibration; callback of :func:`dvo.odometry.calibration.calibrate.calibrate`.
+
+        Args:
+            number: of the round, from 1.
+            most: rounds.
+            frames: that it tracks.
+        """
+        self.begin(f"calibrating, round {number} of at most {most}", frames)
+
+    @property
+    def line(self) -> str:
+        """The phase with its counts in words."""
+        seconds = time.perf_counter() - self._began
+        if not self._done:
+            return f"{self._name}, {seconds:.0f} s so far"
+        if self._total is None:
+            return f"{self._name}, {self._done} frames, {self._rate:.1f} frames/s"
+        left = max(self._total - self._done, 0) / max(self._rate, 1e-9)
+        return f"{self._name}, {self._done} of {self._total} frames, {self._rate:.1f} frames/s, {left:.0f} s left"
+
+    def _tell(self) -> None:
+        while not self._ended.wait(PLAIN_INTERVAL):
+            warn(self.line, "progress")
 
     def update(self, frame: Frame, estimate: Estimate | None) -> None:
         """Advance by a frame; callback of :func:`dvo.session.session.run`.
@@ -222,6 +283,7 @@ class TrackingProgress:
         """
         self._moments.append(time.perf_counter())
         rate = (len(self._moments) - 1) / max(self._moments[-1] - self._moments[0], 1e-9)
+        self._done, self._rate = self._done + 1, rate
         fields: dict[str, Any] = {"rate": rate}
         if estimate is not None:
             fields["status"] = f"[{_COLOURS[estimate.status]}]{describe_status(estimate)}"
@@ -235,8 +297,10 @@ class TrackingProgress:
             result: of the odometry.
         """
         tracked = result.frames_tracked
+        self._ended.set()
         with contextlib.suppress(OSError):
-            self._progress.update(self._task, status=f"[{'green' if tracked else 'red'}]{tracked} tracked")
+            status = f"[{'green' if tracked else 'red'}]{tracked} tracked"
+            self._progress.update(self._task, description="tracking", status=status)
 
 
 def describe_status(estimate: Estimate) -> str:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import Any
+
+from dvo.core.command_line import whole
 
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +28,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-pixels",
         metavar="N",
-        type=int,
+        type=whole,
         help="images with more pixels are reduced when they are read (4000000); 0: never",
     )
     parser.add_argument(
@@ -45,6 +48,33 @@ def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     masks = {"mask": arguments.mask, "mask_invert": arguments.mask_invert}
     pixels = {} if arguments.max_pixels is None else {"max_pixels": arguments.max_pixels or None}
     return {"start": arguments.start, "end": arguments.end, **masks, **pixels}
+
+
+def print_input(source: Any) -> None:
+    """Print what a person compares with what was recorded, to stderr.
+
+    Number of images, duration and rate, where the times are known before the images are read, of a video as its file
+    states them; and a note of inertial samples that are there and not used.
+
+    Args:
+        source: newly opened.
+    """
+    from dvo.commands.console import warn
+    from dvo.core.text import print_line
+
+    recording = getattr(source, "recording", None)
+    times, count = getattr(source, "timestamps", None), getattr(recording, "frame_count", None)
+    text, rate = None, getattr(recording, "rate", None)
+    if times is not None and len(times) > 1:
+        span = float(times[-1] - times[0])
+        text = f"{len(times)} images in {span:.4g} s, {(len(times) - 1) / span:.4g} a second"
+    elif count is not None and rate is not None:
+        text = f"{count} frames of a video, {rate:.4g} a second: {count / rate:.4g} s"
+    if text is not None:
+        with contextlib.suppress(OSError):
+            print_line(text, error=True)
+    if getattr(recording, "inertial", None) is not None:
+        warn("there are inertial samples beside the images; they are not used", "note")
 
 
 def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:

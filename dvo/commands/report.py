@@ -99,6 +99,31 @@ def error_text(metrics: Metrics) -> str:
     return f"ATE {metrics.ate_rmse:.3g} m ({metrics.ate_percent:.2f} % of {metrics.path_length:.3g} m)"
 
 
+_PHASES = {
+    "calibrating": "calibration", "reading": "reading", "tracking": "tracking", "finishing": "final",
+    "checking": "check",
+}  # fmt: skip
+
+
+def describe_seconds(seconds: Mapping[str, float]) -> str:
+    """Describe where the time of a run went.
+
+    Args:
+        seconds: by phase, of :class:`dvo.session.session.Run`.
+
+    Returns:
+        A line such as ``96 s: calibration 61, reading 7, tracking 22, final 6``.
+    """
+    total = sum(seconds.values())
+    digits = 0 if total >= 10 else 1
+    parts = [
+        f"{name} {seconds[phase]:.{digits}f}"
+        for phase, name in _PHASES.items()
+        if phase in seconds and f"{seconds[phase]:.{digits}f}" != f"{0:.{digits}f}"
+    ]
+    return f"{total:.{digits}f} s" + (f": {', '.join(parts)}" if parts else "")
+
+
 def describe_breaks(breaks: tuple[Break, ...]) -> str:
     """Describe the breaks of a trajectory.
 

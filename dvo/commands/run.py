@@ -16,14 +16,14 @@ import torch
 import dvo
 from dvo.commands import NOTHING_TRACKED, OK, Terminated
 from dvo.commands.base_frame import base_observers
-from dvo.commands.camera import CALIBRATION, with_calibration
+from dvo.commands.camera import CALIBRATION, calibration_origin, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
-from dvo.commands.input_options import input_facts, input_settings
+from dvo.commands.input_options import input_facts, input_settings, print_input
 from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
 from dvo.commands.picture import draw
 from dvo.commands.places import check_outputs
-from dvo.commands.report import Scores, headline, print_report, score
+from dvo.commands.report import Scores, describe_seconds, headline, print_report, score
 from dvo.commands.request import request_facts
 from dvo.commands.run_options import INPUTS
 from dvo.commands.scale import scale_observers, scale_settings, scaled_source
@@ -36,6 +36,7 @@ from dvo.data.frame import Frame
 from dvo.data.streams.capture import is_stream, shown
 from dvo.data.trajectory import Trajectory
 from dvo.export.formats import TRAJECTORY_FORMATS, check_formats, export_run
+from dvo.odometry.load import check_early
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
@@ -84,6 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     check_formats(arguments.export)
     device = device_for(arguments)
+    check_settings_early(arguments)
     early: Odometry | None = None
     if is_stream(arguments.source):  # frames arrive from its opening on
         seed_everything(arguments.seed)
@@ -105,7 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
         "source": shown(str(arguments.source)),
         "kind": getattr(source, "kind", None),
         **stream_facts(source),
-        "calibration": arguments.calib,
+        "calibration": calibration_origin(source, arguments.calib),
         "readout": source.camera.readout,
         "groundtruth": arguments.groundtruth,
         "weights": arguments.weights if arguments.system is None else None,
@@ -131,6 +133,7 @@ def run(arguments: argparse.Namespace) -> int:
         facts["map"] = arguments.map
         if arguments.map is not None and isinstance(odometry, Saveable):
             facts["weights"] = getattr(odometry, "weights", "") or arguments.weights
+        print_input(source)  # behind what may fail, so that an error is one line
         source, camera = with_calibration(source, odometry, arguments, device, folder)
         code = track(
             odometry,
@@ -188,6 +191,35 @@ def device_for(arguments: argparse.Namespace) -> torch.device:
     return torch.device("cpu")
 
 
+def check_settings_early(arguments: argparse.Namespace) -> None:
+    """Check preset and settings of weights before the source is opened.
+
+    Args:
+        arguments: of the command line.
+
+    Raises:
+        DvoError: no such preset, or an unknown or invalid setting.
+    """
+    settings = _settings(arguments)
+    if arguments.system is None and arguments.map is None:
+        check_early(arguments.weights, None, settings)
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Settings of ``--config``, ``--set``, ``--preset``, ``--no-loops`` and the scale; the later ones win."""
+    settings = read_settings(arguments.config) if arguments.config else {}
+    settings |= parse_settings(arguments.set)
+    if arguments.preset is not None:
+        settings["preset"] = arguments.preset
+    if arguments.no_loops and (arguments.system is None or "loops" in settings):
+        settings["loops"] = False
+    settings |= scale_settings(arguments)
+    reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
+    if reserved:
+        raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")
+    return settings
+
+
 def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odometry:
     """Load the odometry of ``--weights`` with the settings of ``--preset``, ``--config``, ``--set`` and ``--no-loops``.
 
@@ -203,16 +235,7 @@ def load_odometry(arguments: argparse.Namespace, device: torch.device) -> Odomet
     Raises:
         DvoError: no such weights, or an unknown or invalid setting.
     """
-    settings = read_settings(arguments.config) if arguments.config else {}
-    settings |= parse_settings(arguments.set)
-    if arguments.preset is not None:
-        settings["preset"] = arguments.preset
-    if arguments.no_loops and (arguments.system is None or "loops" in settings):
-        settings["loops"] = False
-    settings |= scale_settings(arguments)
-    reserved = sorted(set(settings) & {"weights", "device", "seed", "config"})
-    if reserved:
-        raise DvoError("not a setting of the odometry", field=reserved[0], remedy="use the option of that name")
+    settings = _settings(arguments)
     if getattr(arguments, "map", None) is not None:
         if arguments.system is not None:
             raise DvoError("a map is tracked in by weights", field="--system", remedy="leave out --system or --map")
@@ -280,7 +303,7 @@ def track(
             try:
                 done = session.run(
                     odometry, clip, stride=stride, on_frame=on_frame, should_stop=lambda: switch.pressed is not None,
-                    in_haste=lambda: switch.in_haste, again=again,
+                    in_haste=lambda: switch.in_haste, on_phase=progress.name, again=again,
                 )  # fmt: skip
             except KeyboardInterrupt:
                 recorder.stop(interrupted=True, reason=_ABORTED)
@@ -321,6 +344,7 @@ def track(
                 say(f"{getattr(observer, 'option', '').removeprefix('--')} in {file}")
         if save_map is not None:
             say(f"map in {save_map}")
+        say(describe_seconds(done.seconds))
         if hasty and (left := [name for name in export if name not in TRAJECTORY_FORMATS]):
             warn(f"{', '.join(left)}: not exported, there was no time for the final optimisation")
             export = [name for name in export if name not in left]

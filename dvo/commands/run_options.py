@@ -70,7 +70,9 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stride", type=positive_int, default=1, metavar="N", help="track every N-th frame")
     times = parser.add_mutually_exclusive_group()
     times.add_argument(
-        "--times", metavar="FILE", help="file with the time of each image in seconds in the first column"
+        "--times",
+        metavar="FILE",
+        help="file with the time of each image, in any unit (a header such as 'time [ms]' names it)",
     )
     times.add_argument(
         "--fps", type=positive_float, metavar="F", help="frames per second, if the source does not define it"

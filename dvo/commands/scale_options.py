@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from dvo.core.command_line import number
+
 OWN = ""  # value of --depth and --right without a path: those of the data set itself
 
 
@@ -21,20 +23,20 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         const=OWN,
         metavar="PATH",
-        help="depth images: a folder of 16-bit PNG files, or a list as depth.txt (default: those of the data set)",
+        help="depth images: a folder of 16-bit PNG files, a list as depth.txt or a topic (default: of the data set)",
     )
     source.add_argument(
         "--right",
         nargs="?",
         const=OWN,
         metavar="PATH",
-        help="right images of a stereo pair: a folder, a list, a second video (default: those of the data set)",
+        help="right images of a stereo pair: a folder, list, second video or topic (default: those of the data set)",
     )
     source.add_argument("--height", type=_metres, metavar="METRES", help="of the camera over the ground")
     source.add_argument(
         "--distance",
         nargs=3,
-        type=float,
+        type=number,
         action="append",
         metavar=("T0", "T1", "METRES"),
         help="straight distance between the camera at two times, seconds; repeatable",
@@ -62,7 +64,7 @@ def add_scale_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _metres(text: str) -> float:
-    value = float(text)
+    value = number(text)
     if not 0 < value < 1e6:
         raise argparse.ArgumentTypeError(f"must be more than 0, got {text[:60]}")
     return value

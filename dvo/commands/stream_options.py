@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from dvo.core.command_line import whole
+
 
 def add_stream_options(parser: argparse.ArgumentParser) -> None:
     """Add the options.
@@ -20,7 +22,7 @@ def add_stream_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _length(text: str) -> int:
-    value = int(text)
+    value = whole(text)
     if not 0 <= value <= 100_000:
         raise argparse.ArgumentTypeError(f"must be 0 to 100000, got {text[:60]}")
     return value

@@ -14,7 +14,7 @@ from dvo.commands.console import device_of, say, warn
 from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
 from dvo.core.text import print_line
-from dvo.data.files.output import check_place, replaced
+from dvo.data.files.output import check_place, replaced, spelled_in_text
 from dvo.synth import FAMILIES, MeshScene, load_mesh
 from dvo.synth.export import export_sequence, mesh_sequence
 from dvo.synth.preview import contact_sheet, family_sheet, sequence_rows
@@ -62,8 +62,8 @@ def preview(arguments: argparse.Namespace) -> int:
         mesh, form = _mesh(arguments, arguments.source), SequenceFormat(60, height, width, fps=10)
         sequences = [mesh_sequence(mesh, arguments.seed + i, form) for i in range(rows)]
         sheet = np.concatenate([sequence_rows(sequence) for sequence in sequences])
-    with replaced(out) as part:
-        if not cv2.imwrite(str(part), sheet[..., ::-1]):
+    with replaced(out) as part, spelled_in_text(part) as name:
+        if not cv2.imwrite(name, sheet[..., ::-1]):
             raise DvoError("cannot be written", file=out, field="--out", remedy="name a file elsewhere")
     say(f"{out}: frames, depth (near is red), flow (hue is direction), path from above")
     return 0

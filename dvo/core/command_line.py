@@ -18,13 +18,37 @@ class OneLineParser(argparse.ArgumentParser):
         self.exit(BAD_ARGUMENT, printable(f"{self.prog}: error: {message} (see {self.prog} --help)") + "\n")
 
 
+def whole(text: str) -> int:
+    """Whole number; a type of arguments.
+
+    Args:
+        text: of the command line.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a whole number, got {text[:60]!r}") from None
+
+
+def number(text: str) -> float:
+    """Number; a type of arguments.
+
+    Args:
+        text: of the command line.
+    """
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number, got {text[:60]!r}") from None
+
+
 def positive_int(text: str) -> int:
     """Whole number of at least 1; a type of arguments.
 
     Args:
         text: of the command line.
     """
-    value = int(text)
+    value = whole(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"must be 1 or more, got {text}")
     return value
@@ -36,7 +60,7 @@ def positive_float(text: str) -> float:
     Args:
         text: of the command line.
     """
-    value = float(text)
+    value = number(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"must be more than 0, got {text}")
     return value
@@ -48,7 +72,7 @@ def seed(text: str) -> int:
     Args:
         text: of the command line.
     """
-    value = int(text)
+    value = whole(text)
     if not 0 <= value < 2**63:
         raise argparse.ArgumentTypeError(f"must be 0 or more and below 2^63, got {text[:60]}")
     return value

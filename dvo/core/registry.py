@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import Any
 
 from dvo.core.errors import DvoError
+from dvo.core.text import choice
 
 
 class Registry:
@@ -81,7 +82,7 @@ class Registry:
         """
         targets = self._all()
         if name not in targets:
-            raise DvoError(f"no {self.kind} '{name}'", field=self.kind, remedy=f"use one of {', '.join(targets)}")
+            raise DvoError(f"no {self.kind} '{name}'", field=self.kind, remedy=choice(name, targets))
         return targets[name]
 
     def resolve(self, name: str) -> Any:

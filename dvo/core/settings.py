@@ -11,6 +11,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from dvo.core.errors import DvoError
+from dvo.core.text import choice
 from dvo.core.yaml_files import parse_yaml, read_yaml
 
 T = TypeVar("T")
@@ -72,7 +73,7 @@ def check_settings(settings: Any, ranges: Mapping[str, Range]) -> None:
                 f"must be a {kind.__name__}, got {shown(value)}", field=item.name, remedy="see its description"
             )
         if get_origin(kind) is Literal and not (isinstance(value, str) and value in get_args(kind)):
-            remedy = f"use one of {', '.join(map(str, get_args(kind)))}"
+            remedy = choice(value, map(str, get_args(kind)))
             raise DvoError(f"unknown: {shown(value)}", field=item.name, remedy=remedy)
         if item.name in ranges:
             low, high = ranges[item.name]
@@ -186,7 +187,7 @@ def check_names(kind: type, values: Mapping[str, Any]) -> None:
     unknown = sorted(set(values) - set(names))
     if unknown:
         raise DvoError(
-            f"unknown setting of {kind.__name__}", field=", ".join(unknown), remedy=f"use one of {', '.join(names)}"
+            f"unknown setting of {kind.__name__}", field=", ".join(unknown), remedy=choice(unknown[0], names)
         )
 
 
@@ -230,7 +231,7 @@ def from_table(kind: type[T], entry: Any, file: Path, place: str = "") -> T:
     known = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
     unknown = [name for name in entry if name not in known]
     if unknown:
-        remedy = f"known are {', '.join(sorted(known))}"
+        remedy = choice(unknown[0], sorted(known), "known are")
         raise DvoError(f"unknown setting {_brief(unknown[0])}", file=file, field=place or None, remedy=remedy)
     needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
     missing = [name for name in needed if name not in entry]
@@ -269,7 +270,7 @@ def typed(value: Any, hint: Any, file: Path, field: str) -> Any:
         return None if value is None and NoneType in inner else typed(value, choices[0], file, field)
     if origin is Literal:
         if not isinstance(value, str) or value not in inner:
-            remedy = f"choose one of {', '.join(map(str, inner))}"
+            remedy = choice(value, map(str, inner), "choose one of")
             raise DvoError(f"unknown: {_brief(value)}", file=file, field=field, remedy=remedy)
         return value
     if origin is dict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import sys
 import traceback
@@ -31,6 +32,24 @@ _SECRET_PARTS = (
 _SECRET_NAMES = ("code", "pin", "otp", "sid", "k", "p", "pw", "s", "st", "u", "hdnts", "hdnea")
 _PIECE = 5000  # characters of a line that are looked at together
 _LONG = 20  # characters of a value that is taken for a secret whatever its name
+
+
+def choice(name: object, names: Iterable[str], lead: str = "use one of") -> str:
+    """Remedy for a name that is not known: the nearest one that is, and all of them.
+
+    Args:
+        name: as given.
+        names: those that are known.
+        lead: words before all of them.
+
+    Example:
+        >>> choice("pathces", ["pixels", "patches"])
+        "did you mean 'patches'? Use one of pixels, patches"
+    """
+    known = list(names)
+    near = difflib.get_close_matches(str(name)[:100], known, 1)
+    listed = f"{lead} {', '.join(known)}"
+    return f"did you mean '{near[0]}'? {listed[0].upper()}{listed[1:]}" if near else listed
 
 
 def redacted(text: str, whole: bool = False) -> str:

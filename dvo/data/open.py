@@ -14,6 +14,7 @@ from dvo.data.calibration.focal_guess import guess_focal
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
+from dvo.data.images.halves import two_views
 from dvo.data.images.reduction import MAX_PIXELS, reduction_to
 from dvo.data.interval import Bound, Interval, expected_frames
 from dvo.data.mask import open_masks
@@ -58,7 +59,7 @@ def open_source(
         source: path to a file or folder.
         calib: calibration that wins over the dataset's own; see
             :func:`dvo.data.calibration.read.read_calibration`.
-        times: file with the time of every image in its first column.
+        times: file with the time of every image, see :func:`dvo.data.files.clock.clock_of_rows`.
         fps: frames a second, where nothing else gives times; for a video it overrides the container.
         stride: read every ``stride``-th frame.
         groundtruth: TUM trajectory (camera to world), or a format without times for the images of a folder, see
@@ -140,6 +141,13 @@ def open_source(
         what = "images are" if recording.images else "video is"
         doubts.append(f"the {what} turned by {recording.turned} degrees: the readout of the calibration was not used")
     camera = calibration.camera(width, height)
+    halves = two_views(first.image)
+    if halves is not None:
+        part = "iw/2:ih:0:0" if halves == "side by side" else "iw:ih/2:0:0"
+        doubts.append(
+            f"the halves of the images look alike, {halves}: if this is stereo, track one of them "
+            f"(ffmpeg -vf crop={part})"
+        )
     reduction = reduction_to(max_pixels, width, height)
     size, masks = (width, height), None
     if mask is not None:

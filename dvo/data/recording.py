@@ -17,7 +17,7 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import exists
 from dvo.data.frame import InertialSamples
 from dvo.data.images.images import converted, decode, read_image, used_bits
-from dvo.data.images.orientation import common_orientation, turn
+from dvo.data.images.orientation import check_zoom, common_orientation, turn
 from dvo.data.images.reduction import Reduction
 from dvo.data.interval import Interval
 from dvo.data.sensors.depth import read_depth
@@ -268,6 +268,7 @@ class ImageRecording:
         self.timestamps: np.ndarray = np.asarray(timestamps, dtype=np.float64)[later]
         self.frame_count: int | None = len(self.images)
         self._is_transparent = False
+        check_zoom(self.images, self.warnings)
         has_others = self.sensors.depth is not None or self.sensors.right is not None
         self.orientation = 1 if has_others else common_orientation(self.images, self.warnings)
 

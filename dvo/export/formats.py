@@ -96,8 +96,25 @@ def export_graph(graph: KeyframeGraph, segment: int, format: str, folder: Path |
     """
     from dvo.export.reconstruction import reconstruct
 
+    MAP_FORMATS.target(format)
+    return write_reconstruction(reconstruct(graph, segment), format, folder)
+
+
+def write_reconstruction(reconstruction: Reconstruction, format: str, folder: Path | str) -> Reconstruction:
+    """Write images, cameras and points.
+
+    Args:
+        reconstruction: to write.
+        format: name in :data:`MAP_FORMATS`.
+        folder: new or empty folder.
+
+    Returns:
+        The same.
+
+    Raises:
+        DvoError: an unknown format, or a folder that is not empty or cannot be written.
+    """
     write: Callable[[Reconstruction, Path], None] = MAP_FORMATS.resolve(format)
-    reconstruction = reconstruct(graph, segment)
     with _written(Path(folder)) as part:
         write(reconstruction, part)
     return reconstruction

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 from dataclasses import dataclass
@@ -126,8 +127,29 @@ def find_weights(name_or_file: str | Path) -> Path:
     shipped = FOLDER / f"{name_or_file}.safetensors"
     if path.name == str(name_or_file) and shipped.is_file():
         return shipped
-    names = ", ".join(sorted(p.stem for p in FOLDER.glob("*.safetensors"))) or "none"
-    raise DvoError("no such weights", file=name_or_file, remedy=f"give a file, or one of: {names}")
+    names = sorted(p.stem for p in FOLDER.glob("*.safetensors"))
+    near = difflib.get_close_matches(str(name_or_file)[:100], names, 1)
+    hint = f"did you mean '{near[0]}'? Give" if near else "give"
+    raise DvoError(
+        "no such weights", file=name_or_file, remedy=f"{hint} a file, or one of: {', '.join(names) or 'none'}"
+    )
+
+
+def architecture_of(name_or_file: str | Path) -> str:
+    """Architecture that a weights file names, without reading its tensors.
+
+    Args:
+        name_or_file: shipped weights by name, or a safetensors file.
+
+    Raises:
+        DvoError: no such file, or not safetensors.
+    """
+    path = find_weights(name_or_file)
+    try:
+        with safe_open(path, framework="pt") as file:
+            return str((file.metadata() or {}).get("architecture", DEFAULT_ARCHITECTURE))
+    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
+        raise DvoError("not a safetensors file", file=path, remedy="give dvo weights") from error
 
 
 def _open(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

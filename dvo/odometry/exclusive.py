@@ -6,8 +6,9 @@ import os
 import threading
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
+from dvo.core.context import in_own_context, own_context
 from dvo.core.errors import DvoError
 from dvo.core.threads import use_threads
 
@@ -24,7 +25,7 @@ def exclusive(cls: type[T]) -> type[T]:
     that one has ended: ``current`` and ``save`` see the state between two frames. Attributes are not protected. The
     lock is an attribute of the object, which its constructor makes first. In a forked process that cannot compute
     (:func:`dvo.core.threads.use_threads`), or that was forked while another thread was in a method, all of them raise a
-    :class:`DvoError`.
+    :class:`DvoError`. They compute in :func:`dvo.core.context.own_context`.
 
     Args:
         cls: any of the methods may be missing.
@@ -45,14 +46,58 @@ def exclusive(cls: type[T]) -> type[T]:
     changed = {name: _locked(vars(cls)[name]) for name in METHODS if name in vars(cls)}
     for name, method in {"__init__": _with_lock(cls.__init__), **changed}.items():
         setattr(cls, name, method)
+    return described(cls)
+
+
+def sheltered(cls: type[T]) -> type[T]:
+    """Let an odometry without a lock compute in :func:`dvo.core.context.own_context`: a class decorator.
+
+    Args:
+        cls: any of the methods may be missing.
+
+    Returns:
+        The same class.
+    """
+    for name in ("__init__", *METHODS):
+        if name in vars(cls):
+            setattr(cls, name, in_own_context(vars(cls)[name]))
+    return described(cls)
+
+
+def described(cls: type[T]) -> type[T]:
+    """Give an odometry a short ``repr``, and let copying it be an error with a remedy: a class decorator.
+
+    Args:
+        cls: whose objects have ``name``.
+
+    Returns:
+        The same class.
+    """
+    for name, method in {"__repr__": _short, "__getstate__": _no_state}.items():
+        setattr(cls, name, method)
     return cls
+
+
+def _short(self: Any) -> str:
+    gate = getattr(self, "gate", None) or getattr(self, "_gate", None)
+    state = "" if gate is None else ", finished" if gate.finished else ""
+    return f"<{type(self).__name__} {getattr(self, 'name', '')}{state}>"
+
+
+def _no_state(self: Any) -> NoReturn:
+    raise DvoError(
+        "an odometry is not copied or pickled: it holds a sequence, with threads and locks of its own",
+        field=type(self).__name__,
+        remedy="build another one (dvo.load), or save its map and load that (save, dvo.load_map)",
+    )
 
 
 def _with_lock(construct: Callable[..., None]) -> Callable[..., None]:
     @wraps(construct)
     def call(self: Any, *args: Any, **keywords: Any) -> None:
         self._lock, self._lock_process = threading.RLock(), os.getpid()
-        construct(self, *args, **keywords)
+        with own_context():
+            construct(self, *args, **keywords)
 
     return call
 
@@ -74,7 +119,7 @@ def _locked(method: Callable[..., Any]) -> Callable[..., Any]:
         use_threads()
         if self._lock_process != os.getpid():
             _check_forked(self._lock)
-        with self._lock:
+        with self._lock, own_context():
             return method(self, *args, **keywords)
 
     return call

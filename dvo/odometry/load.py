@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from dvo.core.arguments import checked_arguments
+from dvo.core.context import in_own_context
+from dvo.core.errors import DvoError
+from dvo.core.registry import resolve_target
 from dvo.core.settings import check_seed
 from dvo.core.threads import settle_threads
-from dvo.models.weights import FOLDER, LoadedWeights, load_weights
+from dvo.models.weights import FOLDER, LoadedWeights, architecture_of, load_weights
 from dvo.odometry.patch.config import PRESETS, TRACKER_PRESETS, TrackerConfig, with_changes
 from dvo.odometry.protocol import Odometry
 from dvo.odometry.registry import SYSTEMS, build_system, odometry_builder
@@ -20,6 +25,7 @@ if TYPE_CHECKING:
 
 
 @partial(checked_arguments, skip=("seed",))
+@in_own_context
 def load(
     weights: str = "small",
     *,
@@ -62,10 +68,12 @@ def load(
     if isinstance(weights, str) and weights in SYSTEMS and not (FOLDER / f"{weights}.safetensors").is_file():
         check_seed(seed)
         return build_system(weights, seed, overrides if config is None else {"config": config, **overrides})
+    check_early(weights, config, overrides)
     return build_odometry(load_weights(weights, device), device=device, seed=seed, config=config, **overrides)
 
 
 @partial(checked_arguments, skip=("seed",))
+@in_own_context
 def build_odometry(
     weights: LoadedWeights,
     *,
@@ -92,6 +100,36 @@ def build_odometry(
     check_seed(seed)
     builder = odometry_builder(weights.architecture)
     return builder(weights, device=device, seed=seed, config=config, **overrides)
+
+
+SETTINGS = {
+    "patch_vo": "dvo.odometry.patch.config:TrackerConfig",
+    "droid": "dvo.odometry.droid.config:DenseConfig",
+    "deepvo": "dvo.odometry.two_frame.deepvo:RegressionConfig",
+    "tartanvo": "dvo.odometry.two_frame.tartanvo:TwoFrameConfig",
+}
+"""Architecture to the settings of its odometry, whose module has their ``PRESETS``."""
+
+
+def check_early(weights: str, config: Any, overrides: Mapping[str, Any]) -> None:
+    """Check preset and settings of :func:`load` before the weights are read.
+
+    Args:
+        weights: name or file; one that cannot be read is left to :func:`dvo.models.weights.load_weights`.
+        config, overrides: of :func:`load`.
+
+    Raises:
+        DvoError: no such preset, an unknown or invalid setting.
+    """
+    try:
+        target = SETTINGS.get(architecture_of(weights))
+    except DvoError:
+        return
+    if config is not None or target is None:
+        return
+    settings = resolve_target(target, "settings")
+    changes = dict(overrides)
+    with_changes(settings(), changes.pop("preset", "default"), sys.modules[settings.__module__].PRESETS, changes)
 
 
 @partial(checked_arguments, skip=("preset",))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from dvo.core.arguments import checked_arguments
+from dvo.core.context import in_own_context
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_seed
 from dvo.core.threads import settle_threads
@@ -30,6 +31,7 @@ from dvo.odometry.patch.tracker import PatchOdometry
 
 
 @partial(checked_arguments, skip=("seed", "preset"))
+@in_own_context
 def load_map(
     file: str | Path,
     *,

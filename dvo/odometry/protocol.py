@@ -15,6 +15,7 @@ import numpy as np
 
 from dvo.data.frame import Frame, Lazy, LazyNumber
 from dvo.data.trajectory import Trajectory
+from dvo.geometry.poses import pose_matrices
 from dvo.odometry.quality import Quality
 
 
@@ -69,6 +70,11 @@ class Estimate:
     reference: Lazy[float] = Lazy()  # noqa: RUF009
 
     @property
+    def matrix(self) -> np.ndarray | None:
+        """``(4, 4)`` float64 camera to world, the pose as a matrix; None without one."""
+        return None if self.pose_wc is None else pose_matrices(self.pose_wc)
+
+    @property
     def position_sigma(self) -> float | None:
         """Standard deviation of the position relative to the reference, units of the segment: root of the trace."""
         covariance = self.covariance
@@ -79,6 +85,11 @@ class Estimate:
         """Standard deviation of the rotation relative to the reference, degrees: root of the trace."""
         covariance = self.covariance
         return None if covariance is None else float(np.rad2deg(np.sqrt(np.trace(covariance[3:, 3:]))))
+
+    def __repr__(self) -> str:
+        where = self.reason if self.pose_wc is None else f"x y z {np.array2string(self.pose_wc[:3], precision=3)}"
+        rest = "".join(f", {part}" for part in (where, f"segment {self.segment}" if self.segment else "") if part)
+        return f"Estimate({self.timestamp:.3f} s, {self.status}{rest})"
 
     def __getstate__(self) -> dict[str, Any]:
         """State for pickling and copying: values in place of functions that would give them."""
@@ -139,6 +150,10 @@ class Segment:
     joined_to: int | None = None
     in_map: bool = False
 
+    def __repr__(self) -> str:
+        joined = "" if self.joined_to is None else f", joined to {self.joined_to}"
+        return f"Segment({len(self)} poses, {self.start:.3f} to {self.end:.3f} s{joined}{', in the map' * self.in_map})"
+
     def __len__(self) -> int:
         return len(self.trajectory)
 
@@ -196,6 +211,12 @@ class Result:
         if not self.segments and len(times):
             only = Segment(self.trajectory, float(times[0]), float(times[-1]))
             object.__setattr__(self, "segments", (only,))
+
+    def __repr__(self) -> str:
+        count = len(self.segments)
+        verdict = "" if self.quality is None else f", {self.quality.verdict}"
+        parts = f"{count} segment{'s' * (count != 1)}, {len(self.map.points)} map points{verdict}"
+        return f"Result({self.frames_tracked} of {self.frames_read} frames tracked, {parts})"
 
     @property
     def frames_tracked(self) -> int:

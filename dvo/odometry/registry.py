@@ -8,6 +8,7 @@ from typing import Any, Protocol, cast
 
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
+from dvo.core.text import choice
 from dvo.models.weights import LoadedWeights
 from dvo.odometry.protocol import Odometry
 
@@ -101,5 +102,5 @@ def build_system(name: str, seed: int, settings: Mapping[str, Any]) -> Odometry:
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):
         unknown = sorted(set(settings) - set(taken))
         if unknown:
-            raise DvoError(f"unknown setting of {name}", field=unknown[0], remedy=f"use one of {', '.join(taken)}")
+            raise DvoError(f"unknown setting of {name}", field=unknown[0], remedy=choice(unknown[0], taken))
     return cast(Odometry, build(**({"seed": seed} if "seed" in taken else {}), **settings))

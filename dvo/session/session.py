@@ -60,6 +60,7 @@ def run(
     on_frame: FrameCallback | None = None,
     should_stop: Callable[[], bool] | None = None,
     in_haste: Callable[[], bool] | None = None,
+    on_phase: Callable[[str], None] | None = None,
     strict: bool = False,
     again: Callable[[], Odometry] | None = None,
 ) -> Run:
@@ -79,6 +80,7 @@ def run(
             KeyboardInterrupt ends tracking too.
         in_haste: asked when tracking has been stopped; True takes the result so far in place of the final optimisation,
             from an odometry that has one (:class:`dvo.odometry.protocol.Interim`), with a warning.
+        on_phase: called with ``adjusting`` before the final optimisation, and with ``checking`` before a second run.
         strict: raise errors and interruptions instead.
         again: builds the odometry with another seed. Where the result leaves doubt, and the source can be read again,
             its beginning is tracked a second time, backward, and compared (:mod:`dvo.session.second_run`).
@@ -123,6 +125,8 @@ def run(
     elif not feeding.frames_read:
         raise DvoError("no frames", file=getattr(source, "name", None), remedy="give a video or a folder with images")
 
+    tell = on_phase or (lambda phase: None)
+    tell("adjusting")
     started = time.perf_counter()
     if interrupted and in_haste is not None and in_haste() and isinstance(odometry, Interim):
         result = odometry.current()
@@ -131,6 +135,7 @@ def run(
         result = odometry.finish()
     feeding.seconds["finishing"] = time.perf_counter() - started
     if again is not None and not interrupted and is_due(result, source):
+        tell("checking")
         started = time.perf_counter()
         stop = should_stop or (lambda: False)
         with contextlib.suppress(DvoError, OSError, KeyboardInterrupt):  # the result stands without it

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dvo.core.errors import DvoError
-from dvo.data.files.output import new_folder
+from dvo.data.files.output import new_folder, spelled_in_text
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import NED_FROM_CAMERA, invert_rodrigues, pose_matrices, poses_from_matrices, split
@@ -161,7 +161,9 @@ def _frames(sequence: SyntheticSequence, on_frame: Callable[[int], None] | None)
 
 def _write_picture(path: Path, picture: Array) -> None:
     picture = picture[..., ::-1] if picture.ndim == 3 else picture
-    if not cv2.imwrite(str(path), picture):
+    with spelled_in_text(path) as name:
+        is_written = cv2.imwrite(name, picture)
+    if not is_written:
         raise DvoError("cannot be written", file=path, remedy="name a folder elsewhere")
 
 

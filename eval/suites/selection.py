@@ -42,17 +42,22 @@ def load_suites(names: list[str], only: list[str] | None = None, stride: int | N
 
 
 def suite_of_folder(path: Path) -> Suite:
-    """A suite of the one sequence in a folder (TUM, EuRoC, KITTI, TartanAir, or images with ``groundtruth_tum.txt``).
+    """A suite of the one sequence in a folder (TUM, EuRoC, KITTI, TartanAir, or images with ``groundtruth_tum.txt``),
+    or of the sequences in its subfolders, by name.
 
     Args:
         path: of the folder.
 
     Raises:
-        DvoError: the folder has none of these layouts.
+        DvoError: neither the folder nor one of its subfolders has one of these layouts.
     """
+    if not is_dataset(path) and (inner := [one for one in sorted(path.iterdir()) if one.is_dir() and is_dataset(one)]):
+        name = path.resolve().name
+        sequences = tuple(Sequence(one.name, str(one.resolve())) for one in inner)
+        return Suite(name, f"the user's own sequences in {name}", sequences, time_limit=7200.0)
     if not is_dataset(path):
         raise DvoError(
-            "no sequence in this folder",
+            "no sequence in this folder or its subfolders",
             file=path,
             field="--suite",
             remedy="give a sequence with ground truth in the layout of TUM, EuRoC, KITTI or TartanAir",

@@ -155,3 +155,63 @@ def test_turned(tmp_path, clockwise):
     assert source.turned == clockwise
     frames = list(source)
     assert max(differences(frames, [np.rot90(image, -clockwise // 90) for image in PICTURES])) < 3
+
+
+def test_trimmed_videos_are_whole_and_cut_ones_are_not(tmp_path):
+    pictures = [picture(index % 20) for index in range(60)]
+    options = ("-c:v", "libx264", "-g", 60, "-pix_fmt", "yuv420p", "-movflags", "faststart")
+    whole = encode(tmp_path / "whole.mp4", *options, pictures=pictures)
+    for start, length in (("0.7", ()), ("1.2", ("-t", "1.1"))):
+        trimmed = tmp_path / f"{start}.mov"
+        ffmpeg("-ss", start, "-i", whole, *length, "-c", "copy", trimmed)
+        source = open_source(trimmed, calib=CALIB)
+        count = len(list(source))
+        assert abs(source.frame_count - count) <= 2 and source.warnings == []
+    data = whole.read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(data[: len(data) * 7 // 10])
+    source = open_source(tmp_path / "cut.mp4", calib=CALIB)
+    assert len(list(source)) < 50 and "cut short or damaged" in " ".join(source.warnings)
+
+
+@pytest.mark.parametrize(
+    ("aspect", "calibration", "size"),
+    [
+        ("4/3", None, (213, 120)),
+        ("4/3", Calibration(100, 100, 100, 60), (213, 120)),
+        ("4/3", Calibration(75, 100, 80, 60), (160, 120)),
+        ("4/3", Calibration(75, 100, 80, 60, width=160, height=120), (160, 120)),
+        ("8/9", Calibration(100, 100, 80, 67, width=160, height=135), (160, 135)),
+        ("1/1", Calibration(100, 100, 80, 60), (160, 120)),
+    ],
+)
+def test_pixels_that_are_not_square(tmp_path, aspect, calibration, size):
+    file = encode(tmp_path / "wide.mp4", "-vf", f"setsar={aspect}", "-c:v", "libx264", "-pix_fmt", "yuv420p")
+    source = open_source(file, calib=calibration, guess=True)
+    assert (source.camera.width, source.camera.height) == size
+    assert all(frame.image.shape[1::-1] == size for frame in source)
+    assert any("not square" in warning for warning in source.warnings) == (size != (WIDTH, HEIGHT))
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+def test_names_that_are_no_utf8(tmp_path, suffix):
+    plain = encode(tmp_path / f"plain{suffix}", "-c:v", "libx264", "-pix_fmt", "yuv420p")
+    for name in (b"vid\xe9o", b"\xff\xfe/clip\xe9"):
+        file = tmp_path / (name + suffix.encode()).decode("utf-8", "surrogateescape")
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(plain.read_bytes())
+        source = open_source(file, calib=CALIB)
+        assert len(list(source)) == COUNT
+        source.name.encode("utf-8")
+
+
+@pytest.mark.parametrize(("stack", "words"), [(np.hstack, "side by side"), (np.vstack, "one above the other")])
+def test_two_views_in_one_video(tmp_path, stack, words):
+    noise = np.random.default_rng(1).integers(0, 256, (HEIGHT // 8, WIDTH // 8 + 8, 3), dtype=np.uint8)
+    texture = noise.repeat(8, 0).repeat(8, 1)
+    views = [texture[:, shift : shift + WIDTH] for shift in (0, 6)]
+    pictures = [stack(views)] * 3
+    file, size = tmp_path / "stereo.mp4", pictures[0].shape
+    ffmpeg("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[1]}x{size[0]}", "-r", FPS, "-i", "-", "-c:v", "libx264",
+           "-crf", 10, "-pix_fmt", "yuv420p", file, data=b"".join(image.tobytes() for image in pictures))  # fmt: skip
+    assert words in " ".join(open_source(file, guess=True).warnings)
+    assert not any("look alike" in text for text in open_source(encode(tmp_path / "a.mp4"), guess=True).warnings)

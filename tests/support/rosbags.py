@@ -59,9 +59,14 @@ class Bag:
         data = cv2.imencode(".png", rgb[..., ::-1])[1].ravel()
         self.write(topic, "sensor_msgs/msg/CompressedImage", stamp, format="png", data=data)
 
-    def info(self, topic, k=K, model="plumb_bob", d=PLUMB):
+    def depth(self, topic, pixels, stamp, encoding):
+        self.write(topic, "sensor_msgs/msg/Image", stamp, height=pixels.shape[0], width=pixels.shape[1],
+                   encoding=encoding, is_bigendian=0, step=pixels.strides[0],
+                   data=pixels.view(np.uint8).ravel())  # fmt: skip
+
+    def info(self, topic, k=K, model="plumb_bob", d=PLUMB, p=P):
         region = self.store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        values = {"d": np.array(d), "k": np.array(k), "r": np.eye(3).ravel(), "p": np.array(P)}
+        values = {"d": np.array(d), "k": np.array(k), "r": np.eye(3).ravel(), "p": np.array(p)}
         values = {name.upper() if self.is1 else name: value for name, value in values.items()}
         self.write(topic, "sensor_msgs/msg/CameraInfo", 100.0, height=48, width=64, distortion_model=model,
                    binning_x=0, binning_y=0, roi=region, **values)  # fmt: skip

@@ -199,7 +199,9 @@ def train() -> None:
     """
     check_files(sys.argv[1:])
     task = named_task(sys.argv[1:])
-    logging.getLogger("lightning.fabric.utilities.seed").setLevel(logging.WARNING)  # the seed is in config.yaml
+    # The seed is in config.yaml; devices that are not there, and tips, are no news.
+    for name in ("fabric.utilities.seed", "pytorch.utilities.rank_zero", "pytorch.accelerators.cuda"):
+        logging.getLogger(f"lightning.{name}").setLevel(logging.WARNING)
     TaskCLI(
         program_factory(task),
         task_class(task).data_type,

@@ -9,8 +9,11 @@ from typing import Any
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration
 from dvo.data.calibration.read import read_calibration
+from dvo.data.companions.bag_topics import CompanionTopic, depth_camera, topic_of
 from dvo.data.companions.companions import CompanionFiles, CompanionKind, files_of_frames, of_positions
 from dvo.data.opening import locate
+from dvo.data.readers.ros_images import decode_depth
+from dvo.data.readers.rosbag import BagRecording
 from dvo.data.readers.tum import DEPTH_SCALE
 from dvo.data.recording import ImageRecording
 from dvo.data.sensors.depth import read_depth
@@ -35,7 +38,8 @@ def with_depth(
 
     Args:
         source: opened with :func:`dvo.open`; not changed.
-        depth: folder of 16-bit PNG files (or other files of :func:`dvo.data.sensors.depth.read_depth`), or a list of
+        depth: of a bag the topic, None for the only one of depth; folder of 16-bit PNG files (or other files of
+        :func:`dvo.data.sensors.depth.read_depth`), or a list of
             ``time file`` rows such as ``depth.txt`` of TUM RGB-D; None for the depth that the data set has itself.
             Relative paths are looked up from the working directory, then from the source's folder.
         scale: units of a metre in integers; None for that of the data set, of a list 5000, of a folder 1000.
@@ -59,7 +63,17 @@ def with_depth(
         if not isinstance(calib, Calibration):
             calib = read_calibration(locate(calib, source.path, "depth-calib"))
         changes["depth_calibration"] = calib
-    path, recording = None if depth is None else locate(depth, source.path, "depth"), source.recording
+    recording = source.recording
+    if isinstance(recording, BagRecording) and (depth is None or not Path(depth).exists()):
+        topic = topic_of(recording, None if depth is None else str(depth), "depth")
+        if calib is None:
+            other = depth_camera(recording, topic, source.calibration)
+            changes |= {} if other is None else {"depth_calibration": other}
+        decode = partial(decode_depth, scale=scale or MILLIMETRES)
+        return source.changed(
+            stages=(*source.reading.stages, CompanionTopic(recording, topic, "depth", decode)), **changes
+        )
+    path = None if depth is None else locate(depth, source.path, "depth")
     own = recording.sensors.depth if isinstance(recording, ImageRecording) else None
     if isinstance(recording, ImageRecording) and path is None:
         if own is None:

@@ -11,6 +11,7 @@ from typing import TypeGuard, TypeVar
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig, rectified
 from dvo.data.calibration.stereo import right_camera
+from dvo.data.companions.bag_topics import CompanionTopic, rig_of_bag, topic_of
 from dvo.data.companions.companions import (
     CompanionFiles,
     CompanionKind,
@@ -21,6 +22,8 @@ from dvo.data.companions.companions import (
 from dvo.data.images.images import read_image
 from dvo.data.opening import locate
 from dvo.data.readers.registry import find_reader
+from dvo.data.readers.ros_images import decode_message
+from dvo.data.readers.rosbag import BagRecording
 from dvo.data.readers.sequence import RIGHT_OF
 from dvo.data.recording import ImageRecording, Log, RawFrame, Recording, Request, Selection
 from dvo.data.sensors.sensors import Finder
@@ -43,7 +46,8 @@ def with_right(source: Source, right: Path | str | None = None, baseline: float 
 
     Args:
         source: opened with :func:`dvo.open`, with a calibration; not changed.
-        right: folder of images, a list of ``time file`` rows, or of a video another one with the same frames; looked up
+        right: of a bag the topic; folder of images, a list of ``time file`` rows, or of a video another one with the
+        same frames; looked up
             beside the source too. None for those of the data set, or a folder with the usual name beside its images
             (``image_1`` of ``image_0``).
         baseline: metres from the left to the right camera; None for that of the calibration.
@@ -64,8 +68,14 @@ def with_right(source: Source, right: Path | str | None = None, baseline: float 
     if source.guess is not None:
         message = "a stereo pair needs the focal length, which was guessed"
         raise DvoError(message, file=source.path, field=_KIND.option, remedy="give a calibration with --calib")
-    path = None if right is None else locate(right, source.path, "right")
     recording, stages = source.recording, source.reading.stages
+    if isinstance(recording, BagRecording) and (right is None or not Path(right).exists()):
+        topic = topic_of(recording, None if right is None else str(right), "right")
+        stages = (*stages, CompanionTopic(recording, topic, "right", decode_message))
+        own = rig_of_bag(recording, topic) if baseline is None and source.calibration is recording.calibration else None
+        rig = _rig(source, baseline) if own is None else partial(_same, own)
+        return source.changed(stages=stages, rig=rig)
+    path = None if right is None else locate(right, source.path, "right")
     orientation = recording.orientation if isinstance(recording, ImageRecording) else 1
     bits = recording.bits if isinstance(recording, ImageRecording) else 16
     read = partial(read_image, reduction=None, orientation=orientation, bits=bits)
@@ -145,7 +155,7 @@ def _rig(source: Source, baseline: float | None) -> Callable[[], StereoRig]:
         found = None if given is None or given is own else right_camera(given, name)
         if found is None and source.recording.stereo is not None:
             found = source.recording.stereo()
-        if found is None and own is not None:
+        if found is None and own is not None and not isinstance(source.recording, BagRecording):
             found = right_camera(own, name)
         if found is not None:
             return partial(_same, found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,8 +16,6 @@ MAX_IMAGE_FILE = 2**29
 """Largest image file, bytes."""
 MAX_NUMBER = 1e12
 """Largest number of seconds or metres in a table: what is beyond cannot be either, and squares of it stay finite."""
-
-_NANOSECONDS = re.compile(r"[0-9]{16,19}")
 
 
 def is_file(path: Path) -> bool:
@@ -172,15 +169,6 @@ def parse_number(text: str) -> float:
     if not abs(value) <= MAX_NUMBER:  # NaN fails too
         raise ValueError("out of bounds")
     return value
-
-
-def is_nanoseconds(text: str) -> bool:
-    """True for an integer of 16 to 19 digits, which can only be nanoseconds.
-
-    Args:
-        text: of a number.
-    """
-    return _NANOSECONDS.fullmatch(text) is not None
 
 
 def parse_nanoseconds(text: str) -> int:

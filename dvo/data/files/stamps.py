@@ -110,9 +110,9 @@ def checked_rate(fps: float | None, field: str = "fps") -> float | None:
     return rate
 
 
-def _beside(folder: Path) -> list[Path]:
-    """Lists of times by their usual names, beside images and one level up."""
-    return [place / name for place in (folder, folder.parent) for name in ("times.txt", "timestamps.txt")]
+def _beside(folder: Path, name: str) -> Path | None:
+    """List of times beside images or one level up."""
+    return next((place / name for place in (folder, folder.parent) if is_file(place / name)), None)
 
 
 def choose_times(
@@ -126,8 +126,8 @@ def choose_times(
 ) -> np.ndarray:
     """Choose the times of the images of a folder.
 
-    The first of these that there is: ``times``, ``times.txt`` or ``timestamps.txt`` beside the images or one level up,
-    names that are stamps, ``fallback()``, ``fps``, and last an assumed rate, with a warning.
+    The first of these that there is: ``times``, ``times.txt`` beside the images or one level up, names that are stamps,
+    ``timestamps.txt`` at the same places, ``fallback()``, ``fps``, and last an assumed rate, with a warning.
 
     Args:
         paths: the images, in order.
@@ -147,11 +147,13 @@ def choose_times(
     if times is not None:
         return read_times(times, len(paths), warnings)
     found, origin = None, ""
-    beside = next((path for path in _beside(folder) if is_file(path)), None)
+    beside = _beside(folder, "times.txt")
     if beside is not None:
         found, origin = read_times(beside, len(paths), warnings), str(beside)
     if found is None:
         found, origin = times_from_names(paths, warnings), "the file names"
+    if found is None and (beside := _beside(folder, "timestamps.txt")) is not None:
+        found, origin = read_times(beside, len(paths), warnings), str(beside)
     if found is None:
         found, origin = fallback(), "the ground truth"
     if found is not None:

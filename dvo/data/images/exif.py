@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 _HEAD = 2**18  # bytes in which the EXIF segment begins and ends: it is at most 64 kB, and near the start
-_EXIF_IFD, _FOCAL_35MM, _ORIENTATION = 0x8769, 0xA405, 0x0112
-_INTEGERS = {3: "H", 4: "I"}
+_EXIF_IFD, _FOCAL_35MM, _ORIENTATION, _FOCAL = 0x8769, 0xA405, 0x0112, 0x920A
+_INTEGERS = {3: "H", 4: "I", 5: "I"}  # of a fraction the place
 
 
 def equivalent_focal(file: Path) -> float | None:
@@ -23,6 +23,33 @@ def equivalent_focal(file: Path) -> float | None:
     """
     focal = _read(file, _focal)
     return float(focal) if focal else None  # 0 stands for unknown
+
+
+def focal_length(file: Path) -> float | None:
+    """Read the focal length of the lens (EXIF 2.3, tag 0x920A), which optical zoom changes.
+
+    Args:
+        file: an image.
+
+    Returns:
+        Millimetres; None if the file does not state it or is no JPEG.
+    """
+
+    def value(tiff: bytes, order: str, first: int) -> int | None:
+        inner = _value(tiff, order, first, _EXIF_IFD)
+        return None if inner is None else _value(tiff, order, inner, _FOCAL)
+
+    found: list[float] = []
+
+    def parts(tiff: bytes, order: str, first: int) -> int | None:
+        at = value(tiff, order, first)
+        if at is not None:
+            above, below = struct.unpack_from(f"{order}II", tiff, at)
+            found.extend([above / below] if below else [])
+        return None
+
+    _read(file, parts)
+    return found[0] if found and found[0] > 0 else None
 
 
 def orientation(file: Path) -> int:

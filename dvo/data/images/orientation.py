@@ -9,6 +9,8 @@ import numpy as np
 from dvo.data.files.files import is_file
 from dvo.data.images import exif
 
+_LOOKED_AT = 9
+_ZOOM = 1.02  # ratio of focal lengths above which the lens has zoomed; focusing changes them less
 _MIRRORED = (2, 4, 5, 7)
 _CLOCKWISE = {1: 0, 2: 0, 3: 180, 4: 180, 5: 270, 6: 90, 7: 90, 8: 270}  # after the mirroring
 
@@ -34,6 +36,26 @@ def common_orientation(images: list[Path], warnings: list[str]) -> int:
         return found.pop()
     warnings.append("the EXIF data of the images state different orientations: they are read as stored, not turned")
     return 1
+
+
+def check_zoom(images: list[Path], warnings: list[str]) -> None:
+    """Warn of images whose EXIF data state different focal lengths: they have no calibration in common.
+
+    Args:
+        images: files in order, at least one; some of them are looked at.
+        warnings: receives a sentence.
+    """
+    some = sorted({round(k * (len(images) - 1) / (_LOOKED_AT - 1)) for k in range(_LOOKED_AT)})
+    found = [focal for focal in (_focal(images[index]) for index in some) if focal is not None]
+    if found and max(found) > _ZOOM * min(found):
+        warnings.append(
+            f"the EXIF data of the images state focal lengths from {min(found):g} to {max(found):g} mm: with zoom"
+            " no calibration fits all of them; track each part without zooming (--start, --end)"
+        )
+
+
+def _focal(file: Path) -> float | None:
+    return exif.focal_length(file) if is_file(file) else None
 
 
 def _orientation(file: Path) -> int:

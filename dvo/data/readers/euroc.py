@@ -3,10 +3,12 @@ in ``mav0``.
 
 Trap: the ground truth is the pose of the body (the inertial sensor) in the world, with the quaternion as ``w x y z``.
 ``T_BS`` in ``cam0/sensor.yaml`` takes camera coordinates to the body, so ``T_world_camera = T_world_body T_BS``.
+TUM-VI has the same layout with Kalibr's ``T_cam_imu``, the inverse, in ``dso/camchain.yaml``.
 """
 
 from __future__ import annotations
 
+import re
 from array import array
 from functools import partial
 from pathlib import Path
@@ -14,10 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.calibration.calibration import Calibration
+from dvo.core.yaml_files import read_text
+from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.euroc import read_extrinsics, read_rig
 from dvo.data.calibration.read import read_calibration
+from dvo.data.calibration.stereo import right_camera
+from dvo.data.calibration.values import load_yaml
+from dvo.data.extrinsics import pose_of_numbers
 from dvo.data.files.files import (
+    is_file,
+    is_folder,
     parse_nanoseconds,
     parse_number,
     read_lines,
@@ -32,18 +40,29 @@ from dvo.data.sensors.sensors import SameName, Sensors
 from dvo.data.trajectory import Trajectory, interpolate, unit_quaternions
 from dvo.geometry.poses import compose_poses, invert_poses
 
+_CAMERA = re.compile(r"cam[0-9]+")
 
-def _mav(path: Path) -> Path | None:
-    return next((folder for folder in (path / "mav0", path) if (folder / "cam0" / "data").is_dir()), None)
+
+def _place(path: Path) -> tuple[Path, str] | None:
+    """Folder ``mav0`` and name of the camera, for a path to the sequence, to ``mav0``, ``camN`` or ``camN/data``."""
+    mav = next((folder for folder in (path / "mav0", path) if is_folder(folder / "cam0" / "data")), None)
+    if mav is not None:
+        return mav, "cam0"
+    real = path.resolve()
+    for camera, data in ((real, real / "data"), (real.parent, real)):
+        is_camera = data.name == "data" and _CAMERA.fullmatch(camera.name) and is_folder(data)
+        if is_camera and (is_file(camera / "sensor.yaml") or is_file(camera / "data.csv")):
+            return camera.parent, camera.name
+    return None
 
 
 def matches(path: Path) -> bool:
-    """True for a folder with ``mav0/cam0/data``, or ``mav0`` itself.
+    """True for a folder with ``mav0/cam0/data``, ``mav0`` itself, or ``camN`` or ``camN/data`` beside ``sensor.yaml``.
 
     Args:
         path: existing file or folder.
     """
-    return _mav(path) is not None
+    return path.is_dir() and _place(path) is not None
 
 
 def read_state_groundtruth(path: Path) -> Trajectory:
@@ -95,34 +114,72 @@ def read_inertial(path: Path, T_camera_imu: np.ndarray | None = None) -> Inertia
     return InertialSamples(nanoseconds / 1e9, table[:, :3], table[:, 3:], T_camera_imu)
 
 
-def _inertial(mav: Path) -> InertialSamples:
-    body_camera, body_imu = (read_extrinsics(mav / name / "sensor.yaml") for name in ("cam0", "imu0"))
+def _camchain(mav: Path) -> Path | None:
+    """Kalibr's calibration of both cameras, where TUM-VI has it."""
+    options = (mav.parent / "dso" / "camchain.yaml", mav / "camchain.yaml", mav.parent / "camchain.yaml")
+    return next((option for option in options if is_file(option)), None)
+
+
+def _body_camera(mav: Path, camera: str) -> np.ndarray | None:
+    """Pose of a camera on the body, by ``sensor.yaml`` or Kalibr's ``T_cam_imu``; None if neither states it."""
+    found = read_extrinsics(mav / camera / "sensor.yaml")
+    chain = _camchain(mav)
+    if found is not None or chain is None:
+        return found
+    data = load_yaml(read_text(chain), chain)
+    entry = data.get(camera) if isinstance(data, dict) else None
+    if not isinstance(entry, dict) or entry.get("T_cam_imu") is None:
+        return None
+    try:
+        return invert_poses(pose_of_numbers(entry["T_cam_imu"], chain))
+    except DvoError as error:
+        remedy = "give a rigid 4x4 matrix, row by row"
+        raise DvoError(error.message, file=chain, field=f"{camera}.T_cam_imu", remedy=remedy) from None
+
+
+def _calibration(mav: Path, camera: str) -> Calibration | None:
+    sensor, chain = mav / camera / "sensor.yaml", _camchain(mav)
+    if is_file(sensor):
+        return read_calibration(sensor)
+    return read_calibration(chain) if chain is not None and camera == "cam0" else None
+
+
+def _rig(mav: Path) -> StereoRig | None:
+    found, calibration = read_rig(mav), _calibration(mav, "cam0")
+    return right_camera(calibration, "cam0") if found is None and calibration is not None else found
+
+
+def _inertial(mav: Path, camera: str) -> InertialSamples:
+    body_camera, body_imu = _body_camera(mav, camera), read_extrinsics(mav / "imu0" / "sensor.yaml")
+    if body_imu is None and _camchain(mav) is not None:
+        body_imu = np.array([0, 0, 0, 0, 0, 0, 1.0])
     T_camera_imu = None
     if body_camera is not None and body_imu is not None:
         T_camera_imu = compose_poses(invert_poses(body_camera), body_imu)
     return read_inertial(mav / "imu0" / "data.csv", T_camera_imu)
 
 
-def _sensors(mav: Path, request: Request) -> Sensors:
+def _sensors(mav: Path, camera: str, request: Request) -> Sensors:
     """Right images and inertial samples, where there are files of them; nothing is read yet."""
     # times that the user named need not be on the clock of the inertial sensor
     has_inertial = (mav / "imu0" / "data.csv").is_file() and request.times is None
-    inertial = partial(_inertial, mav) if has_inertial else None
-    if not (mav / "cam1" / "data").is_dir():
+    inertial = partial(_inertial, mav, camera) if has_inertial else None
+    if camera != "cam0" or not (mav / "cam1" / "data").is_dir():
         return Sensors(inertial=inertial)
-    return Sensors(right=SameName(mav / "cam1" / "data"), stereo=partial(read_rig, mav), inertial=inertial)
+    return Sensors(right=SameName(mav / "cam1" / "data"), stereo=partial(_rig, mav), inertial=inertial)
 
 
-def _groundtruth(mav: Path, timestamps: np.ndarray, warnings: list[str]) -> Trajectory | None:
-    folder = mav / "state_groundtruth_estimate0"
-    if not (folder / "data.csv").is_file():
+def _groundtruth(mav: Path, camera: str, timestamps: np.ndarray, warnings: list[str]) -> Trajectory | None:
+    folders = (mav / name for name in ("state_groundtruth_estimate0", "mocap0"))
+    folder = next((folder for folder in folders if is_file(folder / "data.csv")), None)
+    if folder is None:
         return None
-    body_camera = read_extrinsics(mav / "cam0" / "sensor.yaml")
+    body_camera = _body_camera(mav, camera)
     if body_camera is None:
-        warnings.append("cam0/sensor.yaml has no T_BS: ground truth of the body was not used for the camera")
+        warnings.append(f"{camera}/sensor.yaml has no T_BS: ground truth of the body was not used for the camera")
         return None
     body_marker = read_extrinsics(folder / "sensor.yaml")  # the identity in EuRoC, not in every copy of the layout
-    if body_marker is not None:
+    if body_marker is not None and folder.name != "mocap0":
         body_camera = compose_poses(invert_poses(body_marker), body_camera)
     bodies = interpolate(read_state_groundtruth(folder / "data.csv"), timestamps)
     if len(bodies) < len(timestamps):
@@ -154,35 +211,39 @@ def _images(camera: Path, warnings: list[str]) -> tuple[list[Path], np.ndarray |
 
 
 def open_euroc(path: Path, request: Request) -> Recording:
-    """Read the left camera of a sequence in EuRoC's layout; ground truth is that of the camera, at the images' times.
+    """Read one camera of a sequence in EuRoC's layout, ``cam0`` unless another is named; also of TUM-VI, whose
+    calibration is ``dso/camchain.yaml`` and whose ground truth is ``mocap0``. Ground truth is that of the camera, at
+    the images' times.
 
-    Frames carry the image of ``cam1`` of the same name (undistorted, not rectified) and the samples of ``imu0``.
+    Frames of ``cam0`` carry the image of ``cam1`` of the same name (undistorted, not rectified), and frames the
+    samples of ``imu0``.
 
     Args:
-        path: folder that holds ``mav0``, or ``mav0``.
+        path: folder that holds ``mav0``, ``mav0``, the folder of a camera in it, or its ``data``.
         request: options of the user.
 
     Raises:
         DvoError: no images, or a malformed file.
     """
-    mav = _mav(path)
-    if mav is None:
+    place = _place(path)
+    if place is None:
         raise DvoError("not a EuRoC sequence", file=path, remedy="give the folder that holds mav0")
+    mav, camera = place
     warnings: list[str] = []
-    images, listed = _images(mav / "cam0", warnings)
+    images, listed = _images(mav / camera, warnings)
     if listed is None:
-        times = choose_times(images, mav / "cam0" / "data", times=request.times, fps=request.fps, warnings=warnings)
+        times = choose_times(images, mav / camera / "data", times=request.times, fps=request.fps, warnings=warnings)
     else:
-        times = listed if request.times is None else read_times(request.times, len(images))
+        times = listed if request.times is None else read_times(request.times, len(images), warnings)
         if request.fps is not None:
-            warnings.append("--fps was not used: the times come from cam0/data.csv")
-    sensor = mav / "cam0" / "sensor.yaml"
-    calibration: Calibration | None = read_calibration(sensor) if sensor.is_file() else None
-    groundtruth = _groundtruth(mav, times, warnings)
+            warnings.append(f"--fps was not used: the times come from {camera}/data.csv")
+    groundtruth = _groundtruth(mav, camera, times, warnings)
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else None
+    if path.resolve().name == "data" and name is None:
+        name = mav.resolve().name
     return ImageRecording(
-        "euroc", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings, name=name,
-        sensors=_sensors(mav, request),
+        "euroc", path, images, times, calibration=_calibration(mav, camera), groundtruth=groundtruth, warnings=warnings,
+        name=name, sensors=_sensors(mav, camera, request),
     )  # fmt: skip
 
 

@@ -13,9 +13,10 @@ _BUILT_IN = {
     "video": "dvo.data.readers.video:READER",
     "euroc": "dvo.data.readers.euroc:READER",
     "kitti": "dvo.data.readers.kitti:READER",
+    "kitti_raw": "dvo.data.readers.kitti_raw:READER",
     "tartanair": "dvo.data.readers.tartanair:READER",
-    "tum": "dvo.data.readers.tum:READER",
     "icl_nuim": "dvo.data.readers.icl_nuim:READER",
+    "tum": "dvo.data.readers.tum:READER",
     "sequence": "dvo.data.readers.sequence:READER",
     "folder": "dvo.data.readers.folder:READER",
 }

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ from dvo.data.calibration.values import from_values
 from dvo.data.files.files import MAX_NUMBER, is_file, lookups
 from dvo.data.files.stamps import checked_rate, read_times
 from dvo.data.frame import InertialSamples
-from dvo.data.readers.ros_images import decode_message
+from dvo.data.images.images import used_bits
+from dvo.data.readers.ros_images import decode_message, raw_levels
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_LOOKED_AT = 5  # images of 16 bits whose largest values are compared
 INFO, IMU = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu"
 
 
@@ -85,9 +88,20 @@ def _seconds(message: Any) -> float:
     return message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
 
 
+def is_depth(topic: str) -> bool:
+    """True for the name of a topic of depth images.
+
+    Args:
+        topic: its name.
+    """
+    return "depth" in topic.lower()
+
+
 def _choose_topic(path: Path, topics: dict[str, Any], asked: str | None) -> str:
     found = {name: info.msgcount for name, info in topics.items() if info.msgtype in IMAGES and info.msgcount}
-    found = {name: count for name, count in found.items() if not name.endswith("/compressedDepth")}
+    others = {name: count for name, count in found.items() if not is_depth(name)}
+    if asked is None and others:
+        found = others
     listed = ", ".join(f"{name} ({count})" for name, count in sorted(found.items())) or "none"
     if asked is not None:
         asked = f"/{asked.lstrip('/')}"
@@ -125,7 +139,18 @@ class BagRecording:
             topics = reader.topics
             self.topic = _choose_topic(path, topics, request.topic)
             self.frame_count: int | None = topics[self.topic].msgcount
-            self._times = read_times(request.times, self.frame_count) if request.times is not None else None
+            self.image_topics = {
+                n: info.msgcount for n, info in topics.items() if info.msgtype in IMAGES and info.msgcount
+            }
+            seconds = (reader.end_time - reader.start_time) / 1e9
+            self.reach = max(0.5 * seconds / max(topics[self.topic].msgcount, 1), 1e-3)
+            self._times = (
+                read_times(request.times, self.frame_count, self.warnings) if request.times is not None else None
+            )
+            self._bits = self._used_bits(reader)
+            beside = sorted(name for name in self.image_topics if is_depth(name) and name != self.topic)
+            if beside:
+                self.warnings.append(f"reading {self.topic}; depth is beside it for --depth: {', '.join(beside)}")
             first = _first(reader, self.topic)
             self._stamped = first is not None and _seconds(first) > 0
             self.calibration: Calibration | None = None
@@ -142,26 +167,67 @@ class BagRecording:
             partial(read_inertial, path, imu[0]) if is_usable else None
         )
 
+    def _used_bits(self, reader: Any) -> int:
+        """Bits that images of 16 bits use, by the first ones."""
+        some = islice(_messages(reader, self.topic), _LOOKED_AT)
+        messages = (reader.deserialize(data, connection.msgtype) for connection, _, data in some)
+        bits = used_bits(raw_levels(message, str(self.path)) for message in messages)
+        if bits < 16:
+            factor = 2 ** (bits - 8)
+            self.warnings.append(f"the images of 16 bits hold {bits} bits: they are divided by {factor}, not by 257")
+        return bits
+
+    def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
+        """Messages of a topic in the order of recording.
+
+        Args:
+            topic: of the bag.
+
+        Yields:
+            Seconds of the header, or of recording where the images are timed by it, and the message.
+        """
+        with _opened(self.path) as reader:
+            for connection, recorded, data in _messages(reader, topic):
+                message = reader.deserialize(data, connection.msgtype)
+                yield (_seconds(message) if self._stamped else recorded / 1e9), message
+
+    def camera_info(self, topic: str) -> Any:
+        """Message of the ``camera_info`` topic in the namespace of a topic of images.
+
+        Args:
+            topic: of images.
+
+        Returns:
+            The first message; None if there is none.
+        """
+        name = _info_topic(topic)
+        with _opened(self.path) as reader:
+            return _first(reader, name) if name in reader.topics and reader.topics[name].msgtype == INFO else None
+
+    def stamp(self, index: int, timestamp: float) -> float | None:
+        """Seconds of the clock of the bag of a frame.
+
+        Args:
+            index: of the frame.
+            timestamp: that it has.
+
+        Returns:
+            None if the user gave the times or a rate: frames of other topics then belong to them by order.
+        """
+        return timestamp if self._times is None and self._fps is None else None
+
     def _read_calibration(self, reader: Any, topics: dict[str, Any]) -> Calibration | None:
         """Calibration of the ``camera_info`` topic in the namespace of the images, if there is one."""
-        parts = self.topic.removesuffix("/compressed").split("/")
-        name = "/".join([*parts[:-1], "camera_info"])
+        parts, name = self.topic.removesuffix("/compressed").split("/"), _info_topic(self.topic)
         info = _first(reader, name) if name in topics and topics[name].msgtype == INFO else None
         if info is None:
             return None
-        ros1 = hasattr(info, "K")
-        k, d, p = (list(getattr(info, key if ros1 else key.lower())) for key in "KDP")
-        values: dict[str, Any] = {"camera_matrix": k, "distortion_model": info.distortion_model, "D": d}
-        if "rect" in parts[-1]:
-            values = {"camera_matrix": [*p[0:3], *p[4:7], *p[8:11]]}
-        if not min(values["camera_matrix"][0], values["camera_matrix"][4]) > 0:
-            self.warnings.append(f"{name} is not calibrated")
-            return None
-        size = {key: getattr(info, key) for key in ("width", "height") if getattr(info, key)}
         try:
-            return from_values({**values, **(size if len(size) == 2 else {})}, self.path)
+            return calibration_of_info(info, parts[-1], self.path)
         except DvoError as error:
-            self.warnings.append(f"{name} was not used: {error.message}")
+            self.warnings.append(
+                f"{name} {error.message}" if error.field == "K" else f"{name} was not used: {error.message}"
+            )
             return None
 
     def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
@@ -185,7 +251,7 @@ class BagRecording:
                     late = True
                     continue
                 origin = f"{self.path} {self.topic} image {index}"
-                image = decode_message(message, origin)
+                image = decode_message(message, origin, self._bits)
                 if image is None:
                     log.unreadable.append(f"image {index}")
                     continue
@@ -199,6 +265,45 @@ class BagRecording:
         if self._fps is not None:
             return index / self._fps
         return _seconds(message) if self._stamped else recorded / 1e9
+
+
+def _info_topic(topic: str) -> str:
+    parts = topic.removesuffix("/compressed").removesuffix("/compressedDepth").split("/")
+    return "/".join([*parts[:-1], "camera_info"])
+
+
+def info_matrices(info: Any) -> dict[str, np.ndarray]:
+    """Matrices K, D, R and P of a ``camera_info`` message of ROS 1 or 2.
+
+    Args:
+        info: deserialised.
+
+    Returns:
+        Name in capitals to float64 numbers: 9, any number, 9 and 12.
+    """
+    return {key: np.asarray(getattr(info, key if hasattr(info, "K") else key.lower()), np.float64) for key in "KDRP"}
+
+
+def calibration_of_info(info: Any, image: str, path: Path) -> Calibration:
+    """Calibration of a ``camera_info`` message.
+
+    Args:
+        info: deserialised.
+        image: last part of the name of the topic of images: rectified ones have the projection.
+        path: of the bag, for messages.
+
+    Raises:
+        DvoError: a camera that is not calibrated (``field`` K), or a model that is not known.
+    """
+    matrices = info_matrices(info)
+    k, d, p = (matrices[key].tolist() for key in "KDP")
+    values: dict[str, Any] = {"camera_matrix": k, "distortion_model": info.distortion_model, "D": d}
+    if "rect" in image:
+        values = {"camera_matrix": [*p[0:3], *p[4:7], *p[8:11]]}
+    if not min(values["camera_matrix"][0], values["camera_matrix"][4]) > 0:
+        raise DvoError("is not calibrated", file=path, field="K", remedy="give a calibration with --calib")
+    size = {key: getattr(info, key) for key in ("width", "height") if getattr(info, key)}
+    return from_values({**values, **(size if len(size) == 2 else {})}, path)
 
 
 def _messages(reader: Any, topic: str) -> Iterator[tuple[Any, int, bytes]]:

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, rectified
-from dvo.data.files.listing import listed_files
+from dvo.data.files.files import is_file
+from dvo.data.files.listing import associated_columns, listed_files
 from dvo.data.files.stamps import choose_times, read_times, times_from_names
 from dvo.data.images.images import has_images, list_images
 from dvo.data.readers.folder import camera_images
 from dvo.data.readers.sequence import find_calibration
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
-from dvo.data.sensors.sensors import NearestInTime, SameName, Sensors
+from dvo.data.sensors.sensors import Listed, NearestInTime, SameName, Sensors
 from dvo.data.trajectory import Trajectory, interpolate, read_tum
 
 # The colour cameras as published with the benchmark (file_formats page); freiburg3 is delivered undistorted.
@@ -28,12 +30,22 @@ CALIBRATIONS = {
 }
 
 
+ASSOCIATIONS = ("associations.txt", "associate.txt", "association.txt", "associated.txt", "assoc.txt")
+
+
+def _associations(path: Path) -> Path | None:
+    """List of colour and depth images that belong to each other, rows ``time file time file``."""
+    return next((path / name for name in ASSOCIATIONS if is_file(path / name)), None)
+
+
 def matches(path: Path) -> bool:
-    """True for a folder with ``rgb.txt``, or with ``rgb/`` and ``groundtruth.txt``.
+    """True for a folder with ``rgb.txt``, with a list of associated images, or with ``rgb/`` and ``groundtruth.txt``.
 
     Args:
         path: existing file or folder.
     """
+    if _associations(path) is not None:
+        return True
     return (path / "rgb.txt").is_file() or ((path / "groundtruth.txt").is_file() and has_images(path / "rgb"))
 
 
@@ -73,10 +85,15 @@ def open_tum(path: Path, request: Request) -> Recording:
         DvoError: no images, or a malformed file.
     """
     warnings: list[str] = []
-    listing = path / "rgb.txt"
-    if listing.is_file():
+    listing, pairs = path / "rgb.txt", _associations(path)
+    stamps: np.ndarray | None
+    depth: Listed | None = None
+    if not listing.is_file() and pairs is not None:
+        images, times, depth = _associated(pairs, request, warnings)
+        stamps = None
+    elif listing.is_file():
         images, times = listed_files(listing)
-        stamps: np.ndarray | None = times
+        stamps = times
         if request.times is not None:
             times = read_times(request.times, len(images))
         elif request.fps is not None:
@@ -89,14 +106,44 @@ def open_tum(path: Path, request: Request) -> Recording:
     groundtruth = _groundtruth(path, times, warnings)
     return ImageRecording(
         "tum", path, images, times, calibration=calibration, groundtruth=groundtruth, warnings=warnings,
-        sensors=_sensors(path, images, stamps, request.calibration or calibration),
+        sensors=_sensors(path, images, stamps, request.calibration or calibration, depth),
     )  # fmt: skip
 
 
-def _sensors(path: Path, images: list[Path], stamps: np.ndarray | None, calibration: Calibration | None) -> Sensors:
+def _associated(listing: Path, request: Request, warnings: list[str]) -> tuple[list[Path], np.ndarray, Listed | None]:
+    """Colour images and times of a list of associated images, and the depth images that belong to them."""
+    columns = associated_columns(listing)
+    if "rgb" not in columns:
+        remedy = "use rows 'time file time file', as TUM's associate.py writes them"
+        raise DvoError("no colour images in it", file=listing, remedy=remedy)
+    images, times = listed_files(listing, "images", column=columns["rgb"])
+    depth = None
+    if "depth" in columns:
+        others, _ = listed_files(listing, "depth images", column=columns["depth"])
+        if len(others) == len(images):
+            depth = Listed(dict(zip(images, others, strict=True)))
+    counts = len(times) > 1 and (times % 1 == 0).all() and float(np.median(np.diff(times))) == 1.0
+    if request.times is not None or counts:  # rows of ICL-NUIM count the images
+        folder = images[0].parent if images else listing.parent
+        times = choose_times(images, folder, times=request.times, fps=request.fps, warnings=warnings)
+    elif request.fps is not None:
+        warnings.append(f"--fps was not used: the times come from {listing}")
+    return images, times, depth
+
+
+def _sensors(
+    path: Path,
+    images: list[Path],
+    stamps: np.ndarray | None,
+    calibration: Calibration | None,
+    associated: Listed | None = None,
+) -> Sensors:
     right, rig = None, None
     if calibration is not None and calibration.baseline and (path / RIGHT).is_dir():
         right, rig = SameName(path / RIGHT), rectified(calibration, calibration.baseline)
+    if associated is not None:
+        scale = (calibration.depth_scale if calibration else None) or DEPTH_SCALE
+        return Sensors(depth=associated, depth_scale=scale, right=right, stereo=rig)
     if stamps is None or not ((path / "depth.txt").is_file() or (path / "depth").is_dir()):
         return Sensors(right=right, stereo=rig)
     times = dict(zip(images, stamps.tolist(), strict=True))

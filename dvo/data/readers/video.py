@@ -19,6 +19,7 @@ from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.frame import InertialSamples
 from dvo.data.images.image_header import MAX_PIXELS
 from dvo.data.images.images import SUFFIXES, to_rgb8
+from dvo.data.readers.edit_list import shown_seconds
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
 
@@ -102,6 +103,35 @@ def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
         index += 1
 
 
+def _aspect(capture: cv2.VideoCapture) -> float:
+    """Width over height of a pixel as it is shown; 1 if it is not stated."""
+    import cv2
+
+    found = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    ratio = found[0] / found[1] if found[0] > 0 and found[1] > 0 else 1.0
+    return ratio if 0.1 < ratio < 10 else 1.0
+
+
+def _square_size(
+    width: float, height: float, aspect: float, turned: int, calibration: Calibration | None
+) -> tuple[int, int] | None:
+    """Width and height at which pixels are square; None if they are, or if the calibration is that of the others.
+
+    Of a calibration for images of no stated size the ratio of fx and fy tells which ones it is for.
+    """
+    if abs(aspect - 1) < 0.004 or not (width > 0 and height > 0):  # 1088 lines for 1080
+        return None
+    if turned in (90, 270):  # the width and height are those of the upright frame
+        aspect = 1 / aspect
+    size = (round(width * aspect), round(height)) if aspect > 1 else (round(width), round(height / aspect))
+    if calibration is None or (calibration.width, calibration.height) == size:
+        return size
+    if (calibration.width, calibration.height) == (width, height):
+        return None
+    ratio = calibration.fx / calibration.fy
+    return size if abs(ratio - 1) <= abs(ratio - 1 / aspect) else None
+
+
 class VideoRecording:
     """Video file as a recording.
 
@@ -113,6 +143,7 @@ class VideoRecording:
         request: options of the user.
 
     Attributes:
+        rate: frames a second that the file states, or the user; None with a list of times.
         turned: degrees by which frames are turned to stand upright, as the file asks for; their rows are then not the
             rows of the sensor in the order in which it reads them.
 
@@ -139,14 +170,26 @@ class VideoRecording:
             angle = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 360
             does_turn = capture.get(cv2.CAP_PROP_ORIENTATION_AUTO) and angle in (90, 180, 270)
             self.turned = int(angle) if does_turn else 0
+            width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            self._square = _square_size(width, height, _aspect(capture), self.turned, request.calibration)
             first = [milliseconds for (_, milliseconds, _), _ in zip(_grabs(capture), range(3), strict=False)]
         if not first:
             raise DvoError("no frame of this video decodes", file=path, remedy="check that it plays, or re-encode it")
         # containers without a count give huge or negative numbers
         self.frame_count: int | None = int(announced) if 0 < announced < 1e9 else None
+        if self._square is not None:
+            wide, high = self._square
+            self.warnings.append(
+                f"the pixels of the video are not square: images of {width:g}x{height:g} are resized to {wide}x{high}"
+            )
+        shown = shown_seconds(path)
+        if shown is not None and self.frame_count is not None and RATES[0] <= rate <= RATES[1]:
+            # the frames before and behind what is shown are counted, and not decoded
+            self.frame_count = max(1, min(self.frame_count, round(shown * rate)))
         self._times = self._read_times(request.times) if request.times is not None else None
         self._use_container = bool(request.fps is None and (np.diff(first) > 0).all() and np.isfinite(first).all())
         self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
+        self.rate = self._fps if self._times is None else None
         if self._times is None and not self._use_container and request.fps is None:
             known = "the stated" if self._fps == rate else "a guessed"
             self.warnings.append(
@@ -163,6 +206,8 @@ class VideoRecording:
 
     def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
         """See :class:`dvo.data.recording.Recording`; frames that are not wanted are decoded, but not converted."""
+        import cv2
+
         read, last, previous, dropped, offset = 0, 0.0, -np.inf, 0, 0.0
 
         def grabbed(capture: cv2.VideoCapture) -> Iterator[tuple[int, float]]:
@@ -190,6 +235,8 @@ class VideoRecording:
                     log.unreadable.append(f"frame {index}")
                     continue
                 previous = timestamp
+                if self._square is not None:
+                    image = cv2.resize(image, self._square, interpolation=cv2.INTER_LINEAR)
                 image = image if selection.reduction is None else selection.reduction(image)
                 yield RawFrame(index, timestamp, to_rgb8(image), f"{self.path} frame {index}")
         missing = (self.frame_count or 0) - read - len(log.unreadable)

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from dvo.core.arguments import checked_arguments
+from dvo.core.context import in_own_context
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_settings
 from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
@@ -91,6 +92,7 @@ class CalibrationOptions:
 
 
 @partial(checked_arguments, skip=("seed",))
+@in_own_context
 def calibrate(
     frames: Iterable[Frame],
     guess: FocalGuess | None = None,
@@ -100,6 +102,7 @@ def calibrate(
     seed: int = 0,
     options: CalibrationOptions = CalibrationOptions(),  # noqa: B008 (frozen)
     on_frame: Callable[[Frame, Estimate | None], None] | None = None,
+    on_round: Callable[[int, int, int], None] | None = None,
 ) -> SelfCalibration:
     """Estimate the focal length of the camera that has recorded a clip.
 
@@ -111,6 +114,8 @@ def calibrate(
         device, seed: as in :func:`dvo.load`.
         options: number of frames, and what is believed.
         on_frame: called after each frame of each round.
+        on_round: called before each round with its number from 1, the largest number of rounds, and the number of
+            frames that it tracks if none is left out or lost.
 
     Returns:
         The focal length with its standard deviation, or the guess if the images do not tell.
@@ -144,6 +149,8 @@ def calibrate(
     left = math.inf if length is None else length + options.spare
     tracking: _Tracking | None = None
     for number in range(options.rounds):
+        if on_round is not None:
+            on_round(number + 1, options.rounds, int(min(wanted, left)))
         if tracking is None:
             clip = islice(_readable(frames if kept is None else copy(kept)), limit)
             x, y = (value * first.camera.width / width for value in aside)

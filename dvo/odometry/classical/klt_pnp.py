@@ -19,6 +19,7 @@ from dvo.data.frame import Frame
 from dvo.odometry.classical import two_view
 from dvo.odometry.classical.frame_log import FrameLog, map_of
 from dvo.odometry.classical.klt import Tracks, detect, follow
+from dvo.odometry.exclusive import sheltered
 from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
@@ -58,6 +59,7 @@ class KltPnpConfig:
     patience: int = 10
 
 
+@sheltered
 class KltPnp:
     """See the module. Deterministic for a seed; poses are up to scale, the first frame is the world."""
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from dvo.ba.kernels import Kernel
 from dvo.core.errors import DvoError
 from dvo.core.settings import check_names, check_settings, settings_of, shown
+from dvo.core.text import choice
 from dvo.map.measured_depths import SIGMA
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions
@@ -306,7 +307,7 @@ def preset_changes(name: str, presets: Mapping[str, dict[str, Any]] = PRESETS) -
         DvoError: no such preset.
     """
     if not isinstance(name, str) or name not in presets:
-        raise DvoError(f"unknown preset {shown(name)}", field="preset", remedy=f"use one of {', '.join(presets)}")
+        raise DvoError(f"unknown preset {shown(name)}", field="preset", remedy=choice(name, presets))
     return presets[name]
 
 

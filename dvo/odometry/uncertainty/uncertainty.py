@@ -32,6 +32,7 @@ from dvo.ba.layer.window_equations import window_equations
 from dvo.ba.multistart import Solution
 from dvo.ba.options import BADamping, BAOptions
 from dvo.ba.patch_problem import PatchProblem
+from dvo.core.context import in_own_context
 from dvo.odometry.uncertainty.displacement import confidence_of, window_metric
 from dvo.odometry.uncertainty.gauge import Gauge, window_gauge
 from dvo.odometry.uncertainty.measurements import WindowMeasurements
@@ -77,6 +78,7 @@ class LaterUncertainty:
         self._compute = partial(_uncertainty, window, variance, ambiguous)
         self._found = UNKNOWN
 
+    @in_own_context
     def _value(self) -> Uncertainty:
         compute = self._compute  # of two threads that ask at once, both compute the same
         if compute is not None:

@@ -118,3 +118,25 @@ def test_run_json_tells(make, given):
     assert main(line) == 0
     camera = json.loads((out / "run.json").read_text())["camera"]
     assert (camera["turned"], camera["width"], camera["height"]) == (90, HEIGHT, WIDTH)
+
+
+def with_focal(jpeg, millimetres, order):
+    """The image with an EXIF segment that states a focal length, in tenths of a millimetre."""
+    first = struct.pack(f"{order}H", 1) + struct.pack(f"{order}HHII", 0x8769, 4, 1, 26) + bytes(4)
+    inner = struct.pack(f"{order}H", 1) + struct.pack(f"{order}HHII", 0x920A, 5, 1, 44) + bytes(4)
+    tiff = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", 8) + first + inner
+    body = b"Exif\0\0" + tiff + struct.pack(f"{order}II", round(10 * millimetres), 10)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("focals", "zooms"), [([18, 18.1, 18], False), ([24, 24, 35, 70], True)])
+def test_optical_zoom_is_said(make, order, focals, zooms):
+    path = make.root / "zoom"
+    path.mkdir()
+    for index, focal in enumerate(focals):
+        jpeg = cv2.imencode(".jpg", make.image(index))[1].tobytes()
+        (path / f"{index}.jpg").write_bytes(with_focal(jpeg, focal, order))
+    assert exif.focal_length(path / "0.jpg") == focals[0]
+    warnings = open_source(path, calib=SENSOR, fps=10).warnings
+    assert any("from 24 to 70 mm" in text for text in warnings) == zooms and len(warnings) == zooms

@@ -47,9 +47,10 @@ def test_order_of_matching():
         "video",
         "euroc",
         "kitti",
+        "kitti_raw",
         "tartanair",
-        "tum",
         "icl_nuim",
+        "tum",
         "sequence",
         "folder",
     ]

@@ -9,9 +9,11 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.core.errors import DvoError
+from dvo.data.companions.depth_source import with_depth
+from dvo.data.companions.right_source import with_right
 from dvo.data.readers.ros_images import decode_message
 from dvo.data.readers.rosbag import matches, split_topic
-from tests.support.rosbags import PLUMB, Bag
+from tests.support.rosbags import PLUMB, Bag, P
 
 
 def rgb(make, index):
@@ -175,3 +177,70 @@ def test_encodings():
     short = message("mono8", grey)
     short.data = short.data[:-1]
     assert decode_message(short, "x") is None
+
+
+def stereo(bag, make):
+    for index in range(6):
+        bag.image("/cam0/image_raw", rgb(make, index), 100 + 0.1 * index)
+        bag.image("/cam1/image_raw", rgb(make, index + 20), 100.002 + 0.1 * index)
+    bag.info("/cam0/camera_info", p=P)
+    bag.info("/cam1/camera_info", p=[*P[:3], -P[0] * 0.12, *P[4:]])
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+@pytest.mark.parametrize("right", ["/cam1/image_raw", None])
+def test_right_images_of_another_topic(make, kind, right):
+    path = make.root / ("pair.bag" if kind == "bag" else "pair")
+    with Bag(path, kind) as bag:
+        stereo(bag, make)
+    source = dvo.open(path, topic="/cam0/image_raw", undistort=False, stride=2)
+    frames = list(with_right(source, right))
+    assert [frame.index for frame in frames] == [0, 2, 4]
+    assert all(np.array_equal(frame.right.image, rgb(make, frame.index + 20)) for frame in frames)
+    assert frames[0].right.T_left_right[:3] == pytest.approx([0.12, 0, 0]) and frames[0].right.camera.fx == 50
+    assert next(iter(with_right(source, right, 0.3))).right.T_left_right[0] == pytest.approx(0.3)
+    with pytest.raises(DvoError, match="/cam2 is no other topic of images in this bag; those are: /cam1/image_raw"):
+        with_right(source, "/cam2")
+
+
+def test_right_images_without_a_baseline(make):
+    path = make.root / "pair"
+    with Bag(path, "mcap") as bag:
+        for index in range(2):
+            bag.image("/left/image", rgb(make, index), 100 + 0.1 * index)
+            bag.image("/right/image", rgb(make, index), 100 + 0.1 * index)
+        bag.info("/left/camera_info")
+    source = dvo.open(path, topic="/left/image")
+    with pytest.raises(DvoError, match="--baseline: is not known from a calibration"):
+        with_right(source)
+    assert next(iter(with_right(source, baseline=0.1))).right.T_left_right[0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
+def test_depth_of_another_topic(make, encoding):
+    path, deep = make.root / "rgbd", (np.indices((48, 64))[0] * 10 + 500).astype(np.uint16)
+    with Bag(path, "mcap") as bag:
+        for index in range(4):
+            bag.image("/camera/color/image_raw", rgb(make, index), 100 + 0.1 * index)
+            if index != 2:
+                pixels = deep + np.uint16(index) if encoding == "16UC1" else ((deep + index) / 1000).astype(np.float32)
+                bag.depth("/camera/aligned_depth_to_color/image_raw", pixels, 100.003 + 0.1 * index, encoding)
+        bag.info("/camera/color/camera_info", d=[])
+    source = dvo.open(path)  # the topic of colour, without --topic
+    assert "depth is beside it for --depth" in source.warnings[0]
+    for depth in (None, "/camera/aligned_depth_to_color/image_raw"):
+        frames = list(with_depth(source, depth))
+        assert frames[2].depth is None
+        assert np.allclose(frames[3].depth, (deep + 3) / 1000)
+    if encoding == "16UC1":
+        assert np.allclose(next(iter(with_depth(source, None, 500.0))).depth, deep / 500)
+
+
+def test_few_bits_of_16_in_messages(make):
+    path = make.root / "deep"
+    with Bag(path, "mcap") as bag:
+        for index in range(3):
+            bag.depth("/image", rgb(make, index)[..., 1].astype(np.uint16) << 4, 100 + 0.1 * index, "mono16")
+    source = dvo.open(path, calib=make.calib())
+    assert np.array_equal(list(source)[2].image[..., 0], rgb(make, 2)[..., 1])
+    assert "hold 12 bits" in source.warnings[0]

@@ -131,6 +131,11 @@ def test_folders_of_ones_own(tmp_path, image_folder):
     assert suite.name == "clip" and len(suite.sequences) == 1
     source, found = open_sequence(suite.sequences[0], tmp_path / "elsewhere", 1)
     assert len(list(source)) == 20 and np.allclose(found.poses_wc, truth.poses_wc, atol=1e-6)
+    shutil.copytree(clip, tmp_path / "all" / "second")
+    shutil.copytree(clip, tmp_path / "all" / "first")
+    (tmp_path / "all" / "notes").mkdir()
+    (several,) = load_suites([str(tmp_path / "all")])
+    assert several.name == "all" and [one.name for one in several.sequences] == ["first", "second"]
     shutil.rmtree(image_folder)
     with pytest.raises(DvoError, match="no sequence in this folder"):
         suite_of_folder(clip)

@@ -23,6 +23,7 @@ from dvo.odometry.classical.direct.image import Level, pyramid
 from dvo.odometry.classical.direct.start import TwoViewStart, spread
 from dvo.odometry.classical.direct.stereo import StereoConfig, search_lines
 from dvo.odometry.classical.frame_log import FrameLog, map_of
+from dvo.odometry.exclusive import sheltered
 from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
@@ -89,6 +90,7 @@ class Keyframe:
     seen: list[tuple[Level, Alignment]] = field(default_factory=list)
 
 
+@sheltered
 class DirectOdometry:
     """See the module. Deterministic for a seed; poses are up to scale, the first frame is the world."""
 

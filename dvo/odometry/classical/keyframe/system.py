@@ -28,10 +28,12 @@ from dvo.odometry.classical.keyframe.map import Keyframe, Map
 from dvo.odometry.classical.keyframe.pose import centre, refine_pose
 from dvo.odometry.classical.keyframe.relocalise import relocalise, search
 from dvo.odometry.classical.klt import detect, follow
+from dvo.odometry.exclusive import sheltered
 from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, SparseMap, Status
 
 
+@sheltered
 class KeyframeOdometry:
     """See the module. Deterministic for a seed; poses are up to scale, the first frame is the world."""
 

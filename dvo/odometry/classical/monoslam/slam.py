@@ -36,6 +36,7 @@ from dvo.odometry.classical.monoslam.search import (
     self_likeness,
     templates,
 )
+from dvo.odometry.exclusive import sheltered
 from dvo.odometry.frames.gate import Admitted, Gate
 from dvo.odometry.protocol import Estimate, Result, Status
 
@@ -87,6 +88,7 @@ class MonoSlamConfig:
     patience: float = 0.7
 
 
+@sheltered
 class MonoSlam:
     """See the module. Deterministic for a seed; poses are up to scale, the first frame is the world."""
 

@@ -69,7 +69,10 @@ def test_an_odometry_without_a_graph_logs_poses_and_images(rerun, given, image_f
 
 def test_a_file_that_cannot_be_written(rerun, given, image_folder, tmp_path, capsys):
     odometry = given()
-    assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(image_folder.parent / "calib.txt" / "a.rrd"))) == 2
+    assert (
+        main(arguments(image_folder, tmp_path / "out", "--rerun", str(image_folder.parent / "calib.txt" / "a.rrd")))
+        == 2
+    )
     (line,) = errors(capsys.readouterr().err)
     assert "a.rrd" in line and "--rerun" in line and not odometry.asked
 

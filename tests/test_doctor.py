@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
+import tomllib
 
 import cv2
 import pytest
@@ -126,3 +128,18 @@ def test_formats():
     assert probes.video_state("MJPG", ".avi") == "reads"
     assert probes.video_state("????", ".nothing").startswith("not tested")
     assert probes.image_works(".png") and not probes.image_works(".nothing")
+
+
+def test_every_package_of_an_extra_is_listed(repository):
+
+    from dvo.commands.doctor import OPTIONAL, REQUIRED
+
+    extras = tomllib.loads((repository / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    wanted = {
+        re.match(r"[A-Za-z0-9._-]+", text).group().lower()
+        for extra, packages in extras.items()
+        if extra != "dev"
+        for text in packages
+    }
+    listed = {name for name, *_ in (*OPTIONAL, *REQUIRED)}
+    assert wanted <= listed, wanted - listed

@@ -21,7 +21,7 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.euroc import read_extrinsics, read_rig
 from dvo.data.calibration.read import read_calibration
 from dvo.data.calibration.stereo import right_camera
-from dvo.data.calibration.values import load_yaml
+from dvo.data.calibration.documents import load_yaml
 from dvo.data.extrinsics import pose_of_numbers
 from dvo.data.files.files import (
     is_file,

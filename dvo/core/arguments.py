@@ -70,7 +70,7 @@ def checked_arguments(function: Callable[P, R], *, skip: tuple[str, ...] = ()) -
             return function(*args, **keywords)
         for name, value in given.items():
             if name in annotated:
-                _check(name, value, annotated[name], function)
+                _check(name, value, annotated[name], inspect.unwrap(function))
         return function(*args, **keywords)
 
     return call

@@ -69,15 +69,8 @@ def test_an_odometry_without_a_graph_logs_poses_and_images(rerun, given, image_f
 
 def test_a_file_that_cannot_be_written(rerun, given, image_folder, tmp_path, capsys):
     odometry = given()
-<<<<<<< HEAD
     below_a_file = str(image_folder.parent / "calib.txt" / "a.rrd")
     assert main(arguments(image_folder, tmp_path / "out", "--rerun", below_a_file)) == 2
-=======
-    assert (
-        main(arguments(image_folder, tmp_path / "out", "--rerun", str(image_folder.parent / "calib.txt" / "a.rrd")))
-        == 2
-    )
->>>>>>> 7970b6c8e493ba3ab70405a47f05144eca15af18
     (line,) = errors(capsys.readouterr().err)
     assert "a.rrd" in line and "--rerun" in line and not odometry.asked
 

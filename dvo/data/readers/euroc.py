@@ -18,10 +18,10 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.core.yaml_files import read_text
 from dvo.data.calibration.calibration import Calibration, StereoRig
+from dvo.data.calibration.documents import load_yaml
 from dvo.data.calibration.euroc import read_extrinsics, read_rig
 from dvo.data.calibration.read import read_calibration
 from dvo.data.calibration.stereo import right_camera
-from dvo.data.calibration.documents import load_yaml
 from dvo.data.extrinsics import pose_of_numbers
 from dvo.data.files.files import (
     is_file,

@@ -16,7 +16,7 @@ from dvo.core.threads import settle_threads
 from dvo.models.weights import FOLDER, LoadedWeights, architecture_of, load_weights
 from dvo.odometry.patch.config import PRESETS, TRACKER_PRESETS, TrackerConfig, with_changes
 from dvo.odometry.protocol import Odometry
-from dvo.odometry.registry import SYSTEMS, build_system, odometry_builder
+from dvo.odometry.registry import SETTINGS, SYSTEMS, build_system, odometry_builder
 
 if TYPE_CHECKING:
     import torch
@@ -100,15 +100,6 @@ def build_odometry(
     check_seed(seed)
     builder = odometry_builder(weights.architecture)
     return builder(weights, device=device, seed=seed, config=config, **overrides)
-
-
-SETTINGS = {
-    "patch_vo": "dvo.odometry.patch.config:TrackerConfig",
-    "droid": "dvo.odometry.droid.config:DenseConfig",
-    "deepvo": "dvo.odometry.two_frame.deepvo:RegressionConfig",
-    "tartanvo": "dvo.odometry.two_frame.tartanvo:TwoFrameConfig",
-}
-"""Architecture to the settings of its odometry, whose module has their ``PRESETS``."""
 
 
 def check_early(weights: str, config: Any, overrides: Mapping[str, Any]) -> None:

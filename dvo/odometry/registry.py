@@ -24,6 +24,14 @@ ODOMETRIES = Registry(
 )
 """Architecture name to ``"module:function"`` or ``"module:Class"`` of an :class:`OdometryBuilder`."""
 
+SETTINGS = {
+    "patch_vo": "dvo.odometry.patch.config:TrackerConfig",
+    "droid": "dvo.odometry.droid.config:DenseConfig",
+    "deepvo": "dvo.odometry.two_frame.deepvo:RegressionConfig",
+    "tartanvo": "dvo.odometry.two_frame.tartanvo:TwoFrameConfig",
+}
+"""Architecture to the settings of its odometry, whose module has their ``PRESETS``."""
+
 _CLASSICAL = "dvo.odometry.classical"
 SYSTEMS = Registry(
     "system",

@@ -89,8 +89,10 @@ def _reopened(folder: Path, facts: dict[str, Any]) -> Source:
             file=folder,
             remedy="put it back, or track again with --save-map and export the map file",
         )
-    own = folder / CALIBRATION
-    calib = str(own) if facts.get("calibration_file") and own.is_file() else path("calib") or options.get("calib")
+    own, was_found = folder / CALIBRATION, facts.get("calibration_file")
+    if was_found and not own.is_file():
+        raise DvoError("the calibration that the run has found is not there", file=own, remedy="put it back")
+    calib = str(own) if was_found else path("calib") or options.get("calib")
     names = ("fps", "topic", "start", "end", "mask_invert")
     more = {name: options[name] for name in names if options.get(name) is not None}
     if options.get("max_pixels") is not None:

@@ -67,8 +67,9 @@ def print_input(source: Any) -> None:
     text, rate = None, getattr(recording, "rate", None)
     if times is not None and len(times) > 1:
         span = float(times[-1] - times[0])
-        text = f"{len(times)} images in {span:.4g} s, {(len(times) - 1) / span:.4g} a second"
-    elif count is not None and rate is not None:
+        text = f"{len(times)} images in {span:.4g} s"
+        text += f", {(len(times) - 1) / span:.4g} a second" if span > 0 else ""
+    elif count is not None and rate:
         text = f"{count} frames of a video, {rate:.4g} a second: {count / rate:.4g} s"
     if text is not None:
         with contextlib.suppress(OSError):

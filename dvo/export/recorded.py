@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import groupby
 
 import cv2
 import numpy as np
@@ -20,6 +21,16 @@ _QUALITY = 95
 _ROUNDING = 1e-5  # seconds; trajectory files have nine decimals, and times may be large
 
 
+def _row_of(frame: Frame, times: np.ndarray) -> int | None:
+    """Row of the pose of a frame; None without one."""
+    row = int(np.argmin(np.abs(times - frame.timestamp))) if len(times) else -1
+    return row if row >= 0 and abs(times[row] - frame.timestamp) <= _ROUNDING else None
+
+
+def _sharpness(frame: Frame) -> float:
+    return float(cv2.Laplacian(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
+
+
 def reconstruct_recorded(
     frames: Iterable[Frame], trajectory: Trajectory, points: SparseMap, most: int = MOST_IMAGES
 ) -> Reconstruction:
@@ -28,7 +39,7 @@ def reconstruct_recorded(
     The poses are divided into stretches of equal numbers, and the sharpest image of each is taken.
 
     Args:
-        frames: of the recording, without lens distortion.
+        frames: of the recording in order of time, without lens distortion.
         trajectory: camera-to-world poses; frames belong to them by their times.
         points: in the world of the trajectory.
         most: images.
@@ -41,29 +52,22 @@ def reconstruct_recorded(
     """
     times = trajectory.timestamps
     length = max(1, -(-len(times) // most))
-    best: dict[int, tuple[float, int, int, Frame]] = {}  # by stretch: sharpness, row, number, frame
-    for frame in frames:
-        row = int(np.argmin(np.abs(times - frame.timestamp))) if len(times) else -1
-        if row < 0 or abs(times[row] - frame.timestamp) > _ROUNDING:
-            continue
-        sharpness = float(cv2.Laplacian(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
-        stretch = row // length
-        if stretch not in best or sharpness > best[stretch][0]:
-            best[stretch] = sharpness, row, frame.index, frame
-    if not best:
-        raise DvoError(
-            "no image of the source has the time of a pose", field="source", remedy="give the folder of its last run"
-        )
     cameras: list[Camera] = []
     rows, identifiers, owners, jpegs = [], [], [], []
-    for _, row, number, frame in (best[stretch] for stretch in sorted(best)):
+    with_pose = ((row, frame) for frame in frames if (row := _row_of(frame, times)) is not None)
+    for _, stretch in groupby(with_pose, lambda one: one[0] // length):  # one image is held at a time
+        row, frame = max(stretch, key=lambda one: _sharpness(one[1]))
         if frame.camera not in cameras:
             cameras.append(frame.camera)
         rows.append(row)
-        identifiers.append(number)
+        identifiers.append(frame.index)
         owners.append(cameras.index(frame.camera))
         bgr = np.ascontiguousarray(frame.image[..., ::-1])
         jpegs.append(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+    if not rows:
+        raise DvoError(
+            "no image of the source has the time of a pose", field="source", remedy="give the folder of its last run"
+        )
     none = np.zeros(0, np.int64)
     return Reconstruction(
         cameras=tuple(cameras),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from torch.overrides import TorchFunctionMode
 from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.limits import limit_error
+from dvo.core.text import choice
 from dvo.core.threads import use_threads
 from dvo.data.files.output import replaced
 from dvo.models.pickles import check_plain, load_pickle
@@ -128,11 +128,8 @@ def find_weights(name_or_file: str | Path) -> Path:
     if path.name == str(name_or_file) and shipped.is_file():
         return shipped
     names = sorted(p.stem for p in FOLDER.glob("*.safetensors"))
-    near = difflib.get_close_matches(str(name_or_file)[:100], names, 1)
-    hint = f"did you mean '{near[0]}'? Give" if near else "give"
-    raise DvoError(
-        "no such weights", file=name_or_file, remedy=f"{hint} a file, or one of: {', '.join(names) or 'none'}"
-    )
+    remedy = choice(name_or_file, names or ["none"], "give a file, or one of:")
+    raise DvoError("no such weights", file=name_or_file, remedy=remedy)
 
 
 def architecture_of(name_or_file: str | Path) -> str:

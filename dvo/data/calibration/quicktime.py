@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from dvo.data.files.boxes import boxes, read_head
+
 _KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
 _CONTAINERS = (b"moov", b"trak", b"udta")
 _MOST_BOXES = 4096
@@ -47,15 +49,10 @@ def _metadata(stream: BinaryIO, size: int) -> Iterator[bytes]:
         if not ranges:
             return
         at, end = ranges.pop()
-        stream.seek(at)
-        length, kind = struct.unpack(">I4s", stream.read(8))
-        head = 8
-        if length == 1:  # the length follows in 64 bits
-            (length,) = struct.unpack(">Q", stream.read(8))
-            head = 16
-        length = end - at if length == 0 else length
-        if not head <= length <= end - at:
+        found = read_head(stream, at, end)
+        if found is None:
             return
+        kind, head, length = found
         ranges.append((at + length, end))
         if kind in _CONTAINERS:
             ranges.append((at + head, at + length))
@@ -63,24 +60,14 @@ def _metadata(stream: BinaryIO, size: int) -> Iterator[bytes]:
             yield stream.read(length - head)
 
 
-def _boxes(data: bytes, at: int = 0) -> Iterator[tuple[bytes, bytes]]:
-    """Kind and content of boxes that follow each other."""
-    while at + 8 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        if not 8 <= length <= len(data) - at:
-            return
-        yield kind, data[at + 8 : at + length]
-        at += length
-
-
 def _number(meta: bytes) -> float | None:
     """Number of the key in a box of metadata; those of MP4 begin with a version, those of QuickTime do not."""
-    parts = dict(_boxes(meta, 0 if meta[4:8] == b"hdlr" else 4))
-    keys = [name for _, name in _boxes(parts.get(b"keys", b""), 8)]
-    for index, item in _boxes(parts.get(b"ilst", b"")):
+    parts = dict(boxes(meta, 0 if meta[4:8] == b"hdlr" else 4))
+    keys = [name for _, name in boxes(parts.get(b"keys", b""), 8)]
+    for index, item in boxes(parts.get(b"ilst", b"")):
         (position,) = struct.unpack(">I", index)
         if 1 <= position <= len(keys) and keys[position - 1] == _KEY:
-            data = dict(_boxes(item)).get(b"data", b"")
+            data = dict(boxes(item)).get(b"data", b"")
             (kind,) = struct.unpack_from(">I", data)
             return _decoded(kind, data[8:])
     return None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from pathlib import Path
+
+from dvo.data.files.boxes import boxes, read_head
 
 _LARGEST = 2**26  # bytes of the index of a video
 _MOST_BOXES = 256
@@ -24,12 +25,12 @@ def shown_seconds(file: Path) -> float | None:
         if index is None:
             return None
         scale = 0
-        for kind, box in _boxes(index):
+        for kind, box in boxes(index):
             if kind == b"mvhd":
                 scale = struct.unpack_from(">I", box, 20 if box[0] else 12)[0]
-        for kind, track in _boxes(index):
+        for kind, track in boxes(index):
             if kind == b"trak" and _is_video(track) and scale:
-                edits = dict(_boxes(dict(_boxes(track)).get(b"edts", b""))).get(b"elst")
+                edits = dict(boxes(dict(boxes(track)).get(b"edts", b""))).get(b"elst")
                 return None if edits is None else _length(edits) / scale
     except (OSError, ValueError, IndexError, struct.error):  # cut, or sizes that lead nowhere
         return None
@@ -43,34 +44,18 @@ def _index(file: Path) -> bytes | None:
         for _ in range(_MOST_BOXES):
             if at + 8 > size:
                 return None
-            stream.seek(at)
-            length, kind = struct.unpack(">I4s", stream.read(8))
-            head = 8
-            if length == 1:  # the length follows in 64 bits
-                (length,) = struct.unpack(">Q", stream.read(8))
-                head = 16
-            length = size - at if length == 0 else length
-            if not head <= length <= size - at or (at == 0 and not kind.isalpha()):
+            found = read_head(stream, at, size)
+            if found is None or (at == 0 and not found[0].isalpha()):
                 return None
+            kind, head, length = found
             if kind == b"moov":
                 return stream.read(length - head) if length <= _LARGEST else None
             at += length
     return None
 
 
-def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Kind and content of boxes that follow each other."""
-    at = 0
-    while at + 8 <= len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        if not 8 <= length <= len(data) - at:
-            return
-        yield kind, data[at + 8 : at + length]
-        at += length
-
-
 def _is_video(track: bytes) -> bool:
-    media = dict(_boxes(dict(_boxes(track)).get(b"mdia", b"")))
+    media = dict(boxes(dict(boxes(track)).get(b"mdia", b"")))
     return media.get(b"hdlr", b"")[8:12] == b"vide"
 
 

@@ -25,7 +25,7 @@ from dvo.odometry.frames.working_image import working_image, working_size
 
 RECENT = 30
 """Number of intervals that the usual one is the median of."""
-_REPEATED = 2  # intervals at least half as long, among the recent ones, that make a long one usual
+_USUAL = ((6, 2), (RECENT, 3))  # among so many of the newest intervals, so many half as long make a long one usual
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ class FrameSequence:
     Args:
         max_gap: time without an image above which two images are separated by a gap, in medians of the recent
             intervals. Time in which images were received and dropped (:attr:`dvo.data.frame.Frame.silence`) is none,
-            and neither is an interval as there have been two lately: frames are taken at irregular times, or the rate
-            has changed.
+            and neither is an interval as there have been two among the newest six, or three among the newest thirty:
+            frames are taken at irregular times, or the rate has changed.
 
     Attributes:
         required: size of the working images, if a map demands one.
@@ -150,11 +150,12 @@ class FrameSequence:
             return Gap(time - last, frozen=False, reason=interruption)
         usual = median(self._intervals) if len(self._intervals) > 1 else None
         quiet, frozen = _quiet(time - last, silence), last - new
-        alike = sum(2 * interval >= quiet for interval in self._intervals)
+        alike = [2 * interval >= quiet for interval in self._intervals]
+        is_usual = any(sum(alike[-newest:]) >= count for newest, count in _USUAL)
         self._intervals.append(quiet)
         if usual is None or quiet + frozen <= self.max_gap * usual:
             return None
-        if quiet > self.max_gap * usual and alike < _REPEATED:
+        if quiet > self.max_gap * usual and not is_usual:
             return Gap(quiet, frozen=False)
         return Gap(frozen, frozen=True) if frozen > 0 else None
 

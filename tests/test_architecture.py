@@ -35,13 +35,13 @@ ARROWS: dict[str, set[str]] = {
 # Inside of these two a room, or a file between rooms, may import those that stand before it.
 FLOORS: dict[str, tuple[str, ...]] = {
     "data": (
-        "files", "images", "interval", "frame", "trajectory", "extrinsics", "calibration", "sensors", "recording",
-        "mask", "frame_checks", "readers", "opening", "source", "companions", "streams", "open",
+        "files", "images", "interval", "inertial", "frame", "trajectory", "extrinsics", "calibration", "sensors",
+        "recording", "mask", "frame_checks", "readers", "opening", "source", "companions", "streams", "open",
     ),
     "odometry": (
-        "quality", "protocol", "exclusive", "registry", "segments", "frames", "window", "uncertainty", "depth",
-        "global_ba", "maintenance", "loops", "scale", "checks", "patch", "two_frame", "droid", "classical", "load",
-        "load_map", "merging", "calibration",
+        "quality", "protocol", "exclusive", "registry", "segments", "frames", "inertial", "window", "uncertainty",
+        "depth", "global_ba", "maintenance", "loops", "scale", "checks", "patch", "two_frame", "droid", "classical",
+        "load", "load_map", "merging", "calibration",
     ),
 }  # fmt: skip
 TOP = {"cli", "commands", "demo", "moved", "__main__", "__init__"}  # these know everything, nobody below knows them

@@ -2,7 +2,8 @@
 
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.read import read_calibration
-from dvo.data.frame import Frame, InertialSamples, StereoView
+from dvo.data.frame import Frame, StereoView
+from dvo.data.inertial import InertialSamples
 from dvo.data.open import open_source
 from dvo.data.readers.registry import READERS
 from dvo.data.recording import ImageRecording, Reader, Recording, Request

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from dvo.core.errors import DvoError
+from dvo.data.inertial import InertialSamples
 from dvo.geometry.camera import Camera
 
 T = TypeVar("T")
@@ -37,48 +37,6 @@ class StereoView:
     def baseline(self) -> float:
         """Distance between the two camera centres in metres."""
         return float(np.linalg.norm(self.T_left_right[:3]))
-
-
-@dataclass(frozen=True)
-class InertialSamples:
-    """Samples of an inertial measurement unit, in its own axes.
-
-    Attributes:
-        timestamps: ``(K,)`` float64 seconds, strictly increasing, on the clock of the frames.
-        gyro: ``(K, 3)`` float64 angular rates, rad/s.
-        accel: ``(K, 3)`` float64 specific forces, m/s^2 (gravity included).
-        T_camera_imu: ``(7,)`` float64 ``tx ty tz qx qy qz qw``, inertial sensor to camera, or None if not calibrated.
-
-    Raises:
-        DvoError: arrays whose shapes do not match.
-    """
-
-    timestamps: np.ndarray
-    gyro: np.ndarray
-    accel: np.ndarray
-    T_camera_imu: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        count = len(self.timestamps)
-        if self.timestamps.shape != (count,) or self.gyro.shape != (count, 3) or self.accel.shape != (count, 3):
-            raise DvoError(
-                f"times {self.timestamps.shape}, gyro {self.gyro.shape} and accel {self.accel.shape} do not match",
-                field="inertial",
-                remedy="give (K,), (K, 3) and (K, 3) arrays",
-            )
-
-    def __len__(self) -> int:
-        return len(self.timestamps)
-
-    def between(self, after: float, until: float) -> InertialSamples:
-        """Samples with ``after < time <= until``.
-
-        Args:
-            after, until: seconds.
-        """
-        first, last = np.searchsorted(self.timestamps, [after, until], side="right")
-        part = slice(int(first), int(last))
-        return InertialSamples(self.timestamps[part], self.gyro[part], self.accel[part], self.T_camera_imu)
 
 
 class Lazy(Generic[T]):

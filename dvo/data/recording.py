@@ -15,10 +15,10 @@ from dvo.core.errors import DvoError
 from dvo.core.text import visible
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import exists
-from dvo.data.frame import InertialSamples
 from dvo.data.images.images import converted, decode, read_image, used_bits
 from dvo.data.images.orientation import check_zoom, common_orientation, turn
 from dvo.data.images.reduction import Reduction
+from dvo.data.inertial import InertialSamples
 from dvo.data.interval import Interval
 from dvo.data.sensors.depth import read_depth
 from dvo.data.sensors.sensors import Sensors

@@ -14,7 +14,8 @@ from dvo.core.errors import DvoError
 from dvo.core.text import in_utf8
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.focal_guess import FocalGuess
-from dvo.data.frame import Frame, InertialSamples, StereoView
+from dvo.data.frame import Frame, StereoView
+from dvo.data.inertial import InertialSamples
 from dvo.data.interval import expected_frames
 from dvo.data.mask import Masks
 from dvo.data.recording import EVERYTHING, ImageRecording, Log, RawFrame, Recording, Selection

@@ -33,7 +33,7 @@ from dvo.data.files.files import (
 )
 from dvo.data.files.listing import listed_file
 from dvo.data.files.stamps import choose_times, read_times
-from dvo.data.frame import InertialSamples
+from dvo.data.inertial import InertialSamples
 from dvo.data.readers.folder import camera_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import SameName, Sensors

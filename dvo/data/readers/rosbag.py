@@ -20,8 +20,8 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.values import from_values
 from dvo.data.files.files import MAX_NUMBER, is_file, lookups
 from dvo.data.files.stamps import checked_rate, read_times
-from dvo.data.frame import InertialSamples
 from dvo.data.images.images import used_bits
+from dvo.data.inertial import InertialSamples
 from dvo.data.readers.ros_images import decode_message, raw_levels
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory

@@ -16,9 +16,9 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.files.files import is_file, lookups
 from dvo.data.files.output import spelled_in_text
 from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
-from dvo.data.frame import InertialSamples
 from dvo.data.images.image_header import MAX_PIXELS
 from dvo.data.images.images import SUFFIXES, to_rgb8
+from dvo.data.inertial import InertialSamples
 from dvo.data.readers.edit_list import shown_seconds
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory

@@ -16,8 +16,8 @@ import numpy as np
 
 from dvo.data.calibration.calibration import StereoRig
 from dvo.data.files.files import is_file
-from dvo.data.frame import InertialSamples
 from dvo.data.images.images import list_images
+from dvo.data.inertial import InertialSamples
 
 MILLIMETRES = 1000.0
 """Units of a metre in 16-bit depth images of a folder, unless it is a list in the layout of TUM RGB-D."""

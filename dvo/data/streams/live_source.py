@@ -21,8 +21,8 @@ from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.focal_guess import guess_from_angle
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import checked_rate
-from dvo.data.frame import InertialSamples
 from dvo.data.images.images import decode_bytes, to_rgb8
+from dvo.data.inertial import InertialSamples
 from dvo.data.interval import Bound, Interval
 from dvo.data.mask import open_masks
 from dvo.data.opening import check_invert, check_stride

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.data.inertial import ImuNoise
 from dvo.geometry.poses import split
 from dvo.synth import salts
 from dvo.synth.protocols import Motion
@@ -21,26 +22,6 @@ from dvo.synth.protocols import Motion
 Array = np.ndarray
 GRAVITY = np.array([0.0, 0.0, -9.81])  # world, m/s^2; z is up
 STEP = 2e-4  # seconds on either side of a sample over which motion is differentiated
-
-
-@dataclass(frozen=True)
-class ImuNoise:
-    """Noise densities; the defaults are those of the ADIS16448 in EuRoC's calibration (Burri et al., 2016).
-
-    Attributes:
-        gyro: rad/s/sqrt(Hz).
-        gyro_walk: rad/s^2/sqrt(Hz).
-        accel: m/s^2/sqrt(Hz).
-        accel_walk: m/s^3/sqrt(Hz).
-        gyro_bias, accel_bias: standard deviation of the initial bias, rad/s and m/s^2.
-    """
-
-    gyro: float = 1.6968e-4
-    gyro_walk: float = 1.9393e-5
-    accel: float = 2.0e-3
-    accel_walk: float = 3.0e-3
-    gyro_bias: float = 2e-3
-    accel_bias: float = 2e-2
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,81 @@
+"""Samples of an inertial measurement unit, and the noise in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dvo.core.errors import DvoError
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Noise densities; the defaults are those of the ADIS16448 in EuRoC's calibration (Burri et al., 2016).
+
+    Attributes:
+        gyro: rad/s/sqrt(Hz).
+        gyro_walk: rad/s^2/sqrt(Hz).
+        accel: m/s^2/sqrt(Hz).
+        accel_walk: m/s^3/sqrt(Hz).
+        gyro_bias, accel_bias: standard deviation of the initial bias, rad/s and m/s^2.
+    """
+
+    gyro: float = 1.6968e-4
+    gyro_walk: float = 1.9393e-5
+    accel: float = 2.0e-3
+    accel_walk: float = 3.0e-3
+    gyro_bias: float = 2e-3
+    accel_bias: float = 2e-2
+
+
+NOISE_PRESETS: dict[str, ImuNoise] = {
+    "euroc": ImuNoise(),
+    "action": ImuNoise(1e-3, 1e-4, 1e-2, 5e-3, 2e-2, 0.1),
+    "phone": ImuNoise(1.7e-3, 1.9e-4, 2e-2, 3e-2, 2e-2, 0.2),
+}
+"""Noise by the kind of the device; ``phone``, ten times that of EuRoC's sensor, is assumed where none is stated."""
+
+
+@dataclass(frozen=True)
+class InertialSamples:
+    """Samples of an inertial measurement unit, in its own axes.
+
+    Attributes:
+        timestamps: ``(K,)`` float64 seconds, strictly increasing, on the clock of the frames.
+        gyro: ``(K, 3)`` float64 angular rates, rad/s.
+        accel: ``(K, 3)`` float64 specific forces, m/s^2 (gravity included).
+        T_camera_imu: ``(7,)`` float64 ``tx ty tz qx qy qz qw``, inertial sensor to camera, or None if not calibrated.
+        noise: of the sensor, or None if it is not stated.
+
+    Raises:
+        DvoError: arrays whose shapes do not match.
+    """
+
+    timestamps: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
+    T_camera_imu: np.ndarray | None = None
+    noise: ImuNoise | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.timestamps)
+        if self.timestamps.shape != (count,) or self.gyro.shape != (count, 3) or self.accel.shape != (count, 3):
+            raise DvoError(
+                f"times {self.timestamps.shape}, gyro {self.gyro.shape} and accel {self.accel.shape} do not match",
+                field="inertial",
+                remedy="give (K,), (K, 3) and (K, 3) arrays",
+            )
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def between(self, after: float, until: float) -> InertialSamples:
+        """Samples with ``after < time <= until``.
+
+        Args:
+            after, until: seconds.
+        """
+        first, last = np.searchsorted(self.timestamps, [after, until], side="right")
+        part = slice(int(first), int(last))
+        return InertialSamples(self.timestamps[part], self.gyro[part], self.accel[part], self.T_camera_imu, self.noise)

@@ -1,0 +1,1 @@
+"""Inertial measurements: preintegration, alignment with a visual trajectory, prediction of poses."""

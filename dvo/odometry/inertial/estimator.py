@@ -45,18 +45,30 @@ REVISED = (5.0, 15.0)
 REVISED_EVERY = 15.0
 MAX_GRAVITY_SIGMA = 1.5
 """Standard deviation of the vertical that an alignment needs, degrees."""
+NOTHING_TOLD = 0.5
+"""Relative deviation of the scale above which the motion tells nothing of it."""
 MAX_ERROR = 6.0
 """Mean squared whitened residual above which samples and images do not fit."""
-GRAVITY_RANGE = (8.0, 12.0)
+GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
 MAX_TURN = 1.5
 """Root mean square difference of rotations between nodes, degrees, above which gyroscope and images disagree."""
+MAX_ROTATION_SIGMA = 0.01
+"""Noise of visual orientations above which samples and images do not fit, rad."""
+MAX_SHIFT = 0.02
+"""Change of the time offset since the alignment above which the clocks drift, seconds."""
 MAX_BIASES = (0.15, 1.0)
 """Biases that no working sensor has, rad/s and m/s^2."""
 AGREEMENT = 0.03
 """Difference of the scales of two estimates in a row that agree, relative, beyond three of their deviations."""
+FIT = 0.3
+"""Mean squared whitened residual of visual poses that their noise is chosen by: less than one, since errors of poses
+near in time are alike."""
 FAILURES = 3
 """Estimates in a row that fail the tests, after which an alignment is withdrawn."""
+MOST_PATIENCE = 4.0
+"""Seconds from one estimate to the next where all that is known speaks against one."""
+_WAITING = ("too few poses", "too few samples")
 STILL = (0.02, 0.15)
 """Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
 STILL_FOR = 0.4
@@ -113,6 +125,10 @@ class BodyState:
         return float(np.linalg.norm(self.velocity))
 
 
+class _DisagreementError(Exception):
+    """Gyroscope and images do not belong together."""
+
+
 class InertialEstimator:
     """Scale, vertical, velocity and biases of one recording.
 
@@ -139,9 +155,9 @@ class InertialEstimator:
         self.rotation_camera_imu: Array | None = None
         self.translation_camera_imu: Array = np.zeros(3)
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
-        self._failures = 0
+        self._failures, self._patience = 0, EVERY / 2
         self._next = -np.inf
-        self._aligned = np.nan  # time of the alignment
+        self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
         self._revised = np.nan
         self._smoother = SmootherOptions()
         self._known: list[int] = []  # worlds of the solution, in its order
@@ -196,9 +212,11 @@ class InertialEstimator:
             return
         try:
             found = self._solved(problem, worlds)
-        except np.linalg.LinAlgError:
-            self._refuse("the motion does not tell scale and gravity", time)
+        except _DisagreementError as disagreement:
+            self._refuse(str(disagreement), time)
             return
+        except np.linalg.LinAlgError:
+            found = None
         if found is None:
             self._refuse("the motion does not tell scale and gravity", time)
             return
@@ -349,6 +367,7 @@ class InertialEstimator:
         problem.nodes = nodes
         scale, gravity, bias = linear_start(problem)
         problem.gyro_bias = bias
+        self._turned_apart(problem, nodes, np.tile(bias, (len(nodes), 1)), np.zeros((len(nodes), 3)), problem.offset)
         best: Smoothed | None = None
         for factor in STARTS:
             first = np.array([np.log(factor * (scale if scale > 1e-6 else 1.0))])
@@ -414,24 +433,32 @@ class InertialEstimator:
         scale = scale if scale > 1e-6 else 1.0
         return Similarity(scale, rotation, state.position + arms[0] - scale * rotation @ path[0])
 
+    @staticmethod
+    def _turned_apart(problem: Smoother, nodes: VisualNodes, gyro: Array, accel: Array, offset: float) -> None:
+        """Compare the rotations of gyroscope and images between nodes."""
+        turned = nodes.rotation @ problem.rotation_camera_imu
+        motion = preintegrate(problem.samples, nodes.times + offset, gyro[:-1], accel[:-1], problem.noise)
+        off = rotation_vector(np.swapaxes(motion.rotation, -1, -2) @ np.swapaxes(turned[:-1], -1, -2) @ turned[1:])
+        off = off[motion.covered & (nodes.segment[1:] == nodes.segment[:-1])]
+        angle = float(np.rad2deg(np.sqrt((off**2).sum(-1).mean()))) if len(off) else 0.0
+        if angle > MAX_TURN:
+            raise _DisagreementError(
+                f"gyroscope and images turn differently, by {angle:.1f} degrees: axes, time offset or clock"
+            )
+
     def _adapt(self, found: Smoothed) -> None:
         """Follow the noise of the visual poses."""
-        factors = np.clip(np.sqrt(found.visual_error / 0.7), 0.7, 1.4)
+        factors = np.clip(np.sqrt(found.visual_error / FIT), 0.7, 1.4)
         rotation = float(np.clip(self._smoother.rotation_sigma * factors[0], 5e-4, 2e-2))
         position = float(np.clip(self._smoother.position_sigma * factors[1], 3e-4, 2e-2))
         self._smoother = replace(self._smoother, rotation_sigma=rotation, position_sigma=position)
 
     def _doubt(self, problem: Smoother, found: Smoothed) -> str:
         """Why an estimate is not believed; empty if it is."""
-        nodes = problem.nodes
-        turned = nodes.rotation @ problem.rotation_camera_imu
-        times = nodes.times + found.time_offset
-        motion = preintegrate(problem.samples, times, found.gyro_bias[:-1], found.accel_bias[:-1], problem.noise)
-        off = rotation_vector(np.swapaxes(motion.rotation, -1, -2) @ np.swapaxes(turned[:-1], -1, -2) @ turned[1:])
-        off = off[motion.covered & (nodes.segment[1:] == nodes.segment[:-1])]
-        disagreement = float(np.rad2deg(np.sqrt((off**2).sum(-1).mean()))) if len(off) else 0.0
-        if disagreement > MAX_TURN:
-            return f"gyroscope and images turn differently, by {disagreement:.1f} degrees: axes, time offset or clock"
+        try:
+            self._turned_apart(problem, problem.nodes, found.gyro_bias, found.accel_bias, found.time_offset)
+        except _DisagreementError as disagreement:
+            return str(disagreement)
         for name, values, limit, unit in (
             ("gyroscope", found.gyro_bias, MAX_BIASES[0], "rad/s"),
             ("accelerometer", found.accel_bias, MAX_BIASES[1], "m/s^2"),
@@ -439,14 +466,19 @@ class InertialEstimator:
             bias = float(np.abs(values[-1]).max())
             if bias > limit + 3 * (self.noise.gyro_bias if unit == "rad/s" else self.noise.accel_bias):
                 return f"a bias of the {name} of {bias:.2g} {unit}: a damaged sensor, or wrong units"
-        if found.inertial_error > MAX_ERROR:
+        if found.inertial_error > MAX_ERROR or self._smoother.rotation_sigma > MAX_ROTATION_SIGMA:
             return "samples and images do not fit: noise, time offset or extrinsic calibration"
+        if self.aligned and abs(found.time_offset - self._offset) > MAX_SHIFT:
+            shift = 1000 * (found.time_offset - self._offset)
+            return f"the time offset has changed by {shift:.0f} ms: the clocks drift"
         if not self.aligned:
             speeding = np.diff(found.velocity, axis=0) / np.diff(found.times)[:, None]
             excitation = float(np.sqrt(speeding.var(0).sum()))
             if excitation < self.options.min_excitation:
                 least = self.options.min_excitation
                 return f"too little acceleration, {excitation:.2f} of {least:.2f} m/s^2"
+            if found.scale_sigma > NOTHING_TOLD:
+                return "the images show rotation, and too little translation with changes of speed"
             if found.scale_sigma > self.options.max_scale_sigma:
                 return f"the scale is uncertain by {100 * found.scale_sigma:.1f} %: move on, with changes of speed"
             if found.gravity_sigma > MAX_GRAVITY_SIGMA:
@@ -459,10 +491,15 @@ class InertialEstimator:
         """Note why there is no estimate; an alignment that fails again and again is withdrawn."""
         self._candidate = None
         if not self.aligned:
+            if reason == self.reason and reason not in _WAITING:  # the same again and again: look more rarely
+                self._patience = min(2 * self._patience, MOST_PATIENCE)
+            else:
+                self._patience = EVERY / 2
+            self._next = time + self._patience
             self.reason = reason
             return
         self._failures += 1
-        if self._failures >= FAILURES and reason not in ("too few poses", "too few samples"):
+        if self._failures >= FAILURES and reason not in _WAITING:
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
             self.worlds, self.solution, self._known, self._failures = {}, None, [], 0
@@ -478,6 +515,7 @@ class InertialEstimator:
                 self.reason = "the estimate waits for another that confirms it"
                 return
             self.state, self.reason, self._aligned, self._revised = ScaleState.ALIGNED, "", time, time
+            self._offset = found.time_offset
             self._take(found, worlds)
             self.history.append({"time": time, "event": "aligned", "scale_sigma": found.scale_sigma})
             return

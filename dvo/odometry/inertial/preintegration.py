@@ -311,10 +311,12 @@ def _uncertainty(samples: InertialSamples, s: _Steps, times: Array, noise: ImuNo
     whole = high - low
     held = ~np.isfinite(whole)
     whole = np.where(held, 2 * s.dt[:, 0], whole)  # one of its ends is not known
-    for step in np.flatnonzero((held | (whole > reach)) & covered[interval]):
-        lag = int(np.clip(round(whole[step] / median), 1, max(len(stamps) // 2, 1)))
-        longer = max(whole[step] / (lag * median), 1.0)
-        for kind, signal in enumerate((samples.gyro, samples.accel)):
-            change = np.mean((signal[lag:] - signal[:-lag]) ** 2) * longer**2
-            variance[step, kind] += change / 16
+    steps = np.flatnonzero((held | (whole > reach)) & covered[interval])
+    if len(steps):
+        lags = np.clip(np.rint(whole[steps] / median), 1, max(len(stamps) // 2, 1)).astype(int)
+        longer = np.maximum(whole[steps] / (lags * median), 1.0)
+        for lag in np.unique(lags):
+            change = [np.mean((x[lag:] - x[:-lag]) ** 2) for x in (samples.gyro, samples.accel)]
+            which = lags == lag
+            variance[steps[which]] += np.multiply.outer(longer[which] ** 2, change) / 16
     return variance, longest, covered

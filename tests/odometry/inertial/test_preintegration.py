@@ -86,7 +86,7 @@ def turn_error(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(rotation_vector(np.swapaxes(a, -1, -2) @ b)).max())
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(st.integers(0, 2**20), st.floats(0.0, 0.004))
 def test_equals_a_brute_force_integration_at_10_khz_and_the_analytic_motion(seed: int, start: float) -> None:
     motion = Motion(seed)
@@ -151,15 +151,15 @@ def test_the_covariance_is_that_of_monte_carlo_runs() -> None:
     clean, rng = motion.samples(stamps), np.random.default_rng(0)
     times = np.array([0.05, 0.55])
     plain = preintegrate(clean, times, NONE, NONE, NOISE)
-    # one stream in which run after run follows, a second apart
-    count = len(stamps)
+    # one stream in which run follows run
+    count, later = len(stamps), np.arange(runs)[:, None] * 0.6
     noise = rng.normal(size=(runs, count, 6)) * np.sqrt(rate) * np.repeat([NOISE.gyro, NOISE.accel], 3)
     long = InertialSamples(
-        (stamps + np.arange(runs)[:, None]).ravel(),
+        (stamps + later).ravel(),
         (clean.gyro + noise[..., :3]).reshape(-1, 3),
         (clean.accel + noise[..., 3:]).reshape(-1, 3),
     )
-    got = preintegrate(long, (times + np.arange(runs)[:, None]).ravel(), NONE, NONE, NOISE)
+    got = preintegrate(long, (times + later).ravel(), NONE, NONE, NOISE)
     turn = rotation_vector(plain.rotation[0].T @ got.rotation[::2])
     errors = np.concatenate([turn, got.velocity[::2] - plain.velocity, got.position[::2] - plain.position], 1)
     sampled, told = errors.T @ errors / runs, plain.covariance[0]
@@ -276,7 +276,7 @@ def test_bad_input_is_refused(change: str, field: str) -> None:
     elif change == "nan":
         samples = InertialSamples(samples.timestamps, samples.gyro * np.nan, samples.accel)
     else:
-        bias = NONE * np.inf
+        bias = NONE + np.inf
     with pytest.raises(DvoError) as error:
         preintegrate(samples, times, bias, NONE, NOISE)
     assert error.value.field == field
@@ -311,7 +311,9 @@ def test_gtsam_integrates_the_same() -> None:
     assert np.allclose(theirs.deltaVij(), ours.velocity[0], atol=1e-3)
     assert np.allclose(theirs.deltaPij(), ours.position[0], atol=1e-3)
     order = [0, 1, 2, 6, 7, 8, 3, 4, 5]  # theirs is (phi, p, v)
-    covariance = theirs.preintMeasCov()[np.ix_(order, order)]
+    to_right = np.eye(9)  # theirs is of the rotation vector
+    to_right[:3, :3] = gtsam.Rot3.ExpmapDerivative(rotation_vector(ours.rotation[0]))
+    covariance = to_right @ theirs.preintMeasCov()[np.ix_(order, order)] @ to_right.T
     scale = np.sqrt(np.diag(covariance))
     assert np.allclose(ours.covariance[0] / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.01)
 

@@ -15,7 +15,7 @@ from dvo.geometry import se3, sim3, so3
 POSES, INVERSE_DEPTHS, INTRINSICS = "poses", "inverse_depths", "intrinsics"
 """Names of the blocks of :func:`dvo.ba.layer.layer.bundle_adjust`; poses are world to camera (or to body)."""
 VELOCITY, IMU_BIAS = "velocity", "imu_bias"
-"""Of each frame: velocity of the inertial sensor in the world, m/s; biases of gyroscope and accelerometer, 6 numbers."""
+"""Of each frame: velocity of the inertial sensor in the world, m/s; biases of gyroscope and accelerometer."""
 GRAVITY, LOG_SCALE, TIME_OFFSET, T_CAMERA_IMU = "gravity", "log_scale", "time_offset", "T_camera_imu"
 """Globals of :class:`dvo.ba.inertial_factor.InertialFactor`."""
 

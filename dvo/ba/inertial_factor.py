@@ -12,7 +12,7 @@ visual unit, the body is at ``R_wb = R_cw^T R_cb`` and ``p = e^s c + R_cw^T t_cb
 tangent ``[tau, phi]`` of ``T_cw`` turns the body by ``-R_cb^T phi`` on its right and moves it by
 ``R_cw^T (t_cb x phi - e^s tau)``. With a time offset (stamps of the inertial clock minus those of the camera) that
 differs by d from the one that was integrated with, the states are first moved to the instants of the integration:
-``R Exp(-w d)``, ``v - (R f + g) d``, ``p - v d``, to first order.
+``R Exp(-w d)``, ``v - a d``, ``p - v d + a d^2 / 2``, with the rate w and the acceleration ``a = R f + g`` there.
 """
 
 from __future__ import annotations
@@ -125,18 +125,20 @@ class InertialFactor(Factor):
             p_i, p_j = (scale * centre + lever).split(count, 1)
             v_i, v_j = values[VELOCITY].index_select(1, torch.cat((state_i, state_j))).split(count, 1)
             back = so3.matrix(q_wb[:, :count]).mT
-            step, gain = v_j - v_i, force[:, :count] + down
-            u_v = step - down * time - (force[:, count:] - force[:, :count]) * late
-            u_p = p_j - p_i - v_i * time - down * time**2 / 2 - step * late + gain * (late * time)
+            step, change, gain = v_j - v_i, force[:, count:] - force[:, :count], force[:, :count] + down
+            u_v = step - down * time - change * late
+            u_p = (
+                p_j - p_i - v_i * time - down * time**2 / 2 - step * late + gain * (late * time) + change * late**2 / 2
+            )
             r_v, r_p = (back @ u_v[..., None])[..., 0], (back @ u_p[..., None])[..., 0]
             by = (self.by_bias @ db)[..., 0] if db is not None else torch.zeros_like(self.root[..., 0])
             residual += [r_v - self.velocity - by[..., 3:6], r_p - self.position - by[..., 6:]]
             x_i, late_, time_ = turned[:, :count], late[..., None], time[..., None]
             hat_v, hat_p, hat_f = so3.hat(r_v), so3.hat(r_p), so3.hat(f)
             by_force = x_i @ hat_f[:, :count] * late_
-            turns[0] = torch.cat((turns[0], hat_v @ x_i - by_force, hat_p @ x_i - by_force * time_), -2)
-            other = back @ r_wb[:, count:] @ hat_f[:, count:] * late_
-            turns[1] = torch.cat(torch.broadcast_tensors(turns[1], other, zero), -2)
+            turns[0] = torch.cat((turns[0], hat_v @ x_i - by_force, hat_p @ x_i - by_force * (time_ - late_ / 2)), -2)
+            by_force = back @ r_wb[:, count:] @ hat_f[:, count:] * late_
+            turns[1] = torch.cat(torch.broadcast_tensors(turns[1], by_force, -by_force * late_ / 2), -2)
             moves = [torch.cat((zero, zero, sign * back), -2) for sign in (-1, 1)]  # by positions
             add(VELOCITY, state_i, zero, -back, (late_ - time_) * back)
             add(VELOCITY, state_j, zero, back, -late_ * back)
@@ -161,14 +163,16 @@ class InertialFactor(Factor):
             by_down = back @ (tangent_basis(values[GRAVITY]) * self.gravity.norm(dim=-1)[:, None, None, None])
             add(GRAVITY, none, zero[..., :2], -time_ * by_down, (late_ - time_ / 2) * time_ * by_down)
         if full and LOG_SCALE in values:
-            moved = ((moves[0] @ centre[:, :count, :, None]) + (moves[1] @ centre[:, count:, :, None])) * scale[..., None]
+            moved = ((moves[0] @ centre[:, :count, :, None]) + (moves[1] @ centre[:, count:, :, None])) * scale[
+                ..., None
+            ]
             slots.append((LOG_SCALE, none, moved))
         if TIME_OFFSET in values:
             w_i, w_j = (part[..., None] for part in self._ends(self.rates).split(count, 1))
             parts = [-by_end @ w_j - by_start @ w_i]
             if full:
-                parts.append(-hat_v @ w_i - back @ (force[:, count:] - force[:, :count])[..., None])
-                parts.append(-hat_p @ w_i + back @ (gain * time - step)[..., None])
+                parts.append(-hat_v @ w_i - back @ change[..., None])
+                parts.append(-hat_p @ w_i + back @ (gain * time - step + change * late)[..., None])
             add(TIME_OFFSET, none, *parts)
         if T_CAMERA_IMU in values:
             by_phi = (turns[0] + turns[1]) @ r_cb.mT

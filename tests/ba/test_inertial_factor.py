@@ -24,17 +24,17 @@ F64 = torch.float64
 seeds = st.integers(0, 2**32 - 1)
 
 
-def random_case(seed: int, *, turn: float = 0.5, frames: int = 4) -> tuple[InertialFactor, dict[str, StateBlock]]:
-    """A factor of three intervals that fits the states but for some noise, and all of its blocks."""
+def random_case(seed: int, *, turn: float = 0.5, frames: int = 3) -> tuple[InertialFactor, dict[str, StateBlock]]:
+    """A factor of two intervals that fits the states but for some noise, and all of its blocks."""
     randn = generator_of(seed)
-    ii, jj = torch.tensor([0, 2, 1]), torch.tensor([2, 1, 3])
+    ii, jj = torch.tensor([0, 2]), torch.tensor([2, 1])
     poses = se3.exp(torch.cat((randn(1, frames, 3), turn * randn(1, frames, 3)), -1))
     extrinsics = se3.exp(0.5 * randn(1, 6))
-    root = torch.eye(9, dtype=F64) + 0.2 * randn(1, 3, 9, 9).tril()
+    root = torch.eye(9, dtype=F64) + 0.2 * randn(1, 2, 9, 9).tril()
     factor = InertialFactor(
-        duration=0.2 + randn(1, 3).abs(), rotation=so3.exp(turn * randn(1, 3, 3)), velocity=randn(1, 3, 3),
-        position=randn(1, 3, 3), by_bias=randn(1, 3, 9, 6), root=root, bias=0.1 * randn(1, 3, 6),
-        rates=randn(1, 3, 2, 3), forces=randn(1, 3, 2, 3), offset=0.1 * randn(1, 3), gravity=3 * randn(1, 3),
+        duration=0.2 + randn(1, 2).abs(), rotation=so3.exp(turn * randn(1, 2, 3)), velocity=randn(1, 2, 3),
+        position=randn(1, 2, 3), by_bias=randn(1, 2, 9, 6), root=root, bias=0.1 * randn(1, 2, 6),
+        rates=randn(1, 2, 2, 3), forces=randn(1, 2, 2, 3), offset=0.1 * randn(1, 2), gravity=3 * randn(1, 3),
         extrinsics=extrinsics, ii=ii, jj=jj,
     )  # fmt: skip
     blocks = inertial_blocks(
@@ -44,7 +44,7 @@ def random_case(seed: int, *, turn: float = 0.5, frames: int = 4) -> tuple[Inert
     return factor, {**blocks, POSES: pose_block(poses, 0)}
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seeds, st.sampled_from([1e-6, 0.1, 0.5]))
 def test_jacobians_of_all_blocks(seed: int, turn: float) -> None:
     factor, blocks = random_case(seed, turn=turn)
@@ -53,7 +53,7 @@ def test_jacobians_of_all_blocks(seed: int, turn: float) -> None:
     assert_jacobians(factor, State({**blocks, T_CAMERA_IMU: extrinsics_block(quaternion)}))
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(seeds)
 def test_jacobians_of_some_blocks(seed: int) -> None:
     factor, blocks = random_case(seed)
@@ -62,8 +62,8 @@ def test_jacobians_of_some_blocks(seed: int) -> None:
     assert_jacobians(replace(factor, kernel=Kernel("none")), State({n: blocks[n] for n in (POSES, VELOCITY)}))
     del blocks[VELOCITY]  # the rotation alone
     assert_jacobians(factor, State(blocks))
-    assert factor.linearise({POSES: blocks[POSES].value}).residual.shape == (1, 3, 3)
-    other = replace(factor, state_i=torch.tensor([1, 0, 2]), state_j=torch.tensor([0, 2, 3]))
+    assert factor.linearise({POSES: blocks[POSES].value}).residual.shape == (1, 2, 3)
+    other = replace(factor, state_i=torch.tensor([1, 0]), state_j=torch.tensor([0, 2]))
     assert_jacobians(other, State({**some, POSES: blocks[POSES]}))
 
 

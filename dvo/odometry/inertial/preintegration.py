@@ -37,6 +37,7 @@ class Preintegration:
             derivatives by the biases; that of the rotation is on its right.
         gyro_bias, accel_bias: ``(K, 3)`` subtracted from the samples, rad/s and m/s^2.
         longest: ``(K,)`` longest time without a sample in the interval, seconds.
+        rates, forces: ``(K, 2, 3)`` rad/s and m/s^2 of the body at start and end, without the bias.
     """
 
     duration: Array
@@ -52,6 +53,8 @@ class Preintegration:
     gyro_bias: Array
     accel_bias: Array
     longest: Array
+    rates: Array
+    forces: Array
 
     def __len__(self) -> int:
         return len(self.duration)
@@ -114,11 +117,9 @@ def preintegrate(
     if not all(np.isfinite(b).all() for b in biases):
         raise DvoError("are not finite", field="gyro_bias, accel_bias", remedy="give biases in rad/s and m/s^2")
     if count == 0:
-        empty = {9: np.zeros((0, 9, 9)), 3: np.zeros((0, 3)), 1: np.zeros(0)}
-        matrix = np.zeros((0, 3, 3))
-        return Preintegration(
-            empty[1], matrix, empty[3], empty[3], empty[9], *(matrix,) * 5, empty[3], empty[3], empty[1]
-        )
+        scalar, vector, matrix, ends = (np.zeros((0, *shape)) for shape in ((), (3,), (3, 3), (2, 3)))
+        own = scalar, matrix, vector, vector, np.zeros((0, 9, 9))
+        return Preintegration(*own, *(matrix,) * 5, vector, vector, scalar, ends, ends)
     steps = np.diff(np.searchsorted(samples.timestamps, times)) + 1
     part = np.cumsum(steps) // MOST_STEPS
     cuts = [0, *(np.flatnonzero(np.diff(part)) + 1), count]
@@ -254,13 +255,15 @@ def _integrate(
     turn[:, :3, :3], turn[:, 3:6, 3:6], turn[:, 6:, 6:] = np.eye(3), inverse, inverse
     covariance = turn @ covariance @ np.swapaxes(turn, -1, -2)
     by_interval *= -1  # a bias is subtracted
+    rates, forces = (np.stack([first[start], second[end - 1]], 1) for first, second in (s.gyro, s.accel))
     if not covered.all():
         rotation[~covered], velocity[~covered], position[~covered], by_interval[~covered] = np.eye(3), 0, 0, 0
         covariance[~covered] = np.where(np.eye(9, dtype=bool), np.inf, 0)
     return Preintegration(
         duration, rotation, velocity, position, covariance,
         by_interval[:, :3, :3], by_interval[:, 3:6, :3], by_interval[:, 3:6, 3:], by_interval[:, 6:, :3],
-        by_interval[:, 6:, 3:], gyro_bias, accel_bias, longest,
+        by_interval[:, 6:, 3:], gyro_bias, accel_bias, longest, rates,
+        forces,
     )  # fmt: skip
 
 

@@ -11,53 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
-from dvo.data.inertial import ImuNoise, InertialSamples
+from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import so3_exp
 from dvo.odometry.inertial.preintegration import GAP, Preintegration, preintegrate, propagate
 from dvo.synth.sensors.imu import rotation_vector
+from tests.support.inertial_motion import DOWN, NOISE, Motion
 
-GRAVITY = np.array([0.0, 0.0, -9.81])
 NONE = np.zeros(3)
-NOISE = ImuNoise(1e-3, 1e-5, 1e-2, 1e-4)
-
-
-class Motion:
-    """Rotation by two turns about fixed axes, position by sines: all derivatives are known."""
-
-    def __init__(self, seed: int, speed: float = 1.0) -> None:
-        rng = np.random.default_rng(seed)
-        self.axes = rng.normal(size=(2, 3))
-        self.axes /= np.linalg.norm(self.axes, axis=1, keepdims=True)
-        self.turns = rng.uniform(0.5, 1.5, 2) * np.array([1.5, -1.2]) * speed
-        self.amount = rng.uniform(0.3, 1.0, (3, 3))
-        self.frequency = rng.uniform(0.5, 4.0, (3, 3)) * speed
-        self.phase = rng.uniform(0, 6, (3, 3))
-
-    def rotation(self, t: np.ndarray) -> np.ndarray:
-        first, second = (so3_exp(np.multiply.outer(w * t, a)) for w, a in zip(self.turns, self.axes, strict=True))
-        return first @ second
-
-    def position(self, t: np.ndarray) -> np.ndarray:
-        return (self.amount * np.sin(np.multiply.outer(t, self.frequency) + self.phase)).sum(-1)
-
-    def velocity(self, t: np.ndarray) -> np.ndarray:
-        return (self.amount * self.frequency * np.cos(np.multiply.outer(t, self.frequency) + self.phase)).sum(-1)
-
-    def samples(self, t: np.ndarray) -> InertialSamples:
-        second = so3_exp(np.multiply.outer(self.turns[1] * t, self.axes[1]))
-        gyro = (np.swapaxes(second, -1, -2) @ (self.turns[0] * self.axes[0])) + self.turns[1] * self.axes[1]
-        swing = np.sin(np.multiply.outer(t, self.frequency) + self.phase)
-        force = -(self.amount * self.frequency**2 * swing).sum(-1) - GRAVITY
-        accel = (np.swapaxes(self.rotation(t), -1, -2) @ force[..., None])[..., 0]
-        return InertialSamples(t, gyro, accel)
-
-    def truth(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What an interval measures."""
-        r, p, v, t = self.rotation(times), self.position(times), self.velocity(times), np.diff(times)[:, None]
-        back = np.swapaxes(r[:-1], -1, -2)
-        dv = back @ (np.diff(v, axis=0) - GRAVITY * t)[..., None]
-        dp = back @ (np.diff(p, axis=0) - v[:-1] * t - 0.5 * GRAVITY * t**2)[..., None]
-        return back @ r[1:], dv[..., 0], dp[..., 0]
 
 
 def brute_force(samples: InertialSamples, begin: float, end: float, rate: float = 1e4) -> tuple[np.ndarray, ...]:
@@ -196,8 +156,8 @@ def test_a_yaw_of_the_world_changes_nothing(yaw: float, seed: int) -> None:
     samples = motion.samples(np.arange(0, 0.8, 1 / 400))
     state = motion.rotation(times[:1])[0], motion.position(times[:1])[0], motion.velocity(times[:1])[0]
     turn = so3_exp(np.array([0, 0, yaw]))
-    here = propagate(*state, samples, times, NONE, NONE, GRAVITY)
-    there = propagate(turn @ state[0], turn @ state[1], turn @ state[2], samples, times, NONE, NONE, GRAVITY)
+    here = propagate(*state, samples, times, NONE, NONE, DOWN)
+    there = propagate(turn @ state[0], turn @ state[1], turn @ state[2], samples, times, NONE, NONE, DOWN)
     assert np.allclose(turn @ here[0], there[0]) and np.allclose(here[2] @ turn.T, there[2])
     assert np.allclose(here[1] @ turn.T, there[1])
 
@@ -208,15 +168,15 @@ def test_dead_reckoning_follows_the_motion_and_agrees_with_the_intervals() -> No
     samples = motion.samples(np.arange(0, 3.2, 1 / 500))
     samples = InertialSamples(samples.timestamps, samples.gyro + bias, samples.accel - bias)
     state = motion.rotation(times[:1])[0], motion.position(times[:1])[0], motion.velocity(times[:1])[0]
-    rotation, position, velocity = propagate(*state, samples, times, bias, -bias, GRAVITY)
+    rotation, position, velocity = propagate(*state, samples, times, bias, -bias, DOWN)
     assert np.abs(position - motion.position(times)).max() < 2e-3
     assert np.abs(velocity - motion.velocity(times)).max() < 2e-3
     assert turn_error(rotation, motion.rotation(times)) < 1e-4
     parts = preintegrate(samples, times, bias, -bias, NOISE)
     r, p, v = state
     for k, t in enumerate(parts.duration):
-        p = p + v * t + GRAVITY * t**2 / 2 + r @ parts.position[k]
-        v, r = v + GRAVITY * t + r @ parts.velocity[k], r @ parts.rotation[k]
+        p = p + v * t + DOWN * t**2 / 2 + r @ parts.position[k]
+        v, r = v + DOWN * t + r @ parts.velocity[k], r @ parts.rotation[k]
     assert np.allclose(r, rotation[-1]) and np.allclose(p, position[-1]) and np.allclose(v, velocity[-1])
 
 

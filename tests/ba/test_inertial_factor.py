@@ -35,8 +35,8 @@ from dvo.ba.solve import solve
 from dvo.ba.sparse.global_adjust import GlobalBAOptions
 from dvo.ba.sparse.levenberg import LMOptions
 from dvo.geometry import se3, so3
-from tests.ba.test_factors import assert_jacobians, generator_of
 from tests.support.inertial_motion import InertialWindow, disturbed, inertial_window
+from tests.support.jacobians import assert_jacobians, generator_of
 
 F64 = torch.float64
 seeds = st.integers(0, 2**32 - 1)

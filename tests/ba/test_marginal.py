@@ -18,8 +18,8 @@ from dvo.ba.problem import Factor, Problem, State
 from dvo.ba.solve import solve
 from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3, so3
-from tests.ba.test_factors import assert_jacobians
 from tests.support.inertial_motion import InertialWindow, disturbed, inertial_window
+from tests.support.jacobians import assert_jacobians
 
 F64 = torch.float64
 OLD = {POSES: torch.tensor([0]), VELOCITY: torch.tensor([0]), IMU_BIAS: torch.tensor([0])}

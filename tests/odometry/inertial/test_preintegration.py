@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from dvo.core.errors import DvoError
 from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import so3_exp
-from dvo.odometry.inertial.preintegration import GAP, Preintegration, preintegrate, propagate
+from dvo.odometry.inertial.preintegration import CONTEXT, GAP, Preintegration, preintegrate, propagate
 from dvo.synth.sensors.imu import rotation_vector
 from tests.support.inertial_motion import DOWN, NOISE, Motion
 
@@ -46,7 +46,7 @@ def turn_error(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(rotation_vector(np.swapaxes(a, -1, -2) @ b)).max())
 
 
-@settings(deadline=None, max_examples=8)
+@settings(deadline=None, max_examples=5)
 @given(st.integers(0, 2**20), st.floats(0.0, 0.004))
 def test_equals_a_brute_force_integration_at_10_khz_and_the_analytic_motion(seed: int, start: float) -> None:
     motion = Motion(seed)
@@ -192,6 +192,29 @@ def test_intervals_integrated_together_equal_those_integrated_alone(monkeypatch:
         for name, value in vars(alone).items():
             assert np.allclose(getattr(together, name)[k], value[0], rtol=1e-9, atol=1e-12), name
             assert np.allclose(getattr(in_parts, name)[k], value[0], rtol=1e-9, atol=1e-12), name
+
+
+def test_the_kernel_equals_its_twin(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = random_samples(9, 400, 50.0)
+    kept = np.abs(samples.timestamps - 3) > 0.2
+    samples = InertialSamples(samples.timestamps[kept], 3 * samples.gyro[kept], samples.accel[kept])
+    times = np.array([-1, 0.5, 0.51, 2.0, 3.3, 7.0])
+    biases = np.random.default_rng(0).normal(0, 0.1, (2, 5, 3))
+    found = preintegrate(samples, times, *biases, NOISE)
+    monkeypatch.setenv("DVO_KERNELS", "torch")
+    twin = preintegrate(samples, times, *biases, NOISE)
+    for name, value in vars(twin).items():
+        assert np.allclose(getattr(found, name), value, rtol=1e-9, atol=1e-12), name
+
+
+def test_samples_far_away_change_nothing() -> None:
+    motion, times = Motion(4), np.array([10.0, 10.1, 10.3])
+    whole = motion.samples(np.arange(0, 20, 1 / 200))
+    near = whole.between(times[0] - CONTEXT, times[-1] + CONTEXT)
+    for a, b in zip(vars(preintegrate(whole, times, NONE, NONE, NOISE)).values(),
+                    vars(preintegrate(near, times, NONE, NONE, NOISE)).values(), strict=True):  # fmt: skip
+        assert np.array_equal(a, b)
+    assert not preintegrate(whole, times + 30, NONE, NONE, NOISE).covered.any()
 
 
 def test_a_gap_inflates_the_covariance_by_what_the_signal_does_in_such_a_time() -> None:

@@ -3,23 +3,28 @@
 Forster, Carlone, Dellaert, Scaramuzza, "On-manifold preintegration for real-time visual-inertial odometry" (IEEE
 Transactions on Robotics, 2017). The body frame is that of the inertial sensor. Between samples, rates and specific
 forces are linear: the rotation of a step is the mean rate with the coning term ``dt^2/12 w0 x w1``, and velocity and
-position integrate the specific force, linear in the frame of the interval's start. All steps of all intervals are
-computed at once: rotations by a scan, velocities and positions by cumulative sums, covariance and bias Jacobians from
-the closed form of what an error in one step does to the end of its interval.
+position integrate the specific force, linear in the frame of the interval's start.
+
+A compiled kernel goes step by step. Its twin computes all steps of all intervals at once: rotations by a scan,
+velocities and positions by cumulative sums, covariance and bias Jacobians from the closed form of what an error in one
+step does to the end of its interval.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
 from dvo.core.errors import DvoError
+from dvo.core.kernels import available
 from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry.poses import skew, so3_exp
 
 Array = np.ndarray
 GAP = 2.5  # median intervals between samples; a longer time without one is a gap
+CONTEXT = 2.0  # seconds of samples before and after the intervals that are looked at
 MOST_STEPS = 20_000  # integrated at once, which bounds memory to some ten megabytes
 
 
@@ -37,6 +42,7 @@ class Preintegration:
             derivatives by the biases; that of the rotation is on its right.
         gyro_bias, accel_bias: ``(K, 3)`` subtracted from the samples, rad/s and m/s^2.
         longest: ``(K,)`` longest time without a sample in the interval, seconds.
+        rates, forces: ``(K, 2, 3)`` rad/s and m/s^2 of the body at start and end, without the bias.
     """
 
     duration: Array
@@ -52,6 +58,8 @@ class Preintegration:
     gyro_bias: Array
     accel_bias: Array
     longest: Array
+    rates: Array
+    forces: Array
 
     def __len__(self) -> int:
         return len(self.duration)
@@ -94,7 +102,8 @@ def preintegrate(
     When a keyframe is dropped, call this again without its time.
 
     Args:
-        samples: any that contain the intervals; those elsewhere tell how fast the signals change in a gap.
+        samples: any that contain the intervals; those within ``CONTEXT`` of them also tell the rate, and how fast the
+            signals change in a gap.
         times: ``(K + 1,)`` strictly increasing seconds on the clock of the samples.
         gyro_bias, accel_bias: ``(3,)`` or ``(K, 3)``, rad/s and m/s^2.
         noise: white noise of the samples. The bias walks are measurements of their own
@@ -108,17 +117,15 @@ def preintegrate(
         DvoError: times or samples that do not increase, samples or biases that are not finite.
     """
     times = np.asarray(times, float)
-    _check(samples, times)
+    samples = _checked(samples, times)
     count = len(times) - 1
     biases = [np.broadcast_to(np.asarray(b, float), (count, 3)).copy() for b in (gyro_bias, accel_bias)]
     if not all(np.isfinite(b).all() for b in biases):
         raise DvoError("are not finite", field="gyro_bias, accel_bias", remedy="give biases in rad/s and m/s^2")
     if count == 0:
-        empty = {9: np.zeros((0, 9, 9)), 3: np.zeros((0, 3)), 1: np.zeros(0)}
-        matrix = np.zeros((0, 3, 3))
-        return Preintegration(
-            empty[1], matrix, empty[3], empty[3], empty[9], *(matrix,) * 5, empty[3], empty[3], empty[1]
-        )
+        scalar, vector, matrix, ends = (np.zeros((0, *shape)) for shape in ((), (3,), (3, 3), (2, 3)))
+        own = scalar, matrix, vector, vector, np.zeros((0, 9, 9))
+        return Preintegration(*own, *(matrix,) * 5, vector, vector, scalar, ends, ends)
     steps = np.diff(np.searchsorted(samples.timestamps, times)) + 1
     part = np.cumsum(steps) // MOST_STEPS
     cuts = [0, *(np.flatnonzero(np.diff(part)) + 1), count]
@@ -158,7 +165,7 @@ def propagate(
         DvoError: see :func:`preintegrate`; no samples.
     """
     times = np.asarray(times, float)
-    _check(samples, times)
+    samples = _checked(samples, times)
     if len(samples) == 0:
         raise DvoError("there are none", field="samples", remedy="give samples that cover the times")
     steps = _Steps.between(samples, times, np.asarray(gyro_bias, float), np.asarray(accel_bias, float))
@@ -168,28 +175,31 @@ def propagate(
     return rotation @ steps.rotation[at], moved, velocity + steps.velocity[at] @ rotation.T + gravity * since
 
 
-def _check(samples: InertialSamples, times: Array) -> None:
+def _checked(samples: InertialSamples, times: Array) -> InertialSamples:
+    """The samples about the times."""
     if times.ndim != 1 or len(times) == 0 or not np.isfinite(times).all() or not (np.diff(times) > 0).all():
         raise DvoError("do not strictly increase", field="times", remedy="give one time of each frame, in order")
+    if len(samples) and not (
+        times[0] - CONTEXT <= samples.timestamps[0] and samples.timestamps[-1] <= times[-1] + CONTEXT
+    ):
+        near = samples.between(times[0] - CONTEXT, times[-1] + CONTEXT)
+        samples = near if len(near) else samples
     if not (np.diff(samples.timestamps) > 0).all():
         raise DvoError("do not strictly increase", field="samples.timestamps", remedy="sort the samples")
     if not all(np.isfinite(x).all() for x in (samples.timestamps, samples.gyro, samples.accel)):
         raise DvoError("are not finite", field="samples", remedy="leave out samples without a value")
+    return samples
 
 
 @dataclass(frozen=True)
 class _Steps:
-    """Integration over the ``S`` steps between ``S + 1`` knots: the samples, and the times between them."""
+    """The ``S`` steps between ``S + 1`` knots: the samples, and the times between them."""
 
     knots: Array  # (S + 1,)
     index: Array  # (K + 1,) knots that are the times
     dt: Array  # (S, 1)
     gyro: tuple[Array, Array]  # (S, 3) at both ends of a step
     accel: tuple[Array, Array]
-    turn: Array  # (S, 3) rotation vectors
-    rotation: Array  # (S + 1, 3, 3) to the first knot
-    velocity: Array  # (S + 1, 3) from the first knot, in its frame
-    position: Array  # (S + 1, 3) likewise
 
     @staticmethod
     def between(samples: InertialSamples, times: Array, gyro_bias: Array, accel_bias: Array) -> _Steps:
@@ -201,19 +211,39 @@ class _Steps:
         low, high = max(int(first) - 1, 0), int(last) + 1
         values = np.concatenate([samples.gyro[low:high], samples.accel[low:high]], 1)
         values = np.stack([np.interp(knots, stamps[low:high], column) for column in values.T], 1)
-        if gyro_bias.ndim == 2:
-            interval = np.repeat(np.arange(len(times) - 1), np.diff(index))
-            gyro_bias, accel_bias = gyro_bias[interval], accel_bias[interval]
-        gyro = values[:-1, :3] - gyro_bias, values[1:, :3] - gyro_bias
-        accel = values[:-1, 3:] - accel_bias, values[1:, 3:] - accel_bias
-        dt = np.diff(knots)[:, None]
-        turn = (gyro[0] + gyro[1]) * (dt / 2) + np.cross(*gyro) * (dt**2 / 12)
-        rotation = _products(so3_exp(turn))
-        f0, f1 = ((r @ a[..., None])[..., 0] for r, a in zip((rotation[:-1], rotation[1:]), accel, strict=True))
-        zero = np.zeros((1, 3))
-        velocity = np.concatenate([zero, np.cumsum((f0 + f1) * (dt / 2), 0)])
-        position = np.concatenate([zero, np.cumsum(velocity[:-1] * dt + (2 * f0 + f1) * (dt**2 / 6), 0)])
-        return _Steps(knots, index, dt, gyro, accel, turn, rotation, velocity, position)
+        bias = np.concatenate([gyro_bias, accel_bias], -1)
+        if bias.ndim == 2:
+            bias = np.repeat(bias, np.diff(index), 0)
+        start, end = values[:-1] - bias, values[1:] - bias
+        return _Steps(knots, index, np.diff(knots)[:, None], (start[:, :3], end[:, :3]), (start[:, 3:], end[:, 3:]))
+
+    @cached_property
+    def turn(self) -> Array:
+        """``(S, 3)`` rotation vectors."""
+        return (self.gyro[0] + self.gyro[1]) * (self.dt / 2) + np.cross(*self.gyro) * (self.dt**2 / 12)
+
+    @cached_property
+    def rotation(self) -> Array:
+        """``(S + 1, 3, 3)`` to the first knot."""
+        return _products(so3_exp(self.turn))
+
+    @cached_property
+    def forces(self) -> tuple[Array, Array]:
+        """``(S, 3)`` at both ends of a step, in the frame of the first knot."""
+        ends = (self.rotation[:-1], self.accel[0]), (self.rotation[1:], self.accel[1])
+        first, second = ((r @ a[..., None])[..., 0] for r, a in ends)
+        return first, second
+
+    @cached_property
+    def velocity(self) -> Array:
+        """``(S + 1, 3)`` from the first knot, in its frame."""
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(sum(self.forces) * (self.dt / 2), 0)])
+
+    @cached_property
+    def position(self) -> Array:
+        """``(S + 1, 3)`` likewise."""
+        moved = self.velocity[:-1] * self.dt + (2 * self.forces[0] + self.forces[1]) * (self.dt**2 / 6)
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(moved, 0)])
 
 
 def _products(rotations: Array) -> Array:
@@ -233,35 +263,45 @@ def _integrate(
     if len(samples) == 0:
         samples = InertialSamples(times[:1], np.zeros((1, 3)), np.zeros((1, 3)))
     s = _Steps.between(samples, times, gyro_bias, accel_bias)
+    variance, longest, covered = _uncertainty(samples, s, times, noise)
+    rotation, velocity, position, covariance, by_bias = (_by_kernel if available() else _at_once)(s, variance)
+    rates, forces = (np.stack([first[s.index[:-1]], second[s.index[1:] - 1]], 1) for first, second in (s.gyro, s.accel))
+    if not covered.all():
+        rotation[~covered], velocity[~covered], position[~covered], by_bias[~covered] = np.eye(3), 0, 0, 0
+        covariance[~covered] = np.where(np.eye(9, dtype=bool), np.inf, 0)
+    return Preintegration(
+        np.diff(times), rotation, velocity, position, covariance,
+        by_bias[:, :3, :3], by_bias[:, 3:6, :3], by_bias[:, 3:6, 3:], by_bias[:, 6:, :3], by_bias[:, 6:, 3:],
+        gyro_bias, accel_bias, longest, rates, forces,
+    )  # fmt: skip
+
+
+def _by_kernel(s: _Steps, variance: Array) -> tuple[Array, ...]:
+    from dvo.odometry.inertial.preintegration_kernels import integrate
+
+    count = len(s.index) - 1
+    out = tuple(np.empty((count, *shape)) for shape in ((3, 3), (3,), (3,), (9, 9), (9, 6)))
+    given = (s.dt[:, 0], *s.gyro, *s.accel, variance)
+    integrate(s.index, *(np.ascontiguousarray(x) for x in given), *out)
+    return out
+
+
+def _at_once(s: _Steps, variance: Array) -> tuple[Array, ...]:
+    """Rotation, velocity, position, covariance and derivatives ``(K, 9, 6)`` by the biases, of all intervals."""
     start, end, count = s.index[:-1], s.index[1:], np.diff(s.index)
     last = np.repeat(end, count)  # of the interval of a step
     inverse = np.swapaxes(s.rotation[start], -1, -2)
-    duration = np.diff(times)
-
-    def within(vectors: Array) -> Array:
-        return (inverse @ vectors[..., None])[..., 0]
-
-    rotation = inverse @ s.rotation[end]
-    velocity = within(s.velocity[end] - s.velocity[start])
-    position = within(s.position[end] - s.position[start] - s.velocity[start] * duration[:, None])
+    duration = (s.knots[end] - s.knots[start])[:, None]
+    velocity = inverse @ (s.velocity[end] - s.velocity[start])[..., None]
+    position = inverse @ (s.position[end] - s.position[start] - s.velocity[start] * duration)[..., None]
     effect = _effect(s, last)
-    by_interval = np.add.reduceat(effect, start, axis=0)
-    by_interval[:, 3:6], by_interval[:, 6:9] = inverse @ by_interval[:, 3:6], inverse @ by_interval[:, 6:9]
-    variance, longest, covered = _uncertainty(samples, s, times, noise)
     scaled = effect * np.sqrt(np.repeat(variance, 3, 1))[:, None]
     covariance = np.add.reduceat(scaled @ np.swapaxes(scaled, -1, -2), start, axis=0)
     turn = np.zeros((len(start), 9, 9))
     turn[:, :3, :3], turn[:, 3:6, 3:6], turn[:, 6:, 6:] = np.eye(3), inverse, inverse
+    by_bias = -turn @ np.add.reduceat(effect, start, axis=0)  # a bias is subtracted
     covariance = turn @ covariance @ np.swapaxes(turn, -1, -2)
-    by_interval *= -1  # a bias is subtracted
-    if not covered.all():
-        rotation[~covered], velocity[~covered], position[~covered], by_interval[~covered] = np.eye(3), 0, 0, 0
-        covariance[~covered] = np.where(np.eye(9, dtype=bool), np.inf, 0)
-    return Preintegration(
-        duration, rotation, velocity, position, covariance,
-        by_interval[:, :3, :3], by_interval[:, 3:6, :3], by_interval[:, 3:6, 3:], by_interval[:, 6:, :3],
-        by_interval[:, 6:, 3:], gyro_bias, accel_bias, longest,
-    )  # fmt: skip
+    return inverse @ s.rotation[end], velocity[..., 0], position[..., 0], covariance, by_bias
 
 
 def _effect(s: _Steps, last: Array) -> Array:
@@ -311,10 +351,12 @@ def _uncertainty(samples: InertialSamples, s: _Steps, times: Array, noise: ImuNo
     whole = high - low
     held = ~np.isfinite(whole)
     whole = np.where(held, 2 * s.dt[:, 0], whole)  # one of its ends is not known
-    for step in np.flatnonzero((held | (whole > reach)) & covered[interval]):
-        lag = int(np.clip(round(whole[step] / median), 1, max(len(stamps) // 2, 1)))
-        longer = max(whole[step] / (lag * median), 1.0)
-        for kind, signal in enumerate((samples.gyro, samples.accel)):
-            change = np.mean((signal[lag:] - signal[:-lag]) ** 2) * longer**2
-            variance[step, kind] += change / 16
+    steps = np.flatnonzero((held | (whole > reach)) & covered[interval])
+    if len(steps):
+        lags = np.clip(np.rint(whole[steps] / median), 1, max(len(stamps) // 2, 1)).astype(int)
+        longer = np.maximum(whole[steps] / (lags * median), 1.0)
+        for lag in np.unique(lags):
+            change = [np.mean((x[lag:] - x[:-lag]) ** 2) for x in (samples.gyro, samples.accel)]
+            which = lags == lag
+            variance[steps[which]] += np.multiply.outer(longer[which] ** 2, change) / 16
     return variance, longest, covered

@@ -72,8 +72,8 @@ _WAITING = ("too few poses", "too few samples")
 STILL = (0.02, 0.15)
 """Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
 STILL_FOR = 0.4
-STILL_SPEED = 0.5
-"""Predicted speed below which a sensor that feels nothing stands still, m/s."""
+STILL_SPEED = 0.05
+"""Predicted speed, beyond three of its deviations, below which a sensor that feels nothing stands still, m/s."""
 
 
 @dataclass(frozen=True)
@@ -568,22 +568,22 @@ def _step(state: BodyState, time: float, offset: float, samples: InertialSamples
     walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * (time - state.time)
     added[range(9, STATE), range(9, STATE)] = walk
     covariance = forward @ state.covariance @ forward.T + added
-    if _stands_still(near, times[1], state, velocity):
+    sigma = float(np.sqrt(np.trace(covariance[6:9, 6:9])))
+    if np.linalg.norm(velocity) < STILL_SPEED + 3 * sigma and _stands_still(near, times[1], state):
         position, velocity = state.position, np.zeros(3)
         covariance[6:9, :], covariance[:, 6:9] = 0, 0
         covariance[6:9, 6:9] = 1e-4 * np.eye(3)
     return BodyState(time, rotation, position, velocity, state.gyro_bias, state.accel_bias, covariance)
 
 
-def _stands_still(samples: InertialSamples, time: float, state: BodyState, velocity: Array) -> bool:
-    """Nothing is felt for a while, at a predicted speed that drift explains."""
+def _stands_still(samples: InertialSamples, time: float, state: BodyState) -> bool:
+    """Nothing is felt for a while."""
     recent = samples.between(time - STILL_FOR, time)
     if len(recent) < 5 or recent.timestamps[-1] - recent.timestamps[0] < 0.7 * STILL_FOR:
         return False
     rates, forces = recent.gyro - state.gyro_bias, recent.accel
     quiet = rates.std(0).max() < STILL[0] and forces.std(0).max() < STILL[1]
-    turning = float(np.linalg.norm(rates.mean(0)))
-    return bool(quiet and turning < STILL[0] and np.linalg.norm(velocity) < STILL_SPEED)
+    return bool(quiet and np.linalg.norm(rates.mean(0)) < STILL[0])
 
 
 def camera_pose(state: BodyState, rotation_camera_imu: Array, translation_camera_imu: Array) -> tuple[Array, Array]:

@@ -30,6 +30,9 @@ from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState
 GYRO_TRUST = 0.7
 """The gyroscope predicts the rotation of a frame where its error of late is below this share of that of the motion
 model: a sensor that is turned, or whose clock is off, predicts worse."""
+LEAST_TURN = np.deg2rad(1.0)
+"""Difference of the two predictions below which that of the motion model stays: the network finds the rest, and calm
+images give the same bytes with and without samples."""
 FORGET = 0.9
 """Weight of the past in these errors, from frame to frame."""
 MOST_NODES = 400
@@ -107,6 +110,8 @@ class InertialTracking:
         if turned is None or self._errors is None or self._errors[0] > GYRO_TRUST**2 * self._errors[1]:
             return pose_cw
         rotation, position = split(se3.inverse(pose_cw.double()).cpu().numpy())
+        if np.linalg.norm(rotation_vector(rotation.T @ turned)) < LEAST_TURN:
+            return pose_cw
         return se3.inverse(torch.from_numpy(pose_from(turned, position))).to(pose_cw)
 
     def express(self, record: FrameRecord, estimate: Estimate) -> Estimate:

@@ -400,9 +400,23 @@ class InertialEstimator:
         bias = np.concatenate([known.gyro_bias, known.accel_bias], 1)
         start.bias = np.stack([np.interp(times, known.times, column) for column in bias.T], 1)
         start.extrinsic = rotation_vector(problem.rotation_camera_imu.T @ known.rotation_camera_imu)
-        inside = times <= known.times[-1]
-        for axis in range(3):
-            start.velocity[inside, axis] = np.interp(times[inside], known.times, known.velocity[:, axis])
+        # Nodes of the last solution as they were, and those after it as the samples tell: visual poses are too noisy.
+        same = np.searchsorted(known.times, times).clip(max=len(known.times) - 1)
+        old = np.abs(known.times[same] - times) < 1e-6
+        for values, solved in (
+            (start.rotation, known.rotation), (start.position, known.position), (start.velocity, known.velocity)
+        ):  # fmt: skip
+            values[old] = solved[same[old]]
+        later, state = np.flatnonzero(times > known.times[-1] + 1e-6), self.last_state()
+        assert state is not None
+        samples = problem.samples
+        times_there = np.concatenate([[state.time], times[later]]) + problem.offset
+        if len(later) and samples.timestamps[0] <= times_there[0]:
+            found = propagate(
+                state.rotation, state.position, state.velocity, samples, times_there, state.gyro_bias,
+                state.accel_bias, GRAVITY,
+            )  # fmt: skip
+            start.rotation[later], start.position[later], start.velocity[later] = (part[1:] for part in found)
         return start
 
     def _known_similarity(self, world: int) -> Similarity | None:

@@ -383,12 +383,15 @@ def _ordered(covariance: np.ndarray) -> np.ndarray:
 
 
 def _spaced(times: np.ndarray, worlds: Sequence[int], spacing: float) -> list[int]:
-    """Positions of frames about ``spacing`` apart; those on either side of a break and the last one among them."""
+    """Positions of frames about ``spacing`` apart; those on either side of a break and the last one among them.
+
+    The first frame of each interval of a fixed division of time: most are the same from estimate to estimate.
+    """
     chosen: list[int] = []
     for k, time in enumerate(times.tolist()):
         edge = k == len(times) - 1 or worlds[k + 1] != worlds[k] or times[k + 1] - time > 2 * spacing
         begins = k == 0 or worlds[k - 1] != worlds[k] or time - times[k - 1] > 2 * spacing
-        if begins or edge or time - times[chosen[-1]] >= spacing - 1e-6:
+        if begins or edge or int(time / spacing + 1e-6) != int(times[k - 1] / spacing + 1e-6):
             chosen.append(k)
     return chosen
 

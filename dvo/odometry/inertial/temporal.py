@@ -5,11 +5,12 @@ A camera that turns and the gyroscope fixed to it measure the same rotation. Ove
 
     R_i^T R_j = C D(t_i + offset, t_j + offset; bias) C^T,    C = R_camera_imu.
 
-Start: mean rates of the intervals, ``Log(.) / (t_j - t_i)``, less their means (which removes the bias), are rotated into
-each other by Kabsch's method (Wahba's problem) for every offset of a grid, and the offset whose singular values are largest
-against the norms is taken: a cross-correlation that needs neither the bias nor the rotation, and that frames at
-irregular times do not harm. Refinement: Gauss-Newton over bias, rotation and offset with Cauchy's weights. The
-covariance is that of a robust M-estimator with residuals correlated between overlapping intervals (Newey and West, 1987).
+Start: mean rates of the intervals, ``Log(.) / (t_j - t_i)``, less their medians (which removes the bias), are rotated
+into each other by Kabsch's method (Wahba's problem) for every offset of a grid, and the offset is taken whose singular
+values are largest against the norms: a cross-correlation that needs neither the bias nor the rotation, and to which
+frames at irregular times do no harm. Refinement: Gauss-Newton over bias, rotation and offset with Cauchy's weights. The
+covariance is that of a robust M-estimator whose residuals are correlated between overlapping intervals (Newey and West,
+1987).
 
 Sign of the offset as in Kalibr (Furgale et al., "Unified temporal and spatial calibration", IROS 2013):
 ``t_imu = t_camera + offset``. Time of a frame is that of its middle row, else half a readout is part of the offset.
@@ -22,13 +23,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.geometry.poses import rotation_vector, skew, so3_exp
+from dvo.geometry.poses import rotation_vector, so3_exp
 
 Array = np.ndarray
 GRID = 0.01  # seconds between the offsets of the search
 INTERVAL = 0.3  # seconds of an interval; longer where frames are further apart
 MAX_GAP = 0.05  # seconds without samples over which nothing is integrated; three times their spacing if that is more
 MIN_INTERVALS = 12
+MAX_SEARCHED = 300  # intervals in the search for the offset
 MIN_RATE = 0.03  # rad/s, deviation of the mean rates that is needed, for the rotation about two axes
 MIN_SCORE = 0.6  # correlation below which vision and gyroscope do not see the same motion
 RIVAL_SCORE = 0.95  # of the best correlation; a second offset with this much is as good
@@ -199,8 +201,8 @@ def align_imu(
         rotations_wc: ``(N, 3, 3)`` camera to world; the world is arbitrary, and the same for all.
         imu_times: ``(K,)`` increasing stamps of the samples, seconds.
         gyro: ``(K, 3)`` rad/s.
-        rotation_camera_imu: ``(3, 3)`` stated rotation, or None. It settles what periodic motion leaves open, and stands
-            in the result where the motion does not tell the rotation.
+        rotation_camera_imu: ``(3, 3)`` stated rotation, or None. It settles what periodic motion leaves open, and
+            stands in the result where the motion does not tell the rotation.
         max_offset: seconds searched on either side.
         interval: seconds over which rotations are compared, at least two frames.
         fixed: the stated rotation is taken as exact.
@@ -228,7 +230,8 @@ def align_imu(
     if spread[0] < MIN_RATE:
         rates = f"{np.degrees(spread[0]):.2g} of {np.degrees(MIN_RATE):.2g} degrees/s"
         return replace(nothing, reason=f"too little rotation: the camera's rate varies by {rates}")
-    start = _search(turns, raw, stated, max_offset)
+    step = -(-len(turns.first) // MAX_SEARCHED)
+    start = _search(turns.part(np.arange(0, len(turns.first), step)), raw, stated, max_offset)
     found = replace(nothing, **start.facts)
     if start.reason:
         return replace(found, reason=start.reason)
@@ -340,6 +343,8 @@ def _centred(turns: _Turns, raw: IntegratedGyro, offset: float) -> tuple[Array, 
     """Mean rates of both sensors less their means, and which intervals the samples cover."""
     first, last = turns.first + offset, turns.last + offset
     used = raw.covers(first, last)
+    if not used.any():
+        return np.zeros((0, 3)), np.zeros((0, 3)), used
     start, end = raw.at(first[used])[0], raw.at(last[used])[0]
     imu = rotation_vector(np.swapaxes(start, -1, -2) @ end) / (last - first)[used, None]
     camera = turns.rates[used]
@@ -369,8 +374,6 @@ def _doubt(offsets: Array, scores: Array, best: int, max_offset: float, is_mirro
     """Why a correlation does not tell the offset; empty if it does."""
     if scores[best] < MIN_SCORE:
         return f"vision and gyroscope do not agree at any offset (correlation {scores[best]:.2f})"
-    if best in (0, len(scores) - 1):
-        return f"the time offset is not within {max_offset:g} s"
     tops = np.flatnonzero((scores[1:-1] >= scores[:-2]) & (scores[1:-1] > scores[2:])) + 1
     rivals = tops[(tops != best) & (scores[tops] > RIVAL_SCORE * scores[best])]
     dips = [scores[min(best, k) : max(best, k)].min() for k in rivals]
@@ -378,6 +381,8 @@ def _doubt(offsets: Array, scores: Array, best: int, max_offset: float, is_mirro
     if len(rivals):
         pair = f"{offsets[best]:.3f} and {offsets[rivals[0]]:.3f} s"
         return f"periodic motion: time offsets of {pair} explain it equally well"
+    if best in (0, len(scores) - 1):
+        return f"the time offset is not within {max_offset:g} s"
     return "the axes of the samples are mirrored: no rotation explains them" if is_mirrored else ""
 
 

@@ -36,7 +36,8 @@ ARROWS: dict[str, set[str]] = {
 FLOORS: dict[str, tuple[str, ...]] = {
     "data": (
         "files", "images", "interval", "inertial", "frame", "positions", "trajectory", "extrinsics", "calibration",
-        "inertial_files", "sensors", "recording", "mask", "frame_checks", "readers", "opening", "source", "companions", "streams", "open",
+        "inertial_files", "sensors", "recording", "mask", "frame_checks", "readers", "opening", "source", "companions",
+        "streams", "open",
     ),
     "odometry": (
         "quality", "protocol", "exclusive", "registry", "segments", "frames", "inertial", "window", "uncertainty",

@@ -76,3 +76,12 @@ class Positions:
             "precision": float(np.median(stated)) if len(stated) else None,
             "precision_unit": self.precision_unit,
         }
+
+    def describe(self) -> str:
+        """One line for people."""
+        facts = self.summary()
+        text = f"positions: {facts['count']} of {self.origin}, {facts['with_fix']} with a fix"
+        text += f", {facts['length']:.4g} m of way" if facts["length"] is not None else ""
+        precision = facts["precision"]
+        text += f", median precision {precision:.3g} {self.precision_unit}" if precision is not None else ""
+        return f"{text}; they are for comparison only"

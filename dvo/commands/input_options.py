@@ -50,9 +50,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         help="calibration of the inertial sensor: Kalibr's imu.yaml and camchain-imucam.yaml, EuRoC's sensor.yaml, a "
         "YAML file, or a preset of its noise: phone, action, euroc",
     )
-    parser.add_argument(
-        "--imu-topic", metavar="NAME", help="topic of the inertial samples in a bag, if there are several"
-    )
+    parser.add_argument("--imu-topic", metavar="NAME", help="topic of inertial samples in a bag, if there are several")
 
 
 def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -267,7 +267,8 @@ def _stated(names: Sequence[str], sensor: str, path: Path) -> float | None:
 def _times(text: _Text, others: set[int], path: Path) -> tuple[np.ndarray, list[str]]:
     """Seconds of the rows, by the first column whose name is that of a time."""
     names = {place: name for place, name in enumerate(text.header) if place not in others}
-    column = next((k for k, name in names.items() if is_time_name(name) or "time" in name.lower()), None)
+    bare = {k: _UNIT.sub("", name) for k, name in names.items()}  # m/s is no time
+    column = next((k for k, name in bare.items() if is_time_name(name) or "time" in name.lower()), None)
     if column is None:
         raise DvoError("no column of times", file=path, field="time", remedy=REMEDY)
     return _in_seconds([row[column] for row in text.rows], unit_of_name(text.header[column]), path)

@@ -146,7 +146,13 @@ def build_parser() -> argparse.ArgumentParser:
     _rendering_options(preview, "160x120")
     preview.set_defaults(run="dvo.commands.synth:preview")
     export = verbs.add_parser("export", help="write a sequence with ground truth in the layout of a dataset")
-    export.add_argument("--layout", choices=("tum", "tartanair"), default="tum", help="default: %(default)s")
+    export.add_argument("--layout", choices=("tum", "tartanair", "euroc"), default="tum", help="default: %(default)s")
+    export.add_argument(
+        "--imu-noise",
+        choices=("euroc", "phone", "action", "none"),
+        default="euroc",
+        help="of the inertial samples in the layout euroc (default: %(default)s)",
+    )
     export.add_argument("--out", metavar="DIR", required=True, help="new folder")
     content = export.add_mutually_exclusive_group()
     content.add_argument("--family", metavar="F", help="family of scenes (default: random)")

@@ -354,7 +354,7 @@ def _rate_unit(gyro: _Sensor, accel: _Sensor, path: Path) -> tuple[float, list[s
     if gyro.factor is not None:
         return gyro.factor, []
     name, reason = "rad/s", "the usual unit"
-    ratio = _turn_of_gravity(gyro, accel)
+    ratio = turn_of_gravity(gyro.times, gyro.values, accel.times, accel.values)
     if ratio is not None:
         name = "rad/s" if ratio > 0.13 else "deg/s"  # half way between 1 and pi / 180
         reason = "as gravity turns"
@@ -363,13 +363,25 @@ def _rate_unit(gyro: _Sensor, accel: _Sensor, path: Path) -> tuple[float, list[s
     return _RATES[name], [f"{path.name}: the gyroscope is taken for {name} ({reason})"]
 
 
-def _turn_of_gravity(gyro: _Sensor, accel: _Sensor) -> float | None:
+def turn_of_gravity(
+    gyro_times: np.ndarray, gyro: np.ndarray, accel_times: np.ndarray, accel: np.ndarray
+) -> float | None:
     """Rate at which gravity turns in the accelerometer over the rate of the gyroscope (``da/dt = -w x a`` of a sensor
-    that turns in place); None where too little of the one is explained by the other."""
-    a_times, keep = np.unique(accel.times[np.isfinite(accel.times)], return_index=True)
-    a = accel.values[np.isfinite(accel.times)][keep]
-    w_times, keep = np.unique(gyro.times[np.isfinite(gyro.times)], return_index=True)
-    w = gyro.values[np.isfinite(gyro.times)][keep]
+    that turns in place).
+
+    Args:
+        gyro_times: ``(K,)`` seconds, in any order.
+        gyro: ``(K, 3)`` in the unit in question.
+        accel_times: ``(L,)`` seconds, in any order.
+        accel: ``(L, 3)`` in any unit, with gravity.
+
+    Returns:
+        1 for rad/s; None where too little of the one is explained by the other.
+    """
+    a_times, keep = np.unique(accel_times[np.isfinite(accel_times)], return_index=True)
+    a = accel[np.isfinite(accel_times)][keep]
+    w_times, keep = np.unique(gyro_times[np.isfinite(gyro_times)], return_index=True)
+    w = gyro[np.isfinite(gyro_times)][keep]
     start, end = max(a_times[0], w_times[0]), min(a_times[-1], w_times[-1])
     if end - start < 10 * _SMOOTH:
         return None

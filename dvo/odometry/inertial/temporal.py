@@ -26,7 +26,7 @@ from dvo.core.errors import DvoError
 from dvo.geometry.poses import rotation_vector, so3_exp
 
 Array = np.ndarray
-GRID = 0.01  # seconds between the offsets of the search
+GRID = 0.02  # seconds between the offsets of the search
 INTERVAL = 0.3  # seconds of an interval; longer where frames are further apart
 MAX_GAP = 0.05  # seconds without samples over which nothing is integrated; three times their spacing if that is more
 MIN_INTERVALS = 12
@@ -37,6 +37,7 @@ RIVAL_SCORE = 0.95  # of the best correlation; a second offset with this much is
 MAX_SIGMA_OFFSET = 0.01  # seconds
 MAX_SIGMA_ROTATION = 1.5  # degrees
 _STEPS = 12
+_FINE = 0.002  # seconds between orientations in the search
 _UNKNOWN = (np.inf, np.inf, np.inf)
 
 
@@ -287,11 +288,8 @@ class _Turns:
 
 
 def _spread(rates: Array) -> Array:
-    """Deviations ``(3,)`` of rates along their principal axes, the largest first; outliers are bounded."""
-    centred = rates - np.median(rates, 0)
-    size = np.linalg.norm(centred, axis=1)
-    bound = 5 * max(float(np.median(size)), 1e-12)
-    centred = centred * np.minimum(1, bound / np.maximum(size, 1e-300))[:, None]
+    """Deviations ``(3,)`` of rates along their principal axes, the largest first."""
+    centred = _bounded(rates)
     return np.sqrt(np.linalg.eigvalsh(centred.T @ centred / len(centred))[::-1].clip(0))
 
 
@@ -306,55 +304,76 @@ class _Start:
 
 
 def _search(turns: _Turns, raw: IntegratedGyro, stated: Array | None, max_offset: float) -> _Start:
-    """Correlation over the offsets; in a second round without the intervals that do not fit."""
+    """Correlation over the offsets, and the rotation at the best one."""
     count = round(max_offset / GRID)
     offsets = GRID * np.arange(-count, count + 1)
-    chosen = np.ones(len(turns.first), bool)
-    for _ in range(2):
-        free, held = np.array([_score(turns.part(chosen), raw, offset, stated) for offset in offsets]).T
-        scores = held if stated is not None and held.max() > 0.9 * free.max() else free
-        best = int(np.argmax(scores))
-        if scores[best] <= 0:
-            return _Start(0.0, np.eye(3), "the samples do not cover the frames", {})
-        camera, imu, used = _centred(turns, raw, float(offsets[best]))
-        matrix, values, is_mirrored = hand_eye(camera[chosen[used]], imu[chosen[used]])
-        error = np.linalg.norm(camera - imu @ matrix.T, axis=1)
-        chosen[used] = error <= 4 * max(float(np.median(error)), 1e-9)
+    grid = _Sampled.of(raw)
+    free, held = np.array([_score(*_centred(turns, grid, offset)[:2], turns, stated) for offset in offsets]).T
+    scores = held if stated is not None and held.max() > 0.9 * free.max() else free
+    best = int(np.argmax(scores))
+    if scores[best] <= 0:
+        return _Start(0.0, np.eye(3), "the samples do not cover the frames", {})
+    camera, imu, used = _centred(turns, grid, float(offsets[best]))
+    matrix, values, is_mirrored = hand_eye(camera, imu)
     offset = _peak(offsets, scores, best)
-    is_mirrored = is_mirrored and values[2] > 0.02 * values[0] and values[2] > 4 * _noise(camera, imu, matrix, values)
+    is_mirrored = is_mirrored and values[2] > 0.02 * values[0] and values[2] > 4 * _noise(camera, imu, matrix)
     facts = {
         "time_offset": offset,
         "axes": matrix,
         "mirrored": is_mirrored,
         "correlation": float(free[best]),
-        "intervals": int(chosen.sum()),
+        "intervals": int(used.sum()),
     }
-    rotation = nearest_rotation(camera[chosen[used]], imu[chosen[used]])
-    return _Start(offset, rotation, _doubt(offsets, scores, best, max_offset, is_mirrored), facts)
+    doubt = _doubt(offsets, scores, best, max_offset, is_mirrored)
+    return _Start(offset, nearest_rotation(camera, imu), doubt, facts)
 
 
-def _noise(camera: Array, imu: Array, matrix: Array, values: Array) -> float:
+@dataclass(frozen=True)
+class _Sampled:
+    """Orientations of a gyroscope at even times, near enough to each other that the nearest one serves the search."""
+
+    path: IntegratedGyro
+    start: float
+    rotations: Array
+
+    @staticmethod
+    def of(path: IntegratedGyro) -> _Sampled:
+        start, end = float(path.times[0]), float(path.times[-1])
+        return _Sampled(path, start, path.at(np.arange(start, end, _FINE))[0])
+
+    def at(self, times: Array) -> Array:
+        place = np.round((times - self.start) / _FINE).astype(int)
+        return self.rotations[place.clip(0, len(self.rotations) - 1)]
+
+
+def _noise(camera: Array, imu: Array, matrix: Array) -> float:
     """Third singular value that errors alone would give, about."""
     error = camera - imu @ matrix.T
     return float(np.sqrt(np.median((error**2).sum(1)) * (imu**2).sum() / 3))
 
 
-def _centred(turns: _Turns, raw: IntegratedGyro, offset: float) -> tuple[Array, Array, Array]:
-    """Mean rates of both sensors less their means, and which intervals the samples cover."""
+def _centred(turns: _Turns, grid: _Sampled, offset: float) -> tuple[Array, Array, Array]:
+    """Mean rates of both sensors less their medians, outliers bounded, and which intervals the samples cover."""
     first, last = turns.first + offset, turns.last + offset
-    used = raw.covers(first, last)
+    used = grid.path.covers(first, last)
     if not used.any():
         return np.zeros((0, 3)), np.zeros((0, 3)), used
-    start, end = raw.at(first[used])[0], raw.at(last[used])[0]
+    start, end = grid.at(first[used]), grid.at(last[used])
     imu = rotation_vector(np.swapaxes(start, -1, -2) @ end) / (last - first)[used, None]
-    camera = turns.rates[used]
-    return camera - np.median(camera, 0), imu - np.median(imu, 0), used
+    return _bounded(turns.rates[used]), _bounded(imu), used
 
 
-def _score(turns: _Turns, raw: IntegratedGyro, offset: float, stated: Array | None) -> tuple[float, float]:
+def _bounded(rates: Array) -> Array:
+    """Rates less their median, none longer than five times the median length."""
+    centred = rates - np.median(rates, 0)
+    size = np.linalg.norm(centred, axis=1)
+    bound = 5 * max(float(np.median(size)), 1e-12)
+    return centred * np.minimum(1, bound / np.maximum(size, 1e-300))[:, None]
+
+
+def _score(camera: Array, imu: Array, turns: _Turns, stated: Array | None) -> tuple[float, float]:
     """Correlation with the best orthogonal matrix, and with the stated rotation."""
-    camera, imu, used = _centred(turns, raw, offset)
-    if used.sum() < max(MIN_INTERVALS, 0.5 * len(used)):
+    if len(camera) < max(MIN_INTERVALS, 0.5 * len(turns.first)):
         return 0.0, 0.0
     product = camera.T @ imu / max(np.linalg.norm(camera) * np.linalg.norm(imu), 1e-300)
     held = 0.0 if stated is None else float((product * stated).sum())

@@ -38,6 +38,15 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
     )
     parser.add_argument("--topic", metavar="NAME", help="topic of the images in a bag of ROS 1 or 2, or an MCAP file")
+    add_inertial_options(parser)
+
+
+def add_inertial_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options about inertial samples.
+
+    Args:
+        parser: of the command.
+    """
     parser.add_argument(
         "--imu",
         metavar="FILE|auto|none",

@@ -31,14 +31,14 @@ class InertialInput:
     """Inertial samples of one recording with their calibration; read once, when they are first wanted.
 
     Attributes:
-        read: reads the samples at times of the inertial sensor.
+        read: reads the samples at times of the inertial sensor; with ``rough``, as they stand.
         calibration: to be applied to them.
         span: seconds of the first and the last frame, which the samples must meet; None of an end that is not known;
             None for no check.
         file: for messages.
     """
 
-    read: Callable[[], InertialSamples]
+    read: Callable[..., InertialSamples]
     calibration: ImuCalibration
     span: tuple[float, float | None] | None = None
     file: Path | None = None
@@ -54,6 +54,14 @@ class InertialInput:
         if self.span is not None:
             check_overlap(samples, self.span, self.file)
         return samples
+
+    def rough(self) -> InertialSamples:
+        """The samples as they stand, for a check: neither sorted nor refused for their times or units.
+
+        Raises:
+            DvoError: no samples can be made out.
+        """
+        return self.calibration.applied(self.read(rough=True))
 
     def __call__(self) -> InertialSamples:
         return self.samples
@@ -76,36 +84,52 @@ def choose_inertial(
     Raises:
         DvoError: a file that is damaged, or whose times do not meet those of the frames; a calibration without samples.
     """
-    calibration, path = request.imu_calibration or ImuCalibration(), recording.path
-    given = str(imu)
+    given, path = str(imu), recording.path
     if given == NONE and not exists(Path(given)):
         if request.imu_calibration is not None or request.imu_topic is not None:
             field = "imu_calib" if request.imu_calibration is not None else "imu_topic"
             raise DvoError("there are no inertial samples that it is for", field=field, remedy="leave out --imu none")
         return None, []
-    span = (first, _last(recording, first))
+    candidates = inertial_inputs(recording, imu, request, first)
     if given != AUTO or exists(Path(given)):
-        file = locate(imu, path, "imu")
-        found = InertialInput(partial(read_inertial_file, file, request.imu_topic, recording.turned), calibration, span,
-                              file)  # fmt: skip
-        return found, list(found.samples.notes)
+        return candidates[0], list(candidates[0].samples.notes)
     if recording.inertial is not None and recording.kind != "video":
-        return InertialInput(recording.inertial, calibration), []
-    candidates = [(path, InertialInput(recording.inertial, calibration))] if recording.inertial is not None else []
-    candidates += [
-        (file, InertialInput(partial(read_inertial_file, file, None, recording.turned), calibration, span, file))
-        for file in beside(path, recording)
-    ]
+        return candidates[0], []
     notes: list[str] = []
-    for file, found in candidates:
+    for found in candidates:
         try:
             return found, [*notes, *found.samples.notes]
         except DvoError as error:
-            notes.append(f"inertial samples of {file.name} are not used: {error.message}")
+            notes.append(f"inertial samples of {(found.file or path).name} are not used: {error.message}")
     if request.imu_calibration is not None:
         remedy = "give the file of the samples with --imu FILE"
         raise DvoError("there are no inertial samples that it is for", file=path, field="imu_calib", remedy=remedy)
     return None, notes
+
+
+def inertial_inputs(recording: Recording, imu: Path | str, request: Request, first: float) -> list[InertialInput]:
+    """Inertial samples that may be meant, the likeliest first; nothing is read yet.
+
+    Args:
+        recording: as its reader found it.
+        imu: :data:`AUTO` for those in or beside the recording, or a file.
+        request: options of the user.
+        first: seconds of the first frame.
+
+    Raises:
+        DvoError: no such file.
+    """
+    calibration, path = request.imu_calibration or ImuCalibration(), recording.path
+    span = (first, _last(recording, first))
+    if str(imu) != AUTO or exists(Path(imu)):
+        file = locate(imu, path, "imu")
+        read = partial(read_inertial_file, file, request.imu_topic, recording.turned)
+        return [InertialInput(read, calibration, span, file)]
+    own = [] if recording.inertial is None else [InertialInput(recording.inertial, calibration)]
+    return own + [
+        InertialInput(partial(read_inertial_file, file, None, recording.turned), calibration, span, file)
+        for file in beside(path, recording)
+    ]
 
 
 def _last(recording: Recording, first: float) -> float | None:
@@ -169,7 +193,9 @@ def _located(given: Path | str, source: Path) -> Path:
     return locate(given, source, "imu-calib")
 
 
-def read_inertial_file(path: Path, topic: str | None = None, turned: int = 0) -> InertialSamples:
+def read_inertial_file(
+    path: Path, topic: str | None = None, turned: int = 0, *, rough: bool = False
+) -> InertialSamples:
     """Read the inertial samples of a file of any known format.
 
     Args:
@@ -177,17 +203,18 @@ def read_inertial_file(path: Path, topic: str | None = None, turned: int = 0) ->
             folder with a file for each sensor.
         topic: of the samples in a bag.
         turned: degrees clockwise by which the frames of a video are turned to stand upright.
+        rough: as they stand, for a check: neither sorted nor refused.
 
     Raises:
         DvoError: see the readers of the formats.
     """
     if rosbag.matches(path):
-        return rosbag.read_inertial(path, topic)
+        return rosbag.read_inertial(path, topic, rough=rough)
     if topic is not None:
         raise DvoError("only bags have topics", file=path, field="imu_topic", remedy="leave it out")
     if path.suffix.lower() in _VIDEOS or (is_file(path) and has_telemetry(path)):
-        return read_gopro(path, turned)
-    samples = read_inertial_table(path)
+        return read_gopro(path, turned, rough=rough)
+    samples = read_inertial_table(path, rough=rough)
     noise = read_noise(path.parent / "sensor.yaml") if path.parent.name.startswith("imu") else None
     return ImuCalibration(noise).applied(samples)
 

@@ -47,12 +47,13 @@ class _Stream:
     axes: np.ndarray | None = None  # (3, 3) numbers of a sample to axes of the images
 
 
-def read_gopro(file: Path, turned: int = 0) -> InertialSamples:
+def read_gopro(file: Path, turned: int = 0, *, rough: bool = False) -> InertialSamples:
     """Inertial samples in the axes of the images, at times of the video.
 
     Args:
         file: video with telemetry.
         turned: degrees clockwise by which frames are turned to stand upright.
+        rough: as they stand, for a check: neither sorted nor refused.
 
     Returns:
         The samples; ``T_camera_imu`` is the turn of the frames, without a lever arm, ``noise`` that of action cameras.
@@ -67,8 +68,9 @@ def read_gopro(file: Path, turned: int = 0) -> InertialSamples:
             raise DvoError(f"the telemetry has no {noun}", file=file, field="imu", remedy=remedy)
     base = _base(streams)
     (gyro_times, gyro), (accel_times, accel) = (_timed(streams[key], base) for key in ("GYRO", "ACCL"))
-    samples = joined(gyro_times, gyro, accel_times, accel, file, f"telemetry of {file.name}")
-    check_gravity(samples, file, "give another file with --imu, or --imu none")
+    samples = joined(gyro_times, gyro, accel_times, accel, file, f"telemetry of {file.name}", rough=rough)
+    if not rough:
+        check_gravity(samples, file, "give another file with --imu, or --imu none")
     T = np.eye(4)
     angle = np.radians(turned)
     T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]

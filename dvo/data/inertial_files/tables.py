@@ -8,6 +8,7 @@ norm is that of gravity; one of the gyroscope the one in which gravity turns in 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
@@ -80,11 +81,13 @@ class _Text:
     notes: list[str]
 
 
-def read_inertial_table(path: Path) -> InertialSamples:
+def read_inertial_table(path: Path, *, rough: bool = False) -> InertialSamples:
     """Read inertial samples of a text file; where it holds one sensor, those of the other from the file beside it.
 
     Args:
         path: ``.csv`` or ``.txt``, ``.jsonl`` of Spectacular AI, or a folder with a file for each sensor.
+        rough: as they stand, for a check: neither sorted nor refused, and numbers whose unit is not stated or clear are
+            left as they are.
 
     Raises:
         DvoError: no such file; a table in which the columns, or the units, are not clear; an accelerometer from which
@@ -107,15 +110,23 @@ def read_inertial_table(path: Path) -> InertialSamples:
         if name not in sensors:
             raise DvoError(f"no columns of the {_noun(name)}", file=path, field=name, remedy=REMEDY)
     gyro, accel = sensors["gyro"], sensors["accel"]
-    force, told = _force_unit(accel, path)
-    notes += told
-    values = accel.values * force
-    rate, told = _rate_unit(gyro, replace(accel, values=values), path)
-    notes += told
-    if gyro.times is accel.times:
-        samples = tidy(gyro.times, gyro.values * rate, values, path, where)
+    if rough:
+        force, rate = accel.factor or 1.0, gyro.factor or 1.0
+        with contextlib.suppress(DvoError):
+            force, _ = _force_unit(accel, path)
+            rate, _ = _rate_unit(gyro, replace(accel, values=accel.values * force), path)
     else:
-        samples = joined(gyro.times, gyro.values * rate, accel.times, values, path, where)
+        force, told = _force_unit(accel, path)
+        notes += told
+        rate, told = _rate_unit(gyro, replace(accel, values=accel.values * force), path)
+        notes += told
+    values = accel.values * force
+    if gyro.times is accel.times:
+        samples = tidy(gyro.times, gyro.values * rate, values, path, where, rough=rough)
+    else:
+        samples = joined(gyro.times, gyro.values * rate, accel.times, values, path, where, rough=rough)
+    if rough:
+        return samples
     check_gravity(samples, path, "give the accelerometer with gravity in m/s^2, or its unit in the header")
     return replace(samples, notes=(*notes, *samples.notes))
 

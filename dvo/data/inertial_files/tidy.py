@@ -19,7 +19,9 @@ _SET_BACK = 1.0  # seconds: rows that are later than others by more do not stand
 _FEWEST = 2
 
 
-def tidy(times: np.ndarray, gyro: np.ndarray, accel: np.ndarray, file: Path, origin: str) -> InertialSamples:
+def tidy(
+    times: np.ndarray, gyro: np.ndarray, accel: np.ndarray, file: Path, origin: str, *, rough: bool = False
+) -> InertialSamples:
     """Samples in order of time.
 
     Rows with numbers that are not finite are dropped, rows out of order by up to a second are sorted, and of rows that
@@ -31,10 +33,13 @@ def tidy(times: np.ndarray, gyro: np.ndarray, accel: np.ndarray, file: Path, ori
         accel: ``(K, 3)`` m/s^2.
         file: for messages.
         origin: of the samples.
+        rough: as they stand, for a check: nothing is dropped, sorted or refused.
 
     Raises:
         DvoError: fewer than two samples, or a clock that is set back.
     """
+    if rough:
+        return InertialSamples(times, gyro, accel, origin=origin)
     notes = []
     finite = np.isfinite(times) & (np.abs(np.column_stack([gyro, accel])) <= MAX_NUMBER).all(axis=1)  # false for nan
     if not finite.all():
@@ -65,7 +70,14 @@ def _rows(mask: np.ndarray) -> str:
 
 
 def joined(
-    gyro_times: np.ndarray, gyro: np.ndarray, accel_times: np.ndarray, accel: np.ndarray, file: Path, origin: str
+    gyro_times: np.ndarray,
+    gyro: np.ndarray,
+    accel_times: np.ndarray,
+    accel: np.ndarray,
+    file: Path,
+    origin: str,
+    *,
+    rough: bool = False,
 ) -> InertialSamples:
     """Samples of a gyroscope and an accelerometer that have clocks of the same zero: at the times of the gyroscope,
     the specific force between its samples by straight lines.
@@ -77,10 +89,15 @@ def joined(
         accel: ``(L, 3)`` m/s^2.
         file: for messages.
         origin: of the samples.
+        rough: for a check: at all times of the gyroscope in their order, see :func:`tidy`.
 
     Raises:
         DvoError: sensors that did not record at the same time, or see :func:`tidy`.
     """
+    if rough:
+        order = np.argsort(accel_times, kind="stable")
+        forces = np.stack([np.interp(gyro_times, accel_times[order], accel[order, k]) for k in range(3)], axis=1)
+        return tidy(gyro_times, gyro, forces, file, origin, rough=True)
     w = tidy(gyro_times, gyro, np.zeros_like(gyro), file, f"{origin}, gyroscope")
     a = tidy(accel_times, np.zeros_like(accel), accel, file, f"{origin}, accelerometer")
     both = (w.timestamps >= a.timestamps[0]) & (w.timestamps <= a.timestamps[-1])

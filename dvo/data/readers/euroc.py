@@ -36,6 +36,7 @@ from dvo.data.files.listing import listed_file
 from dvo.data.files.stamps import choose_times, read_times
 from dvo.data.inertial import InertialSamples
 from dvo.data.inertial_files.imu_calibration import ImuCalibration, read_noise
+from dvo.data.inertial_files.tables import read_inertial_table
 from dvo.data.readers.folder import camera_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import SameName, Sensors
@@ -158,7 +159,7 @@ def _rig(mav: Path) -> StereoRig | None:
     return right_camera(calibration, "cam0") if found is None and calibration is not None else found
 
 
-def _inertial(mav: Path, camera: str, request: Request) -> InertialSamples:
+def _inertial(mav: Path, camera: str, request: Request, *, rough: bool = False) -> InertialSamples:
     body_camera, body_imu = _body_camera(mav, camera), read_extrinsics(mav / "imu0" / "sensor.yaml")
     if body_imu is None and _camchain(mav) is not None:
         body_imu = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -173,7 +174,8 @@ def _inertial(mav: Path, camera: str, request: Request) -> InertialSamples:
         if offset is not None and not isinstance(offset, int | float):
             field = f"{camera}.timeshift_cam_imu"
             raise DvoError("no number", file=kalibr[1], field=field, remedy="give seconds, t_imu - t_cam")
-    return read_inertial(mav / "imu0" / "data.csv", ImuCalibration(noise, T_camera_imu, offset))
+    calibration, table = ImuCalibration(noise, T_camera_imu, offset), mav / "imu0" / "data.csv"
+    return calibration.applied(read_inertial_table(table, rough=True)) if rough else read_inertial(table, calibration)
 
 
 def _sensors(mav: Path, camera: str, request: Request) -> Sensors:

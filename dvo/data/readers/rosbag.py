@@ -351,13 +351,14 @@ def imu_topic_of(path: Path, topics: Sequence[str], asked: str | None) -> str | 
     return topics[0] if len(topics) == 1 else None
 
 
-def read_inertial(path: Path, topic: str | None = None) -> InertialSamples:
+def read_inertial(path: Path, topic: str | None = None, *, rough: bool = False) -> InertialSamples:
     """Read all samples of a topic.
 
     Args:
         path: of the bag.
         topic: of type ``sensor_msgs/Imu``, rad/s and m/s^2; two apart by a comma, that of the gyroscope first; None for
             the only one.
+        rough: in the order of the bag, for a check, see :func:`dvo.data.inertial_files.tidy.tidy`.
 
     Raises:
         DvoError: the bag cannot be read, the topic is not clear, or see :func:`dvo.data.inertial_files.tidy.tidy`.
@@ -371,9 +372,9 @@ def read_inertial(path: Path, topic: str | None = None) -> InertialSamples:
         tables = [_imu_rows(reader, name) for name in topic.split(",")]
     origin = f"topic {topic.replace(',', ' and ')}"
     if len(tables) == 1:
-        return tidy(tables[0][:, 0], tables[0][:, 1:4], tables[0][:, 4:], path, origin)
+        return tidy(tables[0][:, 0], tables[0][:, 1:4], tables[0][:, 4:], path, origin, rough=rough)
     gyro, accel = tables
-    return joined(gyro[:, 0], gyro[:, 1:4], accel[:, 0], accel[:, 4:], path, origin)
+    return joined(gyro[:, 0], gyro[:, 1:4], accel[:, 0], accel[:, 4:], path, origin, rough=rough)
 
 
 def _imu_rows(reader: Any, topic: str) -> np.ndarray:

@@ -267,12 +267,13 @@ def gravity_error(force: float, where: str) -> Finding | None:
 
 
 def _density(samples: InertialSamples, name: str, parts: list[slice]) -> float | None:
-    """White noise by the Allan deviation over a tenth of a second, times its root; mean of the axes."""
+    """White noise by the Allan deviation over a tenth of a second, times its root; the median of the differences, as a
+    stretch may begin and end with motion."""
     block = max(1, round(_BLOCK * samples.rate))
-    squares = []
+    steps = []
     for part in parts:
         rows = getattr(samples, name)[part]
         means = rows[: len(rows) // block * block].reshape(-1, block, 3).mean(1)
-        squares += [np.diff(means, axis=0) ** 2 / 2]
-    variance = float(np.concatenate(squares).mean()) if squares else 0.0
-    return float(np.sqrt(variance * block / samples.rate)) if variance > 0 else None
+        steps += [np.abs(np.diff(means, axis=0)).ravel()]
+    deviation = float(np.median(np.concatenate(steps))) / 0.6745 / np.sqrt(2) if steps else 0.0
+    return float(deviation * np.sqrt(block / samples.rate)) if deviation > 0 else None

@@ -213,7 +213,7 @@ def _axes(found: ImuAlignment, stated: Array | None) -> Found:
     quaternion = np.round(matrix_to_quaternion(rotation), 5).tolist()
     values = {
         "rotation imu to camera, qx qy qz qw": quaternion,
-        "its deviation, degrees": found.sigma_rotation.tolist(),
+        "deviation of the rotation, degrees": found.sigma_rotation.tolist(),
     }
     pose = f"[0, 0, 0, {', '.join(f'{value:g}' for value in quaternion)}]"
     if stated is None:

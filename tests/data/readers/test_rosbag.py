@@ -52,6 +52,7 @@ def test_images_calibration_and_inertial_samples(make, kind):
     samples = frames[1].inertial
     assert np.allclose(samples.gyro[:, 0], samples.timestamps) and samples.T_camera_imu is None
     assert np.allclose(samples.accel, [0, 0, 9.8])
+    assert np.array_equal(source.reading.inertial.rough().timestamps, source.inertial.timestamps)
     assert [frame.index for frame in dvo.open(path, stride=4)] == [0, 4]
     assert [frame.timestamp for frame in dvo.open(path, fps=2)] == [0, 0.5, 1, 1.5, 2, 2.5]
 

@@ -112,26 +112,24 @@ def _refusal(given: InertialInput) -> Finding | None:
     return Finding("repaired", Level.NOTE, "; ".join(notes), "compare with what was recorded")
 
 
-def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Times and orientations of the longest part of the beginning that is tracked; None if there is none."""
+def _seen(source: Source, arguments: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
+    """Times and orientations of the longest segment of the beginning; none if no image is tracked."""
     device = device_of(arguments.device)
     seed_everything(arguments.seed)
     count = arguments.frames if source.frame_count is None else min(arguments.frames, source.frame_count)
     with TrackingProgress(count, "tracking") as progress:
         if source.guess is not None:
             found = calibrate(
-                source, weights=arguments.weights, device=device, seed=arguments.seed, on_frame=progress.update,
-                on_round=progress.begin_round,
-            )  # fmt: skip
+                source, device=device, seed=arguments.seed, on_frame=progress.update, on_round=progress.begin_round
+            )
             source = source.recalibrated(found.calibration)
             progress.begin("tracking", count)
-        odometry = dvo.load(arguments.weights, device=device, seed=arguments.seed)
+        odometry = dvo.load("small", device=device, seed=arguments.seed, preset="fast", loops=False)
         done = run(odometry, itertools.islice(source, arguments.frames), on_frame=progress.update)
     result = done.result
     number = result.longest
     if number is None:
-        warn("no image could be tracked: the samples are checked by themselves")
-        return None, None
+        return np.zeros(0), np.zeros((0, 3, 3))
     trajectory = result.segments[number].trajectory
     return trajectory.timestamps, quaternion_to_matrix(trajectory.poses_wc[:, 3:])
 

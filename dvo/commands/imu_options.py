@@ -37,7 +37,6 @@ def add_imu(commands: Any) -> None:
     times.add_argument("--times", metavar="FILE", help="file with the time of each image")
     times.add_argument("--fps", type=positive_float, metavar="F", help="frames per second")
     parser.add_argument("--topic", metavar="NAME", help="topic of the images in a bag")
-    parser.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
     parser.add_argument(
         "--device", metavar="D", default="auto", help="torch device (default: accelerator if available)"
     )

@@ -45,8 +45,11 @@ def check_sensor(
         known = {finding.name for finding in findings}
         findings += [finding for finding in found.findings if finding.name not in known]
     else:
-        text = "without orientations of the camera, time offset and axes are not checked"
-        findings.append(Finding("no vision", Level.NOTE, text, "give a source whose images can be tracked"))
+        text = "time offset and axes are not checked without orientations of the camera"
+        if timestamps is not None:
+            text = f"time offset and axes are not checked: {len(timestamps)} frames have a pose in one segment"
+        remedy = f"give images of which {_MIN_FRAMES} or more can be tracked"
+        findings.append(Finding("no vision", Level.NOTE, text, remedy))
         if samples.T_camera_imu is None:
             text = "the pose of the sensor in the camera is not stated"
             remedy = "state T_camera_imu in --imu-calib, or calibrate with Kalibr"

@@ -364,10 +364,10 @@ def _centred(turns: _Turns, grid: _Sampled, offset: float) -> tuple[Array, Array
 
 
 def _bounded(rates: Array) -> Array:
-    """Rates less their median, none longer than five times the median length."""
+    """Rates less their median, none longer than twice the length that nine of ten do not exceed."""
     centred = rates - np.median(rates, 0)
     size = np.linalg.norm(centred, axis=1)
-    bound = 5 * max(float(np.median(size)), 1e-12)
+    bound = 2 * max(float(np.quantile(size, 0.9)), 1e-12)
     return centred * np.minimum(1, bound / np.maximum(size, 1e-300))[:, None]
 
 

@@ -175,7 +175,8 @@ def _text(path: Path) -> _Text:
         named = comments[-1]
         header = cells(named) if mark and mark in named else [cell for cell in re.split(r"[,;\t]\s*|\s{2,}|\s(?![\[(])",
                                                                                         named) if cell]  # fmt: skip
-    texts, notes = [cells(row) for row in rows], []
+    notes: list[str] = []
+    texts = [cells(row) for row in rows]
     if header and texts and all(len(row) == len(header) + 1 and not row[-1] for row in texts):
         texts = [row[:-1] for row in texts]
     width = len(header) or max(map(len, texts), default=0)
@@ -233,10 +234,10 @@ def _columns(header: Sequence[str], path: Path) -> dict[str, tuple[list[int], fl
                 by_sensor.setdefault(sensor, {}).setdefault(match[1], place)
                 break
     if not by_sensor:
-        plain = {_UNIT.sub("", name).strip().lower(): place for place, name in enumerate(header)}
-        sensor = next((kind for pattern, kind in _FILES if pattern.search(path.stem)), None)
-        if sensor is not None and {"x", "y", "z"} <= plain.keys():
-            by_sensor[sensor] = {axis: plain[axis] for axis in "xyz"}
+        bare = {_UNIT.sub("", name).strip().lower(): place for place, name in enumerate(header)}
+        kind = next((kind for pattern, kind in _FILES if pattern.search(path.stem)), None)
+        if kind is not None and {"x", "y", "z"} <= bare.keys():
+            by_sensor[kind] = {axis: bare[axis] for axis in "xyz"}
     if "g-force" in by_sensor:  # Physics Toolbox: ax, ay, az beside them are without gravity
         by_sensor["accel"] = by_sensor.pop("g-force")
         unit: float | None = STANDARD_GRAVITY

@@ -3,6 +3,7 @@ plain YAML file."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -195,6 +196,9 @@ def _says_nothing(value: Any) -> bool:
 
 
 def _number(value: Any, name: str, low: float, path: Path) -> float:
+    if isinstance(value, str):  # YAML takes 1e-3 for a text
+        with contextlib.suppress(ValueError):
+            value = float(value)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not low <= value < math.inf:
         what = "a number" if low == -math.inf else f"a number of at least {low:g}"

@@ -154,6 +154,10 @@ def imu_calibration_of(
     """
     if given is None or isinstance(given, ImuCalibration):
         return given
+    is_listed = isinstance(given, Sequence) and all(isinstance(one, str | Path) for one in given)
+    if not isinstance(given, Path) and not is_listed:
+        remedy = "give a file, a preset, several of them, or an ImuCalibration"
+        raise DvoError(f"must be a file, got {str(given)[:60]!r}", field="imu_calib", remedy=remedy)
     if isinstance(given, str | Path):
         text = str(given)
         given = [text] if "," not in text or exists(Path(text)) else [part.strip() for part in text.split(",")]

@@ -93,7 +93,7 @@ def read_inertial_table(path: Path) -> InertialSamples:
     if path.is_dir():
         path = _in_folder(path)
     if path.suffix.lower() == ".jsonl":
-        sensors, notes = _json_lines(path), []
+        sensors, notes = _json_lines(path), list[str]()
         where = path.name
     else:
         sensors, notes = _of_text(path)

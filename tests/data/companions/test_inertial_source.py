@@ -152,3 +152,10 @@ def test_a_file_wins_over_that_of_the_data_set(make, mav):
     make.text("s/imu0.csv", table(NS / 1e9).replace("9.8", "nan"))
     with pytest.raises(DvoError, match="median of the accelerometer|0 inertial samples"):
         dvo.open(mav, calib=make.root / "calib.txt", imu="imu0.csv")
+
+
+@pytest.mark.parametrize("option", [{"imu": "imu.csv"}, {"imu_calib": "phone"}, {"imu_topic": "/imu"}])
+def test_a_stream_has_none(option):
+    (field,) = option
+    with pytest.raises(DvoError, match=f"{field}: not for a stream"):
+        dvo.open("webcam:0", **option)

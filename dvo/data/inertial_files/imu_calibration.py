@@ -254,7 +254,7 @@ def _noise(entries: _Entries) -> ImuNoise | None:
     for name, value in _table(table, entries.path):
         stated[name] = _number(value, f"noise.{name}", 0.0, entries.path)
     preset = entries.take("preset")
-    if preset is not None and preset not in NOISE_PRESETS:
+    if preset is not None and (not isinstance(preset, str) or preset not in NOISE_PRESETS):
         remedy = f"give one of {', '.join(NOISE_PRESETS)}"
         raise DvoError(f"no preset {str(preset)[:40]}", file=entries.path, field="preset", remedy=remedy)
     if preset is None and not stated:

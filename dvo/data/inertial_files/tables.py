@@ -372,7 +372,7 @@ def _turn_of_gravity(gyro: _Sensor, accel: _Sensor) -> float | None:
     w_times, keep = np.unique(gyro.times[np.isfinite(gyro.times)], return_index=True)
     w = gyro.values[np.isfinite(gyro.times)][keep]
     start, end = max(a_times[0], w_times[0]), min(a_times[-1], w_times[-1])
-    if end - start < 10 * _SMOOTH:
+    if not 10 * _SMOOTH <= end - start <= _SMOOTH * len(w_times):  # too short, or gaps alone
         return None
     edges = np.arange(start, end, _SMOOTH)
     means = [np.stack([_means(times, np.nan_to_num(values[:, k]), edges) for k in range(3)], axis=1)

@@ -110,7 +110,7 @@ def open_source(
                 print(frame.timestamp, frame.image.shape, frame.depth is not None)
     """
     if is_stream(source):
-        given = dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start)
+        given: dict[str, Any] = dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start)
         given |= dict(imu=None if imu in (AUTO, NONE) else imu, imu_calib=imu_calib, imu_topic=imu_topic)
         for field, value in given.items():
             if value is not None:

@@ -100,7 +100,10 @@ def choose_inertial(
         try:
             return found, [*notes, *found.samples.notes]
         except DvoError as error:
-            notes.append(f"inertial samples of {(found.file or path).name} are not used: {error.message}")
+            hint = ""
+            if request.times is None and (times := next(filter(is_file, _times_beside(path)), None)) is not None:
+                hint = f" (is --times {times.name} on their clock?)"
+            notes.append(f"inertial samples of {(found.file or path).name} are not used: {error.message}{hint}")
     if request.imu_calibration is not None:
         remedy = "give the file of the samples with --imu FILE"
         raise DvoError("there are no inertial samples that it is for", file=path, field="imu_calib", remedy=remedy)
@@ -178,6 +181,10 @@ def imu_calibration_of(
     """
     if given is None or isinstance(given, ImuCalibration):
         return given
+    is_listed = isinstance(given, Sequence) and all(isinstance(one, str | Path) for one in given)
+    if not isinstance(given, Path) and not is_listed:
+        remedy = "give a file, a preset, several of them, or an ImuCalibration"
+        raise DvoError(f"must be a file, got {str(given)[:60]!r}", field="imu_calib", remedy=remedy)
     if isinstance(given, str | Path):
         text = str(given)
         given = [text] if "," not in text or exists(Path(text)) else [part.strip() for part in text.split(",")]
@@ -247,6 +254,14 @@ def beside(path: Path, recording: Recording) -> list[Path]:
     else:
         own = []
     return [file for file in own if is_file(file)]
+
+
+def _times_beside(video: Path) -> list[Path]:
+    """Files of times of frames that a sensor logger writes beside a video: MARS logger, OpenCamera Sensors."""
+    stem, folder = video.stem, video.parent
+    date = re.sub("^VID_", "", stem)
+    names = [place / f"{stem}_timestamps.csv" for place in (folder, folder / date, folder / stem)]
+    return [*names, folder / "frame_timestamps.txt"]
 
 
 def described(samples: InertialSamples) -> str:

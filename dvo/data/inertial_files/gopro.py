@@ -3,12 +3,12 @@
 GoPro names the axes of the camera, seen in the direction of view, X left, Y back and Z up (verified on a video of a
 HERO5: rotations of the images against those of the gyroscope, gravity against the horizon). With x right, y down, z
 forward of the images, ``(x, y, z) = (-X, -Z, -Y)``. The order of the numbers of a sample is stated by ``ORIN``, a small
-letter for a negative axis; where it is not stated, it is that of the model (HERO5: Z X Y, Fusion: -Y X Z, HERO6: Y -X
-Z), and ``MTRX`` turns the numbers into Z X Y.
+letter for a negative axis; where it is not stated, it is that of the model (HERO5: Z X Y, Fusion: -Y X Z, HERO6 and
+HERO7 Black: Y -X Z), and ``MTRX`` turns the numbers into Z X Y. The pose of other models in the camera is not known.
 
 Times begin with the video and run by the clock of the camera (``STMP`` in microseconds or ``TICK`` in milliseconds),
 relative to the exposures of frames where both are stated in microseconds. On a HERO5 the clock of the payloads differs
-from it by 0.2 percent, and the samples are 0.03 s ahead of the images: a constant offset is left to calibration.
+from it by 0.2 percent, and ``t_imu = t_cam - 0.032 s`` (cross-correlation): a constant offset is left to calibration.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from dvo.geometry.poses import poses_from_matrices
 CAMERA_AXES = {"X": (-1.0, 0.0, 0.0), "Y": (0.0, 0.0, -1.0), "Z": (0.0, -1.0, 0.0)}
 """Axes of GoPro in those of the images."""
 
-_ORDERS = (("FUSION", "yXZ"), ("HERO6", "YxZ"), ("HERO7", "YxZ"))  # of models that do not state ORIN
-_HERO5 = "ZXY"
+_USUAL = "ZXY"
+_ORDERS = (("HERO5", _USUAL), ("FUSION", "yXZ"), ("HERO6", "YxZ"), ("HERO7BLACK", "YxZ"))  # where ORIN is not stated
 _UNEVEN = 0.01  # seconds: samples that are off an even clock by more are placed payload by payload
 _NO_STABILISATION = ("", "N", "N/A", "OFF", "NO")
 
@@ -45,6 +45,7 @@ class _Stream:
     durations: list[float] = field(default_factory=list)
     is_fine: bool = True  # stamps in microseconds
     axes: np.ndarray | None = None  # (3, 3) numbers of a sample to axes of the images
+    is_oriented: bool = True  # the axes are known
 
 
 def read_gopro(file: Path, turned: int = 0, *, rough: bool = False) -> InertialSamples:
@@ -74,9 +75,11 @@ def read_gopro(file: Path, turned: int = 0, *, rough: bool = False) -> InertialS
     T = np.eye(4)
     angle = np.radians(turned)
     T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    known, notes = all(streams[key].is_oriented for key in ("GYRO", "ACCL")), samples.notes
+    notes += () if known else (f"{samples.origin}: the axes of the sensors of this camera are not known",)
     return InertialSamples(
-        samples.timestamps, samples.gyro, samples.accel, poses_from_matrices(T), NOISE_PRESETS["action"],
-        samples.origin, samples.notes,
+        samples.timestamps, samples.gyro, samples.accel, poses_from_matrices(T) if known else None,
+        NOISE_PRESETS["action"], samples.origin, notes,
     )  # fmt: skip
 
 
@@ -201,28 +204,30 @@ def _add(found: dict[str, _Stream], payload: Payload, element: Element, model: s
         stamp = _first(parts, "TICK", np.nan) / 1e3
     stream.stamps.append(stamp if np.isfinite(stamp) else None)
     if key != "SHUT" and stream.axes is None:
-        stream.axes = _axes(parts, model)
+        stream.axes, stream.is_oriented = _axes(parts, model)
 
 
-def _axes(parts: dict[str, Element], model: str) -> np.ndarray:
-    """``(3, 3)`` numbers of a sample to axes of the images."""
+def _axes(parts: dict[str, Element], model: str) -> tuple[np.ndarray, bool]:
+    """``(3, 3)`` numbers of a sample to axes of the images, and whether they are known."""
     order = parts["ORIN"].text() if "ORIN" in parts else ""
     matrix = parts["MTRX"].numbers() if "MTRX" in parts else np.zeros(0)
     name = model.upper().replace(" ", "")
-    if not order and matrix.size != 9:
-        order = next((letters for part, letters in _ORDERS if part in name), _HERO5)
     if order:
-        if sorted(order.upper()) != ["X", "Y", "Z"]:
-            raise ValueError(f"ORIN {order[:10]!r} is no order of axes")
-        return np.stack([np.array(CAMERA_AXES[c.upper()]) * (1 if c.isupper() else -1) for c in order], axis=1)
-    out = parts["ORIO"].text() if "ORIO" in parts else _HERO5
-    if sorted(out.upper()) != ["X", "Y", "Z"]:
-        raise ValueError(f"ORIO {out[:10]!r} is no order of axes")
-    to_camera = np.stack([np.array(CAMERA_AXES[c.upper()]) * (1 if c.isupper() else -1) for c in out], axis=1)
-    turn = matrix.reshape(3, 3)
-    if not np.allclose(turn @ turn.T, np.eye(3), atol=0.05):
-        raise ValueError("MTRX is no rotation")
-    return to_camera @ turn
+        return _of_letters(order, "ORIN"), True
+    if matrix.size == 9:
+        turn = matrix.reshape(3, 3)
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=0.05):
+            raise ValueError("MTRX is no rotation")
+        return _of_letters(parts["ORIO"].text() if "ORIO" in parts else _USUAL, "ORIO") @ turn, True
+    order = _USUAL if name in ("", "CAMERA") else next((axes for part, axes in _ORDERS if part in name), "")
+    return _of_letters(order or _USUAL, "ORIN"), bool(order)
+
+
+def _of_letters(order: str, key: str) -> np.ndarray:
+    """``(3, 3)`` numbers in an order of GoPro's axes to axes of the images; a small letter is a negative axis."""
+    if sorted(order.upper()) != ["X", "Y", "Z"]:
+        raise ValueError(f"{key} {order[:10]!r} is no order of axes")
+    return np.stack([np.array(CAMERA_AXES[c.upper()]) * (1 if c.isupper() else -1) for c in order], axis=1)
 
 
 def _scaled(element: Element, parts: dict[str, Element]) -> np.ndarray:

@@ -3,6 +3,7 @@ plain YAML file."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -195,6 +196,9 @@ def _says_nothing(value: Any) -> bool:
 
 
 def _number(value: Any, name: str, low: float, path: Path) -> float:
+    if isinstance(value, str):  # YAML takes 1e-3 for a text
+        with contextlib.suppress(ValueError):
+            value = float(value)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not low <= value < math.inf:
         what = "a number" if low == -math.inf else f"a number of at least {low:g}"
@@ -250,7 +254,7 @@ def _noise(entries: _Entries) -> ImuNoise | None:
     for name, value in _table(table, entries.path):
         stated[name] = _number(value, f"noise.{name}", 0.0, entries.path)
     preset = entries.take("preset")
-    if preset is not None and preset not in NOISE_PRESETS:
+    if preset is not None and (not isinstance(preset, str) or preset not in NOISE_PRESETS):
         remedy = f"give one of {', '.join(NOISE_PRESETS)}"
         raise DvoError(f"no preset {str(preset)[:40]}", file=entries.path, field="preset", remedy=remedy)
     if preset is None and not stated:

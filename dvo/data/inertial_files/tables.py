@@ -96,7 +96,7 @@ def read_inertial_table(path: Path, *, rough: bool = False) -> InertialSamples:
     if path.is_dir():
         path = _in_folder(path)
     if path.suffix.lower() == ".jsonl":
-        sensors, notes = _json_lines(path), []
+        sensors, notes = _json_lines(path), list[str]()
         where = path.name
     else:
         sensors, notes = _of_text(path)
@@ -186,7 +186,8 @@ def _text(path: Path) -> _Text:
         named = comments[-1]
         header = cells(named) if mark and mark in named else [cell for cell in re.split(r"[,;\t]\s*|\s{2,}|\s(?![\[(])",
                                                                                         named) if cell]  # fmt: skip
-    texts, notes = [cells(row) for row in rows], []
+    notes: list[str] = []
+    texts = [cells(row) for row in rows]
     if header and texts and all(len(row) == len(header) + 1 and not row[-1] for row in texts):
         texts = [row[:-1] for row in texts]
     width = len(header) or max(map(len, texts), default=0)
@@ -244,10 +245,10 @@ def _columns(header: Sequence[str], path: Path) -> dict[str, tuple[list[int], fl
                 by_sensor.setdefault(sensor, {}).setdefault(match[1], place)
                 break
     if not by_sensor:
-        plain = {_UNIT.sub("", name).strip().lower(): place for place, name in enumerate(header)}
-        sensor = next((kind for pattern, kind in _FILES if pattern.search(path.stem)), None)
-        if sensor is not None and {"x", "y", "z"} <= plain.keys():
-            by_sensor[sensor] = {axis: plain[axis] for axis in "xyz"}
+        bare = {_UNIT.sub("", name).strip().lower(): place for place, name in enumerate(header)}
+        kind = next((kind for pattern, kind in _FILES if pattern.search(path.stem)), None)
+        if kind is not None and {"x", "y", "z"} <= bare.keys():
+            by_sensor[kind] = {axis: bare[axis] for axis in "xyz"}
     if "g-force" in by_sensor:  # Physics Toolbox: ax, ay, az beside them are without gravity
         by_sensor["accel"] = by_sensor.pop("g-force")
         unit: float | None = STANDARD_GRAVITY
@@ -394,7 +395,7 @@ def turn_of_gravity(
     w_times, keep = np.unique(gyro_times[np.isfinite(gyro_times)], return_index=True)
     w = gyro[np.isfinite(gyro_times)][keep]
     start, end = max(a_times[0], w_times[0]), min(a_times[-1], w_times[-1])
-    if end - start < 10 * _SMOOTH:
+    if not 10 * _SMOOTH <= end - start <= _SMOOTH * len(w_times):  # too short, or gaps alone
         return None
     edges = np.arange(start, end, _SMOOTH)
     means = [np.stack([_means(times, np.nan_to_num(values[:, k]), edges) for k in range(3)], axis=1)

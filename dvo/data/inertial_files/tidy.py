@@ -41,9 +41,9 @@ def tidy(
     if rough:
         return InertialSamples(times, gyro, accel, origin=origin)
     notes = []
-    finite = np.isfinite(times) & (np.abs(np.column_stack([gyro, accel])) <= MAX_NUMBER).all(axis=1)  # false for nan
+    finite = (np.abs(np.column_stack([times, gyro, accel])) <= MAX_NUMBER).all(axis=1)  # false for nan
     if not finite.all():
-        notes.append(f"{origin}: {_rows(~finite)} without finite numbers dropped")
+        notes.append(f"{origin}: {_rows(~finite)} without finite numbers in bounds dropped")
         times, gyro, accel = times[finite], gyro[finite], accel[finite]
     late = np.maximum.accumulate(times) - times if len(times) else times
     if len(late) and late.max() > _SET_BACK:

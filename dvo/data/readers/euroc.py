@@ -256,6 +256,8 @@ def open_euroc(path: Path, request: Request) -> Recording:
         times = listed if request.times is None else read_times(request.times, len(images), warnings)
         if request.fps is not None:
             warnings.append(f"--fps was not used: the times come from {camera}/data.csv")
+    if request.times is not None and is_file(mav / "imu0" / "data.csv"):
+        warnings.append("inertial samples of imu0 are not used: the times of --times need not be on their clock")
     groundtruth = _groundtruth(mav, camera, times, warnings)
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else None
     if path.resolve().name == "data" and name is None:

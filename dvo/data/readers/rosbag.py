@@ -169,6 +169,8 @@ class BagRecording:
         if len(imu) > 1 and chosen is None:
             listed = ", ".join(self.imu_topics)
             self.warnings.append(f"several topics of inertial samples, none is used: {listed} (give --imu-topic)")
+        if chosen is not None and not has_clock:
+            self.warnings.append(f"inertial samples of {chosen} are not used: the images have no times on their clock")
         self.inertial: Callable[[], InertialSamples] | None = (
             partial(read_inertial, path, chosen) if has_clock and chosen is not None else None
         )

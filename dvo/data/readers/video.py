@@ -198,6 +198,8 @@ class VideoRecording:
             self.positions = partial(read_gopro_positions, path)
             if request.times is None and request.fps is None and self._use_container:
                 self.inertial = partial(read_gopro, path, self.turned)
+            else:
+                self.warnings.append("inertial samples of the telemetry are not used: frames have no times of the file")
         self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
         self.rate = self._fps if self._times is None else None
         if self._times is None and not self._use_container and request.fps is None:

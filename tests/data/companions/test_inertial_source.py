@@ -87,6 +87,20 @@ def test_another_clock(make, video, start):
     assert open_(video, imu_calib=ImuCalibration(time_offset=start)).inertial is not None
 
 
+@pytest.mark.parametrize(
+    ("name", "header"), [("frame_timestamps.txt", "Frame timestamp[nanosec],Unix time[nanosec]\n"),
+                         ("clip_timestamps.csv", "")],
+)  # fmt: skip
+def test_times_of_a_logger_bring_both_clocks_together(make, video, name, header):
+    make.text("gyro_accel.csv", table(7000.0))
+    stamps = [7_000_000_000_000 + 50_000_000 * k for k in range(20)]
+    file = make.text(name, header + "".join(f"{t},{t}\n" if header else f"{t}\n" for t in stamps))
+    source = open_(video)
+    assert source.inertial is None
+    assert sum(f"(is --times {name} on their clock?)" in note for note in source.warnings) == 1
+    assert [len(frame.inertial) for frame in open_(video, times=file)][:4] == pytest.approx([0, 5, 5, 5], abs=1)
+
+
 def test_a_calibration_without_samples_is_refused(video):
     with pytest.raises(DvoError, match="imu_calib: there are no inertial samples"):
         open_(video, imu_calib="phone")
@@ -152,3 +166,10 @@ def test_a_file_wins_over_that_of_the_data_set(make, mav):
     make.text("s/imu0.csv", table(NS / 1e9).replace("9.8", "nan"))
     with pytest.raises(DvoError, match="median of the accelerometer|0 inertial samples"):
         dvo.open(mav, calib=make.root / "calib.txt", imu="imu0.csv")
+
+
+@pytest.mark.parametrize("option", [{"imu": "imu.csv"}, {"imu_calib": "phone"}, {"imu_topic": "/imu"}])
+def test_a_stream_has_none(option):
+    (field,) = option
+    with pytest.raises(DvoError, match=f"{field}: not for a stream"):
+        dvo.open("webcam:0", **option)

@@ -80,6 +80,11 @@ def test_the_factor_multiplies_densities(tmp_path, factor):
     assert found.gyro_bias == NOISE_PRESETS["phone"].gyro_bias
 
 
+def test_exponents_without_a_point(tmp_path):
+    found = read_imu_calibration(write(tmp_path, DENSITIES.replace("0.00002", "2e-5"))).noise
+    assert found is not None and found.gyro_walk == 2e-5
+
+
 def test_plain_yaml(tmp_path):
     pose = "T_camera_imu: [0.1, 0.2, 0.3, 0, 0, 0, 1]"
     text = f"preset: action\nnoise:\n  gyro_bias: 0.5\n{pose}\ntime_offset: -0.02\n"

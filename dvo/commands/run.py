@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
         "device": str(device),
         "seed": arguments.seed,
         "stride": arguments.stride,
-        **input_facts(arguments),
+        **input_facts(arguments, source),
         **request_facts(arguments),
     }
     seed_everything(arguments.seed)

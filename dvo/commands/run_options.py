@@ -13,6 +13,7 @@ from dvo.core.command_line import names, positive_float, positive_int, seed
 
 INPUTS = (
     "calib", "times", "groundtruth", "extrinsics", "mask", "depth", "right", "depth_calib", "config", "map", "weights",
+    "imu", "imu_calib",
 )  # fmt: skip
 """Options whose value is, or may be, a file or folder that is read."""
 OUTPUTS = ("save_map", "overlay", "rerun")

@@ -18,6 +18,7 @@ from dvo.commands import NOTHING_TRACKED, OK, Terminated
 from dvo.commands.base_frame import base_observers
 from dvo.commands.camera import CALIBRATION, calibration_origin, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.commands.export import SOURCE, check_image_options, export_images, image_choice
 from dvo.commands.input_options import input_facts, input_settings, print_input
 from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
@@ -33,15 +34,17 @@ from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings, read_settings
 from dvo.data.files.output import check_place
 from dvo.data.frame import Frame
+from dvo.data.source import Source
 from dvo.data.streams.capture import is_stream, shown
 from dvo.data.trajectory import Trajectory
 from dvo.export.formats import TRAJECTORY_FORMATS, check_formats, export_run
+from dvo.export.recorded import ImageChoice
 from dvo.odometry.load import check_early
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
 from dvo.session.frame_table import FrameTable
-from dvo.session.observer import Observer
+from dvo.session.observer import Observer, graph_of
 from dvo.session.recorder import Recorder
 
 _ABORTED = "aborted by a second Ctrl-C, SIGTERM or SIGHUP"
@@ -84,6 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         DvoError: invalid source, weights, device, settings or export, or a folder that cannot be written.
     """
     check_formats(arguments.export)
+    check_image_options(arguments, arguments.export, "--export", arguments.source)
     device = device_for(arguments)
     check_settings_early(arguments)
     early: Odometry | None = None
@@ -128,7 +132,9 @@ def run(arguments: argparse.Namespace) -> int:
         observers += base_observers(arguments, folder, source.path)
         observers += scale_observers(arguments, folder)
         odometry = early or load_odometry(arguments, device)
-        check_formats(arguments.export, odometry)
+        images = image_choice(arguments) if arguments.export_images == SOURCE else None
+        if images is None:
+            check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
         facts["map"] = arguments.map
         if arguments.map is not None and isinstance(odometry, Saveable):
@@ -142,6 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
             stride=arguments.stride,
             facts=facts | camera,
             export=arguments.export,
+            images=images,
             save_map=save_map,
             observers=observers,
             again=None if arguments.map else partial(load_odometry, _reseeded(arguments), device),
@@ -257,6 +264,7 @@ def track(
     stride: int = 1,
     facts: dict[str, Any],
     export: Sequence[str] = (),
+    images: ImageChoice | None = None,
     save_map: Path | None = None,
     observers: Sequence[Observer] = (),
     again: Callable[[], Odometry] | None = None,
@@ -275,6 +283,7 @@ def track(
         stride: distance of tracked frames, in frames of the clip.
         facts: metadata to write into run.json.
         export: formats to write the results in too, into ``export/NAME`` of the results folder.
+        images: of the clip for the exported maps; None for those of the keyframes.
         save_map: map file to write at the end; the odometry is :class:`dvo.odometry.protocol.Saveable`.
         observers: told of every frame and of the result; the caller closes them.
         again: builds the odometry with another seed, for a result that leaves doubt.
@@ -348,20 +357,28 @@ def track(
         if hasty and (left := [name for name in export if name not in TRAJECTORY_FORMATS]):
             warn(f"{', '.join(left)}: not exported, there was no time for the final optimisation")
             export = [name for name in export if name not in left]
-        if export:
-            _export(odometry, done, folder / results.EXPORT, export)
+        if export and not done.result.frames_tracked:
+            warn("nothing to export")
+        elif export:
+            place = folder / results.EXPORT
+            maps = [name for name in export if images is not None and name not in TRAJECTORY_FORMATS]
+            for sentence in export_run(odometry, done.result, [name for name in export if name not in maps], place):
+                say(f"exported to {place}/{sentence}")
+            if images is not None and maps:
+                assert isinstance(clip, Source)
+                places, pressed = {name: place / name for name in maps}, switch.pressed
+
+                def stop() -> None:
+                    if switch.pressed is not None and switch.pressed is not pressed:
+                        raise Terminated(switch.pressed)
+
+                graph = graph_of(odometry)
+                said = export_images(clip, done.result, pages.rows(), graph, places, images, check=stop)
+                for sentence in said:
+                    say(f"exported to {place}/{sentence}")
     if done.interrupted:
         return 128 + (switch.pressed or signal.SIGINT)
     return OK if done.result.frames_tracked else NOTHING_TRACKED
-
-
-def _export(odometry: Odometry, done: session.Run, folder: Path, formats: Sequence[str]) -> None:
-    """Write the exports, and print a line for each."""
-    if not done.result.frames_tracked:
-        warn("nothing to export")
-        return
-    for sentence in export_run(odometry, done.result, formats, folder):
-        say(f"exported to {folder}/{sentence}")
 
 
 def _save(odometry: Odometry, file: Path) -> dict[str, Any]:

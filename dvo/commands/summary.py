@@ -94,7 +94,7 @@ class Pages:
 
     def frames(self, path: Path) -> None:
         """Write frames.csv."""
-        write_frames(path, self._rows())
+        write_frames(path, self.rows())
 
     def page(self, path: Path, values: dict[str, Any]) -> None:
         """Write summary.html.
@@ -103,7 +103,7 @@ class Pages:
             path: file to write.
             values: content of run.json.
         """
-        write_page(path, run_page(self.name, self.run.result, self._rows(), values))
+        write_page(path, run_page(self.name, self.run.result, self.rows(), values))
 
     def add_warnings(self, folder: Path, warnings: Sequence[str]) -> None:
         """Add to the warnings in run.json and summary.html what was found after they were written.
@@ -129,7 +129,8 @@ class Pages:
         except OSError as error:
             raise write_error(file, error) from error
 
-    def _rows(self) -> list[FrameRow]:
+    def rows(self) -> list[FrameRow]:
+        """Rows of frames.csv."""
         truth = None if self.groundtruth is None else true_positions(self.table.timestamps, self.groundtruth)
         return self.table.rows(self.run, keyframe_times(self.odometry, self.run.result), truth)
 

@@ -46,6 +46,7 @@ from dvo.session import results, session
 from dvo.session.frame_table import FrameTable
 from dvo.session.observer import Observer, graph_of
 from dvo.session.recorder import Recorder
+from dvo.viz.thumbnails import Thumbnails
 
 _ABORTED = "aborted by a second Ctrl-C, SIGTERM or SIGHUP"
 
@@ -298,11 +299,12 @@ def track(
     for observer in observers:
         observer.begin(odometry)
     facts = {"odometry": odometry.name, **facts, "export": list(export)}
-    recorder, table = Recorder(folder, odometry, facts, warn=warn), FrameTable()
+    recorder, table, thumbnails = Recorder(folder, odometry, facts, warn=warn), FrameTable(), Thumbnails()
 
     def on_frame(frame: Frame, estimate: Estimate | None) -> None:
         recorder.update(frame, estimate)
         table.update(frame, estimate)
+        thumbnails.update(frame, estimate)
         for observer in observers:
             observer.update(frame, estimate)
         progress.update(frame, estimate)
@@ -328,7 +330,7 @@ def track(
             )
             scores = score(done, clip.groundtruth)
             writer = None if save_map is None else partial(_save, odometry, save_map)
-            pages = Pages(clip.name, done, table, odometry, clip.groundtruth)
+            pages = Pages(clip.name, done, table, odometry, clip.groundtruth, thumbnails.images)
             hasty = done.interrupted and switch.in_haste
             views = True
             if hasty:

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import cv2
 import numpy as np
 import pytest
 
+import dvo
 from dvo.cli import main
+from dvo.commands.export import export_images
 from dvo.data.readers.euroc import read_state_groundtruth
-from dvo.data.trajectory import read_kitti_poses, read_tum
+from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
+from dvo.export.recorded import ImageChoice
 from dvo.geometry.poses import pose_matrices
+from dvo.odometry.protocol import Result, Segment, SparseMap
+from tests.support.colmap_models import read_text
 from tests.support.command_line import arguments, errors, names, summary
+from tests.support.fake_odometry import curve
 from tests.support.tiny_tracker import frames, tracker
+
+SOURCE = ["--export-images", "source"]
 
 
 def same(found, expected):
@@ -158,7 +169,7 @@ def test_images_of_the_source_with_a_run(given, image_folder, tmp_path, capsys):
     )
     printed = capsys.readouterr().out
     said = "3 images of 64x48 from the source, with masks, 10 points, without observations; "
-    assert f"{out}/export/colmap-text: {said}left out: segment 0 with a world of their own" in printed
+    assert f"{out}/export/colmap-text: {said}left out: segment 0 with a world of its own" in printed
     assert f"{out}/export/nerfstudio: {said}" in printed
     places = [out / "export" / name for name in ("colmap-text", "nerfstudio")]
     camera = (places[0] / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
@@ -169,6 +180,46 @@ def test_images_of_the_source_with_a_run(given, image_folder, tmp_path, capsys):
         assert cv2.imread(str(place / "images" / images[0])).shape == (48, 64, 3)
         np.testing.assert_array_equal(cv2.imread(str(place / "masks" / f"{images[0]}.png"), -1), mask)
     assert names(out / "export" / "tum") == ["segment-0", "segment-1", "trajectory.txt"]
+
+
+def test_all_segments_of_a_world_are_in_one(image_folder, tmp_path):
+    source = dvo.open(image_folder, calib=image_folder.parent / "calib.txt", times=image_folder.parent / "times.txt")
+    times = source.timestamps
+    poses = np.array([curve(time) for time in times])
+    cuts = (slice(0, 5), slice(5, 9), slice(10, 18), slice(18, 20))
+    parts = [Trajectory(times[cut], poses[cut]) for cut in cuts]
+    joined = (None, None, 0, None)
+    segments = tuple(Segment(t, t.timestamps[0], t.timestamps[-1], j) for t, j in zip(parts, joined, strict=True))
+    world = Trajectory(
+        *(np.concatenate([getattr(parts[k], name) for k in (0, 2)]) for name in ("timestamps", "poses_wc"))
+    )
+    result = Result(world, SparseMap(np.zeros((3, 3), np.float32), np.zeros((3, 3), np.uint8)), 20, 1, {}, segments)
+    for segment, numbers, points, others in (
+        (None, [*range(5), *range(10, 18)], 3, "segments 1, 3 with worlds of their own"),
+        (1, [*range(5, 9)], 0, "segments 0, 2, 3 with"),
+    ):
+        place = tmp_path / str(segment)
+        (said,) = export_images(source, result, [], None, {"colmap-text": place}, ImageChoice(), segment)
+        assert said.startswith(f"colmap-text: {len(numbers)} images of 64x48 from the source, {points} points")
+        assert f"left out: {others}" in said
+        found = read_text(place / "sparse" / "0")
+        assert [int(image.name[:6]) for image in found.images.values()] == numbers
+        for image in found.images.values():
+            point = pose_matrices(poses[int(image.name[:6])])[:3] @ [0.5, -0.2, 2.0, 1.0]
+            np.testing.assert_allclose(image.project(point, found.cameras[1][3]), [32 + 12.5, 24 - 5], atol=1e-6)
+
+
+def test_a_signal_while_images_are_read_ends_the_run(given, image_folder, tmp_path, monkeypatch):
+    """The results are there, a half of an export is not."""
+
+    def signalled(image):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return 0.0
+
+    given()
+    monkeypatch.setattr("dvo.export.recorded.sharpness", signalled)
+    assert main(arguments(image_folder, tmp_path / "out", "--export", "colmap", *SOURCE, "--every", "4")) == 143
+    assert summary(tmp_path / "out")["finished"] and not (tmp_path / "out" / "export").exists()
 
 
 def test_every_or_count_after_the_run(given, image_folder, tmp_path, capsys):
@@ -186,9 +237,6 @@ def test_every_or_count_after_the_run(given, image_folder, tmp_path, capsys):
     options = ["--to", "colmap", "--segment", "1"]
     assert main(["export", str(out), str(tmp_path / "new"), *options]) == 2
     assert "no segment 1" in capsys.readouterr().err and not (tmp_path / "new").exists()
-
-
-SOURCE = ["--export-images", "source"]
 
 
 @pytest.mark.parametrize(

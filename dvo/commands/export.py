@@ -189,9 +189,9 @@ def _describe(found: Reconstruction, others: Sequence[int]) -> str:
     else:
         text += "without observations"
     if others:
-        several = len(others) > 1
         numbers = ", ".join(map(str, others))
-        text += f"; left out: segment{'s' * several} {numbers} with {'worlds' if several else 'a world'} of their own"
+        own = f"segment {numbers} with a world of its own"
+        text += f"; left out: {own if len(others) == 1 else f'segments {numbers} with worlds of their own'}"
     return text
 
 

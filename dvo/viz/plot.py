@@ -205,7 +205,8 @@ def _enlarge(
     _draw_lines(inset, panel, truth, axes)
     inset.set_xticks([])
     inset.set_yticks([])
-    inset.set_title(f"path, {_INSET / (2 * half):.0f} times", fontsize=8, color=INK, pad=3)
+    note = f"path, {_INSET / (2 * half):.0f} times"
+    inset.text(0.03, 0.97, note, fontsize=8, color=INK, ha="left", va="top", transform=inset.transAxes)
     plot.indicate_inset_zoom(inset, edgecolor=INK, alpha=0.6)
 
 

@@ -46,6 +46,7 @@ class OrbitView {
   }
 
   reset() {
+    this.side = undefined;
     this.yaw = -0.5;
     this.pitch = 0.55;
     this.zoom = 1;
@@ -107,7 +108,7 @@ class OrbitView {
     this.prepare();
     const { world, layers, palette } = this;
     if (layers.grid) this.drawGrid();
-    this.mapMiddle = 0; // of the points on the screen, from the left
+    this.marks = []; // positions on the screen that an image should not cover, with their weights
     if (layers.map) this.drawPoints();
     if (layers.truth && world.truth.length) {
       this.drawLine(world.truth, 3, world.truthStarts, palette.truth, 3.5, 0.65);
@@ -148,16 +149,13 @@ class OrbitView {
     const { points } = this.world;
     const few = points.length < 3 * 1500 ? 1.5 : 1;
     const size = few * Math.max(2, Math.min(4, 2 * Math.sqrt(this.zoom)));
-    let [sum, count] = [0, 0];
     for (let k = 0; 3 * k < points.length; k++) {
       const p = this.at(points, k);
       if (!p || p[0] < 0 || p[1] < 0 || p[0] > this.width || p[1] > this.height) continue;
-      sum += p[0];
-      count += 1;
+      this.marks.push([p[0], p[1], 1]);
       this.context.fillStyle = this.pointColours[k];
       this.context.fillRect(p[0] - size / 2, p[1] - size / 2, size, size);
     }
-    this.mapMiddle = count ? sum / count : 0;
   }
 
   drawLine(array, step, starts, colour, width, alpha) {
@@ -169,8 +167,10 @@ class OrbitView {
     context.globalAlpha = alpha;
     context.beginPath();
     let down = false;
+    const weight = (150 * step) / Math.max(array.length, 1); // a line counts as 150 points, however many it has
     for (let k = 0; step * k < array.length; k++) {
       const p = this.at(array, k, step);
+      if (p) this.marks.push([p[0], p[1], weight]);
       if (p && down && !gaps.has(k)) context.lineTo(p[0], p[1]);
       else if (p) context.moveTo(p[0], p[1]);
       down = p !== null;
@@ -251,7 +251,7 @@ class OrbitView {
     return corners;
   }
 
-  /** Image beside the frustum, where it fits away from the map; of a frame without a pose in a corner of the view. */
+  /** Image beside the frustum, where it covers least; of a frame without a pose in a corner of the view. */
   drawPicture(corners) {
     const context = this.context;
     const { naturalWidth, naturalHeight } = this.picture;
@@ -261,15 +261,26 @@ class OrbitView {
     if (corners) {
       const [left, right] = [Math.min(...corners.map((p) => p[0])), Math.max(...corners.map((p) => p[0]))];
       const [top, bottom] = [Math.min(...corners.map((p) => p[1])), Math.max(...corners.map((p) => p[1]))];
-      const [fitsLeft, fitsRight] = [left >= width + 32, this.width - right >= width + 32];
-      const isRight = fitsLeft && fitsRight ? this.mapMiddle < (left + right) / 2 : fitsRight;
-      x = Math.max(6, Math.min(this.width - width - 6, isRight ? right + 26 : left - 26 - width));
-      y = Math.max(6, Math.min(this.height - height - 24, (top + bottom - height) / 2));
+      const [column, row] = [(left + right - width) / 2, (top + bottom - height) / 2];
+      const places = [[right + 26, row], [left - 26 - width, row], [column, top - 44 - height], [column, bottom + 26]];
+      const inside = places.map(([a, b]) => [
+        Math.max(6, Math.min(this.width - width - 6, a)), Math.max(6, Math.min(this.height - height - 24, b)),
+      ]);
+      const costs = inside.map(([a, b]) => {
+        const covers = ([u, v]) => u > a - 4 && u < a + width + 4 && v > b - 4 && v < b + height + 22;
+        const frustum = corners.filter(covers).length;
+        return this.marks.reduce((sum, mark) => sum + (covers(mark) ? mark[2] : 0), 1000 * frustum);
+      });
+      const best = costs.indexOf(Math.min(...costs));
+      // While the frame moves, the image stays on its side unless another one is much better.
+      if (this.side === undefined || costs[best] + 20 < 0.7 * costs[this.side]) this.side = best;
+      [x, y] = inside[this.side];
       context.strokeStyle = this.palette.soft;
       context.lineWidth = 1;
       context.beginPath();
-      context.moveTo(isRight ? right : left, (top + bottom) / 2);
-      context.lineTo(isRight ? x : x + width, y + height / 2);
+      context.moveTo((left + right) / 2, (top + bottom) / 2);
+      const within = (low, value, high) => Math.max(low, Math.min(high, value));
+      context.lineTo(within(x, (left + right) / 2, x + width), within(y, (top + bottom) / 2, y + height));
       context.stroke();
     }
     context.drawImage(this.picture, x, y, width, height);

@@ -243,7 +243,7 @@ def test_every_or_count_after_the_run(given, image_folder, tmp_path, capsys):
     ("options", "message"),
     [(["--export", "colmap", "--every", "3"], "--every: chooses images of the source. Add --export-images source"),
      (["--export", "colmap", "--export-images", "keyframes", "--count", "3"], "--count: chooses images of the source"),
-     (SOURCE, "there are images in exported maps alone. Add --export colmap or nerfstudio"),
+     (SOURCE, "there are images in exported maps alone. Use --export colmap or nerfstudio"),
      (["--export", "kitti", *SOURCE], "there are images in exported maps alone"),
      (["--export", "colmap", *SOURCE, "--every", "2", "--count", "3"], "not allowed with"),
      (["--export", "colmap", *SOURCE, "--every", "0"], "--every")],
@@ -269,7 +269,7 @@ def test_options_of_images_that_mean_nothing_after_the_run(given, image_folder, 
     (tmp_path / "a.dvo").write_bytes(b"a map")
     capsys.readouterr()
     for source, options, message in (
-        (out, ["--to", "kitti", "--count", "3"], "there are images in exported maps alone. Add --to colmap"),
+        (out, ["--to", "kitti", "--count", "3"], "--count: there are images in exported maps alone. Use --to colmap"),
         (out, ["--to", "colmap", "--export-images", "keyframes"], "the run has saved no map file"),
         (out, ["--to", "colmap", "--export-images", "keyframes", "--every", "2"], "--every: chooses images of"),
         (tmp_path / "a.dvo", ["--to", "colmap", *SOURCE], "a map file does not know its source"),

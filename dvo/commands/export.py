@@ -99,8 +99,8 @@ def check_image_options(
     if images is None:
         return
     if not any(name in MAP_FORMATS for name in formats):
-        remedy = f"add {option} colmap or nerfstudio"
-        raise DvoError("there are images in exported maps alone", field="--export-images", remedy=remedy)
+        remedy, field = f"use {option} colmap or nerfstudio", f"--{chosen or 'export-images'}"
+        raise DvoError("there are images in exported maps alone", field=field, remedy=remedy)
     if images == SOURCE and source is not None and is_stream(source):
         remedy = "record it and track the recording, or leave the option out"
         raise DvoError("a stream cannot be read again", field="--export-images", remedy=remedy)

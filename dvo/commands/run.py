@@ -362,25 +362,29 @@ def track(
         if export and not done.result.frames_tracked:
             warn("nothing to export")
         elif export:
-            place = folder / results.EXPORT
             maps = [name for name in export if images is not None and name not in TRAJECTORY_FORMATS]
-            for sentence in export_run(odometry, done.result, [name for name in export if name not in maps], place):
+            others, place = [name for name in export if name not in maps], folder / results.EXPORT
+            said = export_run(odometry, done.result, others, place)
+            if images is not None and isinstance(clip, Source) and maps:
+                places, check = {name: place / name for name in maps}, _stopped_by(switch)
+                rows, graph = pages.rows(), graph_of(odometry)
+                said += export_images(clip, done.result, rows, graph, places, images, check=check)
+            for sentence in said:
                 say(f"exported to {place}/{sentence}")
-            if images is not None and maps:
-                assert isinstance(clip, Source)
-                places, pressed = {name: place / name for name in maps}, switch.pressed
-
-                def stop() -> None:
-                    if switch.pressed is not None and switch.pressed is not pressed:
-                        raise Terminated(switch.pressed)
-
-                graph = graph_of(odometry)
-                said = export_images(clip, done.result, pages.rows(), graph, places, images, check=stop)
-                for sentence in said:
-                    say(f"exported to {place}/{sentence}")
     if done.interrupted:
         return 128 + (switch.pressed or signal.SIGINT)
     return OK if done.result.frames_tracked else NOTHING_TRACKED
+
+
+def _stopped_by(switch: InterruptSwitch) -> Callable[[], None]:
+    """Function that ends the program if a signal has come since; one that has ended tracking does not count."""
+    before = switch.pressed
+
+    def check() -> None:
+        if switch.pressed is not None and switch.pressed is not before:
+            raise Terminated(switch.pressed)
+
+    return check
 
 
 def _save(odometry: Odometry, file: Path) -> dict[str, Any]:

@@ -162,7 +162,7 @@ def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:
     points = points[np.isfinite(points).all(axis=1)]
     _limits(plot, [line.positions for line in (*lines, truth) if line is not None], axes, ratio, points)
     if len(points):
-        plot.scatter(*points.T, s=7, color=INK, alpha=0.4, linewidths=0, label="map points", zorder=1)
+        plot.scatter(points[:, 0], points[:, 1], s=7, color=INK, alpha=0.4, linewidths=0, label="map points", zorder=1)
     _draw_lines(plot, panel, truth, axes)
     path = np.concatenate([line.positions for line in shown])[:, axes] if shown else np.zeros((0, 2))
     if len(path) and len(points):

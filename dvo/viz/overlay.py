@@ -21,7 +21,12 @@ MAX_PAUSE = 2.0  # seconds for which a picture stays at most; what is longer in 
 _LOOKED_AT = 10  # intervals between tracked frames that tell the rate
 _LATE = 0.5  # seconds by which the video may fall behind the source before a picture is left out
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_STATUS_COLOURS = {Status.TRACKING: (47, 143, 131), Status.INITIALISING: (227, 167, 47), Status.LOST: (200, 54, 74)}
+_STATUS_COLOURS = {
+    Status.TRACKING: (47, 143, 131),
+    Status.INITIALISING: (227, 167, 47),
+    Status.LOST: (200, 54, 74),
+    Status.INERTIAL: (108, 92, 190),
+}
 
 
 class OverlayVideo:

@@ -16,7 +16,8 @@ from dvo.data.readers.euroc import read_state_groundtruth
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
 from dvo.export.recorded import ImageChoice
 from dvo.geometry.poses import pose_matrices
-from dvo.odometry.protocol import Result, Segment, SparseMap
+from dvo.odometry.protocol import Result, Segment, SparseMap, Status
+from dvo.session.frame_table import FrameRow
 from tests.support.colmap_models import read_text
 from tests.support.command_line import arguments, errors, names, summary
 from tests.support.fake_odometry import curve
@@ -194,12 +195,13 @@ def test_all_segments_of_a_world_are_in_one(image_folder, tmp_path):
         *(np.concatenate([getattr(parts[k], name) for k in (0, 2)]) for name in ("timestamps", "poses_wc"))
     )
     result = Result(world, SparseMap(np.zeros((3, 3), np.float32), np.zeros((3, 3), np.uint8)), 20, 1, {}, segments)
+    rows = [FrameRow(times[k], Status.INERTIAL if k == 12 else Status.TRACKING) for k in range(20)]
     for segment, numbers, points, others in (
-        (None, [*range(5), *range(10, 18)], 3, "segments 1, 3 with worlds of their own"),
+        (None, [*range(5), 10, 11, *range(13, 18)], 3, "segments 1, 3 with worlds of their own"),
         (1, [*range(5, 9)], 0, "segments 0, 2, 3 with"),
     ):
         place = tmp_path / str(segment)
-        (said,) = export_images(source, result, [], None, {"colmap-text": place}, ImageChoice(), segment)
+        (said,) = export_images(source, result, rows, None, {"colmap-text": place}, ImageChoice(), segment)
         assert said.startswith(f"colmap-text: {len(numbers)} images of 64x48 from the source, {points} points")
         assert f"left out: {others}" in said
         found = read_text(place / "sparse" / "0")

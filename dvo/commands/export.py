@@ -33,7 +33,7 @@ from dvo.export.reconstruction import Reconstruction, observe
 from dvo.export.recorded import MOST_IMAGES, ImageChoice, recorded_images
 from dvo.map.io.serialisation import load_graph
 from dvo.map.keyframe_graph import KeyframeGraph
-from dvo.odometry.protocol import Result
+from dvo.odometry.protocol import Result, Status
 from dvo.odometry.segments import result_of_log
 from dvo.session import results
 from dvo.session.frame_table import SKIPPED, FrameRow, near
@@ -130,7 +130,8 @@ def export_images(
     Args:
         source: of the run.
         result: of the run.
-        rows: of its frames; those that the stride has left out have no pose of their own, and are not chosen.
+        rows: of its frames; those that the stride has left out, and those that inertial samples alone have given a
+            pose, are not chosen.
         graph: of the run; None without one: the points of the map are then written without observations.
         places: new folder of each format of maps.
         choice: of the images.
@@ -171,11 +172,11 @@ def export_images(
 
 
 def _tracked(parts: Sequence[Trajectory], rows: Sequence[FrameRow]) -> Trajectory:
-    """Poses of some segments in order of time, without those that are interpolated."""
+    """Poses of some segments in order of time, without those that are interpolated or predicted."""
     times = np.concatenate([part.timestamps for part in parts])
     poses = np.concatenate([part.poses_wc for part in parts])
-    skipped = np.array([row.timestamp for row in rows if row.status == SKIPPED])
-    chosen = np.flatnonzero(~near(times, skipped))
+    without = np.array([row.timestamp for row in rows if row.status in (SKIPPED, Status.INERTIAL)])
+    chosen = np.flatnonzero(~near(times, without))
     chosen = chosen[np.argsort(times[chosen], kind="stable")]
     return Trajectory(times[chosen], poses[chosen])
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dvo.data.trajectory import Trajectory
-from dvo.session.frame_table import FrameRow
+from dvo.session.frame_table import STATUSES, FrameRow
 from dvo.viz.run_page import (
     ASSETS,
     MAX_FRAMES,
@@ -112,7 +112,7 @@ def test_scripts_use_colours_that_the_style_defines_for_both_themes():
     used = set(
         re.findall(r"var\(--(\w+)\)", style + "".join(p.read_text(encoding="utf-8") for p in ASSETS.glob("*.js")))
     )
-    assert used <= light and {"tracking", "initialising", "lost", "skipped"} <= light
+    assert used <= light and set(STATUSES) <= light
 
 
 def test_data_of_a_short_run():

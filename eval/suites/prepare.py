@@ -29,9 +29,8 @@ def prepare(suites: list[Suite]) -> list[Path]:
         for sequence in suite.sequences:
             if sequence.rendered is None:
                 continue
-            options = dict(sequence.rendered)
-            there = (place_of(sequence.name, options) / RECORD).is_file()
-            folder = rendered_folder(sequence.name, options)
+            there = (place_of(*sequence.rendering) / RECORD).is_file()
+            folder = rendered_folder(*sequence.rendering)
             facts = json.loads((folder / RECORD).read_text(encoding="utf-8"))
             made += not there
             took = (

@@ -74,7 +74,7 @@ class Style:
 
 HAND = Style(
     pace=(0.3, 1.0), waypoint=0.8, turn=45.0, climb=0.12, room=0.45, gaze=(14.0, 6.0, 3.0), gaze_band=(0.05, 0.5),
-    sway=0.05, sway_band=(0.15, 0.8), step=0.008, tremor=(0.0035, 0.8), tremor_band=(0.5, 8.0),
+    sway=0.05, sway_band=(0.15, 0.8), step=0.004, tremor=(0.002, 0.8), tremor_band=(0.5, 8.0),
 )  # fmt: skip
 HASTY = replace(HAND, pace=(0.6, 1.3), gaze=(24.0, 9.0, 7.0), gaze_band=(0.3, 1.3), sway=0.1, sway_band=(0.3, 1.2))
 QUADROTOR = Style(

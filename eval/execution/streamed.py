@@ -22,8 +22,8 @@ class Streamed:
         poses_wc: ``(N, 7)`` camera to world, as they were at that time.
         status: ``(N,)`` text, see :class:`dvo.odometry.protocol.Status`.
         segment: ``(N,)``.
-        scale_state: ``(N,)`` text: ``none``, ``initialising``, ``aligned`` or ``refined``; empty for estimates that do
-            not tell. Of an aligned pose the world is in metres and its z axis points up.
+        scale_state: ``(N,)`` text: ``none``, ``initialising``, ``aligned`` or ``refined``; of a system that does
+            not tell, always ``none`` or empty. Of an aligned pose the world is in metres and its z axis points up.
         velocity_w: ``(N, 3)`` of the inertial sensor in the world, m/s.
         gyro_bias, accel_bias: ``(N, 3)`` in the axes of the sensor, rad/s and m/s^2.
         scale_sigma: ``(N,)`` relative standard deviation of the scale.

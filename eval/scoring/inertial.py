@@ -2,10 +2,9 @@
 
 Definitions:
 
-- The scale at a time is the median, weighted by length, of the ratios of estimated to true displacements over
-  :data:`SPAN` seconds, of streamed poses of one segment, whose middle lies in the :data:`WINDOW` seconds about it. It is
-  not defined where the camera moves less than :data:`LEAST` metres in all, and a single re-expression of the world does
-  not disturb it.
+- The scale at a time is the median, weighted by length, of the ratios of estimated to true displacements of streamed
+  poses over :data:`SPAN` seconds in one segment, whose middle lies in the :data:`WINDOW` seconds about it. It is not
+  defined where the camera moves less than :data:`LEAST` metres in all; one re-expression of the world leaves it right.
 - The time to alignment runs from the first frame, or from the end of a degenerate stretch in which the sequence begins,
   to the first time from which the scale stays within :data:`SCALE_PERCENT` percent, whatever the system says of itself.
 - NEES (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 5.4.2) is
@@ -122,7 +121,7 @@ def inertial_errors(
     """
     if streamed is None or not len(streamed):
         return InertialErrors(gravity_deg=_final_tilt(segments, reference))
-    told = streamed.scale_state != ""
+    told = ~np.isin(streamed.scale_state, ("", "none"))
     aligned = np.isin(streamed.scale_state, _ALIGNED)
     run = _Run.of(streamed, reference, truth)
     origin = _origin(streamed, truth)

@@ -1,7 +1,10 @@
 """ORB-SLAM3 (Campos et al. 2021) from the package ``pyorbslam3`` (GPL-3).
 
 It is monocular, or takes the right images of rectified stereo pairs or depth images of its frames, and is in metres
-then (``--systems orbslam3+sensor=stereo``, ``orbslam3+sensor=rgbd``).
+then (``--systems orbslam3+sensor=stereo``, ``orbslam3+sensor=rgbd``). With inertial samples (``sensor=imu_monocular``,
+``imu_stereo``) it is in metres with z up after its initialisation; poses of a single camera before that have a scale of
+their own, and are carried along with their keyframes at the end. It is given the noise that the samples state, else
+that of a phone, and stamps as they are. While it is lost it predicts poses from the samples, which are not taken.
 
 Its threads race: fed faster than the camera delivers, mapping starves. So frames are fed no faster than their stamps
 say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). A machine that is busy
@@ -34,9 +37,10 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame, StereoView
+from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.geometry.camera import Camera
-from dvo.geometry.poses import pose_matrices, poses_from_matrices
+from dvo.geometry.poses import invert_poses, pose_matrices, poses_from_matrices
 from dvo.geometry.undistort import needs_undistortion
 from dvo.odometry.protocol import Estimate, Result, Status
 from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of
@@ -47,7 +51,11 @@ KINECT_BASELINE = 0.08
 """Metres between projector and camera of a Kinect; ORB-SLAM3 makes a virtual right image of a depth image with it."""
 CLOSE = 40
 """Number of baselines up to which a point counts as close, with a depth of its own."""
-Sensor = Literal["monocular", "stereo", "rgbd"]
+IMU_RATE = 200.0
+"""Samples a second by which it turns densities of noise into variances."""
+Sensor = Literal["monocular", "stereo", "rgbd", "imu_monocular", "imu_stereo"]
+IMU = "imu_"
+"""How the names of sensors with inertial samples begin."""
 version = version_of("pyorbslam3")
 
 
@@ -89,7 +97,7 @@ class OrbSlam3:
     Args:
         loops: closes loops, merges maps and relocalises; see the module.
         pace: seconds of the recording that are fed in a second, at most.
-        sensor: of ``"stereo"`` and ``"rgbd"`` the trajectory is in metres.
+        sensor: of all but ``"monocular"`` the trajectory is in metres.
 
     Attributes:
         waited: seconds that ``track`` has slept so far.
@@ -109,6 +117,7 @@ class OrbSlam3:
             remedy = f"choose from {', '.join(get_args(Sensor))}"
             raise DvoError(f"no such sensor: {sensor}", field="sensor", remedy=remedy)
         self._sensor: Sensor = sensor
+        self._is_inertial, self._is_stereo = sensor.startswith(IMU), sensor.endswith("stereo")
         self._package, self._loops, self._pace = pyorbslam3, loops, pace
         self._vocabulary = vocabulary_file()
         self._folder = tempfile.TemporaryDirectory(prefix="orbslam3-")
@@ -126,10 +135,11 @@ class OrbSlam3:
         if self._slam is None:
             assert self._pictures.camera is not None
             file = Path(self._folder.name) / "settings.yaml"
-            baseline = None if self._sensor == "monocular" else KINECT_BASELINE
-            if self._sensor == "stereo":
+            baseline = KINECT_BASELINE if self._sensor == "rgbd" else None
+            if self._is_stereo:
                 baseline = rectified_view(frame).baseline
-            file.write_text(settings(self._pictures.camera, self._loops, baseline), encoding="utf-8")
+            samples = _samples(frame) if self._is_inertial else None
+            file.write_text(settings(self._pictures.camera, self._loops, baseline, samples), encoding="utf-8")
             sensor = getattr(self._package.Sensor, self._sensor.upper())
             self._slam = self._package.Slam(str(self._vocabulary), str(file), sensor, use_viewer=False)
             self._fed, self._stamp = time.perf_counter(), frame.timestamp
@@ -142,7 +152,9 @@ class OrbSlam3:
         start = self._fed = time.perf_counter()
         self.waited += start - before
         self._stamp = frame.timestamp
-        said = getattr(self._slam, f"track_{self._sensor}")(image, *second, frame.timestamp)
+        samples = {"imu": _table(_samples(frame))} if self._is_inertial else {}
+        track = getattr(self._slam, f"track_{self._sensor.removeprefix(IMU)}")
+        said = track(image, *second, frame.timestamp, **samples)
         self._computing += time.perf_counter() - start
         if self._slam.map_changed():
             self._map_changes.append(frame.timestamp)
@@ -183,9 +195,9 @@ class OrbSlam3:
 
     def _second(self, frame: Frame) -> tuple[np.ndarray, ...]:
         """Image that the sensor gives beside that of the frame, of the same size: none of a monocular one."""
-        if self._sensor == "monocular":
+        if self._sensor.endswith("monocular"):
             return ()
-        if self._sensor == "stereo":
+        if self._is_stereo:
             view = rectified_view(frame)
             return (self._pictures_right(replace(frame, image=view.image, camera=view.camera)),)
         assert self._pictures.camera is not None
@@ -273,13 +285,27 @@ def rectified_view(frame: Frame) -> StereoView:
     return view
 
 
+def _samples(frame: Frame) -> InertialSamples:
+    """Inertial samples of a frame, with the pose of their sensor."""
+    if frame.inertial is None or frame.inertial.T_camera_imu is None:
+        raise _lacks(frame, "inertial, with the pose of the sensor")
+    return frame.inertial
+
+
+def _table(samples: InertialSamples) -> np.ndarray:
+    """``(N, 7)`` rows of stamp, rates and forces."""
+    return np.column_stack([samples.timestamps, samples.gyro, samples.accel])
+
+
 def _lacks(frame: Frame, field: str) -> DvoError:
     return DvoError(
         "not there", field=f"frame {frame.index}: {field}", remedy="choose the sensor that the sequence has"
     )
 
 
-def settings(camera: Camera, loops: bool = True, baseline: float | None = None) -> str:
+def settings(
+    camera: Camera, loops: bool = True, baseline: float | None = None, samples: InertialSamples | None = None
+) -> str:
     """Text of its settings file.
 
     Args:
@@ -287,6 +313,7 @@ def settings(camera: Camera, loops: bool = True, baseline: float | None = None) 
         loops: recognises places: closes loops, merges maps, relocalises.
         baseline: metres between the cameras of rectified stereo pairs, or of the virtual pair of a depth image; None
             for a single camera.
+        samples: some inertial ones, with the pose of their sensor; None for a camera alone.
     """
     lines: dict[str, Any] = {
         "File.version": '"1.0"',
@@ -304,6 +331,7 @@ def settings(camera: Camera, loops: bool = True, baseline: float | None = None) 
         "ORBextractor.minThFAST": 7,
         "loopClosing": int(loops),
         **({} if baseline is None else _pair(camera, baseline)),
+        **({} if samples is None else _sensor(samples)),
         # The viewer is off, but its settings are required.
         **{f"Viewer.{name}": 0.1 for name in ("KeyFrameSize", "GraphLineWidth", "PointSize", "CameraSize")},
         **{f"Viewer.{name}": 1.0 for name in ("KeyFrameLineWidth", "CameraLineWidth", "ViewpointX", "ViewpointY")},
@@ -326,6 +354,22 @@ def _pair(camera: Camera, baseline: float) -> dict[str, Any]:
         "Stereo.b": baseline,
         "Stereo.ThDepth": float(CLOSE),
         "RGBD.DepthMapFactor": 1.0,
+    }
+
+
+def _sensor(samples: InertialSamples) -> dict[str, Any]:
+    """Settings of an inertial sensor."""
+    assert samples.T_camera_imu is not None
+    T_imu_camera = ", ".join(f"{value:.9f}" for value in pose_matrices(invert_poses(samples.T_camera_imu)).ravel())
+    noise = samples.noise or NOISE_PRESETS["phone"]
+    return {
+        "IMU.T_b_c1": f"!!opencv-matrix {{rows: 4, cols: 4, dt: f, data: [{T_imu_camera}]}}",
+        "IMU.NoiseGyro": noise.gyro,
+        "IMU.NoiseAcc": noise.accel,
+        "IMU.GyroWalk": noise.gyro_walk,
+        "IMU.AccWalk": noise.accel_walk,
+        "IMU.Frequency": IMU_RATE,
+        "IMU.InsertKFsWhenLost": 0,
     }
 
 

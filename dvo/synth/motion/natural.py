@@ -73,13 +73,16 @@ class Style:
 
 
 HAND = Style(
-    pace=(0.3, 1.0), waypoint=0.8, turn=45.0, climb=0.12, room=0.45, gaze=(14.0, 6.0, 3.0), gaze_band=(0.05, 0.5),
-    sway=0.05, sway_band=(0.15, 0.8), step=0.004, tremor=(0.002, 0.8), tremor_band=(0.5, 8.0),
+    pace=(0.3, 1.0), waypoint=0.8, turn=45.0, climb=0.12, room=0.45, gaze=(19.8, 8.485, 4.243), gaze_band=(0.05, 0.5),
+    sway=0.07071, sway_band=(0.15, 0.8), step=0.005657, tremor=(0.002828, 1.1314), tremor_band=(0.5, 8.0),
 )  # fmt: skip
-HASTY = replace(HAND, pace=(0.6, 1.3), gaze=(24.0, 9.0, 7.0), gaze_band=(0.3, 1.3), sway=0.1, sway_band=(0.3, 1.2))
+HASTY = replace(
+    HAND, pace=(0.6, 1.3), gaze=(33.94, 12.728, 9.9), gaze_band=(0.3, 1.3), sway=0.14142, sway_band=(0.3, 1.2)
+)  # fmt: skip
 QUADROTOR = Style(
-    pace=(0.7, 1.6), waypoint=1.0, turn=60.0, climb=0.35, room=0.6, gaze=(4.0, 2.0, 0.5), gaze_band=(0.05, 0.4),
-    sway=0.03, sway_band=(0.1, 0.6), step=0.0, tremor=(0.0004, 0.25), tremor_band=(2.0, 10.0),
+    pace=(0.7, 1.6), waypoint=1.0, turn=60.0, climb=0.35, room=0.6, gaze=(5.657, 2.828, 0.7071),
+    gaze_band=(0.05, 0.4), sway=0.04243, sway_band=(0.1, 0.6), step=0.0, tremor=(0.0005657, 0.35355),
+    tremor_band=(2.0, 10.0),
 )  # fmt: skip
 
 
@@ -107,7 +110,7 @@ def band_limited(
     shape *= count / np.sqrt(2 * (shape**2).sum())
     phases = rng.normal(size=(len(frequency), columns, 2)) / np.sqrt(2)
     spectrum = shape[:, None] * (phases[..., 0] + 1j * phases[..., 1])
-    return np.fft.irfft(spectrum, count, axis=0)[: len(times)] * np.sqrt(2)
+    return np.fft.irfft(spectrum, count, axis=0)[: len(times)]
 
 
 def stretches(kind: str, duration: float) -> tuple[tuple[float, float], ...]:
@@ -196,7 +199,7 @@ def _draw(
         state += hasty * np.concatenate([_moved(rng, times, HASTY, shake), _turned(rng, times, HASTY)], axis=1)
     if kind == "one_axis":
         axis = np.append(rng.normal(size=2), 0.3 * rng.normal())
-        swing = 0.12 * band_limited(rng, times, (0.25, 0.9), 1.0, 1)
+        swing = 0.1697 * band_limited(rng, times, (0.25, 0.9), 1.0, 1)
         state[:, :3] += (1 - free)[:, None] * swing * axis / np.linalg.norm(axis)
     none = np.zeros(0)
     return SplinePath(kind, state, 1 / RATE, none, np.zeros((0, 2, 6)), start=-LEAD)

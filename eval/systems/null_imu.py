@@ -77,8 +77,8 @@ class DeadReckoning:
         for rate, step in zip(gyro[1:] - self._gyro_bias, np.diff(times), strict=True):
             turns.append(turns[-1] @ so3_exp(rate * step))
         force = np.mean([turn @ sample for turn, sample in zip(turns, accel, strict=True)], axis=0)
-        x, y, z = look_rotation(np.array([0.0, 1.0, 0.0]), force).T  # any heading; y of a camera points down
-        self._rotation = np.stack([x, z, -y]) @ turns[-1]
+        upright = look_rotation(force, np.array([0.0, 1.0, 0.0])).T  # any heading
+        self._rotation = upright @ turns[-1]
         if is_still:
             self._accel_bias = self._rotation.T @ [0, 0, np.linalg.norm(force) - GRAVITY]
         self._time, self._last = float(times[-1]), np.concatenate([gyro[-1], accel[-1]])

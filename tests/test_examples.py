@@ -84,6 +84,12 @@ def test_bundle_adjustment_in_training(tmp_path):
     assert last < 0.6 * first
 
 
+def test_train_inertial(tmp_path):
+    out = run(EXAMPLES / "train_inertial.py", cwd=tmp_path)
+    first, last = map(float, re.findall(r"third ([\d.]+)", out))
+    assert last < 0.7 * first
+
+
 def test_own_odometry_alone(tmp_path):
     assert "ATE" in run(EXAMPLES / "own_odometry.py", cwd=tmp_path)
 

@@ -117,7 +117,7 @@ def inertial_errors(
         reference: camera to world at the times of the frames, metres, z up.
         truth: about the inertial samples.
         dark: first and last stamp of each stretch of dark, seconds.
-        unseen: stamps of the frames without a view.
+        unseen: stamps of frames without a view, apart from these.
     """
     if streamed is None or not len(streamed):
         return InertialErrors(gravity_deg=_final_tilt(segments, reference))
@@ -127,6 +127,8 @@ def inertial_errors(
     origin = _origin(streamed, truth)
     pairs = run.pairs()
     spent = np.isin(np.round(streamed.timestamps / SAME_FRAME), np.round(np.array(unseen) / SAME_FRAME))
+    for begin, end in dark:
+        spent |= (streamed.timestamps > begin - SAME_FRAME) & (streamed.timestamps < end + SAME_FRAME)
     tracked = streamed.status == "tracking"
     position, orientation, velocity = run.nees(aligned)
     dark_cm, dark_percent, dark_sigmas = run.in_the_dark(dark)
@@ -142,7 +144,7 @@ def inertial_errors(
         accel_bias_error=_last_error(streamed.accel_bias, run.accel_bias),
         offset_error_ms=1000 * _last_error(streamed.time_offset[:, None], np.full((len(streamed), 1), truth.offset)),
         wrong_alignments=run.wrong_alignments(aligned, pairs) if told.any() else math.nan,
-        dark_tracked=float((spent & tracked).sum()) if len(unseen) else math.nan,
+        dark_tracked=float((spent & tracked).sum()) if spent.any() else math.nan,
         dark_cm=dark_cm,
         dark_percent=dark_percent,
         dark_sigmas=dark_sigmas,

@@ -3,7 +3,8 @@
 The first second of samples gives the vertical, from the mean specific force, and, if the sensor stands still in it,
 the bias of the gyroscope and that of the accelerometer along the vertical. Afterwards rates and forces are integrated
 from rest (Titterton and Weston, "Strapdown Inertial Navigation Technology", 2004, 3.5), so that errors grow to metres
-within some seconds. The world is in metres, its z axis points up, and it begins at the sensor.
+within some seconds. The world is in metres, its z axis points up, and it begins at the sensor. Its rows count, so that
+it has errors, although no image has given them.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class DeadReckoning:
         else:
             self._integrate(samples)
         self._rows.append((frame.timestamp, self._pose(frame.timestamp)))
-        return Estimate(frame.timestamp, self._rows[-1][1], Status.TRACKING, 0.0)
+        return Estimate(frame.timestamp, self._rows[-1][1], Status.INERTIAL)
 
     def finish(self) -> Result:
         stamps = np.array([stamp for stamp, _ in self._rows])

@@ -4,7 +4,7 @@ It is monocular, or takes the right images of rectified stereo pairs or depth im
 then (``--systems orbslam3+sensor=stereo``, ``orbslam3+sensor=rgbd``). With inertial samples (``sensor=imu_monocular``,
 ``imu_stereo``) it is in metres with z up after its initialisation; poses of a single camera before that have a scale of
 their own, and are carried along with their keyframes at the end. It is given the noise that the samples state, else
-that of a phone, and stamps as they are. While it is lost it predicts poses from the samples, which are not taken.
+that of a phone, and stamps as they are. Poses that it predicts from the samples while it is lost are marked as such.
 
 Its threads race: fed faster than the camera delivers, mapping starves. So frames are fed no faster than their stamps
 say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). A machine that is busy
@@ -42,7 +42,7 @@ from dvo.data.trajectory import Trajectory, read_tum
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import invert_poses, pose_matrices, poses_from_matrices
 from dvo.geometry.undistort import needs_undistortion
-from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.protocol import Estimate, Result, ScaleState, Status
 from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of
 
 VOCABULARY = "DVO_ORB_VOCABULARY"
@@ -124,6 +124,7 @@ class OrbSlam3:
         self._pictures, self._pictures_right = Pictures(), Pictures()
         self._slam: Any = None
         self._rows: list[Row] = []
+        self._predicted: list[float] = []
         self._keyframes: dict[int, Trajectory] = {}
         self._map_changes: list[float] = []
         self._frames = self._part = 0
@@ -164,14 +165,24 @@ class OrbSlam3:
             self._read_keyframes()
         if said.state in (states.NO_IMAGES_YET, states.NOT_INITIALIZED) and self._was_tracking:
             self._part, self._was_tracking = self._part + 1, False
-        # While it is RECENTLY_LOST the pose is the motion model's guess.
-        if not said.pose_valid or said.state not in (states.OK, states.OK_KLT):
+        scale = ScaleState.NONE
+        if self._is_inertial:
+            scale = ScaleState.ALIGNED if self._slam.imu_initialized() else ScaleState.INITIALISING
+        # While it is RECENTLY_LOST the pose is the guess of the motion model, or of aligned inertial samples.
+        is_seen = said.state in (states.OK, states.OK_KLT)
+        is_predicted = scale is ScaleState.ALIGNED and said.state == states.RECENTLY_LOST
+        if not said.pose_valid or not (is_seen or is_predicted):
             seen = self._was_tracking or self._part > 0
             return Estimate(frame.timestamp, None, Status.LOST if seen else Status.INITIALISING)
         self._was_tracking = True
         T_wc = np.array(said.pose_wc, np.float64)
         self._rows.append(Row(frame.timestamp, T_wc, self._part))
-        return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5, self._part)
+        if not is_seen:
+            self._predicted.append(frame.timestamp)
+        status = Status.TRACKING if is_seen else Status.INERTIAL
+        return Estimate(
+            frame.timestamp, poses_from_matrices(T_wc), status, 0.5 * is_seen, self._part, scale_state=scale
+        )
 
     def finish(self) -> Result:
         if self._slam is not None:
@@ -191,7 +202,7 @@ class OrbSlam3:
             "map_changes": self._map_changes,
             "computing_fps": self._frames / self._computing if self._computing else None,
         }
-        return result(rows, self._frames, info, worlds)
+        return replace(result(rows, self._frames, info, worlds), inertial=tuple(self._predicted))
 
     def _second(self, frame: Frame) -> tuple[np.ndarray, ...]:
         """Image that the sensor gives beside that of the frame, of the same size: none of a monocular one."""

@@ -70,7 +70,7 @@ def test_a_perfect_run_has_no_error_wherever_its_world_lies(yaw: float, east: fl
         assert getattr(found, name) == pytest.approx(0, abs=1e-4), name
     assert found.align_s == 0 and found.coverage == 1 and found.wrong_alignments == 0
     assert found.gyro_bias_error == found.accel_bias_error == found.offset_error_ms == 0
-    assert found.dark_tracked == 3
+    assert found.dark_tracked == 41
 
 
 def test_nees_is_one_for_errors_of_the_stated_covariance() -> None:

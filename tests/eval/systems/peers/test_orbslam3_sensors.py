@@ -50,10 +50,20 @@ def fed(monkeypatch, tmp_path) -> list:
 
         def keep(self, name, *images_and_stamp):
             given.append((name, *images_and_stamp))
-            return SimpleNamespace(state="OK", pose_valid=True, pose_wc=np.eye(4))
+            state = "RECENTLY_LOST" if (images_and_stamp[0] > 250).all() else "OK"
+            return SimpleNamespace(state=state, pose_valid=True, pose_wc=np.eye(4))
 
         def map_changed(self):
             return False
+
+        def imu_initialized(self):
+            return True
+
+        def save_keyframe_trajectory_tum(self, file):
+            pass
+
+        def shutdown(self):
+            pass
 
     names = ("NO_IMAGES_YET", "NOT_INITIALIZED", "RECENTLY_LOST", "LOST", "OK", "OK_KLT")
     states = SimpleNamespace(**{name: name for name in names})
@@ -119,6 +129,18 @@ def test_it_is_given_inertial_samples(fed, tmp_path, sensor, kind, images):
     np.testing.assert_allclose(storage.getNode("IMU.T_b_c1").mat(), expected, atol=1e-6)
     assert storage.getNode("IMU.NoiseGyro").real() == pytest.approx(1.7e-3), "that of a phone, as none is stated"
     assert ("Stereo.b: 0.2" in settings) == (images == 2)
+
+
+@pytest.mark.parametrize(("sensor", "poses"), [("imu_monocular", 2), ("monocular", 1)])
+def test_poses_from_samples_alone_are_marked(fed, sensor, poses):
+    odometry = find_system(f"orbslam3+sensor={sensor}+pace=100").build(0, "cpu")
+    white = np.full((48, 64, 3), 255, np.uint8)
+    seen = odometry.track(replace(frame_with(), inertial=SAMPLES))
+    blind = odometry.track(replace(frame_with(), timestamp=0.1, image=white, inertial=SAMPLES))
+    assert seen.status == "tracking" and blind.status == ("inertial" if poses == 2 else "lost")
+    assert seen.scale_state == ("aligned" if poses == 2 else "none")
+    result = odometry.finish()
+    assert len(result.trajectory) == poses and result.frames_tracked == 1
 
 
 def test_frames_without_inertial_samples_are_refused(fed):

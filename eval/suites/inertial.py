@@ -106,12 +106,11 @@ def write_exact(folder: Path, sequence: Any, kind: str, duration: float) -> None
         kind, duration: of its motion.
     """
     from dvo.synth.motion.natural import stretches
+    from dvo.synth.render.shot import Offset
 
     T_camera_imu = mount(sequence.seed)
     exact = sequence.imu(RATE, T_camera_imu=T_camera_imu, margin=MARGIN)
     step = 1e-3
-    from dvo.synth.render.shot import Offset
-
     path, frames = Offset(sequence.path, T_camera_imu), sequence.groundtruth.timestamps
     velocity = (path.poses_wc(frames + step)[:, :3] - path.poses_wc(frames - step)[:, :3]) / (2 * step)
     np.savez(
@@ -149,17 +148,17 @@ def read_stream(folder: Path, options: dict[str, Any]) -> tuple[InertialSamples,
         Imu(exact["timestamps"], exact["gyro"], exact["accel"], zero, zero, GRAVITY), noise, stream.seed
     )
     frames = exact["frames"]
-    biases = [
+    gyro_bias, accel_bias = (
         np.stack([np.interp(frames, measured.timestamps, bias[:, k]) for k in range(3)], -1)
         for bias in (measured.gyro_bias, measured.accel_bias)
-    ]
+    )
     samples = InertialSamples(
         measured.timestamps + stream.offset, measured.gyro, measured.accel, exact["T_camera_imu"], noise
     )
     if stream.fault:
         samples = FAULTS[stream.fault](samples, np.random.default_rng([stream.seed, MOUNT]))
     return samples, InertialTruth(
-        frames, exact["velocity_w"], *biases, exact["T_camera_imu"], stream.offset, exact["stretches"]
+        frames, exact["velocity_w"], gyro_bias, accel_bias, exact["T_camera_imu"], stream.offset, exact["stretches"]
     )
 
 

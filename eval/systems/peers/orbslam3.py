@@ -153,9 +153,9 @@ class OrbSlam3:
         start = self._fed = time.perf_counter()
         self.waited += start - before
         self._stamp = frame.timestamp
-        samples = {"imu": _table(_samples(frame))} if self._is_inertial else {}
+        beside = {"imu": _table(_samples(frame))} if self._is_inertial else {}
         track = getattr(self._slam, f"track_{self._sensor.removeprefix(IMU)}")
-        said = track(image, *second, frame.timestamp, **samples)
+        said = track(image, *second, frame.timestamp, **beside)
         self._computing += time.perf_counter() - start
         if self._slam.map_changed():
             self._map_changes.append(frame.timestamp)

@@ -41,7 +41,8 @@ class Recording:
 
     def nodes(self, start: float, end: float, step: int = 4) -> VisualNodes:
         """Every few frames of an interval."""
-        chosen = np.flatnonzero((self.times >= start) & (self.times <= end))[::-1][::step][::-1]
+        inside = np.flatnonzero((self.times >= start) & (self.times <= end))
+        chosen = np.union1d(inside[inside % step == 0], inside[-1:])
         none = np.zeros(len(chosen), int)
         depth = np.array([DEPTH / SCALE])
         return VisualNodes(self.times[chosen], none, self.rotation[chosen], self.position[chosen], depth)

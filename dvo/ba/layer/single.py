@@ -52,8 +52,8 @@ class SinglePrecision(Factor):
         return NormalEquations(*(getattr(equations, f.name).double() for f in fields(equations))), memo
 
     def phi(self, state: State, constants: AdjointConstants, memo: Any) -> Iterator[Tensor]:
-        numbers = [getattr(constants, f.name) for f in fields(constants)]
-        single = AdjointConstants(*(x if x is None else x.float() for x in numbers))
+        numbers = {f.name: getattr(constants, f.name) for f in fields(constants)}
+        single = replace(constants, **{name: x.float() for name, x in numbers.items() if x is not None})
         return self.factor.phi(_rounded(state), single, memo)
 
 

@@ -72,8 +72,8 @@ _WAITING = ("too few poses", "too few samples")
 STILL = (0.02, 0.15)
 """Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
 STILL_FOR = 0.4
-STILL_SPEED = 0.5
-"""Predicted speed below which a sensor that feels nothing stands still, m/s."""
+STILL_SPEED = 0.05
+"""Predicted speed, beyond three of its deviations, below which a sensor that feels nothing stands still, m/s."""
 
 
 @dataclass(frozen=True)
@@ -400,9 +400,23 @@ class InertialEstimator:
         bias = np.concatenate([known.gyro_bias, known.accel_bias], 1)
         start.bias = np.stack([np.interp(times, known.times, column) for column in bias.T], 1)
         start.extrinsic = rotation_vector(problem.rotation_camera_imu.T @ known.rotation_camera_imu)
-        inside = times <= known.times[-1]
-        for axis in range(3):
-            start.velocity[inside, axis] = np.interp(times[inside], known.times, known.velocity[:, axis])
+        # Nodes of the last solution as they were, and those after it as the samples tell: visual poses are too noisy.
+        same = np.searchsorted(known.times, times).clip(max=len(known.times) - 1)
+        old = np.abs(known.times[same] - times) < 1e-6
+        for values, solved in (
+            (start.rotation, known.rotation), (start.position, known.position), (start.velocity, known.velocity)
+        ):  # fmt: skip
+            values[old] = solved[same[old]]
+        later, state = np.flatnonzero(times > known.times[-1] + 1e-6), self.last_state()
+        assert state is not None
+        samples = problem.samples
+        times_there = np.concatenate([[state.time], times[later]]) + problem.offset
+        if len(later) and samples.timestamps[0] <= times_there[0]:
+            found = propagate(
+                state.rotation, state.position, state.velocity, samples, times_there, state.gyro_bias,
+                state.accel_bias, GRAVITY,
+            )  # fmt: skip
+            start.rotation[later], start.position[later], start.velocity[later] = (part[1:] for part in found)
         return start
 
     def _known_similarity(self, world: int) -> Similarity | None:
@@ -568,22 +582,22 @@ def _step(state: BodyState, time: float, offset: float, samples: InertialSamples
     walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * (time - state.time)
     added[range(9, STATE), range(9, STATE)] = walk
     covariance = forward @ state.covariance @ forward.T + added
-    if _stands_still(near, times[1], state, velocity):
+    sigma = float(np.sqrt(np.trace(covariance[6:9, 6:9])))
+    if np.linalg.norm(velocity) < STILL_SPEED + 3 * sigma and _stands_still(near, times[1], state):
         position, velocity = state.position, np.zeros(3)
         covariance[6:9, :], covariance[:, 6:9] = 0, 0
         covariance[6:9, 6:9] = 1e-4 * np.eye(3)
     return BodyState(time, rotation, position, velocity, state.gyro_bias, state.accel_bias, covariance)
 
 
-def _stands_still(samples: InertialSamples, time: float, state: BodyState, velocity: Array) -> bool:
-    """Nothing is felt for a while, at a predicted speed that drift explains."""
+def _stands_still(samples: InertialSamples, time: float, state: BodyState) -> bool:
+    """Nothing is felt for a while."""
     recent = samples.between(time - STILL_FOR, time)
     if len(recent) < 5 or recent.timestamps[-1] - recent.timestamps[0] < 0.7 * STILL_FOR:
         return False
     rates, forces = recent.gyro - state.gyro_bias, recent.accel
     quiet = rates.std(0).max() < STILL[0] and forces.std(0).max() < STILL[1]
-    turning = float(np.linalg.norm(rates.mean(0)))
-    return bool(quiet and turning < STILL[0] and np.linalg.norm(velocity) < STILL_SPEED)
+    return bool(quiet and np.linalg.norm(rates.mean(0)) < STILL[0])
 
 
 def camera_pose(state: BodyState, rotation_camera_imu: Array, translation_camera_imu: Array) -> tuple[Array, Array]:

@@ -79,7 +79,7 @@ class SmootherOptions:
     rotation_sigma: float = 2e-3
     position_sigma: float = 1e-3
     extrinsic_sigma: float = 5e-3
-    offset_sigma: float = 5e-3
+    offset_sigma: float = 2e-2
     iterations: int = 12
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
-from dvo.geometry.poses import split
+from dvo.geometry.poses import rotation_vector, split
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.preintegration import preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
@@ -27,7 +27,6 @@ from dvo.odometry.inertial.smoother import (
     first_values,
     linear_start,
     motion_factors,
-    rotation_vector,
     smooth,
     upright,
 )

@@ -24,7 +24,7 @@ from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.smoother import Smoothed, VisualNodes, rotation_vector
+from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
 from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState, Segment, Status
 
 GYRO_TRUST = 0.7

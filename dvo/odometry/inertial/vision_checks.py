@@ -23,6 +23,7 @@ ANGLE = (3.0, 10.0)
 ACCEL_BIAS = (0.5, 2.0)
 """Bias of the accelerometer that is told, and that makes samples unusable, m/s^2."""
 _NEAR_AXES = 20.0  # degrees from a permutation of axes within which it is named
+_WIDE = 3.0  # seconds on either side of a second search, where the first one finds no offset
 _WINDOW = 4.0  # seconds of vision for one point of the line of offsets
 _MIN_WINDOWS = 3
 _MEAN = 0.5  # seconds over which the force is averaged
@@ -132,10 +133,16 @@ def check_against_vision(
     samples, told = _rates(samples, timestamps, rotations_wc)
     findings += told
     found = align_imu(timestamps, rotations_wc, samples.timestamps, samples.gyro, stated)
+    if found.correlation > 0 and not found.is_offset_told and not found.mirrored:
+        wide = align_imu(timestamps, rotations_wc, samples.timestamps, samples.gyro, stated, max_offset=_WIDE)
+        found = wide if wide.is_offset_told or wide.mirrored else found
     values: dict[str, object] = {"frames with a pose": len(timestamps), "correlation": found.correlation}
     line = None
     if found.correlation > 0 and not found.mirrored:
-        line = clock_line(timestamps, rotations_wc, samples.timestamps, samples.gyro, found.rotation_camera_imu)
+        shift = found.time_offset if found.is_offset_told else 0.0
+        stamps = samples.timestamps - shift
+        line = clock_line(timestamps, rotations_wc, stamps, samples.gyro, found.rotation_camera_imu)
+        line = None if line is None else replace(line, offset=line.offset + shift)
     if line is not None and line.is_drifting:
         samples = replace(samples, timestamps=line.corrected(samples.timestamps))
         steady = align_imu(timestamps, rotations_wc, samples.timestamps, samples.gyro, stated)
@@ -150,7 +157,8 @@ def check_against_vision(
         findings += part.findings
     if found.reason and not found.mirrored:
         remedy = "turn the device about all three axes for some seconds while the camera sees a textured scene"
-        level = Level.WARNING if "do not agree" in found.reason else Level.NOTE
+        is_wrong = "do not agree" in found.reason or "not within" in found.reason
+        level = Level.WARNING if is_wrong else Level.NOTE
         findings.append(Finding("not told", level, found.reason, remedy))
     return found, Found(values, tuple(findings))
 

@@ -101,7 +101,7 @@ def test_extrinsics_inverse_off_and_missing() -> None:
     assert finding is not None and "T_camera_imu: [" in finding.remedy and missing.is_usable
 
 
-@pytest.mark.parametrize("offset", [0.1, -0.1, 0.02])
+@pytest.mark.parametrize("offset", [0.1, -0.1, 0.02, 1.3])
 def test_constant_time_offset(offset: float) -> None:
     report = checked(timestamps=good()[0].timestamps + offset)
     finding = report.named("time offset")

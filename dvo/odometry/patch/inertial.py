@@ -18,7 +18,7 @@ from dvo.data.frame import Frame
 from dvo.data.inertial import InertialSamples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
-from dvo.geometry.poses import pose_from, slerp, split
+from dvo.geometry.poses import pose_from, rotation_vector, slerp, split
 from dvo.map.correction import re_express
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord

@@ -55,17 +55,19 @@ MAX_TURN = 1.5
 """Root mean square difference of rotations between nodes, degrees, above which gyroscope and images disagree."""
 FOUND_EXTRINSIC = 0.02
 """Deviation of a rotation between sensor and camera that was found from the motion, rad."""
-MAX_ROTATION_SIGMA = 0.01
-"""Noise of visual orientations above which samples and images do not fit, rad."""
+NOISE_RANGE = (0.3, 30.0)
+"""Factors of the noise of visual poses."""
+MAX_ROTATION_FACTOR = 8.0
+"""Factor of the noise of visual orientations above which samples and images do not fit."""
 MAX_SHIFT = 0.02
 """Change of the time offset since the alignment above which the clocks drift, seconds."""
 MAX_BIASES = (0.15, 1.0)
 """Biases that no working sensor has, rad/s and m/s^2."""
 AGREEMENT = 0.03
 """Difference of the scales of two estimates in a row that agree, relative, beyond three of their deviations."""
-FIT = 0.3
-"""Mean squared whitened residual of visual poses that their noise is chosen by: less than one, since errors of poses
-near in time are alike."""
+FIT = 0.5
+"""Mean squared whitened residual of visual poses that their noise is chosen by: white noise and drift are two unknowns
+for each measurement."""
 FAILURES = 3
 """Estimates in a row that fail the tests, after which an alignment is withdrawn."""
 MOST_PATIENCE = 4.0
@@ -423,7 +425,8 @@ class InertialEstimator:
         same = np.searchsorted(known.times, times).clip(max=len(known.times) - 1)
         old = np.abs(known.times[same] - times) < 1e-6
         for values, solved in (
-            (start.rotation, known.rotation), (start.position, known.position), (start.velocity, known.velocity)
+            (start.rotation, known.rotation), (start.position, known.position), (start.velocity, known.velocity),
+            (start.drift, known.drift),
         ):  # fmt: skip
             values[old] = solved[same[old]]
         later, state = np.flatnonzero(times > known.times[-1] + 1e-6), self.last_state()
@@ -436,6 +439,7 @@ class InertialEstimator:
                 state.accel_bias, GRAVITY,
             )  # fmt: skip
             start.rotation[later], start.position[later], start.velocity[later] = (part[1:] for part in found)
+            start.drift[later] = known.drift[-1]
         return start
 
     def _known_similarity(self, world: int) -> Similarity | None:
@@ -482,9 +486,9 @@ class InertialEstimator:
     def _adapt(self, found: Smoothed) -> None:
         """Follow the noise of the visual poses."""
         factors = np.clip(np.sqrt(found.visual_error / FIT), 0.7, 1.4)
-        rotation = float(np.clip(self._smoother.rotation_sigma * factors[0], 5e-4, 2e-2))
-        position = float(np.clip(self._smoother.position_sigma * factors[1], 3e-4, 2e-2))
-        self._smoother = replace(self._smoother, rotation_sigma=rotation, position_sigma=position)
+        now = self._smoother.rotation_factor, self._smoother.position_factor
+        rotation, position = np.clip(np.array(now) * factors, *NOISE_RANGE).tolist()
+        self._smoother = replace(self._smoother, rotation_factor=rotation, position_factor=position)
 
     def _doubt(self, problem: Smoother, found: Smoothed) -> str:
         """Why an estimate is not believed; empty if it is."""
@@ -499,7 +503,7 @@ class InertialEstimator:
             bias = float(np.abs(values[-1]).max())
             if bias > limit + 3 * (self.noise.gyro_bias if unit == "rad/s" else self.noise.accel_bias):
                 return f"a bias of the {name} of {bias:.2g} {unit}: a damaged sensor, or wrong units"
-        if found.inertial_error > MAX_ERROR or self._smoother.rotation_sigma > MAX_ROTATION_SIGMA:
+        if found.inertial_error > MAX_ERROR or self._smoother.rotation_factor > MAX_ROTATION_FACTOR:
             return "samples and images do not fit: noise, time offset or extrinsic calibration"
         if self.aligned and abs(found.time_offset - self._offset) > MAX_SHIFT:
             shift = 1000 * (found.time_offset - self._offset)

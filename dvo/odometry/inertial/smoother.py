@@ -1,11 +1,11 @@
 """Metric trajectory from a visual one and inertial samples: maximum a posteriori of a chain of body states.
 
-The visual trajectory of each segment is known up to a similarity, with white noise. Unknown are, at nodes a fraction of
-a second apart, orientation, position, velocity and biases of the sensor in a world whose z axis points up; and, for all
-nodes, the similarity of each segment, the time offset, and the rotation between sensor and camera. Preintegrated
-samples tie consecutive nodes (Forster et al., 2017, eq. 45), also across an interval without images, so that a segment
-after it is joined to the one before. With the visual trajectory held, this is the inertial-only estimation of ORB-SLAM3
-(Campos et al., 2021, III-D), with the noise of the visual poses in it.
+The visual trajectory of each segment is known up to a similarity, with a little white noise and a drift that walks.
+Unknown are, at nodes a fraction of a second apart, orientation, position, velocity and biases of the sensor in a world
+whose z axis points up, and the drift of the visual pose; and, for all nodes, the similarity of each segment, the time
+offset, and the rotation between sensor and camera. Preintegrated samples tie consecutive nodes (Forster et al., 2017,
+eq. 45), also across an interval without images, so that a segment after it is joined to the one before. It is the
+inertial-only estimation of ORB-SLAM3 (Campos et al., 2021, III-D), with the noise of the visual poses in it.
 
 Errors: ``R_wb = R Exp(phi)`` and additive positions, velocities and biases, as in that paper; ``A <- Exp(alpha) A`` of
 the rotation of a segment's world.
@@ -26,7 +26,9 @@ Array = np.ndarray
 GRAVITY = np.array([0.0, 0.0, -9.81])
 """Acceleration of a falling body in the world, m/s^2; z is up."""
 STATE = 15
-"""Unknowns of a node: rotation, position, velocity, gyroscope and accelerometer bias."""
+"""Unknowns of the body at a node: rotation, position, velocity, gyroscope and accelerometer bias."""
+NODE = 21
+"""Those, and the drift of the visual rotation and position."""
 _TIME, _EXTRINSIC, _SEGMENT = 0, slice(1, 4), 4  # unknowns that all nodes share; 7 for each segment after them
 SHIFT = 5e-4
 """Change of the time offset, seconds, after which samples are integrated anew."""
@@ -69,15 +71,20 @@ class SmootherOptions:
     """Noise of the visual trajectory, and what is known before.
 
     Attributes:
-        rotation_sigma: of visual orientations, rad.
-        position_sigma: of visual positions, in depths of the scene.
+        rotation_sigma, position_sigma: white noise of visual orientations, rad, and positions, in depths of the scene.
+        rotation_walk, position_walk: their drift in a second, rad and depths of the scene.
+        rotation_factor, position_factor: of both kinds of noise.
         extrinsic_sigma: of the rotation between sensor and camera, rad.
         offset_sigma: of the time offset, seconds.
         iterations: of Gauss-Newton, at most.
     """
 
-    rotation_sigma: float = 2e-3
-    position_sigma: float = 1e-3
+    rotation_sigma: float = 4e-4
+    position_sigma: float = 3e-4
+    rotation_walk: float = 2e-3
+    position_walk: float = 1.5e-3
+    rotation_factor: float = 1.0
+    position_factor: float = 1.0
     extrinsic_sigma: float = 5e-3
     offset_sigma: float = 2e-2
     iterations: int = 12
@@ -107,14 +114,15 @@ class Smoothed:
         rotation: ``(N, 3, 3)`` body to world.
         position, velocity: ``(N, 3)`` of the body, metres and m/s.
         gyro_bias, accel_bias: ``(N, 3)``.
+        drift: ``(N, 6)`` of the visual rotation, rad, and position, units of the segment.
         worlds: of the segments.
         time_offset: seconds to add to a time of the camera for that of the sensor.
         rotation_camera_imu: ``(3, 3)``.
-        covariance: ``(15 + m, 15 + m)`` of the newest node (rotation, position, velocity, biases) and the shared
+        covariance: ``(21 + m, 21 + m)`` of the newest node (rotation, position, velocity, biases, drift) and the shared
             unknowns (time offset, extrinsic rotation, and log scale, rotation, translation of each segment).
         cost: half of the sum of squares.
         inertial_error: mean squared whitened residual of the preintegrated motion.
-        visual_error: ``(2,)`` mean squared whitened residual of visual orientations and positions.
+        visual_error: ``(2,)`` mean squared whitened residual of visual orientations and positions, and their drift.
     """
 
     times: Array
@@ -123,6 +131,7 @@ class Smoothed:
     velocity: Array
     gyro_bias: Array
     accel_bias: Array
+    drift: Array
     worlds: Similarities
     time_offset: float
     rotation_camera_imu: Array
@@ -150,6 +159,7 @@ class Values:
     position: Array
     velocity: Array
     bias: Array  # (N, 6)
+    drift: Array  # (N, 6) of the visual rotation (rad) and position (units of the segment)
     offset: float
     extrinsic: Array  # (3,) rotation vector after the given rotation
     log_scale: Array
@@ -213,7 +223,8 @@ def _moved(problem: Smoother, values: Values, states: Array, shared: Array) -> V
         values.rotation @ so3_exp(states[:, :3]) @ so3_exp(rates * late),
         values.position + states[:, 3:6] + values.velocity * late,
         values.velocity + states[:, 6:9] + speeding * late,
-        values.bias + states[:, 9:], values.offset + late, values.extrinsic + shared[_EXTRINSIC],
+        values.bias + states[:, 9:STATE], values.drift + states[:, STATE:], values.offset + late,
+        values.extrinsic + shared[_EXTRINSIC],
         values.log_scale + by_segment[:, 0], so3_exp(by_segment[:, 1:4]) @ values.world,
         values.translation + by_segment[:, 4:],
     )  # fmt: skip
@@ -241,7 +252,8 @@ def first_values(problem: Smoother, worlds: Similarities) -> Values:
             velocity[mine] = np.gradient(position[mine], nodes.times[mine], axis=0)
     bias = np.tile(np.concatenate([problem.gyro_bias, problem.accel_bias]), (len(nodes), 1))
     return Values(
-        rotation, position, velocity, bias, problem.offset, np.zeros(3), worlds.log_scale.copy(),
+        rotation, position, velocity, bias, np.zeros((len(nodes), 6)), problem.offset, np.zeros(3),
+        worlds.log_scale.copy(),
         worlds.rotation.copy(), worlds.translation.copy(),
     )  # fmt: skip
 
@@ -259,7 +271,7 @@ def linear_start(problem: Smoother) -> tuple[float, Array, Array]:
     nodes = problem.nodes
     body = nodes.rotation @ problem.rotation_camera_imu
     start = Values(
-        body, nodes.position, nodes.position, np.zeros((len(nodes), 6)), problem.offset, np.zeros(3), np.zeros(1),
+        body, nodes.position, nodes.position, *np.zeros((2, len(nodes), 6)), problem.offset, np.zeros(3), np.zeros(1),
         np.eye(3)[None], np.zeros((1, 3)),
     )  # fmt: skip
     bias = problem.gyro_bias
@@ -339,7 +351,7 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
     covariance = solve_chain(system).covariance
     return Smoothed(
         problem.nodes.times, values.rotation, values.position, values.velocity, values.bias[:, :3], values.bias[:, 3:],
-        Similarities(values.log_scale, values.world, values.translation), values.offset,
+        values.drift, Similarities(values.log_scale, values.world, values.translation), values.offset,
         problem.rotation_camera_imu @ so3_exp(values.extrinsic), covariance, cost, *errors,
     )  # fmt: skip
 
@@ -363,7 +375,7 @@ def _linearise(
 ) -> tuple[ChainSystem, float, tuple[float, Array]]:
     """Normal equations, half of the sum of squares, and mean squared inertial and visual residual."""
     count, segments = len(problem.nodes), problem.segments
-    system = ChainSystem.zeros(count, STATE, _SEGMENT + 7 * segments)
+    system = ChainSystem.zeros(count, NODE, _SEGMENT + 7 * segments)
     cost, inertial = _add_motion(problem, values, motion, system)
     more, visual = _add_visual(problem, values, system)
     return system, cost + more + _add_priors(problem, values, system), (inertial, visual)
@@ -415,20 +427,28 @@ def _add_motion(problem: Smoother, values: Values, motion: Preintegration, syste
     _add_pairs(system, residual, before, after)
     cost = float((residual**2).sum())
     walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) * np.sqrt(motion.duration)[:, None]
-    drift = (values.bias[1:] - values.bias[:-1]) / walk
-    before, after = np.zeros((2, len(walk), 6, STATE))
-    index = np.arange(6)
-    before[:, index, 9 + index], after[:, index, 9 + index] = -1 / walk, 1 / walk
-    _add_pairs(system, drift, before, after)
+    drift = _add_walk(system, values.bias, walk, 9)
     return 0.5 * (cost + float((drift**2).sum())), cost / residual.size
 
 
-def _add_pairs(system: ChainSystem, residual: Array, before: Array, after: Array) -> None:
-    system.diagonal[:-1] += _turn(before) @ before
-    system.diagonal[1:] += _turn(after) @ after
-    system.upper += _turn(before) @ after
-    system.right[:-1] -= _apply(_turn(before), residual)
-    system.right[1:] -= _apply(_turn(after), residual)
+def _add_pairs(system: ChainSystem, residual: Array, before: Array, after: Array, first: int = 0) -> None:
+    """Add residuals of consecutive nodes, by their unknowns from ``first`` on."""
+    mine = slice(first, first + before.shape[-1])
+    system.diagonal[:-1, mine, mine] += _turn(before) @ before
+    system.diagonal[1:, mine, mine] += _turn(after) @ after
+    system.upper[:, mine, mine] += _turn(before) @ after
+    system.right[:-1, mine] -= _apply(_turn(before), residual)
+    system.right[1:, mine] -= _apply(_turn(after), residual)
+
+
+def _add_walk(system: ChainSystem, values: Array, sigma: Array, first: int) -> Array:
+    """Add a random walk of unknowns ``(N, D)``, deviations ``(N - 1, D)``; its whitened residuals."""
+    residual = (values[1:] - values[:-1]) / sigma
+    step = np.zeros((*sigma.shape, sigma.shape[1]))
+    index = np.arange(sigma.shape[1])
+    step[:, index, index] = 1 / sigma
+    _add_pairs(system, residual, -step, step, first)
+    return residual
 
 
 def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> tuple[float, Array]:
@@ -443,12 +463,17 @@ def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> tuple
     place = values.position + arm - values.translation[segment]
     back = _turn(world)
     seen = _apply(back, place) / scale
-    sigma = options.position_sigma * nodes.depth[segment][:, None]
-    residual = np.concatenate([turn / options.rotation_sigma, (seen - nodes.position) / sigma], -1)
-    states = np.zeros((count, 6, STATE))
+    depth = nodes.depth[segment][:, None]
+    sigma = options.position_sigma * options.position_factor * depth
+    angle = options.rotation_sigma * options.rotation_factor
+    residual = np.concatenate(
+        [(turn - values.drift[:, :3]) / angle, (seen - nodes.position - values.drift[:, 3:]) / sigma], -1
+    )
+    states = np.zeros((count, 6, NODE))
     shared = np.zeros((count, 6, _SEGMENT + 7 * problem.segments))
     back_body = _turn(values.rotation)
     states[:, :3, :3] = np.eye(3)
+    states[:, :, STATE:] = -np.eye(6)
     shared[:, :3, _TIME] = rates
     shared[:, :3, _EXTRINSIC] = -np.eye(3)
     states[:, 3:, 3:6] = back / scale[..., None]
@@ -461,7 +486,7 @@ def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> tuple
         shared[mine, :3, start + 1 : start + 4] = -back_body[mine]
         shared[mine, 3:, start + 1 : start + 4] = back[mine] @ skew(place[mine]) / scale[mine][..., None]
         shared[mine, 3:, start + 4 : start + 7] = -back[mine] / scale[mine][..., None]
-    weight = np.concatenate([np.full((count, 3), 1 / options.rotation_sigma), np.repeat(1 / sigma, 3, 1)], 1)[..., None]
+    weight = np.concatenate([np.full((count, 3), 1 / angle), np.repeat(1 / sigma, 3, 1)], 1)[..., None]
     states, shared = states * weight, shared * weight
     # Cauchy's weights, so that single wrong poses count less.
     squares = (residual**2).sum(-1)
@@ -472,9 +497,26 @@ def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> tuple
     system.shared += (_turn(shared) @ shared).sum(0)
     system.right -= _apply(_turn(states), residual)
     system.right_shared -= _apply(_turn(shared), residual).sum(0)
-    return float(18 * np.log1p(squares / 36).sum()), np.array(
-        [(residual[:, :3] ** 2).mean(), (residual[:, 3:] ** 2).mean()]
+    # The drift of a segment begins with its first node.
+    begins = np.concatenate([[True], segment[1:] != segment[:-1]])
+    held = np.flatnonzero(begins)
+    index = np.arange(STATE, NODE)
+    system.diagonal[held[:, None], index, index] += _FIXED
+    walk = (
+        np.concatenate(
+            [
+                np.full((count, 3), options.rotation_walk * options.rotation_factor),
+                np.repeat(options.position_walk * options.position_factor * depth, 3, 1),
+            ],
+            1,
+        )[1:]
+        * np.sqrt(np.diff(nodes.times))[:, None]
     )
+    walk[begins[1:]] = _UNKNOWN
+    drift = _add_walk(system, values.drift, walk, STATE)
+    errors = np.array([(residual[:, k] ** 2).sum() + (drift[:, k] ** 2).sum() for k in (slice(3), slice(3, 6))])
+    cost = 18 * np.log1p(squares / 36).sum() + 0.5 * (drift**2).sum()
+    return float(cost), errors / max(residual[:, :3].size + drift[:, :3].size, 1)
 
 
 def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float:
@@ -485,7 +527,7 @@ def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float
     off = (values.bias[0] - known) / sigma
     index = np.arange(9, STATE)
     system.diagonal[0, index, index] += 1 / sigma**2
-    system.right[0, 9:] -= off / sigma
+    system.right[0, 9:STATE] -= off / sigma
     late = (values.offset - problem.offset) / options.offset_sigma
     tilt = values.extrinsic / options.extrinsic_sigma
     system.shared[_TIME, _TIME] += 1 / options.offset_sigma**2

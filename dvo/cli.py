@@ -21,7 +21,13 @@ from dvo.commands import BAD_INPUT, HUNG_UP, INTERRUPTED, OK, TERMINATED, Termin
 from dvo.commands.calibrate_options import add_calibrate
 from dvo.commands.imu_options import add_imu
 from dvo.commands.kernels import compiled_meanwhile
-from dvo.commands.run_options import add_batch_options, add_folder_options, add_run_options, add_tracking_options
+from dvo.commands.run_options import (
+    add_batch_options,
+    add_folder_options,
+    add_image_options,
+    add_run_options,
+    add_tracking_options,
+)
 from dvo.commands.stream_options import add_stream_options
 from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed, whole
 from dvo.core.errors import DvoError
@@ -112,6 +118,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--to", metavar="NAME", required=True, help="format: tum, kitti, euroc, colmap, colmap-text or nerfstudio"
     )
     export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
+    add_image_options(export)
     export.set_defaults(run="dvo.commands.export:export")
 
     weights = commands.add_parser("weights", help="list, import, export or describe weights")

@@ -144,6 +144,13 @@ class Source:
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
         return self.changed(recorded_camera=camera, calibration=calibration, guess=None)
 
+    def at_recorded_size(self) -> Self:
+        """The same recording, its images not reduced."""
+        if self.reduction is None:
+            return self
+        masks = None if self.masks is None else self.masks.at_recorded_size()
+        return self.changed(selection=replace(self.reading.selection, reduction=None), masks=masks)
+
     def __len__(self) -> int:
         """``frame_count``.
 

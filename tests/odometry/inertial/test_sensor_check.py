@@ -22,7 +22,8 @@ HARMLESS = {"no rest"}
 @cache
 def good() -> tuple[InertialSamples, np.ndarray, np.ndarray]:
     path = hand_motion(21)
-    return samples(path, SECONDS, rate=100.0, noise=NOISE_PRESETS["euroc"], seed=21), *frames(path, SECONDS, rate=20.0, seed=21)
+    imu = samples(path, SECONDS, rate=100.0, noise=NOISE_PRESETS["euroc"], seed=21)
+    return imu, *frames(path, SECONDS, rate=20.0, seed=21)
 
 
 def checked(**changes: np.ndarray | None) -> SensorReport:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -16,7 +15,6 @@ from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
 from dvo.data.inertial import InertialSamples
 from dvo.data.open import open_source
-from dvo.data.recording import ImageRecording
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, associate
@@ -263,10 +261,7 @@ def inertial_truth(sequence: Sequence) -> InertialTruth | None:
 
 def _with_stream(source: Source, samples: InertialSamples) -> Source:
     """The source with other inertial samples."""
-    recording = copy(source.recording)
-    assert isinstance(recording, ImageRecording)
-    recording.sensors = replace(recording.sensors, inertial=lambda: samples)
-    return Source(recording, source.reading)
+    return Source(source.recording, replace(source.reading, inertial=lambda: samples))
 
 
 def reference_for(groundtruth: Trajectory, stamps: np.ndarray, max_dt: float = 0.02) -> Trajectory:

@@ -15,7 +15,7 @@ import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.inertial import ImuNoise
-from dvo.geometry.poses import split
+from dvo.geometry.poses import rotation_vector, split
 from dvo.synth import salts
 from dvo.synth.protocols import Motion
 
@@ -101,25 +101,3 @@ def with_noise(exact: Imu, noise: ImuNoise, seed: int) -> Imu:
     gyro = exact.gyro + biases[0] + rng.normal(0, noise.gyro * np.sqrt(rate), exact.gyro.shape)
     accel = exact.accel + biases[1] + rng.normal(0, noise.accel * np.sqrt(rate), exact.accel.shape)
     return replace(exact, gyro=gyro, accel=accel, gyro_bias=biases[0], accel_bias=biases[1])
-
-
-def rotation_vector(rotation: Array) -> Array:
-    """Logarithm of rotations of angles well below pi, accurate for tiny ones.
-
-    Args:
-        rotation: ``(..., 3, 3)``.
-
-    Returns:
-        ``(..., 3)`` rad.
-    """
-    twist = 0.5 * np.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )  # sin(angle) * axis
-    sine = np.linalg.norm(twist, axis=-1, keepdims=True)
-    cosine = (np.trace(rotation, axis1=-2, axis2=-1)[..., None] - 1) / 2
-    return twist * np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-300), 1.0)

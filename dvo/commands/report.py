@@ -15,6 +15,8 @@ from dvo.odometry.protocol import Break
 from dvo.session import results
 from dvo.session.session import Run
 
+OVERLAP = "film with overlap, or return to a place seen before: segments that show the same place are joined"
+"""Advice for segments that stay apart."""
 _SHOWN = 5  # breaks and segments that are printed one by one
 _SCALES = {
     "depth": "depth images", "stereo": "stereo images",
@@ -214,6 +216,8 @@ def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = (
             f"{len(result.segments)} segments, {worlds}; {results.TRAJECTORY} and "
             f"{results.MAP} hold the longest, segment {result.longest}{whole}"
         )
+        if joined < len(result.segments) - 1 and "loops" in result.info:
+            say(f"what may help: {OVERLAP}")
     if "localised" in result.info:
         found = result.info["localised"]
         outside = "not recognised in the map: the poses have a world and a scale of their own"

@@ -119,7 +119,7 @@ def pairs():
     for old, kind in ((40, "retrieval"), (10, "retrieval"), (70, "proximity"), (55, "retrieval")):
         group = tuple(replace(frame, identifier=old + k) for k, frame in enumerate(frames))
         later = tuple(replace(frame, identifier=100 + k) for k, frame in enumerate(frames))
-        made.append(Pair(Candidate(old, 101, kind, poses[0]), group, later, poses, moved, new_cw))
+        made.append(Pair(Candidate(old, 101, kind, poses[0]), group, later, poses, moved, new_cw, new_cw is None))
     return made
 
 

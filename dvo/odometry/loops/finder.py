@@ -330,7 +330,8 @@ class LoopFinder:
     def _before_break(self, new: int) -> int | None:
         """Last kept keyframe before the segment of a keyframe, if this is one of its first and has its own world."""
         graph, at, segment = self.graph, bisect_left(self.kept, new), self.graph.segment_of(new)
-        first = next((k for k in range(max(0, at - AFTER_BREAK), at) if graph.segment_of(self.kept[k]) == segment), 0)
+        near = range(max(0, at - AFTER_BREAK + 1), at + 1)
+        first = next((k for k in near if graph.segment_of(self.kept[k]) == segment), 0)
         last = self.kept[first - 1] if first else -1
         if last < graph.recording.keyframe or graph.segment_of(last) < 0:
             return None

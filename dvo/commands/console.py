@@ -33,7 +33,9 @@ LONG_RUN = 60.0
 ESTIMATED_AFTER = 30
 GRACE = 1.5
 """Seconds after SIGTERM in which a frame is finished and results are written."""
-_COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red"}
+_COLOURS = {
+    Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red", Status.INERTIAL: "magenta",
+}  # fmt: skip
 
 
 def device_of(name: str) -> torch.device:

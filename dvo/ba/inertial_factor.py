@@ -87,9 +87,10 @@ class InertialFactor(Factor):
         q_wc = so3.conjugate(ends[..., 3:])
         q_cb, t_cb = self._extrinsics(values)
         r_wc, r_cb = so3.matrix(q_wc), so3.matrix(q_cb)
-        x = so3.exp(self._ends(self.rates) * self._late(values)[..., None])  # Exp(w d)
-        q_wb = so3.multiply(so3.multiply(q_wc, q_cb), so3.conjugate(x))
-        turned = so3.matrix(x)
+        q_wb, turned = so3.multiply(q_wc, q_cb), torch.eye(3).to(q_wc).expand(1, 2 * count, 3, 3)
+        if TIME_OFFSET in values:
+            x = so3.exp(self._ends(self.rates) * self._late(values)[..., None])  # Exp(w d)
+            q_wb, turned = so3.multiply(q_wb, so3.conjugate(x)), so3.matrix(x)
 
         db = None
         if IMU_BIAS in values:

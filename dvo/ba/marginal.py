@@ -20,7 +20,7 @@ from torch import Tensor
 
 from dvo.ba.layer.linearisation import landmark_count, landmark_part, reduced_part
 from dvo.ba.problem import Factor, Linearisation, Problem
-from dvo.ba.state import State
+from dvo.ba.state import State, StateBlock
 from dvo.core.errors import DvoError
 
 Difference = Callable[[Tensor, Tensor], Tensor]
@@ -144,7 +144,7 @@ def marginalise(
     Args:
         problem: factors that touch what leaves, and no others; a factor stays in use elsewhere or goes in here, never
             both. They are linearised at the state, with Jacobians at first estimates where a :class:`FirstEstimates`
-            has them.
+            has them. Of patches they are of the generic kind (:class:`dvo.ba.layer.reprojection.PatchReprojection`).
         leaving: by block ``(n,)`` the elements that leave. Fixed elements are constants.
         form: ``root`` by QR of the rows, ``schur`` by the normal equations.
 
@@ -158,16 +158,17 @@ def marginalise(
     """
     if form not in ("root", "schur"):
         raise DvoError(f"is {form!r}", field="form", remedy="use root or schur")
-    state = problem.state.with_values({name: x.detach().double() for name, x in problem.state.values().items()})
+    state = State({name: _exact(block) for name, block in problem.state.blocks.items()})
+    device = next(iter(problem.state.values().values())).device
     with torch.no_grad():
-        factors = [factor.with_tensors([x.detach().double() for x in factor.tensors()]) for factor in problem.factors]
-        rows = [_rows(factor.linearise(state.values()), state) for factor in factors]
+        rows = [_rows(factor.exact().linearise(state.values()), state) for factor in problem.factors]
         jacobian, by_landmark, residual = (torch.cat(x, 1) for x in zip(*rows, strict=True))
         touched = (jacobian != 0).any(0).any(0)
-        out, kept, slots = [], [], []
+        out, kept = [], []
+        slots: list[tuple[str, int, Difference]] = []
         for name in state.offsets:
             block = state[name]
-            gone = set(leaving[name].tolist()) if name in leaving else set()
+            gone = set(leaving[name].tolist()) if name in leaving else set[int]()
             every = state.rows(name, torch.arange(block.value.shape[1]))
             unknowns = every[every[:, 0] < state.size, 0]
             for element, columns in enumerate(every):
@@ -179,7 +180,7 @@ def marginalise(
                     if block.difference is None or len(unknowns.unique()) < len(unknowns):
                         raise DvoError(f"{name!r} cannot be in a prior", field="problem", remedy="hold it")
                     kept.append(columns)
-                    slots.append((name, element))
+                    slots.append((name, element, block.difference))
         none = torch.zeros(0, dtype=torch.long)
         stays = jacobian[..., torch.cat([*kept, none])]
         leaves = torch.cat((by_landmark, jacobian[..., torch.cat([*out, none])]), -1)
@@ -187,12 +188,22 @@ def marginalise(
         reduce = _by_qr if form == "root" else _by_schur
         root, white = reduce(leaves, stays, residual)
         batch = len(root)
-        firsts = [state[name].value[:, element].reshape(batch, -1) for name, element in slots]
+        firsts = [state[name].value[:, element].reshape(batch, -1) for name, element, _ in slots]
         return LinearPrior(
-            white, root, torch.cat([*firsts, root.new_zeros(batch, 0)], 1),
-            torch.tensor([element for _, element in slots], dtype=torch.long), tuple(name for name, _ in slots),
-            tuple(state[name].difference for name, _ in slots), tuple(state[name].dim for name, _ in slots),  # type: ignore[misc]
-        )  # fmt: skip
+            residual=white.to(device),
+            jacobian=root.to(device),
+            first=torch.cat([*firsts, root.new_zeros(batch, 0)], 1).to(device),
+            elements=torch.tensor([element for _, element, _ in slots], dtype=torch.long, device=device),
+            blocks=tuple(name for name, _, _ in slots),
+            differences=tuple(difference for _, _, difference in slots),
+            dims=tuple(state[name].dim for name, _, _ in slots),
+        )
+
+
+def _exact(block: StateBlock) -> StateBlock:
+    """The block on the CPU in double precision."""
+    slot = None if block.slot is None else block.slot.cpu()
+    return replace(block, value=block.value.detach().cpu().double(), slot=slot)
 
 
 def _rows(linear: Linearisation, state: State) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
-from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, so3_exp
-from dvo.odometry.inertial.smoother import GRAVITY, Smoother, VisualNodes, rotation_vector
+from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, rotation_vector, so3_exp
+from dvo.odometry.inertial.smoother import GRAVITY, Smoother, VisualNodes
 
 Array = np.ndarray
 RATE = 1000
@@ -41,7 +41,8 @@ class Recording:
 
     def nodes(self, start: float, end: float, step: int = 4) -> VisualNodes:
         """Every few frames of an interval."""
-        chosen = np.flatnonzero((self.times >= start) & (self.times <= end))[::-1][::step][::-1]
+        inside = np.flatnonzero((self.times >= start) & (self.times <= end))
+        chosen = np.union1d(inside[inside % step == 0], inside[-1:])
         none = np.zeros(len(chosen), int)
         depth = np.array([DEPTH / SCALE])
         return VisualNodes(self.times[chosen], none, self.rotation[chosen], self.position[chosen], depth)

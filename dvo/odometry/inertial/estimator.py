@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
-from dvo.geometry.poses import split
+from dvo.geometry.poses import rotation_vector, split
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.preintegration import preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
@@ -27,11 +27,11 @@ from dvo.odometry.inertial.smoother import (
     first_values,
     linear_start,
     motion_factors,
-    rotation_vector,
     smooth,
     upright,
 )
 from dvo.odometry.inertial.stream import SampleStream
+from dvo.odometry.inertial.temporal import align_imu
 from dvo.odometry.protocol import ScaleState
 
 Array = np.ndarray
@@ -53,6 +53,8 @@ GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
 MAX_TURN = 1.5
 """Root mean square difference of rotations between nodes, degrees, above which gyroscope and images disagree."""
+FOUND_EXTRINSIC = 0.02
+"""Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 MAX_ROTATION_SIGMA = 0.01
 """Noise of visual orientations above which samples and images do not fit, rad."""
 MAX_SHIFT = 0.02
@@ -72,8 +74,8 @@ _WAITING = ("too few poses", "too few samples")
 STILL = (0.02, 0.15)
 """Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
 STILL_FOR = 0.4
-STILL_SPEED = 0.5
-"""Predicted speed below which a sensor that feels nothing stands still, m/s."""
+STILL_SPEED = 0.05
+"""Predicted speed, beyond three of its deviations, below which a sensor that feels nothing stands still, m/s."""
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,7 @@ class InertialEstimator:
         self.noise: ImuNoise = NOISE_PRESETS["phone"]
         self.rotation_camera_imu: Array | None = None
         self.translation_camera_imu: Array = np.zeros(3)
+        self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
         self._failures, self._patience = 0, EVERY / 2
         self._next = -np.inf
@@ -269,7 +272,7 @@ class InertialEstimator:
         samples, turn = self.stream.samples(), self.rotation_camera_imu
         if samples is None or turn is None or not self.options.use:
             return None
-        offset = 0.0 if self.solution is None else self.solution.time_offset
+        offset = self.first_offset if self.solution is None else self.solution.time_offset
         bias = np.zeros(3) if self.solution is None else self.solution.gyro_bias[-1]
         times = np.array([before, after]) + offset
         if samples.timestamps[0] > times[0] or samples.timestamps[-1] < times[1] - 0.02:
@@ -327,8 +330,11 @@ class InertialEstimator:
         if samples is None or len(samples) < 2:
             return None, "too few samples"
         if turn is None:
-            return None, "the rotation between sensor and camera is not known"
-        offset = 0.0 if self.solution is None else self.solution.time_offset
+            reason = self._turn_between(nodes, samples)
+            turn = self.rotation_camera_imu
+            if turn is None:
+                return None, reason
+        offset = self.first_offset if self.solution is None else self.solution.time_offset
         lead = 0.03 + abs(offset)
         kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
         if not kept.all():
@@ -349,6 +355,19 @@ class InertialEstimator:
             at = int(np.abs(self.solution.times - nodes.times[0]).argmin())
             problem.gyro_bias, problem.accel_bias = self.solution.gyro_bias[at], self.solution.accel_bias[at]
         return problem, ""
+
+    def _turn_between(self, nodes: VisualNodes, samples: InertialSamples) -> str:
+        """Find the rotation between sensor and camera; why it is not found."""
+        unknown = "the rotation between sensor and camera is not known"
+        if len(nodes) < 10 or nodes.segment[0] != nodes.segment[-1]:
+            return unknown
+        found = align_imu(nodes.times, nodes.rotation, samples.timestamps, samples.gyro)
+        if found.reason or found.sigma_rotation.max() > MAX_TURN or not np.isfinite(found.sigma_offset):
+            return f"{unknown}, and {found.reason or 'the motion does not tell it'}: turn about several axes"
+        self.rotation_camera_imu, self.first_offset = found.rotation_camera_imu, found.time_offset
+        self._smoother = replace(self._smoother, extrinsic_sigma=FOUND_EXTRINSIC)
+        self.history.append({"time": float(nodes.times[-1]), "event": "rotation between sensor and camera found"})
+        return ""
 
     def _solved(self, problem: Smoother, worlds: list[int]) -> Smoothed | None:
         """The best solution from some starts."""
@@ -400,9 +419,23 @@ class InertialEstimator:
         bias = np.concatenate([known.gyro_bias, known.accel_bias], 1)
         start.bias = np.stack([np.interp(times, known.times, column) for column in bias.T], 1)
         start.extrinsic = rotation_vector(problem.rotation_camera_imu.T @ known.rotation_camera_imu)
-        inside = times <= known.times[-1]
-        for axis in range(3):
-            start.velocity[inside, axis] = np.interp(times[inside], known.times, known.velocity[:, axis])
+        # Nodes of the last solution as they were, and those after it as the samples tell: visual poses are too noisy.
+        same = np.searchsorted(known.times, times).clip(max=len(known.times) - 1)
+        old = np.abs(known.times[same] - times) < 1e-6
+        for values, solved in (
+            (start.rotation, known.rotation), (start.position, known.position), (start.velocity, known.velocity)
+        ):  # fmt: skip
+            values[old] = solved[same[old]]
+        later, state = np.flatnonzero(times > known.times[-1] + 1e-6), self.last_state()
+        assert state is not None
+        samples = problem.samples
+        times_there = np.concatenate([[state.time], times[later]]) + problem.offset
+        if len(later) and samples.timestamps[0] <= times_there[0]:
+            found = propagate(
+                state.rotation, state.position, state.velocity, samples, times_there, state.gyro_bias,
+                state.accel_bias, GRAVITY,
+            )  # fmt: skip
+            start.rotation[later], start.position[later], start.velocity[later] = (part[1:] for part in found)
         return start
 
     def _known_similarity(self, world: int) -> Similarity | None:
@@ -568,22 +601,22 @@ def _step(state: BodyState, time: float, offset: float, samples: InertialSamples
     walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * (time - state.time)
     added[range(9, STATE), range(9, STATE)] = walk
     covariance = forward @ state.covariance @ forward.T + added
-    if _stands_still(near, times[1], state, velocity):
+    sigma = float(np.sqrt(np.trace(covariance[6:9, 6:9])))
+    if np.linalg.norm(velocity) < STILL_SPEED + 3 * sigma and _stands_still(near, times[1], state):
         position, velocity = state.position, np.zeros(3)
         covariance[6:9, :], covariance[:, 6:9] = 0, 0
         covariance[6:9, 6:9] = 1e-4 * np.eye(3)
     return BodyState(time, rotation, position, velocity, state.gyro_bias, state.accel_bias, covariance)
 
 
-def _stands_still(samples: InertialSamples, time: float, state: BodyState, velocity: Array) -> bool:
-    """Nothing is felt for a while, at a predicted speed that drift explains."""
+def _stands_still(samples: InertialSamples, time: float, state: BodyState) -> bool:
+    """Nothing is felt for a while."""
     recent = samples.between(time - STILL_FOR, time)
     if len(recent) < 5 or recent.timestamps[-1] - recent.timestamps[0] < 0.7 * STILL_FOR:
         return False
     rates, forces = recent.gyro - state.gyro_bias, recent.accel
     quiet = rates.std(0).max() < STILL[0] and forces.std(0).max() < STILL[1]
-    turning = float(np.linalg.norm(rates.mean(0)))
-    return bool(quiet and turning < STILL[0] and np.linalg.norm(velocity) < STILL_SPEED)
+    return bool(quiet and np.linalg.norm(rates.mean(0)) < STILL[0])
 
 
 def camera_pose(state: BodyState, rotation_camera_imu: Array, translation_camera_imu: Array) -> tuple[Array, Array]:

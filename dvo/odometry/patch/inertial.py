@@ -18,18 +18,21 @@ from dvo.data.frame import Frame
 from dvo.data.inertial import InertialSamples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
-from dvo.geometry.poses import pose_from, slerp, split
+from dvo.geometry.poses import pose_from, rotation_vector, slerp, split
 from dvo.map.correction import re_express
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.smoother import Smoothed, VisualNodes, rotation_vector
+from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
 from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState, Segment, Status
 
 GYRO_TRUST = 0.7
 """The gyroscope predicts the rotation of a frame where its error of late is below this share of that of the motion
 model: a sensor that is turned, or whose clock is off, predicts worse."""
+LEAST_TURN = np.deg2rad(1.0)
+"""Difference of the two predictions below which that of the motion model stays: the network finds the rest, and calm
+images give the same bytes with and without samples."""
 FORGET = 0.9
 """Weight of the past in these errors, from frame to frame."""
 MOST_NODES = 400
@@ -107,6 +110,8 @@ class InertialTracking:
         if turned is None or self._errors is None or self._errors[0] > GYRO_TRUST**2 * self._errors[1]:
             return pose_cw
         rotation, position = split(se3.inverse(pose_cw.double()).cpu().numpy())
+        if np.linalg.norm(rotation_vector(rotation.T @ turned)) < LEAST_TURN:
+            return pose_cw
         return se3.inverse(torch.from_numpy(pose_from(turned, position))).to(pose_cw)
 
     def express(self, record: FrameRecord, estimate: Estimate) -> Estimate:
@@ -378,12 +383,15 @@ def _ordered(covariance: np.ndarray) -> np.ndarray:
 
 
 def _spaced(times: np.ndarray, worlds: Sequence[int], spacing: float) -> list[int]:
-    """Positions of frames about ``spacing`` apart; those on either side of a break and the last one among them."""
+    """Positions of frames about ``spacing`` apart; those on either side of a break and the last one among them.
+
+    The first frame of each interval of a fixed division of time: most are the same from estimate to estimate.
+    """
     chosen: list[int] = []
     for k, time in enumerate(times.tolist()):
         edge = k == len(times) - 1 or worlds[k + 1] != worlds[k] or times[k + 1] - time > 2 * spacing
         begins = k == 0 or worlds[k - 1] != worlds[k] or time - times[k - 1] > 2 * spacing
-        if begins or edge or time - times[chosen[-1]] >= spacing - 1e-6:
+        if begins or edge or int(time / spacing + 1e-6) != int(times[k - 1] / spacing + 1e-6):
             chosen.append(k)
     return chosen
 

@@ -19,6 +19,7 @@ _SHOWN = 5  # breaks and segments that are printed one by one
 _SCALES = {
     "depth": "depth images", "stereo": "stereo images",
     "height": "the height of the camera", "distance": "known distances", "map": "the map",
+    "inertial": "inertial samples",
 }  # fmt: skip
 
 

@@ -45,7 +45,7 @@ CATALOGUE = (
     System("direct", f"{_CLASSICAL}.direct.system:DirectOdometry",
            about="semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)"),
     System("msckf", f"{_CLASSICAL}.msckf.system:Msckf",
-           about="inertial filter: EKF over past poses, points eliminated (MSCKF with first-estimate Jacobians), metric"),
+           about="inertial filter: EKF over past poses (MSCKF with first-estimate Jacobians), in metres"),
     System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",
            about="ORB-SLAM3 (pyorbslam3), without the official vocabulary; monocular, or in metres with "
            "sensor=stereo or sensor=rgbd; closes loops, unless loops=false",

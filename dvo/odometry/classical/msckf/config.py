@@ -13,7 +13,8 @@ class MsckfConfig:
         corners: number of tracks kept alive.
         refill: new corners are looked for when fewer than this part of ``corners`` is alive.
         quality, window, levels, closed: corner strength, patch side, pyramid levels and forward-backward tolerance.
-        pixel: standard deviation of a tracked pixel.
+        pixel: standard deviation of a tracked pixel, for the gate.
+        drift: factor on it in updates: errors of a track in successive images are alike, as its patch drifts.
         clones: largest number of poses in the window.
         interval: seconds between two of them.
         flow: median displacement of the tracks, as part of the focal length, that calls for one earlier.
@@ -32,7 +33,8 @@ class MsckfConfig:
     window: int = 15
     levels: int = 4
     closed: float = 0.5
-    pixel: float = 1.0
+    pixel: float = 0.25
+    drift: float = 3.0
     clones: int = 16
     interval: float = 0.1
     flow: float = 0.08

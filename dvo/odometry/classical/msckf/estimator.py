@@ -67,15 +67,16 @@ class Estimator:
     """
 
     def __init__(
-        self, config: MsckfConfig, noise: ImuNoise, T_camera_imu: np.ndarray, focal: float, seed: int = 0
+        self, config: MsckfConfig, T_camera_imu: np.ndarray, noise: ImuNoise, focal: float, seed: int = 0
     ) -> None:
         T_cb = pose_matrices(T_camera_imu)
         R_bc = T_cb[:3, :3].T
-        sigma = config.pixel / focal
+        gate = config.pixel / focal
         self.config, self.focal, self.seed = config, focal, seed
         self.device = Device(
-            R_bc, -R_bc @ T_cb[:3, 3], noise, sigma, config.offset_sigma, config.position_sigma, config.rotation_sigma
-        )
+            R_bc, -R_bc @ T_cb[:3, 3], noise, gate, config.drift * gate,
+            config.offset_sigma, config.position_sigma, config.rotation_sigma,
+        )  # fmt: skip
         self.samples = SampleBuffer()
         self.filter: Filter | None = None
         self.start: Start | None = None
@@ -269,7 +270,7 @@ class Estimator:
         R, p, _ = now.shifted(views.clone, views.delay)
         points, good = triangulate(views, R @ f.R_bc, p + R @ f.p_bc)
         measured = linearise(views, points, now, first, f.R_bc, f.p_bc, f.layout)
-        kept = good & passing(measured, f.P, self.device.sigma)
+        kept = good & passing(measured, f.P, self.device.gate)
         self.updates, self.rejected = self.updates + int(kept.sum()), self.rejected + int((good & ~kept).sum())
         self.agreement = float(kept.sum() / max(good.sum(), 1))
         self.points, self.point_ids = points[kept], np.array(used, np.int64)[kept]

@@ -20,7 +20,8 @@ REST_SPEED = 0.01  # m/s, of a body that stands still, standard deviation
 REST_ACCEL = 0.01  # m/s^2, of the mean specific force meanwhile
 GN_STEPS = 12
 RELINEARISE = 3  # times that the samples are integrated again with better biases and time offset
-OUTLIER = 3.0  # root mean square residual of a point over the noise, from which it is left out
+MISFIT = 0.35  # mean cost of a residual over that of an outlier, from which a start is none
+OUTLIER = 3.0  # root mean square residual of a point over the noise, from which it counts little
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,14 @@ class Device:
     Attributes:
         R_bc, p_bc: camera in the body.
         noise: of the samples.
-        sigma: of an observation on the plane z = 1.
+        gate, sigma: of an observation on the plane z = 1, for finding outliers and for updates.
         offset_sigma, position_sigma, rotation_sigma: see :class:`MsckfConfig`.
     """
 
     R_bc: np.ndarray
     p_bc: np.ndarray
     noise: ImuNoise
+    gate: float
     sigma: float
     offset_sigma: float
     position_sigma: float
@@ -395,12 +397,13 @@ def _normal_equations(
     seen = linearise(shifted, points, clones, clones, device.R_bc, device.p_bc, layout)
     lengths = np.diff(seen.begins)
     r, J = seen.residual / device.sigma, seen.jacobian / device.sigma
-    square = np.add.reduceat(r**2, seen.begins[:-1]) / lengths / OUTLIER**2
+    bound = OUTLIER * device.gate
+    square = np.add.reduceat(seen.residual**2, seen.begins[:-1]) / lengths / bound**2
     square[~good] = np.inf
     weight = np.repeat(1 / (1 + square) ** 2, lengths)  # Geman and McClure's
     H += J.T @ (weight[:, None] * J)
     b += J.T @ (weight * r)
-    cost += float((lengths * OUTLIER**2 / (1 + 1 / np.maximum(square, 1e-12))).sum())
+    cost += float((lengths * (bound / device.sigma) ** 2 / (1 + 1 / np.maximum(square, 1e-12))).sum())
     rows = int(lengths[good].sum())
     return H, b, cost, rows
 
@@ -410,7 +413,7 @@ def _checked(
 ) -> Start | str:
     """The start, if it is one: the last position and heading become those of the world."""
     count, noise = len(times), device.noise
-    if solved.misfit > 3.0:
+    if solved.misfit > MISFIT * (OUTLIER * device.gate / device.sigma) ** 2:
         return "images and samples do not agree"
     last = 9 * (count - 1)
     H = solved.information.copy()

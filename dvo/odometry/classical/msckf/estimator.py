@@ -33,6 +33,7 @@ TURN_CHANGE, FORCE_CHANGE = 5.0, 20.0  # rad/s^2 and m/s^3: how fast rate and fo
 STILL_FLOW, STILL_MEAN = 2.0, 0.3  # median and mean displacement of tracks that stand still, over the noise of a pixel
 STILL_TURN, STILL_FORCE = 0.005, 0.06  # rad/s and m/s^2, standard deviations of the samples beside their noise
 REST = np.repeat([0.003, 0.001, 0.01], 3)  # m, rad, m/s: what may have moved while standing still
+TRY_EVERY = 0.5  # seconds between two tries to start from motion
 KEPT = 4.0  # seconds of images and samples before the start
 
 
@@ -86,7 +87,7 @@ class Estimator:
         self._early: list[Observed] = []
         self._last: Observed | None = None  # of the last clone
         self._seen: dict[int, list[tuple[int, float, float, float]]] = defaultdict(list)  # clone number, x, y, delay
-        self._tries = 0
+        self._tries, self._tried = 0, -np.inf
 
     def add(self, samples: InertialSamples) -> None:
         """Take samples in."""
@@ -166,8 +167,10 @@ class Estimator:
             moving = [frame for frame in self._early if frame.time > seen.time - c.moving - 0.5 * c.interval]
             if moving[-1].time - moving[0].time < c.moving - c.interval:
                 found = "waiting for more images"
+            elif seen.time - self._tried < TRY_EVERY:
+                return
             else:
-                self._tries += 1
+                self._tries, self._tried = self._tries + 1, seen.time
                 found = start_from_motion(
                     moving, self.samples, self.device, most=c.start_scale, seed=self.seed + self._tries
                 )
@@ -190,16 +193,22 @@ class Estimator:
         flow, pixel = self._flow(first, second), self.config.pixel
         if len(flow) < 10:
             return False
-        stretch = self.samples.between(first.time + self.offset, second.time + self.offset)
-        rate = len(stretch.times) / max(float(np.ptp(stretch.times)), 1e-3)
-        turn = float(stretch.gyro[1:-1].std(0).max()) if len(stretch.times) > 3 else np.inf
-        push = float(stretch.accel[1:-1].std(0).max()) if len(stretch.times) > 3 else np.inf
-        noise = self.device.noise
         return bool(
             np.median(np.linalg.norm(flow, axis=1)) < STILL_FLOW * pixel
             and np.linalg.norm(np.median(flow, axis=0)) < (STILL_MEAN + 4 / np.sqrt(len(flow))) * pixel
-            and turn < 2 * noise.gyro * np.sqrt(rate) + STILL_TURN
-            and push < 2 * noise.accel * np.sqrt(rate) + STILL_FORCE
+            and self.is_still(first.time, second.time)
+        )
+
+    def is_still(self, start: float, end: float) -> bool:
+        """Return True if the samples show no motion between the times of two images."""
+        stretch, noise = self.samples.between(start + self.offset, end + self.offset), self.device.noise
+        count = len(stretch.times) - 2
+        if count < 2:
+            return False
+        rate = count / max(end - start, 1e-3)
+        turn, push = stretch.gyro[1:-1].std(0).max(), stretch.accel[1:-1].std(0).max()
+        return bool(
+            turn < 2 * noise.gyro * np.sqrt(rate) + STILL_TURN and push < 2 * noise.accel * np.sqrt(rate) + STILL_FORCE
         )
 
     # --- the filter ---------------------------------------------------------------------------------------------------
@@ -214,7 +223,7 @@ class Estimator:
         if self._last is None or seen.time - self._last.time >= 0.999 * self.config.interval:
             return True
         flow = self._flow(self._last, seen)
-        if len(flow) < 0.7 * len(self._last.ids):
+        if len(flow) < max(0.7 * len(self._last.ids), 1):
             return True
         return bool(np.median(np.linalg.norm(flow, axis=1)) > self.config.flow * self.focal)
 

@@ -96,7 +96,7 @@ def propagate(times, gyro, accel, R, p, v, R_first, p_first, v_first, bg, ba, gr
         for j in range(3):  # R [a]x, of the bias of the gyroscope
             x, y = (j + 1) % 3, (j + 2) % 3
             for i in range(3):
-                bent = middle[i, y] * a[x] - middle[i, x] * a[y]
+                bent = middle[i, x] * a[y] - middle[i, y] * a[x]
                 step[6 + i, 9 + j] = bent * dt * dt / 2
                 step[i, 9 + j] = bent * dt * dt * dt / 6
         _times(step, total, product)

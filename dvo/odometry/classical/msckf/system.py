@@ -86,11 +86,9 @@ class Msckf:
             self._estimator = Estimator(self.config, *self._calibration, focal, seed)
         if self._estimator is not None and samples is not None:
             self._estimator.add(samples)
-        if admitted.repeated and not admitted.problem and not self._started:
-            record.follow(self._log.frames[index - 1])
-            return replace(self._last, timestamp=frame.timestamp)
-        problem = admitted.problem or ("repeated image" if admitted.repeated else "")
-        if problem:
+        problem, first = admitted.problem, not self._started
+        frozen = admitted.repeated and not (first or self._is_still(frame))  # the image is older than its time
+        if problem or frozen:
             self._waiting.append((index, None))
         else:
             grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
@@ -101,11 +99,18 @@ class Msckf:
         if problem:
             record.lost, record.reason = True, problem
         self._take_in()
+        if first and admitted.repeated and not self._started:
+            record.follow(self._log.frames[index - 1])
+            return replace(self._last, timestamp=frame.timestamp)
         return self._estimate(index, problem)
 
     @property
     def _started(self) -> bool:
         return self._estimator is not None and self._estimator.filter is not None
+
+    def _is_still(self, frame: Frame) -> bool:
+        """Return True if the samples show no motion since the image before."""
+        return self._estimator is not None and self._estimator.is_still(self._last.timestamp, frame.timestamp)
 
     def finish(self) -> Result:
         if self._gate.finish():

@@ -18,6 +18,7 @@ G = float(np.linalg.norm(GRAVITY))
 HELD = 1e-6  # standard deviation of what is held fixed: position and heading of the start
 REST_SPEED = 0.01  # m/s, of a body that stands still, standard deviation
 REST_ACCEL = 0.01  # m/s^2, of the mean specific force meanwhile
+CAUTION = 2.0  # factor on the covariance of a start from motion, whose equations are far from linear
 GN_STEPS = 12
 RELINEARISE = 3  # times that the samples are integrated again with better biases and time offset
 MISFIT = 0.35  # mean cost of a residual over that of an outlier, from which a start is none
@@ -435,7 +436,7 @@ def _checked(
         return "biases out of bounds"
     at = np.concatenate([last + np.arange(9), 9 * count + np.arange(7)])
     P = _prior(device)
-    P[: FIXED - 6, : FIXED - 6] = covariance[np.ix_(at, at)]
+    P[: FIXED - 6, : FIXED - 6] = CAUTION * covariance[np.ix_(at, at)]
     span = times[-1] - times[0]
     walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * span
     P[np.arange(9, 15), np.arange(9, 15)] += walk

@@ -288,7 +288,11 @@ def filmed(film, seconds, rest, seed=5):
     imu = measure_imu(path, stamps, noise=noise, seed=seed, gravity=np.array([0, 9.81, 0]))
     samples = InertialSamples(stamps, imu.gyro, imu.accel, np.array([0.0, 0, 0, 0, 0, 0, 1]), noise)
     truth = Trajectory(times, path.poses_wc(times))
-    frames = film(truth)
+    grain = np.random.default_rng(seed)
+    frames = [
+        replace(frame, image=np.clip(frame.image + grain.integers(-2, 3, frame.image.shape), 0, 255).astype(np.uint8))
+        for frame in film(truth)
+    ]
     return [frames[0], *(
         replace(frame, inertial=samples.between(before.timestamp, frame.timestamp))
         for before, frame in zip(frames[:-1], frames[1:], strict=True)

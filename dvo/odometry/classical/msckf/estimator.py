@@ -135,12 +135,12 @@ class Estimator:
         """State at the time of an image before the start; None before what the start knows."""
         assert self.start is not None
         at = time + self.start.offset
+        if self.start.rested and self.start.history[0][0] - self.config.interval <= at:  # the first has no samples
+            return self.start.motion
         before = [entry for entry in self.start.history if entry[0] <= at + 1e-9]
         if not before:
             return None
         known, motion = before[-1]
-        if self.start.rested:
-            return motion
         stretch = self.samples.between(known, max(at, known))
         return propagate(stretch, motion, self.start.bias, self.device.noise)[0]
 

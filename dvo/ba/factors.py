@@ -89,6 +89,36 @@ class PosePrior(Factor):
 
 
 @dataclass(frozen=True)
+class VectorPrior(Factor):
+    """Prior ``weight . (value - x)^2`` of the vectors of a block, for example of biases, or of a velocity at rest.
+
+    Attributes:
+        block: name of a :func:`dvo.ba.blocks.vector_block`.
+        value, weight: ``(B, F, D)`` or broadcastable to it; vectors and their inverse variances.
+        index: ``(F,)`` elements; None for all of them in order.
+        kernel: robust kernel of the whitened residual.
+    """
+
+    block: str
+    value: Tensor
+    weight: Tensor
+    index: Tensor | None = None
+    kernel: Kernel = Kernel()  # noqa: RUF009 (frozen)
+
+    def linearise(self, values: Mapping[str, Tensor]) -> Linearisation:
+        vectors = values[self.block]
+        index = _everything(vectors, self.index)
+        if self.index is not None:
+            vectors = vectors.index_select(1, index)
+        residual = self.value - vectors
+        weight = self.weight.expand(residual.shape)
+        scale = self.kernel.weights(residual, weight, -1)
+        weight = weight if scale is None else weight * scale
+        jacobian = torch.eye(residual.shape[-1]).to(residual).expand(*residual.shape, -1)
+        return Linearisation(residual, weight, (self.block,), (index,), (jacobian,))
+
+
+@dataclass(frozen=True)
 class RelativePose(Factor):
     """Measured relative motions of pairs of poses: ``r = Log(measured (T_j T_i^-1)^-1)``.
 

@@ -27,6 +27,8 @@ class StateBlock:
         held: the whole block stays in this call; it has no unknowns, whatever the value of ``slot``.
         eliminated: removed by Schur complement; at most one block, the last, with ``dim`` 1 and ``slot`` None.
         longest: a Gauss-Newton step with a larger number is not taken.
+        difference: ``(value, other) -> tangent`` with ``retract(value, tangent) = other``; None: a prior of
+            :func:`dvo.ba.marginal.marginalise` cannot hold it.
     """
 
     value: Tensor
@@ -37,6 +39,7 @@ class StateBlock:
     held: bool = False
     eliminated: bool = False
     longest: float = LARGEST
+    difference: Callable[[Tensor, Tensor], Tensor] | None = None
 
     @property
     def unknowns(self) -> int:

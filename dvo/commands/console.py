@@ -30,7 +30,9 @@ PLAIN_INTERVAL = 10.0
 """Seconds between two lines about the progress where there is no terminal."""
 GRACE = 1.5
 """Seconds after SIGTERM in which a frame is finished and results are written."""
-_COLOURS = {Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red"}
+_COLOURS = {
+    Status.INITIALISING: "yellow", Status.TRACKING: "green", Status.LOST: "red", Status.INERTIAL: "magenta",
+}  # fmt: skip
 
 
 def device_of(name: str) -> torch.device:

@@ -64,6 +64,11 @@ OPTIONAL = (
     ("pycolmap", "pycolmap", "peer COLMAP", ""),
     ("pyorbslam3", "pyorbslam3", "peer ORB-SLAM3", "pip install pyorbslam3 (Linux x86-64)"),
     ("svo-cpp", "svo_cpp", "peer SVO", "pip install --no-deps svo-cpp"),
+    ("ros-rclpy", "rclpy", "node of ROS 2", "pip install 'dvo[ros2]' (Python 3.11, Linux x86-64)"),
+    ("ros-nav-msgs", "nav_msgs", "node of ROS 2", "pip install 'dvo[ros2]' (Python 3.11, Linux x86-64)"),
+    ("ros-sensor-msgs", "sensor_msgs", "node of ROS 2", "pip install 'dvo[ros2]' (Python 3.11, Linux x86-64)"),
+    ("ros-diagnostic-msgs", "diagnostic_msgs", "node of ROS 2", "pip install 'dvo[ros2]' (Python 3.11, Linux x86-64)"),
+    ("ros-std-srvs", "std_srvs", "node of ROS 2", "pip install 'dvo[ros2]' (Python 3.11, Linux x86-64)"),
 )
 
 GROUPS = ("dvo.architectures", "dvo.odometries", "dvo.readers", "dvo.scene_families", "dvo.systems", "dvo.tasks")

@@ -11,7 +11,7 @@ from dvo.commands.console import say
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Metrics, evaluate
 from dvo.metrics.table import shown
-from dvo.odometry.protocol import Break
+from dvo.odometry.protocol import Break, Result
 from dvo.session import results
 from dvo.session.session import Run
 
@@ -186,6 +186,25 @@ def describe_scale(scale: Mapping[str, Any]) -> str:
     return f"poses and map are in metres, from {sources}{sure}" + (f"; but {problems}" if problems else "")
 
 
+def describe_inertial(result: Result) -> list[str]:
+    """Describe what inertial samples were of use for.
+
+    Args:
+        result: with ``inertial`` in its metadata.
+
+    Returns:
+        Sentences, none where poses are in metres and all by images.
+    """
+    told, said = result.info["inertial"], []
+    if told["state"] not in ("aligned", "refined"):
+        reason = f": {told['reason']}" if told.get("reason") else ""
+        said.append(f"inertial samples give no metres{reason}; `dvo imu check` looks at the sensor")
+    if result.inertial:
+        count = len(result.inertial)
+        said.append(f"{count} frames without a pose by their images have one by inertial samples, marked in frames.csv")
+    return said
+
+
 def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = ()) -> None:
     """Print verdict, counts, breaks, segments, errors and the names of the files.
 
@@ -223,6 +242,9 @@ def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = (
         say(f"rolling shutter with a readout of {1000 * result.info['readout']:.1f} ms, estimated from the images")
     if "scale" in result.info:
         say(describe_scale(result.info["scale"]))
+    if "inertial" in result.info:
+        for line in describe_inertial(result):
+            say(line)
     if metrics is not None and metrics.reason:
         say(f"no error against ground truth: {metrics.reason}")
     elif metrics is not None:

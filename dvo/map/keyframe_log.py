@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,6 +25,7 @@ class FrameRecord:
         lost: tracking was lost; the frame gets no row in the trajectory.
         segment: number of the segment of the frame; means nothing for a lost frame.
         reason: cause of a loss, or of a break before the frame.
+        inertial: it has no pose by its image: the one that it has, or will have, is predicted from inertial samples.
     """
 
     timestamp: float
@@ -33,6 +34,7 @@ class FrameRecord:
     lost: bool = False
     segment: int = 0
     reason: str = ""
+    inertial: bool = False
 
     def place(self, anchor: int, segment: int, reason: str = "") -> None:
         """Give the frame the pose of a keyframe.
@@ -43,6 +45,7 @@ class FrameRecord:
             reason: cause of a break before the frame.
         """
         self.anchor, self.lost, self.segment, self.reason = anchor, False, segment, reason
+        self.inertial = False
 
     def follow(self, other: FrameRecord) -> None:
         """Take the pose and the state of another frame.
@@ -241,18 +244,25 @@ class KeyframeLog:
             relative = further if relative is None else _compose(relative, further)
         return keyframe, relative
 
-    def trajectory(self, segment: int | None = None, poses: Mapping[int, np.ndarray] | None = None) -> Trajectory:
+    def trajectory(
+        self,
+        segment: int | None = None,
+        poses: Mapping[int, np.ndarray] | None = None,
+        frames: Sequence[FrameRecord] | None = None,
+    ) -> Trajectory:
         """Trajectory of every frame that has a pose and was not lost, camera to world.
 
         Args:
             segment: frames of this segment only; None for all.
             poses: ``T_cw`` by keyframe, in place of those of the log or in addition to them.
+            frames: some of the log; None for all.
 
         Returns:
             The trajectory.
         """
         known = {**self._poses, **(poses or {})}
-        placed = [r for r in self.frames if not r.lost and r.anchor is not None and segment in (None, r.segment)]
+        chosen = self.frames if frames is None else frames
+        placed = [r for r in chosen if not r.lost and r.anchor is not None and segment in (None, r.segment)]
         carriers = {r.anchor: self._carrier(r.anchor) for r in placed}  # type: ignore[arg-type]
         kept = [record for record in placed if carriers[record.anchor][0] in known]
         rows = np.zeros((0, 7))

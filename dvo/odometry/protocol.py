@@ -25,6 +25,35 @@ class Status(StrEnum):
     INITIALISING = "initialising"
     TRACKING = "tracking"
     LOST = "lost"  # the result may have a pose all the same (:mod:`dvo.odometry.patch.retry`)
+    INERTIAL = "inertial"  # the images give no pose: it is predicted from inertial samples alone
+
+
+class ScaleState(StrEnum):
+    """What inertial samples have told of scale and vertical."""
+
+    NONE = "none"  # there are no samples, or they are not used
+    INITIALISING = "initialising"  # poses are as without samples
+    ALIGNED = "aligned"  # poses are in metres, and z points up
+    REFINED = "refined"  # for long enough that the scale changes little
+
+
+@dataclass(frozen=True)
+class InertialEstimate:
+    """What is known beside a pose in metres, from inertial samples.
+
+    Attributes:
+        velocity_w: ``(3,)`` of the sensor in the world, m/s.
+        gyro_bias, accel_bias: ``(3,)`` rad/s and m/s^2.
+        scale_sigma: standard deviation of the scale, relative.
+        covariance: ``(9, 9)`` of the errors of position in the world (m), orientation (right tangent, rad) and velocity
+            in the world (m/s), where heading and position of the world are held.
+    """
+
+    velocity_w: np.ndarray
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+    scale_sigma: float
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -34,7 +63,7 @@ class Estimate:
     Attributes:
         timestamp: seconds, of the frame.
         pose_wc: ``(7,)`` float64 camera to world ``T_wc`` (x y z, quaternion x y z w), or None while there is none:
-            never with the status ``lost``, always with ``tracking``.
+            never with the status ``lost``, always with ``tracking`` and ``inertial``.
         status: state of the tracker.
         confidence: in [0, 1], 0 without a pose. Of the patch tracker, the probability that the error of the pose
             relative to the reference displaces the scene by less than half a pixel of an image of 320x240, in the RMS
@@ -54,7 +83,9 @@ class Estimate:
             two motions about as well, it contains both (:mod:`dvo.odometry.uncertainty.second_solution`). None without
             a pose, where the measurements do not determine it, and from odometries that have none.
         reference: timestamp of the reference, seconds: the oldest keyframe of the window that a measurement still
-            reaches; None without one.
+            reaches; None without one. Of the status ``inertial``, the last frame with a pose by its image.
+        scale_state: of the pose, where inertial samples are used.
+        inertial: velocity, biases and more, once they are known (``aligned``).
 
     ``confidence``, ``covariance`` and ``reference`` may be functions, which are called when the value is first read.
     """
@@ -68,6 +99,8 @@ class Estimate:
     recovered: bool = False
     covariance: Lazy[np.ndarray] = Lazy()  # noqa: RUF009
     reference: Lazy[float] = Lazy()  # noqa: RUF009
+    scale_state: ScaleState = ScaleState.NONE
+    inertial: InertialEstimate | None = None
 
     @property
     def matrix(self) -> np.ndarray | None:
@@ -188,6 +221,7 @@ class Result:
         map: sparse coloured map in the world of ``trajectory``, empty for systems without one.
         frames_read: number of input frames.
         frames_lost: number of input frames without a row in any segment.
+        inertial: timestamps of the rows that are predicted from inertial samples alone.
         info: JSON-able metadata for run.json: working resolution, intrinsics, number of keyframes.
         segments: all segments in order of time; given none, the trajectory is the only one.
         breaks: intervals without poses, and changes of segment, in order of time.
@@ -205,6 +239,7 @@ class Result:
     breaks: tuple[Break, ...] = ()
     depth: tuple[DepthMap, ...] = ()
     quality: Quality | None = None
+    inertial: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         times = self.trajectory.timestamps
@@ -220,8 +255,8 @@ class Result:
 
     @property
     def frames_tracked(self) -> int:
-        """Number of rows of all segments."""
-        return sum(len(segment) for segment in self.segments)
+        """Number of rows of all segments, without those that are predicted."""
+        return sum(len(segment) for segment in self.segments) - len(self.inertial)
 
     @property
     def metric(self) -> bool:

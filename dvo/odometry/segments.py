@@ -129,7 +129,8 @@ def result_of_log(
     trajectory = _concatenated(rows[main]) if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
     read, tracked = len(log.frames) - recording.frame, sum(len(segment) for segment in segments)
     breaks = breaks_of(log, recording.frame)
-    return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks), main
+    predicted = tuple(r.timestamp for r in log.frames[recording.frame :] if r.inertial and not r.lost)
+    return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks, inertial=predicted), main
 
 
 def _concatenated(parts: Sequence[Trajectory]) -> Trajectory:

@@ -356,6 +356,7 @@ def summary(run: Run, segment_facts: Sequence[dict[str, Any]] = ()) -> dict[str,
             "fed": run.frames_fed,
             "tracked": result.frames_tracked,
             "lost": result.frames_lost,
+            **({"inertial": len(result.inertial)} if result.inertial else {}),
         },
         "segments": [
             {

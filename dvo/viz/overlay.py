@@ -16,7 +16,12 @@ from dvo.session.session import Run
 from dvo.viz.marks import pixels, shade
 
 RATE = 30.0  # frames per second of the video, whatever the times of the frames
-_STATUS_COLOURS = {Status.TRACKING: (47, 143, 131), Status.INITIALISING: (227, 167, 47), Status.LOST: (200, 54, 74)}
+_STATUS_COLOURS = {
+    Status.TRACKING: (47, 143, 131),
+    Status.INITIALISING: (227, 167, 47),
+    Status.LOST: (200, 54, 74),
+    Status.INERTIAL: (108, 92, 190),
+}
 
 
 class OverlayVideo:

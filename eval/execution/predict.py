@@ -185,6 +185,7 @@ def drive(odometry: Odometry, source: Source) -> tuple[Prediction, tuple[Segment
 
     done = run(odometry, source, on_frame=look, strict=True)
     result, seconds = done.result, done.frame_seconds
+    predicted = set(result.inertial)  # poses that do not claim to come from images
     segments = without_empty(result.segments)
     total = done.seconds["tracking"] + done.seconds["finishing"]
     worked = result.info.get("working_size")
@@ -197,7 +198,7 @@ def drive(odometry: Odometry, source: Source) -> tuple[Prediction, tuple[Segment
         latency_p95_ms=1000 * float(np.percentile(seconds, 95)) if seconds else None,
         peak_memory_mb=process_peak_mb(),
         dark=[list(span) for span in dark_spans(np.array(stamps), np.array(dark, dtype=bool))],
-        unseen=unseen,
+        unseen=[time for time in unseen if time not in predicted],
         segments=[{"rows": len(segment), "joined_to": segment.joined_to} for segment in segments],
         breaks=[asdict(gap) for gap in result.breaks],
         info=result.info,

@@ -12,58 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, inverse_depth_block, pose_block, sim3_block
+from dvo.ba.blocks import INVERSE_DEPTHS, POSES, inverse_depth_block, pose_block, sim3_block
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
 from dvo.ba.kernels import Kernel
 from dvo.ba.layer.layer import BAOptions, Sensors, make_problem
 from dvo.ba.layer.linearisation import adjoint_term, assemble
 from dvo.ba.layer.step import gauss_newton
 from dvo.ba.patch_problem import PatchProblem
-from dvo.ba.problem import AdjointConstants, Factor, Problem, State
+from dvo.ba.problem import AdjointConstants, Problem, State
 from dvo.core.errors import DvoError
 from dvo.geometry import se3, sim3
+from tests.support.jacobians import assert_jacobians, generator_of
 
 F64 = torch.float64
 Maker = Callable[..., Any]
 seeds = st.integers(0, 2**32 - 1)
-
-
-def generator_of(seed: int) -> Callable[..., Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    return lambda *shape: torch.randn(*shape, dtype=F64, generator=generator)
-
-
-def numeric_jacobians(factor: Factor, state: State) -> dict[str, Tensor]:
-    """Minus the derivative of the residuals ``(B, F, D)`` by the tangents of all elements: ``(F, D, N, dim)`` by block,
-    of the first element of the batch."""
-    found = {}
-    for name, block in state.blocks.items():
-        shape = block.value.shape[:2] if block.eliminated else (*block.value.shape[:2], block.dim)
-
-        def residual(tangent: Tensor, name: str = name, block: Any = block) -> Tensor:
-            values = {**state.values(), name: block.retract(block.value, tangent)}
-            return factor.linearise(values).residual[0]
-
-        jacobian = -torch.autograd.functional.jacobian(residual, torch.zeros(shape, dtype=F64))[:, :, 0]
-        found[name] = jacobian[..., None] if block.eliminated else jacobian
-    return found
-
-
-def assert_jacobians(factor: Factor, state: State, tolerance: float = 1e-8) -> None:
-    """Slots that refer to the same element add up; elements that no slot refers to have no derivative."""
-    linear = factor.linearise(state.values())
-    for name, expected in numeric_jacobians(factor, state).items():
-        if state[name].held:
-            continue
-        given_ = torch.zeros_like(expected)
-        for slot, index, jacobian in zip(linear.blocks, linear.indices, linear.jacobians, strict=True):
-            if slot == name:
-                for row, element in enumerate(index.tolist()):
-                    given_[row, :, element] += jacobian[0, row]
-        if name == INTRINSICS and state[name].slot is not None:  # one common step
-            expected, given_ = expected.sum(2), given_.sum(2)
-        scale = expected.abs().max().clamp(min=1.0)
-        torch.testing.assert_close(given_ / scale, expected / scale, atol=tolerance, rtol=0)
 
 
 def poses(seed: int, count: int = 4, size: float = 1.0) -> Tensor:

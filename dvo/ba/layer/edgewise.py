@@ -290,4 +290,4 @@ def _step(problem: Problem, damping: BADamping) -> tuple[Tensor, Tensor]:
     dp, dl = np.empty_like(g_p), np.empty_like(g_l)
     for b in range(len(g_p)):
         solve_reduced(h_pp[b], h_lp[b], h_ll[b], g_p[b], g_l[b], *numbers, dp[b], dl[b])
-    return torch.from_numpy(dp).float(), torch.from_numpy(dl).float()
+    return torch.from_numpy(dp).to(state[POSES].value), torch.from_numpy(dl).to(state[POSES].value)

@@ -24,6 +24,7 @@ from dvo.ba.layer import edgewise
 from dvo.ba.layer.checks import FLOATS, INDICES, check_structure, check_values
 from dvo.ba.layer.edgewise import EdgewiseReprojection, measured_edges
 from dvo.ba.layer.grouped import group_measurements
+from dvo.ba.layer.single import SinglePrecision
 from dvo.ba.layer.step import gauss_newton
 from dvo.ba.layer.transforms import composed
 from dvo.ba.options import BADamping, BAOptions, BAResult, Sensors
@@ -33,6 +34,7 @@ from dvo.core.errors import DvoError
 from dvo.core.kernels import is_transformed, use_device_kernels, use_kernels
 from dvo.core.settings import shown
 from dvo.core.threads import use_threads
+from dvo.geometry import se3
 from dvo.geometry.precision import full_precision
 
 __all__ = ["BADamping", "BAOptions", "BAResult", "Sensors", "bundle_adjust", "make_problem"]
@@ -84,7 +86,8 @@ def bundle_adjust(
         options: see :class:`BAOptions`.
         factors: further measurements, for example priors (:mod:`dvo.ba.factors`).
         blocks: further unknowns that the factors concern, by name, for example velocities; see
-            :func:`dvo.ba.blocks.vector_block`.
+            :func:`dvo.ba.blocks.vector_block`. If one of them is float64, so are all unknowns and factors, and the
+            reprojection alone is summed in the type of the targets.
         plan: layout that :func:`dvo.ba.edges.plan_edges` made of ``ii, jj, kk``, to save doing it again for a graph
             that does not change.
 
@@ -126,13 +129,14 @@ def adjust_dense(given: PatchProblem, options: BAOptions) -> BAResult:
         return _by_device_kernels(given, options)
     with full_precision(given.poses_cw.device):
         problem = _solved(make_problem(given, options), options)
-        state, patches = problem.state, given.patches
-        poses_cw, inverse_depths = state[POSES].value, state[INVERSE_DEPTHS].value
-        patches = patches.to(poses_cw.dtype)
+        state, patches, dtype = problem.state, given.patches, _computed(given.poses_cw.dtype)
+        patches = patches.to(dtype)
+        poses_cw, inverse_depths = (state[name].value.to(dtype) for name in (POSES, INVERSE_DEPTHS))
         if not state[INVERSE_DEPTHS].held:
             row = inverse_depths[:, :, None, None, None].expand_as(patches[:, :, :1])
             patches = torch.cat((patches[:, :, :2], row), 2)
-        intrinsics = state[INTRINSICS].value if INTRINSICS in state.blocks else given.intrinsics.to(poses_cw.dtype)
+        intrinsics = state[INTRINSICS].value if INTRINSICS in state.blocks else given.intrinsics
+        intrinsics = intrinsics.to(dtype)
         cost = inliers = covariance = None
         if options.covariance is not None:
             covariance = pose_covariance(problem, options.covariance, options.damping, sigma=options.sigma)
@@ -171,7 +175,8 @@ def _by_device_kernels(given: PatchProblem, options: BAOptions) -> BAResult:
 
 
 def _solved(problem: Problem, options: BAOptions) -> Problem:
-    if isinstance(problem.factors[0], EdgewiseReprojection):
+    first = problem.factors[0]
+    if isinstance(first.factor if isinstance(first, SinglePrecision) else first, EdgewiseReprojection):
         return edgewise.gauss_newton(problem, options.iterations, options.damping, options.depth_range)
     return gauss_newton(problem, options.iterations, options.damping)
 
@@ -243,22 +248,26 @@ def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped:
     Returns:
         The least-squares problem.
     """
-    dtype = given.poses_cw.dtype
-    if dtype in (torch.float16, torch.bfloat16):
-        dtype = torch.float32
+    wide = _computed(given.poses_cw.dtype)
+    exact = any(block.value.dtype == torch.float64 for block in given.blocks.values())
+    mixed = exact and given.targets.dtype != torch.float64
+    wide, dtype = (torch.float64, torch.float32 if mixed else torch.float64) if exact else (wide, wide)
+    poses_cw = given.poses_cw
     names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
     given = given.with_values(**{name: _cast(getattr(given, name), dtype) for name in names})
     poses = pose_block(given.poses_cw, options.fixed, held=options.structure_only)
     depths = inverse_depth_block(given.inverse_depths, options.depth_range, held=options.motion_only)
-    further = {name: block.with_value(block.value.to(dtype)) for name, block in given.blocks.items()}
+    further = {name: block.with_value(block.value.to(wide)) for name, block in given.blocks.items()}
     own = {POSES: poses, INVERSE_DEPTHS: depths}
     refine = options.refine_intrinsics
-    more = [factor.with_tensors([x.to(dtype) for x in factor.tensors()]) for factor in given.factors]
+    more = [factor.with_tensors([x.to(wide) for x in factor.tensors()]) for factor in given.factors]
     measured = given.centres, given.intrinsics, given.targets, given.weights
     gate: dict[str, Any] = dict(max_residual=options.max_residual, bounds=options.bounds, kernel=options.kernel)
     reprojection: Factor | None = None
     fast = grouped and given.sensors is None and refine == "none"
-    others = (*(block.value for block in further.values()), *(x for factor in more for x in factor.tensors()))
+    others = [*(block.value for block in further.values()), *(x for factor in more for x in factor.tensors())]
+    if mixed and not torch.is_grad_enabled():
+        others = []
     if fast and use_kernels(poses.value, depths.value, *measured, *others, adjoint=not (more or further)):
         reprojection = measured_edges(*measured, given.ii, given.jj, given.kk, **gate)
     if reprojection is not None:
@@ -273,7 +282,15 @@ def make_problem(given: PatchProblem, options: BAOptions = _DEFAULT, *, grouped:
         own = {INTRINSICS: intrinsics_block(given.intrinsics, refine, shared=given.sensors is None), **own}
         focal_only = refine == "focal"
         reprojection = given.reprojection(options.max_residual, options.bounds, options.kernel, focal_only)
+    if mixed:
+        own = {name: block.with_value(block.value.double()) for name, block in own.items()}
+        own[POSES] = poses.with_value(se3.normalise(poses_cw.double()))
+        reprojection = SinglePrecision(reprojection)
     return Problem(State({**further, **own}), (reprojection, *more))
+
+
+def _computed(dtype: torch.dtype) -> torch.dtype:
+    return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
 
 
 def _cast(x: Tensor, dtype: torch.dtype) -> Tensor:

@@ -104,7 +104,7 @@ def global_bundle_adjust(
             in ``blocks``; the elements that they touch must not change between linearisations. Their cost is half of
             :meth:`dvo.ba.problem.Factor.cost`.
         blocks: further unknowns that the factors concern, by name, each with a batch dimension of 1; see
-            :func:`dvo.ba.blocks.vector_block`.
+            :func:`dvo.ba.blocks.vector_block`. If one of them is float64, so is the computation.
 
     Returns:
         Poses and patches of the lowest cost found, and how it went.
@@ -131,8 +131,9 @@ def adjust_sparse(problem: PatchProblem, options: GlobalBAOptions) -> GlobalBARe
         state = outcome.state
         if options.move_depths:
             problem = problem.with_values(inverse_depths=state[INVERSE_DEPTHS].value[0])
+        given = problem.poses_cw.dtype
         return GlobalBAResult(
-            state[POSES].value[0],
+            state[POSES].value[0].to(given),
             problem.patches,
             outcome.initial_cost,
             outcome.cost,
@@ -158,7 +159,9 @@ class SparseProblem:
 
     def __init__(self, problem: PatchProblem, options: GlobalBAOptions) -> None:
         like, count = problem.poses_cw, len(problem.patches)
-        names = ("patches", "intrinsics", "targets", "weights")
+        if any(block.value.dtype == torch.float64 for block in problem.blocks.values()):
+            like = like.double()
+        names = ("poses_cw", "patches", "intrinsics", "targets", "weights")
         problem = problem.with_values(**{name: getattr(problem, name).to(like) for name in names})
         one = problem.batched()
         further = {name: block.with_value(block.value.to(like)) for name, block in problem.blocks.items()}

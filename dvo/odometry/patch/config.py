@@ -15,6 +15,7 @@ from dvo.map.measured_depths import SIGMA
 from dvo.nets.alignment.alignment import AlignmentOptions
 from dvo.odometry.depth.scale_options import ScaleOptions
 from dvo.odometry.global_ba.final_adjustment import AdjustmentOptions
+from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.loops.options import LoopOptions
 from dvo.odometry.window.patch_window import InsertPolicy, Round, StepSettings
 from dvo.odometry.window.sensors import WINDOW_SENSORS
@@ -129,6 +130,8 @@ class TrackerConfig:
             found, it usually has. Right poses had more than 0.3.
         max_gap: time between frames above which they are separated by a gap, in medians of the recent intervals.
         scale: observation that metres come from, none for a trajectory up to scale; a table of its values will do.
+        inertial: use of inertial samples that frames bring, a :class:`dvo.odometry.inertial.options.InertialOptions`; a
+            table of its values will do.
         sensors: names of others whose measurements take part in every step of an initialised window
             (:data:`dvo.odometry.window.sensors.WINDOW_SENSORS`), with commas between or as a list.
 
@@ -180,6 +183,7 @@ class TrackerConfig:
     join_inliers: float = 0.25
     max_gap: float = 4.5
     scale: ScaleOptions = ScaleOptions()  # noqa: RUF009 (frozen)
+    inertial: InertialOptions = InertialOptions()  # noqa: RUF009 (frozen)
     sensors: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -188,6 +192,7 @@ class TrackerConfig:
             raise DvoError(f"not a list of names: {shown(names)}", field="sensors", remedy="give NAME,NAME")
         object.__setattr__(self, "sensors", tuple(name for name in names if name and WINDOW_SENSORS.target(name)))
         object.__setattr__(self, "scale", settings_of(ScaleOptions, self.scale, "scale"))
+        object.__setattr__(self, "inertial", settings_of(InertialOptions, self.inertial, "inertial"))
         object.__setattr__(self, "loop", settings_of(LoopOptions, self.loop, "loop"))
         check_settings(self, _RANGES)
 

@@ -19,6 +19,7 @@ from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.threads import core_left
 from dvo.data.frame import Frame
+from dvo.data.inertial import InertialSamples
 from dvo.geometry import se3
 from dvo.map.archive import ArchiveConfig
 from dvo.map.keyframe_graph import KeyframeGraph
@@ -37,6 +38,7 @@ from dvo.odometry.global_ba.rolling_shutter import Shutter
 from dvo.odometry.loops.relocalisation import REFRESH_EVERY, hold_to_map, invite
 from dvo.odometry.patch.config import TrackerConfig
 from dvo.odometry.patch.finishing import finish_segments, judge_result, run_information
+from dvo.odometry.patch.inertial import InertialTracking
 from dvo.odometry.patch.initial_pose import first_depth, first_pose
 from dvo.odometry.patch.initialisation import (
     NOT_INITIALISED,
@@ -125,6 +127,7 @@ class PatchOdometry:
         if config.aligned_motion > 0 and not self.sensors:
             self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)
         self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
+        self.inertial = InertialTracking(config.inertial, self.graph)
 
     @property
     def window(self) -> Window:
@@ -156,14 +159,15 @@ class PatchOdometry:
         with core_left(self.loops.maintenance.occupies_core), self.gate.admit(frame) as admitted:
             for sensor in self.sensors:
                 sensor.observe(admitted.frame)
+            self.inertial.observe(admitted.frame)
             state.shutter = Shutter(admitted.camera.readout, admitted.camera.height / self.model.config.STRIDE)
             if state.map is not None:
                 begin_in_map(self.graph, self.loops.finder, state)
             record = self.graph.log.add(admitted.timestamp)
             if admitted.repeated:
-                return self._repeat(record)
+                return self.inertial.express(record, self._repeat(record))
             state.last = self._lose(record, admitted.problem) if admitted.problem else self._measure(record, admitted)
-            return state.last
+            return self.inertial.express(record, state.last)
 
     def _measure(self, record: FrameRecord, admitted: Admitted) -> Estimate:
         """Process a frame with content."""
@@ -222,6 +226,7 @@ class PatchOdometry:
             self.loops.complete(state.adjustable)
             state.info |= finish_segments(self.graph, state, self.config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
+            state.info |= self.inertial.settle(metric=self.config.scale.source != "none")
         return replace(self._result({}), quality=state.quality)
 
     @torch.inference_mode()
@@ -233,7 +238,23 @@ class PatchOdometry:
         """
         poses = self.window.poses_cw.double().cpu().numpy()
         known = {frame.identifier: pose for frame, pose in zip(self.window.frames, poses, strict=True)}
-        return self._result(known if self.state.initialised else {})
+        return self.inertial.expressed(self._result(known if self.state.initialised else {}))
+
+    def add_inertial(self, samples: InertialSamples) -> None:
+        """Give inertial samples that do not come with the frames, for live use: late ones too, and from any thread.
+
+        Args:
+            samples: on the clock of the frames; the first with an extrinsic calibration and noise decide these.
+
+        Raises:
+            DvoError: times that do not increase, or values that are not finite.
+
+        Example:
+            >>> odometry = dvo.load("small")
+            >>> odometry.add_inertial(InertialSamples(times, gyro, accel, T_camera_imu))
+            >>> estimate = odometry.track(frame)
+        """
+        self.inertial.add(samples)
 
     @checked_arguments
     def save(self, file: str | Path) -> None:
@@ -421,7 +442,9 @@ class PatchOdometry:
         guess = self.state.guess
         if guess is not None and initialised:
             return torch.from_numpy(guess).to(window.poses_cw), depth
-        return first_pose(window, seen, view.records[0].timestamp, config, initialised), depth
+        time = view.records[0].timestamp
+        pose = first_pose(window, seen, time, config, initialised)
+        return self.inertial.predicted(time, pose) if initialised else pose, depth
 
     def _reduce(self) -> None:
         """Drop a redundant keyframe, and archive edges and keyframes beyond the maximum age."""

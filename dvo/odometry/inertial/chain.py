@@ -1,0 +1,114 @@
+"""Least squares of a chain of states in time with a few unknowns that all of them share.
+
+The information matrix is block tridiagonal with a border: states are eliminated in order of time, which costs a few
+small Cholesky decompositions for each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+Array = np.ndarray
+
+
+@dataclass
+class ChainSystem:
+    """Normal equations ``H x = g`` of ``N`` states of ``n`` unknowns and ``m`` shared ones.
+
+    Attributes:
+        diagonal: ``(N, n, n)`` blocks of the states.
+        upper: ``(N - 1, n, n)`` blocks of a state and the one after it.
+        border: ``(N, n, m)`` blocks of a state and the shared unknowns.
+        shared: ``(m, m)``.
+        right: ``(N, n)`` and
+        right_shared: ``(m,)``, the right side.
+    """
+
+    diagonal: Array
+    upper: Array
+    border: Array
+    shared: Array
+    right: Array
+    right_shared: Array
+
+    @classmethod
+    def zeros(cls, count: int, size: int, shared: int) -> ChainSystem:
+        """System without measurements.
+
+        Args:
+            count, size, shared: ``N``, ``n`` and ``m``.
+        """
+        return cls(
+            np.zeros((count, size, size)), np.zeros((max(count - 1, 0), size, size)), np.zeros((count, size, shared)),
+            np.zeros((shared, shared)), np.zeros((count, size)), np.zeros(shared),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ChainSolution:
+    """Solution of a chain.
+
+    Attributes:
+        states: ``(N, n)``.
+        shared: ``(m,)``.
+        covariance: ``(n + m, n + m)`` of the last state and the shared unknowns, jointly.
+    """
+
+    states: Array
+    shared: Array
+    covariance: Array
+
+
+def solve_chain(system: ChainSystem, damping: float = 0.0) -> ChainSolution:
+    """Solve the normal equations.
+
+    Args:
+        system: positive definite.
+        damping: share of each diagonal entry that is added to it (Levenberg and Marquardt).
+
+    Returns:
+        Solution, and covariance of the newest state and the shared unknowns.
+
+    Raises:
+        numpy.linalg.LinAlgError: it is not positive definite.
+    """
+    count, n, m = system.border.shape
+    # What couples a state with all that come later: the state after it, the border, and the right side as a column.
+    shared = np.empty((m, m + 1))
+    shared[:, :m], shared[:, m] = system.shared, system.right_shared
+    shared[np.arange(m), np.arange(m)] *= 1 + damping
+    inverses = np.empty((count, n, n))
+    coupled = np.empty((count, n, n + m + 1))
+    block, side = system.diagonal[0].copy(), np.concatenate([system.border[0], system.right[0][:, None]], 1)
+    index = np.arange(n)
+    for k in range(count):
+        block[index, index] += damping * system.diagonal[k][index, index]
+        lower = np.linalg.inv(np.linalg.cholesky(block))
+        inverses[k] = lower
+        last = k == count - 1
+        scaled = lower @ (side if last else np.concatenate([system.upper[k], side], 1))
+        coupled[k, :, : scaled.shape[1]] = scaled
+        if last:
+            shared -= scaled[:, :m].T @ scaled
+            break
+        ahead, rest = scaled[:, :n], scaled[:, n:]
+        shared -= rest[:, :m].T @ rest
+        block = system.diagonal[k + 1] - ahead.T @ ahead
+        side = np.concatenate([system.border[k + 1], system.right[k + 1][:, None]], 1) - ahead.T @ rest
+    root = np.linalg.inv(np.linalg.cholesky(shared[:, :m])) if m else np.zeros((0, 0))
+    common = root.T @ (root @ shared[:, m])
+    states = np.empty((count, n))
+    for k in reversed(range(count)):
+        ahead = n if k < count - 1 else 0
+        part = coupled[k, :, ahead + m] - coupled[k, :, ahead : ahead + m] @ common
+        if ahead:
+            part = part - coupled[k, :, :n] @ states[k + 1]
+        states[k] = inverses[k].T @ part
+    # Joint covariance of the last state and the border from their Cholesky factor.
+    joint = np.zeros((n + m, n + m))
+    joint[:n, :n] = inverses[-1].T
+    joint[:n, n:] = -inverses[-1].T @ coupled[-1, :, :m] @ root.T
+    joint[n:, n:] = root.T
+    return ChainSolution(states, common, joint @ joint.T)

@@ -1,0 +1,606 @@
+"""Alignment of a visual trajectory with inertial samples while it grows, and prediction of poses without images.
+
+Until scale and vertical are known for sure nothing is said of them: a wrong alignment is worse than none. Each test
+that fails is a reason that is told.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
+from dvo.geometry.poses import split
+from dvo.odometry.inertial.options import InertialOptions
+from dvo.odometry.inertial.preintegration import preintegrate, propagate
+from dvo.odometry.inertial.smoother import (
+    GRAVITY,
+    STATE,
+    Similarities,
+    Smoothed,
+    Smoother,
+    SmootherOptions,
+    Values,
+    VisualNodes,
+    first_values,
+    linear_start,
+    motion_factors,
+    rotation_vector,
+    smooth,
+    upright,
+)
+from dvo.odometry.inertial.stream import SampleStream
+from dvo.odometry.protocol import ScaleState
+
+Array = np.ndarray
+EVERY = 1.0
+"""Seconds from one estimate to the next; half of it before the alignment."""
+STARTS = (1.0, 0.4, 2.5)
+"""Factors of the scale of the linear solution that the first estimate begins with."""
+REVISED = (5.0, 15.0)
+"""Seconds after the alignment at which poses take the scale and the vertical of the present estimate (Campos et al.,
+2021, III-D); then every :data:`REVISED_EVERY`."""
+REVISED_EVERY = 15.0
+MAX_GRAVITY_SIGMA = 1.5
+"""Standard deviation of the vertical that an alignment needs, degrees."""
+NOTHING_TOLD = 0.5
+"""Relative deviation of the scale above which the motion tells nothing of it."""
+MAX_ERROR = 6.0
+"""Mean squared whitened residual above which samples and images do not fit."""
+GRAVITY_RANGE = (6.0, 16.0)
+"""Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
+MAX_TURN = 1.5
+"""Root mean square difference of rotations between nodes, degrees, above which gyroscope and images disagree."""
+MAX_ROTATION_SIGMA = 0.01
+"""Noise of visual orientations above which samples and images do not fit, rad."""
+MAX_SHIFT = 0.02
+"""Change of the time offset since the alignment above which the clocks drift, seconds."""
+MAX_BIASES = (0.15, 1.0)
+"""Biases that no working sensor has, rad/s and m/s^2."""
+AGREEMENT = 0.03
+"""Difference of the scales of two estimates in a row that agree, relative, beyond three of their deviations."""
+FIT = 0.3
+"""Mean squared whitened residual of visual poses that their noise is chosen by: less than one, since errors of poses
+near in time are alike."""
+FAILURES = 3
+"""Estimates in a row that fail the tests, after which an alignment is withdrawn."""
+MOST_PATIENCE = 4.0
+"""Seconds from one estimate to the next where all that is known speaks against one."""
+_WAITING = ("too few poses", "too few samples")
+STILL = (0.02, 0.15)
+"""Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
+STILL_FOR = 0.4
+STILL_SPEED = 0.05
+"""Predicted speed, beyond three of its deviations, below which a sensor that feels nothing stands still, m/s."""
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Similarity from the world of visual poses to the metric one: ``x = scale rotation x_visual + translation``.
+
+    Attributes:
+        scale: metres in a unit.
+        rotation: ``(3, 3)``.
+        translation: ``(3,)`` metres.
+    """
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    def points(self, points: Array) -> Array:
+        """``(..., 3)`` points in metres."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def inverse_points(self, points: Array) -> Array:
+        """``(..., 3)`` points in the units of the visual poses."""
+        return (points - self.translation) @ self.rotation / self.scale
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """State of the sensor at one time.
+
+    Attributes:
+        time: seconds, clock of the camera.
+        rotation: ``(3, 3)`` body to world.
+        position, velocity: ``(3,)`` metres and m/s.
+        gyro_bias, accel_bias: ``(3,)``.
+        covariance: ``(15, 15)`` of rotation, position, velocity and biases.
+    """
+
+    time: float
+    rotation: Array
+    position: Array
+    velocity: Array
+    gyro_bias: Array
+    accel_bias: Array
+    covariance: Array
+
+    @property
+    def speed(self) -> float:
+        """Metres a second."""
+        return float(np.linalg.norm(self.velocity))
+
+
+class _DisagreementError(Exception):
+    """Gyroscope and images do not belong together."""
+
+
+class InertialEstimator:
+    """Scale, vertical, velocity and biases of one recording.
+
+    Args:
+        options: settings.
+
+    Attributes:
+        state: what is known.
+        reason: why there is no alignment (yet), or why one was withdrawn; empty otherwise.
+        worlds: similarity by the number of the world of visual poses, of those that are aligned.
+        stream: samples.
+        solution: newest estimate that passed the tests; None before it.
+        history: what has happened, for run.json.
+    """
+
+    def __init__(self, options: InertialOptions) -> None:
+        self.options = options
+        self.stream = SampleStream()
+        self.state, self.reason = ScaleState.NONE, ""
+        self.worlds: dict[int, Similarity] = {}
+        self.solution: Smoothed | None = None
+        self.history: list[dict[str, Any]] = []
+        self.noise: ImuNoise = NOISE_PRESETS["phone"]
+        self.rotation_camera_imu: Array | None = None
+        self.translation_camera_imu: Array = np.zeros(3)
+        self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
+        self._failures, self._patience = 0, EVERY / 2
+        self._next = -np.inf
+        self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
+        self._revised = np.nan
+        self._smoother = SmootherOptions()
+        self._known: list[int] = []  # worlds of the solution, in its order
+
+    @property
+    def aligned(self) -> bool:
+        """True if poses are in metres."""
+        return self.state in (ScaleState.ALIGNED, ScaleState.REFINED)
+
+    def add(self, samples: InertialSamples) -> None:
+        """Take samples; the first with an extrinsic calibration and noise decide these.
+
+        Args:
+            samples: of the sensor, see :class:`dvo.data.inertial.InertialSamples`.
+
+        Raises:
+            DvoError: samples out of order or not finite.
+        """
+        self.stream.add(samples)
+        if not len(samples):
+            return
+        if self.state is ScaleState.NONE and not self.reason:
+            self.state, self.reason = ScaleState.INITIALISING, "too few poses"
+        if samples.noise is not None:
+            self.noise = samples.noise
+        if samples.T_camera_imu is not None and self.rotation_camera_imu is None:
+            rotation, translation = split(np.asarray(samples.T_camera_imu, float))
+            self.rotation_camera_imu, self.translation_camera_imu = rotation, translation
+
+    def due(self, time: float) -> bool:
+        """Whether an estimate should be made.
+
+        Args:
+            time: of the newest frame, seconds.
+        """
+        return self.state is not ScaleState.NONE and time >= self._next
+
+    def update(self, nodes: VisualNodes, worlds: list[int]) -> None:
+        """Make an estimate, and take it if it passes the tests.
+
+        Args:
+            nodes: visual poses of the last seconds.
+            worlds: number of the world of each segment of the nodes.
+        """
+        if not len(nodes):
+            return
+        time = float(nodes.times[-1])
+        self._next = time + (EVERY if self.aligned else EVERY / 2)
+        problem, doubt = self._problem(nodes)
+        if problem is None:
+            self._refuse(doubt, time)
+            return
+        try:
+            found = self._solved(problem, worlds)
+        except _DisagreementError as disagreement:
+            self._refuse(str(disagreement), time)
+            return
+        except np.linalg.LinAlgError:
+            found = None
+        if found is None:
+            self._refuse("the motion does not tell scale and gravity", time)
+            return
+        self._adapt(found)
+        reason = self._doubt(problem, found)
+        if reason:
+            self._refuse(reason, time)
+            return
+        self._accept(found, worlds, time)
+
+    def predict(self, start: BodyState, times: Array) -> list[BodyState]:
+        """States after a known one, from samples alone.
+
+        Args:
+            start: the known state.
+            times: ``(N,)`` increasing, later than it, seconds, clock of the camera.
+
+        Returns:
+            A state for each time, with its covariance. A sensor that stands still does not move.
+        """
+        samples = self.stream.samples()
+        assert samples is not None and self.solution is not None
+        offset = self.solution.time_offset
+        found, state = [], start
+        for time in times.tolist():
+            state = _step(state, time, offset, samples, self.noise)
+            found.append(state)
+        return found
+
+    def last_state(self) -> BodyState | None:
+        """State of the newest node of the solution; None without one."""
+        s = self.solution
+        if s is None:
+            return None
+        return BodyState(
+            float(s.times[-1]), s.rotation[-1], s.position[-1], s.velocity[-1], s.gyro_bias[-1], s.accel_bias[-1],
+            s.covariance[:STATE, :STATE],
+        )  # fmt: skip
+
+    def turn_between(self, before: float, after: float) -> Array | None:
+        """Rotation of the camera between two frames by the gyroscope.
+
+        Args:
+            before, after: seconds, clock of the camera.
+
+        Returns:
+            ``(3, 3)`` from the camera after to the camera before; None if samples do not cover the time, or the
+            rotation between sensor and camera is not known.
+        """
+        samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if samples is None or turn is None or not self.options.use:
+            return None
+        offset = 0.0 if self.solution is None else self.solution.time_offset
+        bias = np.zeros(3) if self.solution is None else self.solution.gyro_bias[-1]
+        times = np.array([before, after]) + offset
+        if samples.timestamps[0] > times[0] or samples.timestamps[-1] < times[1] - 0.02:
+            return None
+        near = samples.between(times[0] - 0.1, times[1] + 0.1)
+        if len(near) < 2:
+            return None
+        motion = preintegrate(near, times, bias, np.zeros(3), self.noise)
+        if not motion.covered.all():
+            return None
+        return turn @ motion.rotation[0] @ turn.T
+
+    def information(self) -> dict[str, Any]:
+        """Entries of run.json."""
+        facts: dict[str, Any] = {"state": self.state.value}
+        if self.reason:
+            facts["reason"] = self.reason
+        s = self.solution
+        if s is not None and self.aligned:
+            facts |= {
+                "scale_sigma": s.scale_sigma, "gravity_sigma_deg": s.gravity_sigma, "time_offset": s.time_offset,
+                "gyro_bias": s.gyro_bias[-1].tolist(), "accel_bias": s.accel_bias[-1].tolist(),
+                "aligned_at": self._aligned,
+            }  # fmt: skip
+        return facts | ({"history": self.history} if self.history else {})
+
+    def settle(self, nodes: VisualNodes, worlds: list[int]) -> Smoothed | None:
+        """Estimate of a whole recording at its end, whose similarities are the final ones.
+
+        Args:
+            nodes: visual poses of the recording.
+            worlds: number of the world of each segment of the nodes.
+
+        Returns:
+            The estimate; None where there is none that passes the tests, and what was known before stays.
+        """
+        problem, _ = self._problem(nodes)
+        if problem is None:
+            return None
+        options = replace(self._smoother, iterations=8)
+        try:
+            found = smooth(replace(problem, options=options), self._start(problem, worlds))
+        except np.linalg.LinAlgError:
+            return None
+        if self._doubt(problem, found):
+            return None
+        self._take(found, worlds)
+        return found
+
+    # ------------------------------------------------------------------------------------------------------------------
+
+    def _problem(self, nodes: VisualNodes) -> tuple[Smoother | None, str]:
+        """Problem of nodes that samples cover; None and why there is none."""
+        samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if samples is None or len(samples) < 2:
+            return None, "too few samples"
+        if turn is None:
+            return None, "the rotation between sensor and camera is not known"
+        offset = 0.0 if self.solution is None else self.solution.time_offset
+        lead = 0.03 + abs(offset)
+        kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
+        if not kept.all():
+            nodes = replace(
+                nodes, times=nodes.times[kept], segment=nodes.segment[kept], rotation=nodes.rotation[kept],
+                position=nodes.position[kept],
+            )  # fmt: skip
+        enough = self.options.first if not self.aligned else 2 * self.options.interval
+        if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < enough:
+            return None, "too few poses"
+        near = samples.between(nodes.times[0] - 0.5, nodes.times[-1] + 0.5)
+        force = float(np.median(np.linalg.norm(near.accel, axis=1))) if len(near) else 0.0
+        if not GRAVITY_RANGE[0] <= force <= GRAVITY_RANGE[1]:
+            return None, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
+        lever = -turn.T @ self.translation_camera_imu
+        problem = Smoother(nodes, near, self.noise, turn, lever, self._smoother, offset=offset)
+        if self.solution is not None:
+            at = int(np.abs(self.solution.times - nodes.times[0]).argmin())
+            problem.gyro_bias, problem.accel_bias = self.solution.gyro_bias[at], self.solution.accel_bias[at]
+        return problem, ""
+
+    def _solved(self, problem: Smoother, worlds: list[int]) -> Smoothed | None:
+        """The best solution from some starts."""
+        if self.aligned and self.solution is not None:
+            return smooth(
+                replace(problem, options=replace(problem.options, iterations=4)), self._start(problem, worlds)
+            )
+        last = problem.nodes.segment == problem.segments - 1  # a first alignment needs one segment alone
+        nodes = problem.nodes
+        nodes = VisualNodes(
+            nodes.times[last], np.zeros(int(last.sum()), int), nodes.rotation[last], nodes.position[last],
+            nodes.depth[-1:],
+        )  # fmt: skip
+        if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < self.options.first:
+            return None
+        problem.nodes = nodes
+        scale, gravity, bias = linear_start(problem)
+        problem.gyro_bias = bias
+        self._turned_apart(problem, nodes, np.tile(bias, (len(nodes), 1)), np.zeros((len(nodes), 3)), problem.offset)
+        best: Smoothed | None = None
+        for factor in STARTS:
+            first = np.array([np.log(factor * (scale if scale > 1e-6 else 1.0))])
+            start = first_values(problem, Similarities(first, upright(gravity)[None], np.zeros((1, 3))))
+            try:
+                found = smooth(problem, start)
+            except np.linalg.LinAlgError:
+                continue
+            if best is None or found.cost < best.cost:
+                best = found
+            if scale > 1e-6 and factor == 1.0 and found.scale_sigma < 0.1 * self.options.max_scale_sigma:
+                break  # nothing else fits such measurements
+        return best
+
+    def _start(self, problem: Smoother, worlds: list[int]) -> Values:
+        """Values of the last solution, and of what it tells of a segment after it."""
+        known = self.solution
+        assert known is not None
+        count = problem.segments
+        logs, rotations, translations = np.zeros(count), np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+        for k, world in enumerate(worlds[:count]):
+            similarity = self._known_similarity(world) or self._joined(problem, k)
+            logs[k], rotations[k], translations[k] = (
+                np.log(similarity.scale),
+                similarity.rotation,
+                similarity.translation,
+            )
+        start = first_values(problem, Similarities(logs, rotations, translations))
+        times = problem.nodes.times
+        bias = np.concatenate([known.gyro_bias, known.accel_bias], 1)
+        start.bias = np.stack([np.interp(times, known.times, column) for column in bias.T], 1)
+        start.extrinsic = rotation_vector(problem.rotation_camera_imu.T @ known.rotation_camera_imu)
+        # Nodes of the last solution as they were, and those after it as the samples tell: visual poses are too noisy.
+        same = np.searchsorted(known.times, times).clip(max=len(known.times) - 1)
+        old = np.abs(known.times[same] - times) < 1e-6
+        for values, solved in (
+            (start.rotation, known.rotation), (start.position, known.position), (start.velocity, known.velocity)
+        ):  # fmt: skip
+            values[old] = solved[same[old]]
+        later, state = np.flatnonzero(times > known.times[-1] + 1e-6), self.last_state()
+        assert state is not None
+        samples = problem.samples
+        times_there = np.concatenate([[state.time], times[later]]) + problem.offset
+        if len(later) and samples.timestamps[0] <= times_there[0]:
+            found = propagate(
+                state.rotation, state.position, state.velocity, samples, times_there, state.gyro_bias,
+                state.accel_bias, GRAVITY,
+            )  # fmt: skip
+            start.rotation[later], start.position[later], start.velocity[later] = (part[1:] for part in found)
+        return start
+
+    def _known_similarity(self, world: int) -> Similarity | None:
+        """Present estimate of a world."""
+        if self.solution is not None and world in self._known:
+            k = self._known.index(world)
+            w = self.solution.worlds
+            return Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
+        return self.worlds.get(world)
+
+    def _joined(self, problem: Smoother, segment: int) -> Similarity:
+        """Similarity of a new segment, from the state that is predicted for its first node."""
+        nodes, last = problem.nodes, self.last_state()
+        assert last is not None
+        mine = np.flatnonzero(nodes.segment == segment)
+        mine = mine[nodes.times[mine] > last.time] if (nodes.times[mine] > last.time).any() else mine
+        state = self.predict(last, nodes.times[mine[:1]])[0] if nodes.times[mine[0]] > last.time else last
+        body = problem.rotation_camera_imu
+        rotation = state.rotation @ (nodes.rotation[mine[0]] @ body).T
+        rotation = rotation / np.cbrt(np.linalg.det(rotation))
+        path, times = nodes.position[mine], nodes.times[mine]
+        visual = (path[-1] - path[0]) if len(mine) > 1 else np.zeros(3)
+        ahead = self.predict(state, times[-1:])[0] if len(mine) > 1 and times[-1] > state.time else state
+        arms = [s.rotation @ problem.lever for s in (state, ahead)]
+        moved = ahead.position + arms[1] - state.position - arms[0]
+        length = float(np.linalg.norm(visual))
+        scale = float(np.linalg.norm(moved)) / length if length > 1e-9 else 1.0
+        scale = scale if scale > 1e-6 else 1.0
+        return Similarity(scale, rotation, state.position + arms[0] - scale * rotation @ path[0])
+
+    @staticmethod
+    def _turned_apart(problem: Smoother, nodes: VisualNodes, gyro: Array, accel: Array, offset: float) -> None:
+        """Compare the rotations of gyroscope and images between nodes."""
+        turned = nodes.rotation @ problem.rotation_camera_imu
+        motion = preintegrate(problem.samples, nodes.times + offset, gyro[:-1], accel[:-1], problem.noise)
+        off = rotation_vector(np.swapaxes(motion.rotation, -1, -2) @ np.swapaxes(turned[:-1], -1, -2) @ turned[1:])
+        off = off[motion.covered & (nodes.segment[1:] == nodes.segment[:-1])]
+        angle = float(np.rad2deg(np.sqrt((off**2).sum(-1).mean()))) if len(off) else 0.0
+        if angle > MAX_TURN:
+            raise _DisagreementError(
+                f"gyroscope and images turn differently, by {angle:.1f} degrees: axes, time offset or clock"
+            )
+
+    def _adapt(self, found: Smoothed) -> None:
+        """Follow the noise of the visual poses."""
+        factors = np.clip(np.sqrt(found.visual_error / FIT), 0.7, 1.4)
+        rotation = float(np.clip(self._smoother.rotation_sigma * factors[0], 5e-4, 2e-2))
+        position = float(np.clip(self._smoother.position_sigma * factors[1], 3e-4, 2e-2))
+        self._smoother = replace(self._smoother, rotation_sigma=rotation, position_sigma=position)
+
+    def _doubt(self, problem: Smoother, found: Smoothed) -> str:
+        """Why an estimate is not believed; empty if it is."""
+        try:
+            self._turned_apart(problem, problem.nodes, found.gyro_bias, found.accel_bias, found.time_offset)
+        except _DisagreementError as disagreement:
+            return str(disagreement)
+        for name, values, limit, unit in (
+            ("gyroscope", found.gyro_bias, MAX_BIASES[0], "rad/s"),
+            ("accelerometer", found.accel_bias, MAX_BIASES[1], "m/s^2"),
+        ):
+            bias = float(np.abs(values[-1]).max())
+            if bias > limit + 3 * (self.noise.gyro_bias if unit == "rad/s" else self.noise.accel_bias):
+                return f"a bias of the {name} of {bias:.2g} {unit}: a damaged sensor, or wrong units"
+        if found.inertial_error > MAX_ERROR or self._smoother.rotation_sigma > MAX_ROTATION_SIGMA:
+            return "samples and images do not fit: noise, time offset or extrinsic calibration"
+        if self.aligned and abs(found.time_offset - self._offset) > MAX_SHIFT:
+            shift = 1000 * (found.time_offset - self._offset)
+            return f"the time offset has changed by {shift:.0f} ms: the clocks drift"
+        if not self.aligned:
+            speeding = np.diff(found.velocity, axis=0) / np.diff(found.times)[:, None]
+            excitation = float(np.sqrt(speeding.var(0).sum()))
+            if excitation < self.options.min_excitation:
+                least = self.options.min_excitation
+                return f"too little acceleration, {excitation:.2f} of {least:.2f} m/s^2"
+            if found.scale_sigma > NOTHING_TOLD:
+                return "the images show rotation, and too little translation with changes of speed"
+            if found.scale_sigma > self.options.max_scale_sigma:
+                return f"the scale is uncertain by {100 * found.scale_sigma:.1f} %: move on, with changes of speed"
+            if found.gravity_sigma > MAX_GRAVITY_SIGMA:
+                return f"the vertical is uncertain by {found.gravity_sigma:.1f} degrees"
+        elif found.scale_sigma > 0.2:
+            return f"the scale is uncertain by {100 * found.scale_sigma:.0f} %"
+        return ""
+
+    def _refuse(self, reason: str, time: float) -> None:
+        """Note why there is no estimate; an alignment that fails again and again is withdrawn."""
+        self._candidate = None
+        if not self.aligned:
+            if reason == self.reason and reason not in _WAITING:  # the same again and again: look more rarely
+                self._patience = min(2 * self._patience, MOST_PATIENCE)
+            else:
+                self._patience = EVERY / 2
+            self._next = time + self._patience
+            self.reason = reason
+            return
+        self._failures += 1
+        if self._failures >= FAILURES and reason not in _WAITING:
+            self.history.append({"time": time, "event": "withdrawn", "reason": reason})
+            self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
+            self.worlds, self.solution, self._known, self._failures = {}, None, [], 0
+
+    def _accept(self, found: Smoothed, worlds: list[int], time: float) -> None:
+        """Take an estimate that has passed; the first one has to be confirmed by another."""
+        self._failures = 0
+        if not self.aligned:
+            worlds = worlds[-1:]
+            now = float(found.worlds.log_scale[-1]), found.scale_sigma
+            before, self._candidate = self._candidate, now
+            if before is None or abs(now[0] - before[0]) > AGREEMENT + 3 * before[1]:
+                self.reason = "the estimate waits for another that confirms it"
+                return
+            self.state, self.reason, self._aligned, self._revised = ScaleState.ALIGNED, "", time, time
+            self._offset = found.time_offset
+            self._take(found, worlds)
+            self.history.append({"time": time, "event": "aligned", "scale_sigma": found.scale_sigma})
+            return
+        new = any(world not in self.worlds for world in worlds)
+        passed = time - self._aligned
+        due = (
+            any(self._revised - self._aligned < at <= passed for at in REVISED) or time - self._revised > REVISED_EVERY
+        )
+        self.solution, self._known = found, list(worlds[: len(found.worlds.log_scale)])
+        sure = found.scale_sigma <= 2 * self.options.max_scale_sigma
+        if (new and sure) or due:
+            self._take(found, worlds)
+            if due:
+                self._revised = time
+            if passed >= REVISED[-1]:
+                self.state = ScaleState.REFINED
+
+    def _take(self, found: Smoothed, worlds: list[int]) -> None:
+        """Let poses follow an estimate."""
+        self.solution = found
+        self._known = list(worlds[: len(found.worlds.log_scale)])
+        for k, world in enumerate(self._known):
+            w = found.worlds
+            self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
+
+
+def _step(state: BodyState, time: float, offset: float, samples: InertialSamples, noise: ImuNoise) -> BodyState:
+    """State at a later time."""
+    times = np.array([state.time, time]) + offset
+    near = samples.between(times[0] - 0.5, times[1] + 0.5)
+    if len(near) < 2:
+        return state
+    moved = propagate(
+        state.rotation, state.position, state.velocity, near, times, state.gyro_bias, state.accel_bias, GRAVITY
+    )
+    rotation, position, velocity = (part[1] for part in moved)
+    motion = preintegrate(near, times, state.gyro_bias, state.accel_bias, noise)
+    pair = (
+        np.stack([state.rotation, rotation]),
+        np.stack([state.position, position]),
+        np.stack([state.velocity, velocity]),
+    )
+    bias = np.tile(np.concatenate([state.gyro_bias, state.accel_bias]), (2, 1))
+    _, before, after, own = motion_factors(motion, *pair, bias)
+    back = np.linalg.inv(after[0, :, :9])
+    forward = np.eye(STATE)
+    forward[:9] = -back @ before[0]
+    added = np.zeros((STATE, STATE))
+    added[:9, :9] = back @ own[0] @ back.T
+    walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * (time - state.time)
+    added[range(9, STATE), range(9, STATE)] = walk
+    covariance = forward @ state.covariance @ forward.T + added
+    sigma = float(np.sqrt(np.trace(covariance[6:9, 6:9])))
+    if np.linalg.norm(velocity) < STILL_SPEED + 3 * sigma and _stands_still(near, times[1], state):
+        position, velocity = state.position, np.zeros(3)
+        covariance[6:9, :], covariance[:, 6:9] = 0, 0
+        covariance[6:9, 6:9] = 1e-4 * np.eye(3)
+    return BodyState(time, rotation, position, velocity, state.gyro_bias, state.accel_bias, covariance)
+
+
+def _stands_still(samples: InertialSamples, time: float, state: BodyState) -> bool:
+    """Nothing is felt for a while."""
+    recent = samples.between(time - STILL_FOR, time)
+    if len(recent) < 5 or recent.timestamps[-1] - recent.timestamps[0] < 0.7 * STILL_FOR:
+        return False
+    rates, forces = recent.gyro - state.gyro_bias, recent.accel
+    quiet = rates.std(0).max() < STILL[0] and forces.std(0).max() < STILL[1]
+    return bool(quiet and np.linalg.norm(rates.mean(0)) < STILL[0])
+
+
+def camera_pose(state: BodyState, rotation_camera_imu: Array, translation_camera_imu: Array) -> tuple[Array, Array]:
+    """Camera to world of a body state: rotation ``(3, 3)`` and position ``(3,)``."""
+    rotation = state.rotation @ rotation_camera_imu.T
+    return rotation, state.position - rotation @ translation_camera_imu

@@ -1,0 +1,429 @@
+"""Inertial samples beside the tracker: prediction of rotations, poses in metres, poses without images.
+
+The window and the map stay in the units of the images; what is given to the caller is turned upright and scaled, from
+the frame at which scale and vertical are known for sure. At the end of a sequence the map follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dvo.data.frame import Frame
+from dvo.data.inertial import InertialSamples
+from dvo.data.trajectory import Trajectory
+from dvo.geometry import se3
+from dvo.geometry.poses import pose_from, slerp, split
+from dvo.map.correction import re_express
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.map.keyframe_log import FrameRecord
+from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
+from dvo.odometry.inertial.options import InertialOptions
+from dvo.odometry.inertial.smoother import Smoothed, VisualNodes, rotation_vector
+from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState, Segment, Status
+
+GYRO_TRUST = 0.7
+"""The gyroscope predicts the rotation of a frame where its error of late is below this share of that of the motion
+model: a sensor that is turned, or whose clock is off, predicts worse."""
+LEAST_TURN = np.deg2rad(1.0)
+"""Difference of the two predictions below which that of the motion model stays: the network finds the rest, and calm
+images give the same bytes with and without samples."""
+FORGET = 0.9
+"""Weight of the past in these errors, from frame to frame."""
+MOST_NODES = 400
+"""Nodes of the estimate at the end of a sequence."""
+DRIFT = 2e-3
+"""Standard deviation of visual positions after a way, relative to it, of which the covariance of the world consists."""
+TURN_DRIFT = 2e-3
+"""Likewise of visual orientations, rad for the square root of a minute."""
+BRIDGED = "bridged by inertial samples"
+
+
+class InertialTracking:
+    """What the inertial samples of a sequence tell of its frames.
+
+    Args:
+        options: settings.
+        graph: of the tracker.
+
+    Attributes:
+        estimator: of scale, vertical, velocity and biases.
+    """
+
+    def __init__(self, options: InertialOptions, graph: KeyframeGraph) -> None:
+        self.options, self.graph = options, graph
+        self.estimator = InertialEstimator(options)
+        self._errors: tuple[float, float] | None = None  # squared, of the gyroscope and of the motion model, rad^2
+        self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
+        self._before: tuple[float, np.ndarray] | None = None  # and of the one before it
+        self._anchor: BodyState | None = None  # from which poses are predicted, while there are none by images
+        self._state: BodyState | None = None  # the newest prediction
+        self._way = 0.0  # metres since the alignment
+
+    @property
+    def active(self) -> bool:
+        """True if there are samples, and they are used."""
+        return self.estimator.state is not ScaleState.NONE
+
+    def observe(self, frame: Frame) -> None:
+        """Take the samples of a frame.
+
+        Args:
+            frame: the next one.
+        """
+        if self.options.use and frame.inertial is not None:
+            self.add(frame.inertial)
+
+    def add(self, samples: InertialSamples) -> None:
+        """Take samples.
+
+        Args:
+            samples: of the sensor.
+        """
+        if self.options.use and self.graph.recording.segment == 0:  # a map has a world and a unit of its own
+            self.estimator.add(samples)
+
+    def predicted(self, time: float, pose_cw: Tensor) -> Tensor:
+        """First pose of a new frame.
+
+        Args:
+            time: of the frame, seconds.
+            pose_cw: ``(7,)`` by the motion model.
+
+        Returns:
+            ``(7,)``: with the rotation by the gyroscope where that predicts better than the motion model has of late,
+            and where the images have been missing with the position too.
+        """
+        if not self.active:
+            return pose_cw
+        similarity = self._similarity()
+        if self._state is not None and similarity is not None:  # images are back
+            state = self._predict(time)
+            if state is not None:
+                return self._visual_cw(state, similarity).to(pose_cw)
+        turned = self._turned(time)
+        if turned is None or self._errors is None or self._errors[0] > GYRO_TRUST**2 * self._errors[1]:
+            return pose_cw
+        rotation, position = split(se3.inverse(pose_cw.double()).cpu().numpy())
+        if np.linalg.norm(rotation_vector(rotation.T @ turned)) < LEAST_TURN:
+            return pose_cw
+        return se3.inverse(torch.from_numpy(pose_from(turned, position))).to(pose_cw)
+
+    def express(self, record: FrameRecord, estimate: Estimate) -> Estimate:
+        """Estimate for the caller.
+
+        Args:
+            record: of the frame.
+            estimate: by the images.
+
+        Returns:
+            In metres and upright once that is known; a predicted pose where the images give none.
+        """
+        if not self.active:
+            return estimate
+        time, estimator = record.timestamp, self.estimator
+        if estimate.pose_wc is not None:
+            self._compare(time, estimate.pose_wc)
+            if estimator.due(time) or self._anchor is not None:
+                estimator.update(*self._nodes(time - self.options.window))
+            similarity = self._similarity()
+            if similarity is not None:
+                return self._metric(estimate, similarity)
+        if estimator.aligned and self._last is not None:
+            state = self._predict(time)
+            if state is not None:
+                record.inertial = estimate.pose_wc is None
+                return self._bridged(estimate, state)
+        return replace(estimate, scale_state=estimator.state)
+
+    def expressed(self, result: Result) -> Result:
+        """Result so far, in metres where that is known; the map itself is not changed.
+
+        Args:
+            result: in the units of the images.
+        """
+        worlds, begun = self.estimator.worlds, self.graph.recording.segment
+        if not worlds:
+            return result
+        segments = []
+        for number, segment in enumerate(result.segments):
+            found = worlds.get(self.graph.world_of(begun + number))
+            segments.append(segment if found is None else _moved_segment(segment, found))
+        main = worlds.get(self.graph.world_of(begun + (result.longest or 0)))
+        if main is None:
+            return replace(result, segments=tuple(segments))
+        points = main.points(result.map.points.astype(np.float64)).astype(np.float32)
+        return replace(
+            result, segments=tuple(segments), trajectory=_moved(result.trajectory, main),
+            map=replace(result.map, points=points),
+        )  # fmt: skip
+
+    def settle(self, metric: bool) -> dict[str, Any]:
+        """Bring the map of a finished sequence to metres, and give frames that were bridged their poses.
+
+        Args:
+            metric: it is in metres already, by another source of the scale.
+
+        Returns:
+            Entries for run.json: ``inertial``, and ``scale``.
+        """
+        if not self.active:
+            return {}
+        graph, estimator = self.graph, self.estimator
+        if not estimator.aligned or metric:
+            return {"inertial": estimator.information()}
+        nodes, worlds = self._nodes(-np.inf)
+        smoothed = estimator.settle(nodes, worlds)
+        first, entries = None, []
+        for world, similarity in sorted(estimator.worlds.items()):
+            re_express(graph, world, similarity.scale, similarity.rotation, similarity.translation)
+            graph.metric[world] = "inertial"
+            first = world if first is None else first
+            if world != first:
+                graph.join(world, first)
+            sigma = None if smoothed is None else smoothed.scale_sigma
+            entries.append(
+                {"segment": world - graph.recording.segment, "source": "inertial", "factor": similarity.scale,
+                 "deviation": sigma, "observations": len(nodes)}
+            )  # fmt: skip
+        if smoothed is not None:
+            self._fill(smoothed)
+        scale = {"source": "inertial", "unit": "metres", "segments": entries}
+        return {"inertial": estimator.information(), **({"scale": scale} if entries else {})}
+
+    # ------------------------------------------------------------------------------------------------------------------
+
+    def _similarity(self) -> Similarity | None:
+        return self.estimator.worlds.get(self.graph.world_of(self.graph.segment))
+
+    def _turned(self, time: float) -> np.ndarray | None:
+        """Orientation ``(3, 3)`` of the camera by the gyroscope, from the last frame with a pose on."""
+        if self._last is None or not 0 < time - self._last[0] < self.options.longest:
+            return None
+        turn = self.estimator.turn_between(self._last[0], time)
+        return None if turn is None else split(self._last[1])[0] @ turn
+
+    def _compare(self, time: float, pose_wc: np.ndarray) -> None:
+        """Compare the rotations of gyroscope and motion model with the one that was found."""
+        turned, found = self._turned(time), split(pose_wc)[0]
+        if turned is not None and self._before is not None and self._last is not None:
+            steps = time - self._last[0], self._last[0] - self._before[0]
+            before, last = split(self._before[1])[0], split(self._last[1])[0]
+            if steps[1] > 0 and steps[0] < 2.5 * steps[1]:
+                still = rotation_vector(before.T @ last) * 0.5 * steps[0] / steps[1]
+                errors = rotation_vector(turned.T @ found), rotation_vector(last.T @ found) - still
+                now = tuple(float(error @ error) for error in errors)
+                past = now if self._errors is None else self._errors
+                self._errors = tuple(FORGET * a + (1 - FORGET) * b for a, b in zip(past, now, strict=True))  # type: ignore[assignment]
+        self._before, self._last = self._last, (time, pose_wc)
+
+    def _nodes(self, since: float) -> tuple[VisualNodes, list[int]]:
+        """Visual poses of the frames later than a time, some tenths of a second apart, and their worlds."""
+        graph = self.graph
+        frames: list[FrameRecord] = []
+        for record in reversed(graph.log.frames):
+            if record.timestamp < since:
+                break
+            if not record.lost and record.anchor is not None and not record.inertial:
+                frames.append(record)
+        frames.reverse()
+        poses = graph.window.poses_cw.double().cpu().numpy()
+        known = {frame.identifier: pose for frame, pose in zip(graph.window.frames, poses, strict=True)}
+        rows = graph.log.trajectory(None, known, frames)
+        posed = set(rows.timestamps.tolist())
+        frames = [frame for frame in frames if frame.timestamp in posed]
+        times, world_of = rows.timestamps, [graph.world_of(frame.segment) for frame in frames]
+        spacing = self.options.interval
+        if np.isneginf(since) and len(times):
+            spacing = max(spacing, (times[-1] - times[0]) / MOST_NODES)
+        chosen = _spaced(times, world_of, spacing)
+        worlds = list(dict.fromkeys(world_of[k] for k in chosen))
+        segment = np.array([worlds.index(world_of[k]) for k in chosen], int)
+        rotation, position = split(rows.poses_wc[chosen])
+        depth = np.array([self._depth(world) for world in worlds])
+        return VisualNodes(times[chosen], segment, rotation, position, depth), worlds
+
+    def _depth(self, world: int) -> float:
+        """Usual depth of the scene in a world."""
+        graph, centre = self.graph, self.graph.window.patches.shape[-1] // 2
+        if len(graph.window) and graph.world_of(graph.segment) == world:
+            inverse = graph.window.patches[:, 2, centre, centre].double().cpu().numpy()
+        else:
+            kept = [frame.inverse_depth for frame in graph.members(world)[-20:]]
+            inverse = np.concatenate(kept).astype(np.float64) if kept else np.ones(1)
+        usual = float(np.median(inverse[inverse > 0])) if (inverse > 0).any() else 1.0
+        return 1 / max(usual, 1e-6)
+
+    def _predict(self, time: float) -> BodyState | None:
+        """State at a time after the last frame with a pose; None if that is too long ago."""
+        assert self._last is not None
+        if self._anchor is None:
+            self.estimator.update(*self._nodes(self._last[0] - self.options.window))
+            if not self.estimator.aligned:
+                return None
+            self._anchor = self._state = self.estimator.last_state()
+        state = self._state
+        if state is None or self._anchor is None or time - self._anchor.time > self.options.longest:
+            return None
+        if time > state.time:
+            self._state = self.estimator.predict(state, np.array([time]))[0]
+        return self._state
+
+    def _metric(self, estimate: Estimate, similarity: Similarity) -> Estimate:
+        """Estimate of a visual pose in metres."""
+        assert estimate.pose_wc is not None
+        if self._anchor is not None:
+            self._anchor = self._state = None
+        rotation, position = split(estimate.pose_wc)
+        pose = pose_from(similarity.rotation @ rotation, similarity.points(position))
+        scale, covariance = similarity.scale, estimate.covariance
+        if covariance is not None:
+            unit = np.diag([scale] * 3 + [1.0] * 3)
+            covariance = unit @ covariance @ unit
+        return replace(
+            estimate, pose_wc=pose, covariance=covariance, scale_state=self.estimator.state,
+            inertial=self._beside(estimate.timestamp, pose),
+        )  # fmt: skip
+
+    def _bridged(self, estimate: Estimate, state: BodyState) -> Estimate:
+        """Estimate of a pose that is predicted."""
+        estimator, anchor = self.estimator, self._anchor
+        assert anchor is not None and estimator.solution is not None
+        rotation, position = camera_pose(
+            state, estimator.solution.rotation_camera_imu, estimator.translation_camera_imu
+        )
+        turn = estimator.solution.rotation_camera_imu
+        # Of position and rotation, in the coordinates of this camera, relative to the last frame with a pose.
+        own = np.zeros((6, 15))
+        own[:3, 3:6], own[3:, :3] = rotation.T, turn
+        known = anchor.covariance.copy()
+        known[:6], known[:, :6] = 0.0, 0.0
+        relative = replace(anchor, covariance=known)
+        grown = estimator.predict(relative, np.array([state.time]))[0].covariance if state.time > anchor.time else known
+        reason = estimate.reason or "the images have no scale yet"
+        return Estimate(
+            estimate.timestamp, pose_from(rotation, position), Status.INERTIAL, 0.0, estimate.segment, reason,
+            covariance=own @ grown @ own.T, reference=anchor.time, scale_state=estimator.state,
+            inertial=InertialEstimate(
+                state.velocity, state.gyro_bias, state.accel_bias, estimator.solution.scale_sigma,
+                _ordered(state.covariance) + self._drift(state.position),
+            ),
+        )  # fmt: skip
+
+    def _beside(self, time: float, pose_wc: np.ndarray) -> InertialEstimate | None:
+        """Velocity, biases and covariance at a frame with a visual pose."""
+        estimator, last = self.estimator, self.estimator.last_state()
+        if last is None or estimator.solution is None:
+            return None
+        state = estimator.predict(last, np.array([time]))[0] if time > last.time else last
+        covariance = _ordered(state.covariance)
+        # The pose is the visual one: its position is as good as the scale and the vertical.
+        sigma, tilt = estimator.solution.scale_sigma, np.deg2rad(estimator.solution.gravity_sigma) / np.sqrt(2)
+        x, y, z = pose_wc[:3]
+        level = np.array([[0.0, z], [-z, 0.0], [y, -x]])
+        by_scale = np.outer(pose_wc[:3], pose_wc[:3]) * sigma**2
+        covariance[:3, :3] = by_scale + tilt**2 * level @ level.T + 1e-6 * np.eye(3)
+        return InertialEstimate(
+            state.velocity, state.gyro_bias, state.accel_bias, sigma, covariance + self._drift(pose_wc[:3])
+        )
+
+    def _drift(self, position: np.ndarray) -> np.ndarray:
+        """Covariance ``(9, 9)`` by the drift of the visual trajectory since its beginning."""
+        del position
+        return np.zeros((9, 9))
+
+    def _visual_cw(self, state: BodyState, similarity: Similarity) -> Tensor:
+        """Pose ``T_cw`` of a state, in the units of the images."""
+        solution = self.estimator.solution
+        assert solution is not None
+        found = camera_pose(state, solution.rotation_camera_imu, self.estimator.translation_camera_imu)
+        pose_wc = pose_from(similarity.rotation.T @ found[0], similarity.inverse_points(found[1]))
+        return se3.inverse(torch.from_numpy(pose_wc))
+
+    def _fill(self, smoothed: Smoothed) -> None:
+        """Poses of the frames that were bridged: predicted from the smoothed state before, and led to the one after."""
+        log, estimator = self.graph.log, self.estimator
+        times = np.array([record.timestamp for record in log.frames])
+        bridged = np.array([record.inertial and record.lost for record in log.frames])
+        turn, shift = smoothed.rotation_camera_imu, estimator.translation_camera_imu
+        for begin, end in _runs(bridged):
+            last = int(np.searchsorted(smoothed.times, times[begin], "right")) - 1
+            anchor = log.frames[begin - 1].anchor if begin else None
+            if last < 0 or anchor is None:
+                continue
+            start = BodyState(
+                float(smoothed.times[last]), smoothed.rotation[last], smoothed.position[last], smoothed.velocity[last],
+                smoothed.gyro_bias[last], smoothed.accel_bias[last], np.zeros((15, 15)),
+            )  # fmt: skip
+            wanted = times[begin:end]
+            after = smoothed.times[last + 1] if last + 1 < len(smoothed.times) else None
+            states = estimator.predict(start, wanted if after is None else np.append(wanted, after))
+            cameras = [camera_pose(state, turn, shift) for state in states]
+            poses = np.stack([pose_from(*camera) for camera in cameras])
+            if after is not None:
+                goal = replace(states[-1], rotation=smoothed.rotation[last + 1], position=smoothed.position[last + 1])
+                poses = _led(
+                    poses[:-1], wanted, start.time, float(after), poses[-1], pose_from(*camera_pose(goal, turn, shift))
+                )
+            for record_number, pose_wc in zip(range(begin, end), poses, strict=True):
+                record = log.frames[record_number]
+                log.place(record_number, anchor, se3.inverse(torch.from_numpy(pose_wc)).numpy())
+                record.segment, record.reason = log.frames[begin - 1].segment, ""
+
+
+def _ordered(covariance: np.ndarray) -> np.ndarray:
+    """``(9, 9)`` of position, rotation and velocity, from that of rotation, position, velocity and biases."""
+    order = [3, 4, 5, 0, 1, 2, 6, 7, 8]
+    return covariance[np.ix_(order, order)].copy()
+
+
+def _spaced(times: np.ndarray, worlds: Sequence[int], spacing: float) -> list[int]:
+    """Positions of frames about ``spacing`` apart; those on either side of a break and the last one among them.
+
+    The first frame of each interval of a fixed division of time: most are the same from estimate to estimate.
+    """
+    chosen: list[int] = []
+    for k, time in enumerate(times.tolist()):
+        edge = k == len(times) - 1 or worlds[k + 1] != worlds[k] or times[k + 1] - time > 2 * spacing
+        begins = k == 0 or worlds[k - 1] != worlds[k] or time - times[k - 1] > 2 * spacing
+        if begins or edge or int(time / spacing + 1e-6) != int(times[k - 1] / spacing + 1e-6):
+            chosen.append(k)
+    return chosen
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """First position and the one after the last of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _led(
+    poses: np.ndarray, times: np.ndarray, start: float, end: float, reached: np.ndarray, goal: np.ndarray
+) -> np.ndarray:
+    """Poses ``(n, 7)`` after what is missing at the end, spread over the time."""
+    share = np.clip((times - start) / max(end - start, 1e-9), 0, 1)
+    led = poses.copy()
+    led[:, :3] += share[:, None] * (goal[:3] - reached[:3])
+    rotation = split(poses)[0]
+    missing = split(goal)[0] @ split(reached)[0].T
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    part = pose_from(missing, np.zeros(3))[3:]
+    turned = slerp(np.tile(identity, (len(poses), 1)), np.tile(part, (len(poses), 1)), share)
+    led[:, 3:] = pose_from(split(np.concatenate([np.zeros((len(poses), 3)), turned], 1))[0] @ rotation, led[:, :3])[
+        :, 3:
+    ]
+    return led
+
+
+def _moved(trajectory: Trajectory, similarity: Similarity) -> Trajectory:
+    rotation, position = split(trajectory.poses_wc)
+    return Trajectory(trajectory.timestamps, pose_from(similarity.rotation @ rotation, similarity.points(position)))
+
+
+def _moved_segment(segment: Segment, similarity: Similarity) -> Segment:
+    return replace(segment, trajectory=_moved(segment.trajectory, similarity))

@@ -1,0 +1,135 @@
+"""Alignment while a trajectory grows: what is refused and why, what is found, and what follows in the dark."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dvo.geometry.poses import so3_exp
+from dvo.odometry.inertial.estimator import BodyState, InertialEstimator
+from dvo.odometry.inertial.options import InertialOptions
+from dvo.odometry.protocol import ScaleState
+from tests.support.visual_inertial import CAMERA_IMU, SCALE, Recording, record
+
+
+def drive(recording: Recording, until: float = np.inf) -> tuple[InertialEstimator, list[str]]:
+    """Feed frames to an estimator; the reasons that it gave, each once."""
+    estimator, reasons, before = InertialEstimator(InertialOptions()), [], -np.inf
+    for time in recording.times[recording.times <= until]:
+        estimator.add(recording.samples.between(before, time))
+        before = time
+        if estimator.due(time):
+            estimator.update(recording.nodes(time - 20.0, time), [0])
+            if estimator.reason not in reasons:
+                reasons.append(estimator.reason)
+    return estimator, reasons
+
+
+def test_hand_held_motion_is_aligned_within_six_seconds() -> None:
+    estimator, _ = drive(record(0, seconds=7.0))
+    assert estimator.state is ScaleState.ALIGNED
+    assert estimator.history[0]["time"] < 6
+    assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"still": 30.0, "turning": False}, "acceleration"),
+        ({"still": 30.0, "turning": False, "speed": (0.5, 0.1, 0.0)}, "acceleration"),
+        ({"still": 30.0}, "rotation"),
+    ],
+    ids=["still", "constant velocity", "pure rotation"],
+)
+def test_motion_that_does_not_tell_is_refused_with_the_reason(options: dict[str, object], word: str) -> None:
+    estimator, reasons = drive(record(1, seconds=6.0, **options))  # type: ignore[arg-type]
+    assert estimator.state is ScaleState.INITIALISING
+    assert not estimator.worlds
+    assert any(word in reason for reason in reasons)
+
+
+def test_alignment_follows_a_stretch_that_does_not_tell() -> None:
+    estimator, _ = drive(record(2, still=5.0, turning=False, seconds=11.0))
+    assert estimator.aligned
+    assert estimator.history[0]["time"] > 4
+    assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.03)
+
+
+def _poisoned(kind: str, recording: Recording) -> Recording:
+    s = recording.samples
+    if kind == "g":
+        return recording.with_samples(accel=s.accel / 9.81)
+    if kind == "degrees":
+        return recording.with_samples(gyro=np.rad2deg(s.gyro))
+    if kind == "axes":
+        return recording.with_samples(gyro=s.gyro[:, [1, 0, 2]], accel=s.accel[:, [1, 0, 2]])
+    if kind == "late":
+        return recording.with_samples(times=s.timestamps + 0.1)
+    return recording.with_samples(gyro=s.gyro + [0.3, -0.2, 0.1], accel=s.accel + [1.0, -1.0, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("kind", "word"),
+    [("g", "units"), ("degrees", "turn"), ("axes", "turn"), ("late", "turn"), ("dropped", "gyroscope")],
+)
+def test_poisoned_samples_are_refused_with_the_reason(kind: str, word: str) -> None:
+    estimator, reasons = drive(_poisoned(kind, record(3, seconds=6.0)))
+    assert not estimator.worlds
+    assert any(word in reason for reason in reasons)
+
+
+def test_missing_samples_do_no_harm() -> None:
+    recording = record(4, seconds=7.0)
+    s, kept = recording.samples, np.random.default_rng(0).random(len(recording.samples)) > 0.1
+    estimator, _ = drive(recording.with_samples(s.timestamps[kept], s.gyro[kept], s.accel[kept]))
+    assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.03)
+
+
+def test_an_alignment_that_fails_later_is_withdrawn() -> None:
+    recording = record(5, seconds=12.0)
+    s = recording.samples
+    turned = so3_exp(np.array([0.0, 0.0, 0.5]))  # the sensor slips in its mount
+    late = s.timestamps > 7.0
+    gyro, accel = s.gyro.copy(), s.accel.copy()
+    gyro[late], accel[late] = s.gyro[late] @ turned, s.accel[late] @ turned
+    estimator, _ = drive(recording.with_samples(gyro=gyro, accel=accel))
+    assert [entry["event"] for entry in estimator.history][:2] == ["aligned", "withdrawn"]
+
+
+def test_prediction_in_the_dark_is_within_its_covariance() -> None:
+    squares = []
+    for seed in range(3):
+        recording = record(10 + seed, seconds=12.0)
+        estimator, _ = drive(recording, until=9.0)
+        estimator.update(recording.nodes(0.0, 9.0), [0])
+        start = estimator.last_state()
+        assert start is not None
+        estimator.add(recording.samples.between(estimator.stream.end, 12.0))
+        state = estimator.predict(start, np.array([start.time + 1.0, start.time + 2.0]))[-1]
+        world = estimator.solution.worlds.rotation[0] @ recording.turn  # type: ignore[union-attr]
+        first, last = (int(np.abs(recording.times - time).argmin()) for time in (start.time, state.time))
+        moved = world @ (recording.body[1][last] - recording.body[1][first])
+        error = state.position - start.position - moved
+        assert np.linalg.norm(error) < 0.2
+        covariance = state.covariance[3:6, 3:6]
+        squares.append(error @ np.linalg.solve(covariance, error) / 3)
+    assert np.mean(squares) < 6
+
+
+def test_what_stands_still_does_not_drift() -> None:
+    estimator = InertialEstimator(InertialOptions())
+    recording = record(6, still=30.0, turning=False, seconds=6.0)
+    estimator.add(recording.samples)
+    estimator.solution = _Solution()  # type: ignore[assignment]
+    bias = recording.samples.gyro[:400].mean(0)
+    rotation, position, _ = (part[20] for part in recording.body)
+    zero = np.zeros(3)
+    start = BodyState(float(recording.times[20]), rotation, position, zero, bias, zero, 1e-6 * np.eye(15))
+    state = estimator.predict(start, recording.times[21:-4])[-1]
+    assert np.linalg.norm(state.position - position) < 0.005
+    assert state.speed < 0.02
+
+
+class _Solution:
+    time_offset = 0.0
+    rotation_camera_imu = CAMERA_IMU

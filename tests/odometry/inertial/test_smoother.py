@@ -1,0 +1,77 @@
+"""Scale, vertical, time offset and biases of a visual trajectory with noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dvo.geometry.poses import so3_exp
+from dvo.odometry.inertial import smoother
+from dvo.odometry.inertial.smoother import Similarities, Values, first_values, linear_start, smooth, upright
+from tests.support.visual_inertial import OFFSET, SCALE, Recording, record
+
+
+def solved(recording: Recording, end: float) -> smoother.Smoothed:
+    problem = recording.problem(0.1, end)
+    scale, gravity, problem.gyro_bias = linear_start(problem)
+    worlds = Similarities(np.array([np.log(scale)]), upright(gravity)[None], np.zeros((1, 3)))
+    return smooth(problem, first_values(problem, worlds))
+
+
+@pytest.mark.parametrize(("grade", "seed"), [("euroc", 0), ("euroc", 1), ("phone", 2)])
+def test_scale_vertical_and_offset_are_found(grade: str, seed: int) -> None:
+    recording = record(seed, grade=grade)
+    found = solved(recording, 12.0)
+    error = float(np.exp(found.worlds.log_scale[0])) / SCALE - 1
+    assert abs(error) < min(0.03, 4 * found.scale_sigma)
+    up = (found.worlds.rotation[0] @ recording.turn)[2, 2]
+    assert np.rad2deg(np.arccos(min(up, 1.0))) < 0.5
+    assert abs(found.time_offset - OFFSET) < 1e-3
+
+
+def test_newest_state_is_within_its_covariance() -> None:
+    squares = []
+    for seed in range(4):
+        recording = record(seed, seconds=8.0)
+        found = solved(recording, 7.0)
+        last = int(np.abs(recording.times - found.times[-1]).argmin())
+        world = found.worlds.rotation[0] @ recording.turn
+        error = found.velocity[-1] - world @ recording.body[2][last]
+        squares.append(error @ np.linalg.solve(found.covariance[6:9, 6:9], error))
+    assert 0.2 < np.mean(squares) / 3 < 5
+
+
+def test_jacobians_are_those_of_finite_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = record(3, seconds=4.0)
+    problem = recording.problem(0.5, 2.0)
+    worlds = Similarities(np.array([np.log(SCALE) + 0.1]), so3_exp(np.array([[0.1, -0.2, 0.3]])), np.zeros((1, 3)))
+    values = first_values(problem, worlds)
+    motion = problem.preintegrated(values)
+    # Without the robust weights, the cost is a sum of squares, and the right side its gradient.
+    problem.options = smoother.SmootherOptions(rotation_sigma=10.0, position_sigma=10.0)
+    system, cost, _ = smoother._linearise(problem, values, motion)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        states = rng.normal(size=system.right.shape)
+        shared = rng.normal(size=system.right_shared.shape)
+        shared[0], shared[7:11] = 0.0, 0.0  # another offset asks for other samples; heading and origin are held
+        step = 1e-6
+        ahead, behind = (
+            smoother._linearise(problem, smoother._moved(problem, values, s * states, s * shared), motion)[1]
+            for s in (step, -step)
+        )
+        slope = -float((states * system.right).sum() + shared @ system.right_shared)
+        assert (ahead - behind) / (2 * step) == pytest.approx(slope, rel=1e-3, abs=1e-4 * abs(cost))
+
+
+def test_a_random_heading_of_the_world_changes_nothing() -> None:
+    recording = record(4, seconds=5.0)
+    problem = recording.problem(0.1, 4.0)
+    scale, gravity, problem.gyro_bias = linear_start(problem)
+    level = upright(gravity)
+    costs = []
+    for angle in (0.0, 1.3):
+        rotation = so3_exp(np.array([0, 0, angle])) @ level
+        start: Values = first_values(problem, Similarities(np.array([np.log(scale)]), rotation[None], np.zeros((1, 3))))
+        costs.append(smooth(problem, start).cost)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-3)

@@ -1,0 +1,164 @@
+"""Inertial samples beside the tracker, with an untrained network and an alignment that is given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dvo.core.errors import DvoError
+from dvo.data.frame import Frame
+from dvo.data.inertial import ImuNoise, InertialSamples
+from dvo.geometry.poses import so3_exp, split
+from dvo.odometry.inertial.estimator import Similarity
+from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
+from dvo.odometry.patch.inertial import _led, _runs, _spaced
+from dvo.odometry.patch.tracker import PatchOdometry
+from dvo.odometry.protocol import Estimate, ScaleState, Status
+from tests.support.tiny_tracker import SMALL, frames, tracker
+
+UPRIGHT = so3_exp(np.array([-np.pi / 2, 0.0, 0.0]))  # y down to z up
+SPEED = np.array([0.4, 0.0, 0.0])
+IDENTITY = np.array([0.0, 0, 0, 0, 0, 0, 1])
+
+
+def with_samples(images: list[Frame]) -> list[Frame]:
+    """Frames with samples of a sensor that moves at constant speed, upright."""
+    out, before = [], images[0].timestamp - 0.1
+    for frame in images:
+        times = np.arange(before + 0.005, frame.timestamp + 1e-9, 0.005)
+        forces = np.tile(-UPRIGHT.T @ GRAVITY, (len(times), 1))
+        samples = InertialSamples(times, np.zeros((len(times), 3)), forces, IDENTITY, ImuNoise())
+        out.append(replace(frame, inertial=samples))
+        before = float(times[-1])
+    return out
+
+
+def align(odometry: PatchOdometry, time: float) -> None:
+    """Give the estimator an alignment: two metres a unit, upright."""
+    estimator = odometry.inertial.estimator
+    estimator.state, estimator.reason = ScaleState.ALIGNED, ""
+    estimator.worlds = {0: Similarity(2.0, UPRIGHT, np.zeros(3))}
+    worlds = Similarities(np.log([2.0]), UPRIGHT[None], np.zeros((1, 3)))
+    rows, zero = np.zeros((1, 3)), np.zeros((1, 3))
+    covariance = 1e-6 * np.eye(15 + 11)
+    estimator.solution = Smoothed(
+        np.array([time]), UPRIGHT[None], rows, SPEED[None], zero, zero, worlds, 0.0, np.eye(3), covariance, 0.0, 0.0,
+        np.zeros(2),
+    )  # fmt: skip
+    estimator.update = lambda nodes, worlds: None  # type: ignore[method-assign]
+    estimator.settle = lambda nodes, worlds: estimator.solution  # type: ignore[method-assign]
+
+
+def dark(images: list[Frame], first: int, last: int) -> list[Frame]:
+    """Frames of which some are black."""
+    return [
+        replace(frame, image=np.zeros_like(frame.image)) if first <= k < last else frame
+        for k, frame in enumerate(images)
+    ]
+
+
+def test_until_it_is_aligned_the_output_equals_that_without_samples() -> None:
+    plain, aided = tracker(), tracker()
+    for frame, other in zip(frames(12), with_samples(frames(12)), strict=True):
+        a, b = plain.track(frame), aided.track(other)
+        assert a.scale_state is ScaleState.NONE and b.scale_state is ScaleState.INITIALISING
+        assert (a.pose_wc is None) == (b.pose_wc is None)
+        assert a.pose_wc is None or b.pose_wc is None or a.pose_wc.tobytes() == b.pose_wc.tobytes()
+    first, second = plain.finish(), aided.finish()
+    assert first.trajectory.poses_wc.tobytes() == second.trajectory.poses_wc.tobytes()
+    assert second.info["inertial"]["state"] == "initialising" and second.info["inertial"]["reason"]
+    assert "inertial" not in first.info and not second.metric
+
+
+def test_samples_are_ignored_on_request() -> None:
+    odometry = tracker(replace(SMALL, inertial={"use": False}))
+    estimates = [odometry.track(frame) for frame in with_samples(frames(8))]
+    assert {estimate.scale_state for estimate in estimates} == {ScaleState.NONE}
+    assert "inertial" not in odometry.finish().info
+
+
+def test_poses_turn_upright_and_metric_and_so_does_the_result() -> None:
+    plain, aided = tracker(), tracker()
+    for k, (frame, other) in enumerate(zip(frames(14), with_samples(frames(14)), strict=True)):
+        a, b = plain.track(frame), aided.track(other)
+        if k == 9:
+            align(aided, other.timestamp)
+        if k > 9:
+            assert a.pose_wc is not None and b.pose_wc is not None and b.inertial is not None
+            assert b.scale_state is ScaleState.ALIGNED
+            np.testing.assert_allclose(b.pose_wc[:3], 2 * UPRIGHT @ a.pose_wc[:3], atol=1e-9)
+            np.testing.assert_allclose(split(b.pose_wc)[0], UPRIGHT @ split(a.pose_wc)[0], atol=1e-9)
+            assert a.covariance is not None and b.covariance is not None
+            np.testing.assert_allclose(b.covariance[:3, :3], 4 * a.covariance[:3, :3], rtol=1e-6)
+    so_far = aided.current()
+    before, result = plain.finish(), aided.finish()
+    assert result.metric and result.info["scale"]["source"] == "inertial"
+    expected = 2 * before.trajectory.positions @ UPRIGHT.T
+    np.testing.assert_allclose(result.trajectory.positions, expected, atol=1e-5)
+    np.testing.assert_allclose(result.map.points, 2 * before.map.points @ UPRIGHT.T, atol=1e-3)
+    assert np.isfinite(so_far.trajectory.poses_wc).all() and len(so_far.trajectory) == len(result.trajectory)
+
+
+def test_frames_without_a_view_are_predicted_and_never_counted_as_tracked() -> None:
+    odometry = tracker()
+    images = with_samples(dark(frames(16), 12, 16))
+    estimates: list[Estimate] = []
+    for k, frame in enumerate(images):
+        estimates.append(odometry.track(frame))
+        if k == 11:
+            align(odometry, frame.timestamp)
+    black = estimates[12:]
+    assert [estimate.status for estimate in black] == [Status.INERTIAL] * 4
+    assert all(estimate.reason == "black image" for estimate in black)
+    step = np.diff([estimate.pose_wc[:3] for estimate in black], axis=0)  # type: ignore[index]
+    np.testing.assert_allclose(step, np.tile(SPEED * 0.1, (3, 1)), atol=1e-6)
+    sigmas = [estimate.position_sigma for estimate in black]
+    assert sigmas == sorted(sigmas) and sigmas[0] < sigmas[-1]  # type: ignore[type-var,operator]
+    result = odometry.finish()
+    assert len(result.trajectory) == 16 and len(result.inertial) == 4
+    assert result.frames_tracked == 12 and result.frames_lost == 0
+    assert set(result.inertial) == {frame.timestamp for frame in images[12:]}
+
+
+def test_darkness_that_lasts_is_lost() -> None:
+    odometry = tracker(replace(SMALL, inertial={"longest": 0.25}))
+    statuses = []
+    for k, frame in enumerate(with_samples(dark(frames(16), 12, 16))):
+        statuses.append(odometry.track(frame).status)
+        if k == 11:
+            align(odometry, frame.timestamp)
+    assert statuses[12:] == [Status.INERTIAL, Status.INERTIAL, Status.LOST, Status.LOST]
+
+
+def test_samples_may_come_late_and_beside_the_frames() -> None:
+    odometry, images = tracker(), with_samples(frames(4))
+    for frame in images:
+        odometry.track(replace(frame, inertial=None))
+    parts = [frame.inertial for frame in images]
+    for part in (parts[1], parts[0], parts[3], parts[2], parts[2]):
+        assert part is not None
+        odometry.add_inertial(part)
+    whole = odometry.inertial.estimator.stream.samples()
+    assert whole is not None and len(whole) == sum(len(part) for part in parts if part is not None)
+    assert (np.diff(whole.timestamps) > 0).all()
+    bad = replace(whole, gyro=np.full_like(whole.gyro, np.nan))
+    with pytest.raises(DvoError, match="finite"):
+        odometry.add_inertial(bad)
+
+
+def test_nodes_stand_on_either_side_of_a_break() -> None:
+    times = np.concatenate([np.arange(0, 1, 0.05), np.arange(2, 2.5, 0.05)])
+    chosen = times[_spaced(times, [0] * len(times), 0.2)]
+    assert {0.0, 2.0} <= set(chosen.tolist())
+    assert any(np.isclose(chosen, 0.95)) and np.isclose(chosen[-1], times[-1])
+    assert _runs(np.array([False, True, True, False, True])) == [(1, 3), (4, 5)]
+
+
+def test_what_is_missing_at_the_end_is_spread_over_the_time() -> None:
+    poses = np.tile(IDENTITY, (3, 1))
+    goal = np.concatenate([[0.3, 0.0, 0.0], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]])
+    led = _led(poses, np.array([1.0, 2.0, 3.0]), 0.0, 4.0, IDENTITY, goal)
+    np.testing.assert_allclose(led[:, 0], [0.075, 0.15, 0.225])
+    np.testing.assert_allclose(2 * np.arcsin(led[:, 5]), [0.1, 0.2, 0.3])

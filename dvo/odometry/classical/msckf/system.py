@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, replace
-from functools import partial
 from typing import Any
 
 import cv2
@@ -28,12 +27,11 @@ from dvo.odometry.classical.klt import Tracks, detect, follow
 from dvo.odometry.classical.msckf.config import MsckfConfig
 from dvo.odometry.classical.msckf.estimator import Estimator, State
 from dvo.odometry.classical.msckf.filter import EXTRINSICS, FIXED, OFFSET
-from dvo.odometry.classical.msckf.metric_estimate import InertialEstimate, MetricEstimate, ScaleState
 from dvo.odometry.classical.msckf.motion import Motion
 from dvo.odometry.classical.msckf.start import Observed
 from dvo.odometry.exclusive import sheltered
 from dvo.odometry.frames.gate import Admitted, Gate
-from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState, Status
 from dvo.odometry.segments import result_of_log
 
 SILENCE = 1.0  # seconds from the first frame in which a sample has to come
@@ -65,14 +63,14 @@ class Msckf:
         self._segment, self._clones, self._starts = 0, 0, 0
         self._refined = False
         self._map: list[tuple[np.ndarray, np.ndarray]] = []
-        self._last = MetricEstimate(0.0, None, Status.INITIALISING)
+        self._last = Estimate(0.0, None, Status.INITIALISING)
 
     def track(self, frame: Frame) -> Estimate:
         with self._gate.admit(frame) as admitted:
             self._last = self._process(admitted)
             return self._last
 
-    def _process(self, admitted: Admitted) -> MetricEstimate:
+    def _process(self, admitted: Admitted) -> Estimate:
         frame = admitted.frame
         samples = self._samples(frame)
         if frame.interruption:
@@ -96,8 +94,11 @@ class Msckf:
                 problem = "too few tracks"
             self._refill(grey, frame)
             self._waiting.append((index, self._observed(frame)))
-        if problem:
-            record.lost, record.reason = True, problem
+        record.reason = problem
+        if problem and first:
+            record.lost = True
+        elif problem:
+            record.inertial = True
         self._take_in()
         if first and admitted.repeated and not self._started:
             record.follow(self._log.frames[index - 1])
@@ -124,8 +125,7 @@ class Msckf:
             "maps_started": self._starts,
             "config": asdict(self.config),
         }
-        if self._started:
-            info |= self._facts()
+        info["inertial"] = self._facts()
         result, _ = result_of_log(self._log, info)
         if result.segments:
             sigma = self._last.inertial.scale_sigma if self._last.inertial else None
@@ -136,21 +136,17 @@ class Msckf:
         return replace(result, map=map_of(self._map))
 
     def _facts(self) -> dict[str, Any]:
-        """What the filter knows of the sensors at the end."""
-        assert self._estimator is not None and self._estimator.filter is not None
-        f = self._estimator.filter
-        sigma = np.sqrt(np.diag(f.P))
-        return {
-            "inertial": {
-                "time_offset": f.offset,
-                "time_offset_sigma": float(sigma[OFFSET]),
-                "gyro_bias": f.bias[:3].tolist(),
-                "accel_bias": f.bias[3:].tolist(),
-                "points_used": self._estimator.updates,
-                "points_rejected": self._estimator.rejected,
-                "rests": self._estimator.rests,
-            }
-        }
+        """What the filter knows of scale and sensors at the end."""
+        e, last = self._estimator, self._last
+        facts: dict[str, Any] = {"state": last.scale_state.value}
+        if e is None or e.filter is None or last.inertial is None:
+            return facts | ({"reason": e.reason} if e is not None and e.reason else {})
+        sigma = float(np.sqrt(e.filter.P[OFFSET, OFFSET]))
+        return facts | {
+            "scale_sigma": last.inertial.scale_sigma, "time_offset": e.filter.offset, "time_offset_sigma": sigma,
+            "gyro_bias": e.filter.bias[:3].tolist(), "accel_bias": e.filter.bias[3:].tolist(),
+            "points_used": e.updates, "points_rejected": e.rejected, "rests": e.rests,
+        }  # fmt: skip
 
     # --- samples ------------------------------------------------------------------------------------------------------
 
@@ -249,9 +245,8 @@ class Msckf:
             if before:
                 self._begin(e)
             self._move_clones(e)
-            lost = record.lost
-            self._log.place(index, self._clones + number, self._T_cw(e.filter.motion, e))
-            record.lost = lost
+            if not record.lost:
+                self._log.place(index, self._clones + number, self._T_cw(e.filter.motion, e))
             self._collect(e)
             if not everything and (not e.filter.is_sound() or speed_sigma(e.filter.P) > UNKNOWN_SPEED):
                 self._give_up("the filter has diverged")
@@ -310,13 +305,13 @@ class Msckf:
 
     # --- estimates ----------------------------------------------------------------------------------------------------
 
-    def _estimate(self, index: int, problem: str) -> MetricEstimate:
+    def _estimate(self, index: int, problem: str) -> Estimate:
         time = self._log.frames[index].timestamp
         if not self._started:
             status = Status.LOST if problem else Status.INITIALISING
             reason = problem or ("" if self._estimator is None else self._estimator.reason)
             state = ScaleState.NONE if self._estimator is None else ScaleState.INITIALISING
-            return MetricEstimate(time, None, status, segment=self._segment, reason=reason, scale_state=state)
+            return Estimate(time, None, status, segment=self._segment, reason=reason, scale_state=state)
         e = self._estimator
         assert e is not None and e.filter is not None
         state = e.predict(time)
@@ -327,15 +322,16 @@ class Msckf:
         inertial = InertialEstimate(
             state.motion.v, state.bias[:3], state.bias[3:], sigma, world_covariance(state, R_bc, p_bc)
         )
-        return MetricEstimate(
+        reference = -1 if problem else 0  # by samples alone, the newest clone is the last image that told the pose
+        return Estimate(
             time,
-            None if problem else poses_from_matrices(T_wc),
-            Status.LOST if problem else Status.TRACKING,
+            poses_from_matrices(T_wc),
+            Status.INERTIAL if problem else Status.TRACKING,
             0.0 if problem else e.agreement,
             self._segment,
             problem,
-            covariance=None if problem else partial(relative_covariance, state, R_bc, p_bc),
-            reference=None if problem else state.clones[0].time,
+            covariance=relative_covariance(state, reference, R_bc, p_bc),
+            reference=state.clones[reference].time,
             scale_state=ScaleState.REFINED if self._refined else ScaleState.ALIGNED,
             inertial=inertial,
         )
@@ -375,21 +371,22 @@ def world_covariance(state: State, R_bc: np.ndarray, p_bc: np.ndarray) -> np.nda
     return J @ state.P @ J.T
 
 
-def relative_covariance(state: State, R_bc: np.ndarray, p_bc: np.ndarray) -> np.ndarray:
-    """Covariance ``(6, 6)`` of the camera relative to that of the oldest clone, as of :class:`Estimate`.
+def relative_covariance(state: State, clone: int, R_bc: np.ndarray, p_bc: np.ndarray) -> np.ndarray:
+    """Covariance ``(6, 6)`` of the camera relative to that of a clone, as of :class:`Estimate`.
 
     Args:
-        state: of the body; its first clone is the reference.
+        state: of the body.
+        clone: position of the reference in its clones.
         R_bc, p_bc: camera in the body.
     """
-    reference = state.clones[0].motion
+    reference, at = state.clones[clone].motion, FIXED + 6 * (clone % len(state.clones))
     between = reference.R.T @ state.motion.R  # body to that of the reference
     apart = reference.R.T @ (state.motion.p - reference.p)
     body = np.zeros((6, len(state.P)))  # right tangent of the body relative to that of the reference
     body[:3, :3], body[3:, 3:6] = state.motion.R.T, np.eye(3)
-    body[:3, FIXED : FIXED + 3] = -state.motion.R.T
-    body[:3, FIXED + 3 : FIXED + 6] = between.T @ skew(apart)
-    body[3:, FIXED + 3 : FIXED + 6] = -between.T
+    body[:3, at : at + 3] = -state.motion.R.T
+    body[:3, at + 3 : at + 6] = between.T @ skew(apart)
+    body[3:, at + 3 : at + 6] = -between.T
     J = np.zeros((6, 6))  # to the camera
     J[:3, :3], J[3:, 3:], J[:3, 3:] = R_bc.T, R_bc.T, -R_bc.T @ skew(p_bc)
     return J @ body @ state.P @ body.T @ J.T

@@ -205,6 +205,6 @@ def compressed(measured: Projected, kept: np.ndarray) -> tuple[np.ndarray, np.nd
     rows = np.repeat(kept, np.diff(measured.begins))
     H, r = measured.jacobian[rows], measured.residual[rows]
     if len(r) > H.shape[1]:
-        both = np.linalg.qr(np.column_stack([H, r]), mode="r")[: H.shape[1]]
+        both: np.ndarray = np.asarray(np.linalg.qr(np.column_stack([H, r]), mode="r"))[: H.shape[1]]
         H, r = both[:, :-1], both[:, -1]
     return r, H

@@ -94,9 +94,8 @@ class Msckf:
                 problem = "too few tracks"
             self._refill(grey, frame)
             self._waiting.append((index, self._observed(frame)))
-        record.reason = problem
         if problem and first:
-            record.lost = True
+            record.lost, record.reason = True, problem
         elif problem:
             record.inertial = True
         self._take_in()
@@ -310,8 +309,8 @@ class Msckf:
         if not self._started:
             status = Status.LOST if problem else Status.INITIALISING
             reason = problem or ("" if self._estimator is None else self._estimator.reason)
-            state = ScaleState.NONE if self._estimator is None else ScaleState.INITIALISING
-            return Estimate(time, None, status, segment=self._segment, reason=reason, scale_state=state)
+            scale = ScaleState.NONE if self._estimator is None else ScaleState.INITIALISING
+            return Estimate(time, None, status, segment=self._segment, reason=reason, scale_state=scale)
         e = self._estimator
         assert e is not None and e.filter is not None
         state = e.predict(time)

@@ -19,8 +19,15 @@ from typing import NoReturn
 from dvo import __version__
 from dvo.commands import BAD_INPUT, HUNG_UP, INTERRUPTED, OK, TERMINATED, Terminated, ending_signals
 from dvo.commands.calibrate_options import add_calibrate
+from dvo.commands.imu_options import add_imu
 from dvo.commands.kernels import compiled_meanwhile
-from dvo.commands.run_options import add_batch_options, add_folder_options, add_run_options, add_tracking_options
+from dvo.commands.run_options import (
+    add_batch_options,
+    add_folder_options,
+    add_image_options,
+    add_run_options,
+    add_tracking_options,
+)
 from dvo.commands.stream_options import add_stream_options
 from dvo.core.command_line import OneLineParser, positive_float, positive_int, seed, whole
 from dvo.core.errors import DvoError
@@ -111,6 +118,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--to", metavar="NAME", required=True, help="format: tum, kitti, euroc, colmap, colmap-text or nerfstudio"
     )
     export.add_argument("--segment", type=_count, metavar="N", help="number of the segment (default: the longest)")
+    add_image_options(export)
     export.set_defaults(run="dvo.commands.export:export")
 
     weights = commands.add_parser("weights", help="list, import, export or describe weights")
@@ -146,7 +154,13 @@ def build_parser() -> argparse.ArgumentParser:
     _rendering_options(preview, "160x120")
     preview.set_defaults(run="dvo.commands.synth:preview")
     export = verbs.add_parser("export", help="write a sequence with ground truth in the layout of a dataset")
-    export.add_argument("--layout", choices=("tum", "tartanair"), default="tum", help="default: %(default)s")
+    export.add_argument("--layout", choices=("tum", "tartanair", "euroc"), default="tum", help="default: %(default)s")
+    export.add_argument(
+        "--imu-noise",
+        choices=("euroc", "phone", "action", "none"),
+        default="euroc",
+        help="of the inertial samples in the layout euroc (default: %(default)s)",
+    )
     export.add_argument("--out", metavar="DIR", required=True, help="new folder")
     content = export.add_mutually_exclusive_group()
     content.add_argument("--family", metavar="F", help="family of scenes (default: random)")
@@ -161,6 +175,8 @@ def build_parser() -> argparse.ArgumentParser:
     export.add_argument("--device", metavar="D", default="cpu", help="torch device (default: %(default)s)")
     _rendering_options(export, "320x240")
     export.set_defaults(run="dvo.commands.synth:export")
+
+    add_imu(commands)
 
     doctor = commands.add_parser("doctor", help="report versions, devices, threads, codecs, weights, gaps")
     doctor.add_argument("--json", action="store_true", help="print JSON, for bug reports")

@@ -165,7 +165,7 @@ def test_the_verdict_comes_first(given, image_folder, tmp_path, capsys):
         "doubtful", "film the coast", 0.4, None
     )  # fmt: skip
     page = (out / "summary.html").read_text()
-    assert "doubtful: waves, most likely. What may help: film the coast." in page
+    assert "<strong>verdict: doubtful</strong> waves, most likely. What may help: film the coast.</p>" in page
 
 
 def test_nothing_tracked_says_so(given, image_folder, tmp_path, capsys):

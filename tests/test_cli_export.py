@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
+import cv2
 import numpy as np
 import pytest
 
+import dvo
 from dvo.cli import main
-from dvo.data.frame import Frame
+from dvo.commands.export import export_images
 from dvo.data.readers.euroc import read_state_groundtruth
 from dvo.data.trajectory import Trajectory, read_kitti_poses, read_tum
-from dvo.export.recorded import reconstruct_recorded
-from dvo.geometry.camera import Camera
+from dvo.export.recorded import ImageChoice
 from dvo.geometry.poses import pose_matrices
-from dvo.odometry.protocol import SparseMap
+from dvo.odometry.protocol import Result, Segment, SparseMap, Status
+from dvo.session.frame_table import FrameRow
+from tests.support.colmap_models import read_text
 from tests.support.command_line import arguments, errors, names, summary
+from tests.support.fake_odometry import curve
 from tests.support.tiny_tracker import frames, tracker
+
+SOURCE = ["--export-images", "source"]
 
 
 def same(found, expected):
@@ -137,7 +146,7 @@ def test_a_map_after_the_run(given, image_folder, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(arguments(image_folder, out)) == 0
     assert main(["export", str(out), str(tmp_path / "colmap"), "--to", "colmap-text"]) == 0
-    assert "18 images of the source, 10 points" in capsys.readouterr().out
+    assert "18 images of 64x48 from the source, 10 points" in capsys.readouterr().out
     assert len(names(tmp_path / "colmap" / "images")) == 18
     camera = (tmp_path / "colmap" / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
     assert camera[2:4] == ["64", "48"] and [float(x) for x in camera[4:]] == [50, 50, 32, 24]
@@ -149,11 +158,124 @@ def test_a_map_after_the_run(given, image_folder, tmp_path, capsys):
     assert "the source of the run is not there" in capsys.readouterr().err and not (tmp_path / "again").exists()
 
 
-def test_the_sharpest_image_of_each_stretch():
-    draw, camera = np.random.default_rng(0), Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
-    noise, sharp = draw.integers(0, 255, (48, 64, 3), np.uint8), (2, 5, 8)
-    clip = [Frame(k, 0.1 * k, noise if k in sharp else noise // 4, camera) for k in range(9)]
-    poses = np.tile([0.0, 0, 0, 0, 0, 0, 1], (9, 1))
-    poses[:, 0] = np.arange(9)
-    found = reconstruct_recorded(clip, Trajectory(0.1 * np.arange(9), poses), SparseMap(), most=3)
-    assert found.identifiers.tolist() == list(sharp) and found.T_cw[:, 0, 3].tolist() == [-2.0, -5.0, -8.0]
+def test_images_of_the_source_with_a_run(given, image_folder, tmp_path, capsys):
+    """At the recorded size, not that of reading or tracking, with masks; of any odometry."""
+    given(new_segment=(8,), lost=(7,))
+    out, mask = tmp_path / "out", np.full((48, 64), 255, np.uint8)
+    mask[40:] = 0
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    options = ["--export", "tum,colmap-text,nerfstudio", "--export-images", "source", "--every", "4"]
+    assert (
+        main(arguments(image_folder, out, *options, "--mask", str(tmp_path / "mask.png"), "--max-pixels", "999")) == 0
+    )
+    printed = capsys.readouterr().out
+    said = "3 images of 64x48 from the source, with masks, 10 points, without observations; "
+    assert f"{out}/export/colmap-text: {said}left out: segment 0 with a world of its own" in printed
+    assert f"{out}/export/nerfstudio: {said}" in printed
+    places = [out / "export" / name for name in ("colmap-text", "nerfstudio")]
+    camera = (places[0] / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
+    assert camera[2:4] == ["64", "48"] and [float(x) for x in camera[4:]] == [50, 50, 32, 24]
+    for place in places:
+        images = names(place / "images")
+        assert len(images) == 3 and names(place / "masks") == [f"{name}.png" for name in images]
+        assert cv2.imread(str(place / "images" / images[0])).shape == (48, 64, 3)
+        np.testing.assert_array_equal(cv2.imread(str(place / "masks" / f"{images[0]}.png"), -1), mask)
+    assert names(out / "export" / "tum") == ["segment-0", "segment-1", "trajectory.txt"]
+
+
+def test_all_segments_of_a_world_are_in_one(image_folder, tmp_path):
+    source = dvo.open(image_folder, calib=image_folder.parent / "calib.txt", times=image_folder.parent / "times.txt")
+    times = source.timestamps
+    poses = np.array([curve(time) for time in times])
+    cuts = (slice(0, 5), slice(5, 9), slice(10, 18), slice(18, 20))
+    parts = [Trajectory(times[cut], poses[cut]) for cut in cuts]
+    joined = (None, None, 0, None)
+    segments = tuple(Segment(t, t.timestamps[0], t.timestamps[-1], j) for t, j in zip(parts, joined, strict=True))
+    world = Trajectory(
+        *(np.concatenate([getattr(parts[k], name) for k in (0, 2)]) for name in ("timestamps", "poses_wc"))
+    )
+    result = Result(world, SparseMap(np.zeros((3, 3), np.float32), np.zeros((3, 3), np.uint8)), 20, 1, {}, segments)
+    rows = [FrameRow(times[k], Status.INERTIAL if k == 12 else Status.TRACKING) for k in range(20)]
+    for segment, numbers, points, others in (
+        (None, [*range(5), 10, 11, *range(13, 18)], 3, "segments 1, 3 with worlds of their own"),
+        (1, [*range(5, 9)], 0, "segments 0, 2, 3 with"),
+    ):
+        place = tmp_path / str(segment)
+        (said,) = export_images(source, result, rows, None, {"colmap-text": place}, ImageChoice(), segment)
+        assert said.startswith(f"colmap-text: {len(numbers)} images of 64x48 from the source, {points} points")
+        assert f"left out: {others}" in said
+        found = read_text(place / "sparse" / "0")
+        assert [int(image.name[:6]) for image in found.images.values()] == numbers
+        for image in found.images.values():
+            point = pose_matrices(poses[int(image.name[:6])])[:3] @ [0.5, -0.2, 2.0, 1.0]
+            np.testing.assert_allclose(image.project(point, found.cameras[1][3]), [32 + 12.5, 24 - 5], atol=1e-6)
+
+
+def test_a_signal_while_images_are_read_ends_the_run(given, image_folder, tmp_path, monkeypatch):
+    """The results are there, a half of an export is not."""
+
+    def signalled(image):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return 0.0
+
+    given()
+    monkeypatch.setattr("dvo.export.recorded.sharpness", signalled)
+    assert main(arguments(image_folder, tmp_path / "out", "--export", "colmap", *SOURCE, "--every", "4")) == 143
+    assert summary(tmp_path / "out")["finished"] and not (tmp_path / "out" / "export").exists()
+
+
+def test_every_or_count_after_the_run(given, image_folder, tmp_path, capsys):
+    """Frames that the stride has left out have interpolated poses, and are no images."""
+    given()
+    out = tmp_path / "out"
+    assert main(arguments(image_folder, out, "--stride", "2")) == 0
+    assert main(["export", str(out), str(tmp_path / "all"), "--to", "nerfstudio"]) == 0
+    numbers = [int(name[:6]) for name in names(tmp_path / "all" / "images")]
+    assert numbers == [*range(0, 19, 2), 19], "the last frame is always tracked"
+    for options, count in ((["--every", "3"], 4), (["--count", "5"], 5), (["--export-images", "source"], 11)):
+        assert main(["export", str(out), str(tmp_path / options[0]), "--to", "colmap", *options]) == 0
+        assert len(names(tmp_path / options[0] / "images")) == count
+    capsys.readouterr()
+    options = ["--to", "colmap", "--segment", "1"]
+    assert main(["export", str(out), str(tmp_path / "new"), *options]) == 2
+    assert "no segment 1" in capsys.readouterr().err and not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [(["--export", "colmap", "--every", "3"], "--every: chooses images of the source. Add --export-images source"),
+     (["--export", "colmap", "--export-images", "keyframes", "--count", "3"], "--count: chooses images of the source"),
+     (SOURCE, "there are images in exported maps alone. Use --export colmap or nerfstudio"),
+     (["--export", "kitti", *SOURCE], "there are images in exported maps alone"),
+     (["--export", "colmap", *SOURCE, "--every", "2", "--count", "3"], "not allowed with"),
+     (["--export", "colmap", *SOURCE, "--every", "0"], "--every")],
+)  # fmt: skip
+def test_options_of_images_that_mean_nothing(options, message, given, image_folder, tmp_path, capsys):
+    odometry = given()
+    assert main(arguments(image_folder, tmp_path / "out", *options)) == 2
+    assert message in capsys.readouterr().err
+    assert odometry.asked == {} and not (tmp_path / "out").exists()
+
+
+def test_images_of_a_stream_are_refused(given, tmp_path, capsys):
+    given()
+    assert main(["run", "webcam:0", "--out", str(tmp_path / "out"), "--export", "colmap", *SOURCE]) == 2
+    (line,) = errors(capsys.readouterr().err)
+    assert "--export-images: a stream cannot be read again" in line and not (tmp_path / "out").exists()
+
+
+def test_options_of_images_that_mean_nothing_after_the_run(given, image_folder, tmp_path, capsys):
+    given()
+    out, new = tmp_path / "out", str(tmp_path / "new")
+    assert main(arguments(image_folder, out)) == 0
+    (tmp_path / "a.dvo").write_bytes(b"a map")
+    capsys.readouterr()
+    for source, options, message in (
+        (out, ["--to", "kitti", "--count", "3"], "--count: there are images in exported maps alone. Use --to colmap"),
+        (out, ["--to", "colmap", "--export-images", "keyframes"], "the run has saved no map file"),
+        (out, ["--to", "colmap", "--export-images", "keyframes", "--every", "2"], "--every: chooses images of"),
+        (tmp_path / "a.dvo", ["--to", "colmap", *SOURCE], "a map file does not know its source"),
+    ):
+        assert main(["export", str(source), new, *options]) == 2
+        (line,) = errors(capsys.readouterr().err)
+        assert message in line and not (tmp_path / "new").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -144,14 +145,23 @@ def _times(folder):
     return file
 
 
-def test_inertial_samples_that_are_not_used_are_named(given, images, tmp_path, capsys):
+def test_inertial_samples_that_frames_carry_are_told(given, images, tmp_path, capsys):
     given()
     data = tmp_path / "s" / "mav0" / "cam0" / "data"
     data.parent.mkdir(parents=True)
     images.rename(data)
     images.parent.joinpath("times.txt").unlink()
     (data.parent.parent / "imu0").mkdir()
-    (data.parent.parent / "imu0" / "data.csv").write_text("1,0,0,0,0,0,9.8\n")
+    rows = "".join(f"{k * 5_000_000},0,0,0,0,0,9.8\n" for k in range(100))
+    (data.parent.parent / "imu0" / "data.csv").write_text(rows)
     calib = str(images.parent / "calib.txt")
     assert main(["run", str(tmp_path / "s"), "--out", str(tmp_path / "out"), "--calib", calib, "--fps", "10"]) == 0
-    assert sum("inertial samples" in line for line in errors(capsys.readouterr().err)) == 1
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("inertial:"))
+    assert "100 samples, 200 a second, of imu0/data.csv" in line and "that of a phone is assumed" in line
+    facts = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert facts["inertial"] == {"origin": "imu0/data.csv", "count": 100, "rate": pytest.approx(200), "noise": None,
+                                 "T_camera_imu": None} and facts["gps"] is None  # fmt: skip
+    assert main(["run", str(tmp_path / "s"), "--out", str(tmp_path / "none"), "--calib", calib, "--fps", "10",
+                 "--imu", "none"]) == 0  # fmt: skip
+    assert "inertial" not in capsys.readouterr().err
+    assert json.loads((tmp_path / "none" / "run.json").read_text())["inertial"] is None

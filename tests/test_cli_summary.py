@@ -70,11 +70,20 @@ def test_summary_of_a_folder_is_the_page_of_the_run(run, capsys):
     assert "summary.html" in capsys.readouterr().out
     after = data_of(out / "summary.html")
     assert [after["states"], after["ribbons"]] == [before["states"], before["ribbons"]]
+    assert len(before["images"]) == 20 and after["images"] == [], "the page had them"
     for key in ("time", "segment", "colour"):
         assert after["frames"][key] == before["frames"][key]
     old, new = before["worlds"][0], after["worlds"][0]
     np.testing.assert_allclose(floats(new["tracks"][0]["poses"]), floats(old["tracks"][0]["poses"]), atol=1e-5)
     assert (new["colors"], new["name"]) == (old["colors"], old["name"])
+
+
+def test_a_page_that_is_written_anew_keeps_its_images(run, image_folder, tmp_path):
+    out = run(truth=False)
+    before = data_of(out / "summary.html")["images"]
+    more = ["--groundtruth", str(image_folder.parent / "truth.txt"), "--out", str(tmp_path / "new.html")]
+    assert main(["summary", str(out), *more]) == 0
+    assert data_of(tmp_path / "new.html")["images"] == before and len(before) == 20
 
 
 def test_summary_of_a_folder_of_an_older_version(run, tmp_path):

@@ -32,6 +32,7 @@ from dvo.commands.batch_table import (
     write_table,
 )
 from dvo.commands.console import InterruptSwitch, say, warn
+from dvo.commands.export import SOURCE, check_image_options
 from dvo.commands.places import check_outputs, places
 from dvo.commands.request import differences, request_of
 from dvo.commands.run import device_for, load_odometry
@@ -88,6 +89,7 @@ def batch(arguments: argparse.Namespace) -> int:
             of other options without ``--overwrite``, or an output that is an input.
     """
     check_formats(arguments.export)
+    check_image_options(arguments, arguments.export, "--export")
     sources, options = _sources(arguments.videos), given_options(arguments)
     _check_options(arguments, options)
     workers, threads = share_cores(None if arguments.ray else arguments.jobs)
@@ -172,7 +174,9 @@ def _check_settings(arguments: argparse.Namespace) -> None:
     """Load the odometry once, so that what is wrong with all runs ends the command before the first."""
     texts = (arguments.weights, arguments.config, arguments.map)
     if arguments.map is None and not any("{" in text for text in texts if text):
-        check_formats(arguments.export, load_odometry(arguments, torch.device("cpu")))
+        odometry = load_odometry(arguments, torch.device("cpu"))
+        if arguments.export_images != SOURCE:
+            check_formats(arguments.export, odometry)
 
 
 def _found(job: Job, folder: Path, overwrite: bool) -> tuple[Row, Job | None]:

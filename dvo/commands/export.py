@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from dvo.commands.camera import CALIBRATION
-from dvo.commands.console import say
+from dvo.commands.console import TrackingProgress, say
+from dvo.commands.picture import world_root
 from dvo.core.errors import DvoError
+from dvo.data.frame import Frame
 from dvo.data.open import open_source
 from dvo.data.source import Source
-from dvo.data.trajectory import read_tum
+from dvo.data.streams.capture import is_stream
+from dvo.data.trajectory import Trajectory, read_tum
 from dvo.export.formats import (
     MAP_FORMATS,
     TRAJECTORY_FORMATS,
@@ -21,13 +29,18 @@ from dvo.export.formats import (
     export_trajectory,
     write_reconstruction,
 )
-from dvo.export.recorded import reconstruct_recorded
+from dvo.export.reconstruction import Reconstruction, observe
+from dvo.export.recorded import MOST_IMAGES, ImageChoice, recorded_images
 from dvo.map.io.serialisation import load_graph
-from dvo.odometry.protocol import SparseMap
+from dvo.map.keyframe_graph import KeyframeGraph
+from dvo.odometry.protocol import Result, Status
 from dvo.odometry.segments import result_of_log
 from dvo.session import results
-from dvo.session.files import read_ply
+from dvo.session.frame_table import SKIPPED, FrameRow, near
+from dvo.session.results_reader import read_results
 from dvo.session.run_facts import read_facts
+
+SOURCE = "source"  # value of --export-images
 
 
 def export(arguments: argparse.Namespace) -> int:
@@ -40,18 +53,24 @@ def export(arguments: argparse.Namespace) -> int:
         Exit code.
 
     Raises:
-        DvoError: no results folder or map, a format of maps for a results folder or none at all, no such segment, or a
-            folder that is not empty.
+        DvoError: no results folder or map, no such format or segment, options of images that do not fit, a source that
+            is not there any more, or a folder that is not empty.
     """
     folder, name = Path(arguments.source), arguments.to
+    if arguments.every is not None or arguments.count is not None:
+        arguments.export_images = arguments.export_images or SOURCE
+    check_image_options(arguments, [name], "--to")
     if folder.is_file():
+        if arguments.export_images == SOURCE:
+            message, remedy = "a map file does not know its source", "give the results folder of the run"
+            raise DvoError(message, file=folder, field="--export-images", remedy=remedy)
         return _export_map_file(folder, arguments.out, name, arguments.segment)
     if not folder.is_dir():
         raise DvoError(
             "not a results folder", file=folder, remedy="give a folder that dvo run has written, or a map file"
         )
     if name in MAP_FORMATS and name not in TRAJECTORY_FORMATS:
-        return _export_recorded(folder, arguments.out, name, arguments.segment)
+        return _export_recorded(folder, arguments, image_choice(arguments))
     TRAJECTORY_FORMATS.target(name)  # before any file is read
     trajectory = read_tum(_trajectory_file(folder, arguments.segment))
     export_trajectory(trajectory, arguments.out, name)
@@ -59,18 +78,139 @@ def export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _export_recorded(folder: Path, out: str, name: str, segment: int | None) -> int:
+def check_image_options(
+    arguments: argparse.Namespace, formats: Sequence[str], option: str, source: Path | str | None = None
+) -> None:
+    """Refuse options of exported images that mean nothing beside the others.
+
+    Args:
+        arguments: of the command line.
+        formats: that are exported to.
+        option: of the command line that names them.
+        source: that is tracked; None if there is none.
+
+    Raises:
+        DvoError: images without a format of maps, a choice of images that are not of the source, or images of a stream.
+    """
+    images = arguments.export_images
+    chosen = next((name for name in ("every", "count") if getattr(arguments, name) is not None), None)
+    if chosen is not None and images != SOURCE:
+        raise DvoError("chooses images of the source", field=f"--{chosen}", remedy="add --export-images source")
+    if images is None:
+        return
+    if not any(name in MAP_FORMATS for name in formats):
+        remedy, field = f"use {option} colmap or nerfstudio", f"--{chosen or 'export-images'}"
+        raise DvoError("there are images in exported maps alone", field=field, remedy=remedy)
+    if images == SOURCE and source is not None and is_stream(source):
+        remedy = "record it and track the recording, or leave the option out"
+        raise DvoError("a stream cannot be read again", field="--export-images", remedy=remedy)
+
+
+def image_choice(arguments: argparse.Namespace) -> ImageChoice:
+    """Choice of the images of the source.
+
+    Args:
+        arguments: of the command line.
+    """
+    return ImageChoice(arguments.every, arguments.count or MOST_IMAGES)
+
+
+def export_images(
+    source: Source,
+    result: Result,
+    rows: Sequence[FrameRow],
+    graph: KeyframeGraph | None,
+    places: Mapping[str, Path],
+    choice: ImageChoice,
+    segment: int | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> list[str]:
+    """Write images of a source at its recorded size with their poses and the points of a map, for other programs.
+
+    Args:
+        source: of the run.
+        result: of the run.
+        rows: of its frames; those that the stride has left out, and those that inertial samples alone have given a
+            pose, are not chosen.
+        graph: of the run; None without one: the points of the map are then written without observations.
+        places: new folder of each format of maps.
+        choice: of the images.
+        segment: whose world is written, with all segments in it; None for the longest.
+        check: called at every frame; may raise.
+
+    Returns:
+        A sentence for each format.
+
+    Raises:
+        DvoError: no such segment, no image with a pose, or a folder that is not empty or cannot be written.
+    """
+    number = result.longest if segment is None else segment
+    if number is None or number >= len(result.segments):
+        remedy = f"there are {len(result.segments)}"
+        raise DvoError(f"no segment {number or 0}", field="--segment", remedy=remedy)
+    roots = [world_root(result, k) for k in range(len(result.segments))]
+    members = [k for k, root in enumerate(roots) if root == roots[number]]
+    trajectory = _tracked([result.segments[k].trajectory for k in members], rows)
+    recorded = source.at_recorded_size()
+    said = []
+    with contextlib.ExitStack() as stack:
+        progress = stack.enter_context(TrackingProgress(recorded.frame_count, "reading images"))
+
+        def on_frame(frame: Frame) -> None:
+            check()
+            progress.update(frame, None)
+
+        images = stack.enter_context(recorded_images(recorded, trajectory, choice, on_frame))
+        found = images if graph is None else observe(graph, graph.recording.segment + number, images)
+        if found is images and result.longest in members:
+            points, colors = result.map.points.astype(np.float64), result.map.colors
+            found = replace(images, points=points, colors=colors, errors=np.zeros(len(points)))
+        for name, place in places.items():
+            write_reconstruction(found, name, place)
+            said.append(f"{name}: {_describe(found, sorted(set(range(len(roots))) - set(members)))}")
+    return said
+
+
+def _tracked(parts: Sequence[Trajectory], rows: Sequence[FrameRow]) -> Trajectory:
+    """Poses of some segments in order of time, without those that are interpolated or predicted."""
+    times = np.concatenate([part.timestamps for part in parts])
+    poses = np.concatenate([part.poses_wc for part in parts])
+    without = np.array([row.timestamp for row in rows if row.status in (SKIPPED, Status.INERTIAL)])
+    chosen = np.flatnonzero(~near(times, without))
+    chosen = chosen[np.argsort(times[chosen], kind="stable")]
+    return Trajectory(times[chosen], poses[chosen])
+
+
+def _describe(found: Reconstruction, others: Sequence[int]) -> str:
+    sizes = " and ".join(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in found.cameras))
+    text = f"{len(found.jpegs)} images of {sizes} from the source{', with masks' if found.masks else ''}"
+    text += f", {len(found.points)} points, "
+    if len(found.residuals):
+        text += f"{len(found.residuals)} observations, mean reprojection error {found.mean_error:.2f} px"
+    else:
+        text += "without observations"
+    if others:
+        numbers = ", ".join(map(str, others))
+        own = f"segment {numbers} with a world of its own"
+        text += f"; left out: {own if len(others) == 1 else f'segments {numbers} with worlds of their own'}"
+    return text
+
+
+def _export_recorded(folder: Path, arguments: argparse.Namespace, choice: ImageChoice) -> int:
     """Write a map of a results folder: of the map file that the run has saved, or of the images of its source."""
-    facts = read_facts(folder / results.SUMMARY)
-    saved = facts.get("map_file")
-    if isinstance(saved, str) and Path(saved).is_file():
-        return _export_map_file(Path(saved), out, name, segment)
-    trajectory = read_tum(_trajectory_file(folder, segment))
-    is_main = segment is None or len(trajectory) == len(read_tum(folder / results.TRAJECTORY))
-    points = read_ply(folder / results.MAP) if is_main and (folder / results.MAP).is_file() else SparseMap()
-    found = reconstruct_recorded(_reopened(folder, facts), trajectory, points)
-    write_reconstruction(found, name, out)
-    say(f"exported to {out}: {len(found.jpegs)} images of the source, {len(found.points)} points without observations")
+    out, name, segment = Path(arguments.out), arguments.to, arguments.segment
+    stored = read_results(folder)
+    saved = stored.facts.get("map_file")
+    file = Path(saved) if isinstance(saved, str) and Path(saved).is_file() else None
+    if file is not None and arguments.export_images != SOURCE:
+        return _export_map_file(file, arguments.out, name, segment)
+    if arguments.export_images not in (None, SOURCE):
+        message, remedy = "the run has saved no map file", "track with --save-map, or use --export-images source"
+        raise DvoError(message, file=folder, field="--export-images", remedy=remedy)
+    graph = None if file is None else load_graph(file)
+    source = _reopened(folder, stored.facts)
+    for sentence in export_images(source, stored.result, stored.rows, graph, {name: out}, choice, segment):
+        say(f"exported to {out}: {sentence.removeprefix(f'{name}: ')}")
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+from dataclasses import asdict
 from typing import Any
 
 from dvo.core.command_line import whole
@@ -37,6 +38,28 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         help="pose of the camera in a base frame, 4x4 matrix or 'x y z qx qy qz qw': writes trajectory_base.txt too",
     )
     parser.add_argument("--topic", metavar="NAME", help="topic of the images in a bag of ROS 1 or 2, or an MCAP file")
+    add_inertial_options(parser)
+
+
+def add_inertial_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options about inertial samples.
+
+    Args:
+        parser: of the command.
+    """
+    parser.add_argument(
+        "--imu",
+        metavar="FILE|auto|none",
+        default="auto",
+        help="inertial samples: a table, bag or GoPro video; auto: those of the recording or beside it (default)",
+    )
+    parser.add_argument(
+        "--imu-calib",
+        metavar="FILE[,FILE]",
+        help="calibration of the inertial sensor: Kalibr's imu.yaml and camchain-imucam.yaml, EuRoC's sensor.yaml, a "
+        "YAML file, or a preset of its noise: phone, action, euroc",
+    )
+    parser.add_argument("--imu-topic", metavar="NAME", help="topic of inertial samples in a bag, if there are several")
 
 
 def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -47,20 +70,25 @@ def input_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """
     masks = {"mask": arguments.mask, "mask_invert": arguments.mask_invert}
     pixels = {} if arguments.max_pixels is None else {"max_pixels": arguments.max_pixels or None}
-    return {"start": arguments.start, "end": arguments.end, **masks, **pixels}
+    inertial = {"imu": arguments.imu, "imu_calib": arguments.imu_calib, "imu_topic": arguments.imu_topic}
+    return {"start": arguments.start, "end": arguments.end, **masks, **pixels, **inertial}
 
 
 def print_input(source: Any) -> None:
     """Print what a person compares with what was recorded, to stderr.
 
     Number of images, duration and rate, where the times are known before the images are read, of a video as its file
-    states them; and a note of inertial samples that are there and not used.
+    states them; inertial samples that frames carry, and positions of a satellite receiver.
 
     Args:
         source: newly opened.
+
+    Raises:
+        DvoError: damaged inertial samples or positions.
     """
     from dvo.commands.console import warn
     from dvo.core.text import print_line
+    from dvo.data.companions.inertial_source import described
 
     recording = getattr(source, "recording", None)
     times, count = getattr(source, "timestamps", None), getattr(recording, "frame_count", None)
@@ -71,24 +99,49 @@ def print_input(source: Any) -> None:
         text += f", {(len(times) - 1) / span:.4g} a second" if span > 0 else ""
     elif count is not None and rate:
         text = f"{count} frames of a video, {rate:.4g} a second: {count / rate:.4g} s"
-    if text is not None:
-        with contextlib.suppress(OSError):
-            print_line(text, error=True)
-    if getattr(recording, "inertial", None) is not None:
-        warn("there are inertial samples beside the images; they are not used", "note")
+    lines = [] if text is None else [text]
+    samples, positions = getattr(source, "inertial", None), getattr(source, "positions", None)
+    if samples is not None:
+        lines.append(described(samples))
+    if positions is not None:
+        lines.append(positions.describe())
+    with contextlib.suppress(OSError):
+        for line in lines:
+            print_line(line, error=True)
+    for note in samples.notes if samples is not None else ():
+        if note not in source.warnings:
+            warn(note, "note")
 
 
-def input_facts(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Entries of run.json about the options.
+def input_facts(arguments: argparse.Namespace, source: Any) -> dict[str, Any]:
+    """Entries of run.json about the options, and about the other sensors of the source.
 
     Args:
         arguments: of the command line.
+        source: as it was opened.
 
     Returns:
         ``interval``: start and end as given, None without them; ``extrinsics``: the file;
-        ``mask``: file or folder, and whether it was inverted.
+        ``mask``: file or folder, and whether it was inverted; ``inertial``: origin, number, rate, noise and pose of the
+        inertial samples that frames carry; ``gps``: see :meth:`dvo.data.positions.Positions.summary`.
+
+    Raises:
+        DvoError: damaged inertial samples or positions.
     """
     bounds = {"start": arguments.start, "end": arguments.end}
     given = any(bound is not None for bound in bounds.values())
     mask = None if arguments.mask is None else {"file": arguments.mask, "inverted": arguments.mask_invert}
-    return {"interval": bounds if given else None, "extrinsics": arguments.extrinsics, "mask": mask}
+    samples, positions = getattr(source, "inertial", None), getattr(source, "positions", None)
+    inertial = None
+    if samples is not None:
+        pose = None if samples.T_camera_imu is None else samples.T_camera_imu.tolist()
+        noise = None if samples.noise is None else asdict(samples.noise)
+        inertial = {"origin": samples.origin, "count": len(samples), "rate": samples.rate, "noise": noise,
+                    "T_camera_imu": pose}  # fmt: skip
+    return {
+        "interval": bounds if given else None,
+        "extrinsics": arguments.extrinsics,
+        "mask": mask,
+        "inertial": inertial,
+        "gps": None if positions is None else positions.summary(),
+    }

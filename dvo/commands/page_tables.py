@@ -31,13 +31,24 @@ def headline_of(facts: dict[str, Any]) -> str:
     text = f"tracked with {', '.join(filter(None, parts))}" if any(parts) else ""
     version = (facts.get("versions") or {}).get("dvo")
     text += f" (dvo {version})" if version else ""
-    quality = facts.get("quality") or {}
-    if quality.get("reason"):
-        advice = f" What may help: {quality['remedy']}." if quality.get("remedy") else ""
-        text = f"{quality['verdict']}: {quality['reason']}.{advice} {text}"
     if facts.get("interrupted"):
         text += "; interrupted"
     return text.strip("; ")
+
+
+def verdict_of(facts: dict[str, Any]) -> tuple[str, str]:
+    """Verdict on the result.
+
+    Args:
+        facts: content of run.json.
+
+    Returns:
+        Its word, and in sentences its reason and what may help; empty texts without one.
+    """
+    quality = facts.get("quality") or {}
+    reason = f"{quality['reason']}." if quality.get("reason") else ""
+    advice = f"What may help: {quality['remedy']}." if quality.get("remedy") else ""
+    return str(quality.get("verdict") or ""), " ".join(filter(None, (reason, advice)))
 
 
 def figures(facts: dict[str, Any], rows: Sequence[FrameRow]) -> list[tuple[str, str]]:
@@ -51,9 +62,7 @@ def figures(facts: dict[str, Any], rows: Sequence[FrameRow]) -> list[tuple[str, 
         Name and value of each.
     """
     frames, info, metrics = (facts.get(name) or {} for name in ("frames", "info", "metrics"))
-    quality = facts.get("quality") or {}
-    found = [("verdict", str(quality["verdict"]))] if quality.get("verdict") else []
-    found.append(("tracked frames", f"{frames.get('tracked', '?')} of {frames.get('read', '?')}"))
+    found = [("tracked frames", f"{frames.get('tracked', '?')} of {frames.get('read', '?')}")]
     group = "SE(3)" if metrics.get("alignment") == "se3" else "Sim(3)"
     for metric, text in shown(metrics):
         noun = metric.title.split()[0]

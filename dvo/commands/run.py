@@ -18,6 +18,7 @@ from dvo.commands import NOTHING_TRACKED, OK, Terminated
 from dvo.commands.base_frame import base_observers
 from dvo.commands.camera import CALIBRATION, calibration_origin, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
+from dvo.commands.export import SOURCE, check_image_options, export_images, image_choice
 from dvo.commands.input_options import input_facts, input_settings, print_input
 from dvo.commands.maps import load_in_map
 from dvo.commands.observers import open_observers
@@ -33,16 +34,19 @@ from dvo.core.errors import DvoError
 from dvo.core.settings import parse_settings, read_settings
 from dvo.data.files.output import check_place
 from dvo.data.frame import Frame
+from dvo.data.source import Source
 from dvo.data.streams.capture import is_stream, shown
 from dvo.data.trajectory import Trajectory
 from dvo.export.formats import TRAJECTORY_FORMATS, check_formats, export_run
+from dvo.export.recorded import ImageChoice
 from dvo.odometry.load import check_early
 from dvo.odometry.protocol import Estimate, Odometry, Saveable
 from dvo.odometry.registry import SYSTEMS, build_system
 from dvo.session import results, session
 from dvo.session.frame_table import FrameTable
-from dvo.session.observer import Observer
+from dvo.session.observer import Observer, graph_of
 from dvo.session.recorder import Recorder
+from dvo.viz.thumbnails import Thumbnails
 
 _ABORTED = "aborted by a second Ctrl-C, SIGTERM or SIGHUP"
 
@@ -84,6 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
         DvoError: invalid source, weights, device, settings or export, or a folder that cannot be written.
     """
     check_formats(arguments.export)
+    check_image_options(arguments, arguments.export, "--export", arguments.source)
     device = device_for(arguments)
     check_settings_early(arguments)
     early: Odometry | None = None
@@ -114,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
         "device": str(device),
         "seed": arguments.seed,
         "stride": arguments.stride,
-        **input_facts(arguments),
+        **input_facts(arguments, source),
         **request_facts(arguments),
     }
     seed_everything(arguments.seed)
@@ -128,7 +133,9 @@ def run(arguments: argparse.Namespace) -> int:
         observers += base_observers(arguments, folder, source.path)
         observers += scale_observers(arguments, folder)
         odometry = early or load_odometry(arguments, device)
-        check_formats(arguments.export, odometry)
+        images = image_choice(arguments) if arguments.export_images == SOURCE else None
+        if images is None:
+            check_formats(arguments.export, odometry)
         save_map = None if arguments.save_map is None else _map_file(arguments.save_map, odometry)
         facts["map"] = arguments.map
         if arguments.map is not None and isinstance(odometry, Saveable):
@@ -142,6 +149,7 @@ def run(arguments: argparse.Namespace) -> int:
             stride=arguments.stride,
             facts=facts | camera,
             export=arguments.export,
+            images=images,
             save_map=save_map,
             observers=observers,
             again=None if arguments.map else partial(load_odometry, _reseeded(arguments), device),
@@ -257,6 +265,7 @@ def track(
     stride: int = 1,
     facts: dict[str, Any],
     export: Sequence[str] = (),
+    images: ImageChoice | None = None,
     save_map: Path | None = None,
     observers: Sequence[Observer] = (),
     again: Callable[[], Odometry] | None = None,
@@ -275,6 +284,7 @@ def track(
         stride: distance of tracked frames, in frames of the clip.
         facts: metadata to write into run.json.
         export: formats to write the results in too, into ``export/NAME`` of the results folder.
+        images: of the clip for the exported maps; None for those of the keyframes.
         save_map: map file to write at the end; the odometry is :class:`dvo.odometry.protocol.Saveable`.
         observers: told of every frame and of the result; the caller closes them.
         again: builds the odometry with another seed, for a result that leaves doubt.
@@ -289,11 +299,12 @@ def track(
     for observer in observers:
         observer.begin(odometry)
     facts = {"odometry": odometry.name, **facts, "export": list(export)}
-    recorder, table = Recorder(folder, odometry, facts, warn=warn), FrameTable()
+    recorder, table, thumbnails = Recorder(folder, odometry, facts, warn=warn), FrameTable(), Thumbnails()
 
     def on_frame(frame: Frame, estimate: Estimate | None) -> None:
         recorder.update(frame, estimate)
         table.update(frame, estimate)
+        thumbnails.update(frame, estimate)
         for observer in observers:
             observer.update(frame, estimate)
         progress.update(frame, estimate)
@@ -319,7 +330,7 @@ def track(
             )
             scores = score(done, clip.groundtruth)
             writer = None if save_map is None else partial(_save, odometry, save_map)
-            pages = Pages(clip.name, done, table, odometry, clip.groundtruth)
+            pages = Pages(clip.name, done, table, odometry, clip.groundtruth, thumbnails.images)
             hasty = done.interrupted and switch.in_haste
             views = True
             if hasty:
@@ -348,20 +359,32 @@ def track(
         if hasty and (left := [name for name in export if name not in TRAJECTORY_FORMATS]):
             warn(f"{', '.join(left)}: not exported, there was no time for the final optimisation")
             export = [name for name in export if name not in left]
-        if export:
-            _export(odometry, done, folder / results.EXPORT, export)
+        if export and not done.result.frames_tracked:
+            warn("nothing to export")
+        elif export:
+            maps = [name for name in export if images is not None and name not in TRAJECTORY_FORMATS]
+            others, place = [name for name in export if name not in maps], folder / results.EXPORT
+            said = export_run(odometry, done.result, others, place)
+            if images is not None and isinstance(clip, Source) and maps:
+                places, check = {name: place / name for name in maps}, _stopped_by(switch)
+                rows, graph = pages.rows(), graph_of(odometry)
+                said += export_images(clip, done.result, rows, graph, places, images, check=check)
+            for sentence in said:
+                say(f"exported to {place}/{sentence}")
     if done.interrupted:
         return 128 + (switch.pressed or signal.SIGINT)
     return OK if done.result.frames_tracked else NOTHING_TRACKED
 
 
-def _export(odometry: Odometry, done: session.Run, folder: Path, formats: Sequence[str]) -> None:
-    """Write the exports, and print a line for each."""
-    if not done.result.frames_tracked:
-        warn("nothing to export")
-        return
-    for sentence in export_run(odometry, done.result, formats, folder):
-        say(f"exported to {folder}/{sentence}")
+def _stopped_by(switch: InterruptSwitch) -> Callable[[], None]:
+    """Function that ends the program if a signal has come since; one that has ended tracking does not count."""
+    before = switch.pressed
+
+    def check() -> None:
+        if switch.pressed is not None and switch.pressed is not before:
+            raise Terminated(switch.pressed)
+
+    return check
 
 
 def _save(odometry: Odometry, file: Path) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from dvo.core.command_line import names, positive_float, positive_int, seed
 
 INPUTS = (
     "calib", "times", "groundtruth", "extrinsics", "mask", "depth", "right", "depth_calib", "config", "map", "weights",
+    "imu", "imu_calib",
 )  # fmt: skip
 """Options whose value is, or may be, a file or folder that is read."""
 OUTPUTS = ("save_map", "overlay", "rerun")
@@ -54,6 +55,30 @@ def add_tracking_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-loops", action="store_true", help="pure odometry: do not close loops (--set loops=false)")
 
 
+def add_image_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options about the images of an exported map.
+
+    Args:
+        parser: of the command.
+    """
+    parser.add_argument(
+        "--export-images",
+        choices=("keyframes", "source"),
+        help="images of exported maps: the working images of the keyframes, or images of the source, which is read "
+        "again, at their recorded size without lens distortion",
+    )
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument(
+        "--every", type=positive_int, metavar="N", help="of the source, the sharpest image of every N tracked frames"
+    )
+    choice.add_argument(
+        "--count",
+        type=positive_int,
+        metavar="N",
+        help="of the source, the sharpest image of each of N stretches of equal length (default: 300)",
+    )
+
+
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a run of a recording, those of :func:`add_folder_options` aside.
 
@@ -85,6 +110,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
         metavar="NAMES",
         help="write the results for other programs too: colmap, colmap-text, nerfstudio, tum, kitti, euroc; by commas",
     )
+    add_image_options(parser)
     parser.add_argument("--save-map", metavar="FILE", help="map file (.dvo) to write at the end, for a later --map")
     parser.add_argument("--map", metavar="FILE", help="map file (.dvo) of an earlier recording, to be localised in")
     add_input_options(parser)

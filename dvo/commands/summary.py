@@ -13,7 +13,7 @@ import numpy as np
 
 from dvo.commands import OK
 from dvo.commands.console import say
-from dvo.commands.page_tables import figures, headline_of, tables
+from dvo.commands.page_tables import figures, headline_of, tables, verdict_of
 from dvo.commands.picture import world_root
 from dvo.commands.places import check_outputs
 from dvo.commands.report import score
@@ -26,7 +26,7 @@ from dvo.session.files import write_error
 from dvo.session.frame_table import FrameRow, FrameTable, keyframe_times, write_frames
 from dvo.session.results_reader import Stored, read_results
 from dvo.session.session import Run
-from dvo.viz.run_page import RunPage, TrackLine, World, write_page
+from dvo.viz.run_page import RunPage, TrackLine, World, read_images, write_page
 
 Similarity = tuple[float, np.ndarray, np.ndarray]
 
@@ -53,7 +53,8 @@ def summary(arguments: argparse.Namespace) -> int:
     try:
         with replaced(out) as part:
             name = Path(str(stored.facts.get("source") or folder.resolve())).name
-            write_page(part, run_page(name, stored.result, stored.rows, stored.facts))
+            images = read_images(folder / results.PAGE)
+            write_page(part, run_page(name, stored.result, stored.rows, stored.facts, images))
     except OSError as error:
         raise write_error(out, error) from error
     say(f"summary in {out}")
@@ -84,6 +85,7 @@ class Pages:
         table: record of the estimates.
         odometry: that has tracked the clip.
         groundtruth: camera to world, metres; None if there is none.
+        images: time (seconds) and small JPEG file of some frames.
     """
 
     name: str
@@ -91,10 +93,11 @@ class Pages:
     table: FrameTable
     odometry: Odometry
     groundtruth: Trajectory | None
+    images: Sequence[tuple[float, bytes]] = ()
 
     def frames(self, path: Path) -> None:
         """Write frames.csv."""
-        write_frames(path, self._rows())
+        write_frames(path, self.rows())
 
     def page(self, path: Path, values: dict[str, Any]) -> None:
         """Write summary.html.
@@ -103,7 +106,7 @@ class Pages:
             path: file to write.
             values: content of run.json.
         """
-        write_page(path, run_page(self.name, self.run.result, self._rows(), values))
+        write_page(path, run_page(self.name, self.run.result, self.rows(), values, self.images))
 
     def add_warnings(self, folder: Path, warnings: Sequence[str]) -> None:
         """Add to the warnings in run.json and summary.html what was found after they were written.
@@ -129,7 +132,8 @@ class Pages:
         except OSError as error:
             raise write_error(file, error) from error
 
-    def _rows(self) -> list[FrameRow]:
+    def rows(self) -> list[FrameRow]:
+        """Rows of frames.csv."""
         truth = None if self.groundtruth is None else true_positions(self.table.timestamps, self.groundtruth)
         return self.table.rows(self.run, keyframe_times(self.odometry, self.run.result), truth)
 
@@ -150,7 +154,13 @@ def true_positions(times: np.ndarray, groundtruth: Trajectory) -> np.ndarray:
     return found
 
 
-def run_page(name: str, result: Result, rows: Sequence[FrameRow], facts: dict[str, Any]) -> RunPage:
+def run_page(
+    name: str,
+    result: Result,
+    rows: Sequence[FrameRow],
+    facts: dict[str, Any],
+    images: Sequence[tuple[float, bytes]] = (),
+) -> RunPage:
     """Contents of the page.
 
     With true positions every segment is aligned with them on its own, as for the metrics, and all share a
@@ -161,6 +171,7 @@ def run_page(name: str, result: Result, rows: Sequence[FrameRow], facts: dict[st
         result: of the run.
         rows: of its frames, in order of time.
         facts: content of run.json.
+        images: time (seconds) and small JPEG file of some frames.
 
     Returns:
         The page.
@@ -170,6 +181,7 @@ def run_page(name: str, result: Result, rows: Sequence[FrameRow], facts: dict[st
     loops = [(loop["from"], loop["to"]) for loop in _loops(facts)]
     return RunPage(
         title=name,
+        verdict=verdict_of(facts),
         subtitle=headline_of(facts),
         notices=facts.get("warnings") or [],
         facts=figures(facts, rows),
@@ -178,6 +190,7 @@ def run_page(name: str, result: Result, rows: Sequence[FrameRow], facts: dict[st
         rows=rows,
         errors=_errors(result, rows, fits),
         loops=loops,
+        images=images,
     )
 
 

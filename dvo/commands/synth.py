@@ -15,6 +15,7 @@ from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
 from dvo.core.text import print_line
 from dvo.data.files.output import check_place, replaced, spelled_in_text
+from dvo.data.inertial import NOISE_PRESETS
 from dvo.synth import FAMILIES, MeshScene, load_mesh
 from dvo.synth.export import export_sequence, mesh_sequence
 from dvo.synth.preview import contact_sheet, family_sheet, sequence_rows
@@ -70,7 +71,7 @@ def preview(arguments: argparse.Namespace) -> int:
 
 
 def export(arguments: argparse.Namespace) -> int:
-    """Write a sequence in the layout of TUM RGB-D or TartanAir.
+    """Write a sequence in the layout of TUM RGB-D, TartanAir or EuRoC.
 
     Args:
         arguments: of the command line.
@@ -104,7 +105,11 @@ def export(arguments: argparse.Namespace) -> int:
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=arguments.frames)
         notes = export_sequence(
-            sequence, arguments.out, arguments.layout, on_frame=lambda done: progress.update(task, completed=done)
+            sequence,
+            arguments.out,
+            arguments.layout,
+            on_frame=lambda done: progress.update(task, completed=done),
+            noise=NOISE_PRESETS.get(arguments.imu_noise),
         )
     for note in notes:
         warn(note, "note")

@@ -47,6 +47,8 @@ class InertialSamples:
         accel: ``(K, 3)`` float64 specific forces, m/s^2 (gravity included).
         T_camera_imu: ``(7,)`` float64 ``tx ty tz qx qy qz qw``, inertial sensor to camera, or None if not calibrated.
         noise: of the sensor, or None if it is not stated.
+        origin: what all samples of a recording come from, for messages, such as ``imu0/data.csv``.
+        notes: repairs and guesses of the reader, a sentence each.
 
     Raises:
         DvoError: arrays whose shapes do not match.
@@ -57,6 +59,8 @@ class InertialSamples:
     accel: np.ndarray
     T_camera_imu: np.ndarray | None = None
     noise: ImuNoise | None = None
+    origin: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.timestamps)
@@ -69,6 +73,11 @@ class InertialSamples:
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    @property
+    def rate(self) -> float:
+        """Samples a second, by the median of the intervals; NaN of fewer than two."""
+        return 1.0 / float(np.median(np.diff(self.timestamps))) if len(self) > 1 else float("nan")
 
     def between(self, after: float, until: float) -> InertialSamples:
         """Samples with ``after < time <= until``.

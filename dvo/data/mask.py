@@ -93,6 +93,10 @@ class Masks:
         self.files, self.size, self.invert, self.reduction = files, size, invert, reduction
         self._read = lru_cache(maxsize=1)(self._load)
 
+    def at_recorded_size(self) -> Masks:
+        """The same masks for images that are not reduced."""
+        return Masks(self.files, self.size, self.invert)
+
     def __call__(self, index: int, undistorter: Undistorter | None) -> np.ndarray:
         """Mask of an image.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,10 +13,12 @@ from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration
 from dvo.data.calibration.focal_guess import guess_focal
 from dvo.data.calibration.read import read_calibration
+from dvo.data.companions.inertial_source import AUTO, NONE, choose_inertial, imu_calibration_of
 from dvo.data.files.files import lookups
 from dvo.data.files.stamps import checked_rate
 from dvo.data.images.halves import two_views
 from dvo.data.images.reduction import MAX_PIXELS, reduction_to
+from dvo.data.inertial_files.imu_calibration import ImuCalibration
 from dvo.data.interval import Bound, Interval, expected_frames
 from dvo.data.mask import open_masks
 from dvo.data.opening import check_invert, check_stride, first_frame, locate, no_calibration
@@ -47,6 +50,9 @@ def open_source(
     mask: Path | str | None = None,
     mask_invert: bool = False,
     max_pixels: int | None = MAX_PIXELS,
+    imu: Path | str = AUTO,
+    imu_calib: Path | str | Sequence[Path | str] | ImuCalibration | None = None,
+    imu_topic: str | None = None,
 ) -> Source:
     """Open a video, a folder of images, or a data set's sequence folder (TUM RGB-D, EuRoC, KITTI, TartanAir v1 and v2,
     ICL-NUIM, or an image folder with ``calib.txt`` and ``groundtruth_tum.txt`` beside it), a bag of ROS; or a stream:
@@ -81,6 +87,13 @@ def open_source(
         max_pixels: images with more are reduced by area right after they are decoded, by the smallest whole factor that
             suffices (:mod:`dvo.data.images.reduction`); calibration and masks remain those of the recorded images. None
             for never; streams are never reduced.
+        imu: inertial samples for ``Frame.inertial``: ``auto``, those that belong to the recording (in its folder, bag
+            or video, or a logger's files beside the video); ``none``; or a file of
+            :func:`dvo.data.companions.inertial_source.read_inertial_file`.
+        imu_calib: calibration of the inertial sensor that wins over the data set's own, see
+            :func:`dvo.data.inertial_files.imu_calibration.read_imu_calibration`.
+        imu_topic: of the inertial samples in a bag of ROS, if there are several; two, gyroscope and accelerometer,
+            apart by a comma.
 
     Returns:
         Frames to iterate over; their ``depth``, ``right`` and ``inertial`` are filled where the layout has them.
@@ -97,7 +110,9 @@ def open_source(
                 print(frame.timestamp, frame.image.shape, frame.depth is not None)
     """
     if is_stream(source):
-        for field, value in dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start).items():
+        given: dict[str, Any] = dict(times=times, groundtruth=groundtruth, reader=reader, topic=topic, start=start)
+        given |= dict(imu=None if imu in (AUTO, NONE) else imu, imu_calib=imu_calib, imu_topic=imu_topic)
+        for field, value in given.items():
             if value is not None:
                 raise DvoError("not for a stream", field=field, remedy="leave it out")
         options: dict[str, Any] = dict(calib=calib, fps=fps, queue=queue, stride=stride, undistort=undistort, end=end)
@@ -119,6 +134,8 @@ def open_source(
         checked_rate(fps),
         calib if calib is None or isinstance(calib, Calibration) else read_calibration(locate(calib, path, "calib")),
         topic,
+        imu_topic,
+        imu_calibration_of(imu_calib, path),
     )
     with lookups(path):
         recording = find_reader(path, reader).open(path, request)
@@ -155,11 +172,13 @@ def open_source(
     truth = recording.groundtruth
     if groundtruth is not None:
         truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), recording.timestamps)
+    inertial, told = choose_inertial(recording, imu, request, first.timestamp)
+    doubts += told
     try:
         selection = Selection(interval, stride, reduction)
         reading = Reading(
             camera, selection, calibration=calibration, guess=guessed, masks=masks, groundtruth=truth,
-            undistort=undistort, doubts=tuple(doubts),
+            undistort=undistort, doubts=tuple(doubts), inertial=inertial,
         )  # fmt: skip
         return Source(recording, reading)
     except DvoError as error:  # the lens model does not know its file

@@ -49,14 +49,14 @@ def locate(given: Path | str, source: Path, field: str) -> Path:
         field: name of the option.
 
     Returns:
-        The file; of a mask, depth images or right images, possibly a folder.
+        The file; of a mask, depth images, right images or inertial samples, possibly a folder.
 
     Raises:
         DvoError: no such file.
     """
     path = Path(given)
     base = source if is_folder(source) else source.parent
-    may_be_folder, is_calibration = field in ("mask", "depth", "right"), field in ("calib", "depth-calib")
+    may_be_folder, is_calibration = field in ("mask", "depth", "right", "imu"), field in ("calib", "depth-calib")
     for option in (path, base / path):
         if is_calibration_file(option) if is_calibration else is_file(option):
             return option

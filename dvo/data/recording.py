@@ -19,7 +19,9 @@ from dvo.data.images.images import converted, decode, read_image, used_bits
 from dvo.data.images.orientation import check_zoom, common_orientation, turn
 from dvo.data.images.reduction import Reduction
 from dvo.data.inertial import InertialSamples
+from dvo.data.inertial_files.imu_calibration import ImuCalibration
 from dvo.data.interval import Interval
+from dvo.data.positions import Positions
 from dvo.data.sensors.depth import read_depth
 from dvo.data.sensors.sensors import Sensors
 from dvo.data.trajectory import Trajectory
@@ -36,12 +38,16 @@ class Request:
         fps: frames a second.
         calibration: calibration that the user named; wins over the data set's own.
         topic: of the images, in a bag of ROS.
+        imu_topic: of the inertial samples, in a bag of ROS.
+        imu_calibration: of the inertial sensor, that the user named; wins over the data set's own.
     """
 
     times: Path | None = None
     fps: float | None = None
     calibration: Calibration | None = None
     topic: str | None = None
+    imu_topic: str | None = None
+    imu_calibration: ImuCalibration | None = None
 
 
 @dataclass(frozen=True)
@@ -139,6 +145,7 @@ class Recording(Protocol):
         warnings: guesses and oddities that the user should know, a sentence each.
         stereo: reads the calibration of the right camera; None where frames have no right images.
         inertial: reads all inertial samples of the recording, times on the clock of the frames; None for none.
+        positions: reads the positions of a satellite receiver, of the same clock; None for none.
     """
 
     name: str
@@ -167,6 +174,10 @@ class Recording(Protocol):
 
     @property
     def inertial(self) -> Callable[[], InertialSamples] | None:
+        return None
+
+    @property
+    def positions(self) -> Callable[[], Positions | None] | None:
         return None
 
     def frames(self, log: Log, selection: Selection = EVERYTHING) -> Iterator[RawFrame]:
@@ -281,6 +292,11 @@ class ImageRecording:
     def inertial(self) -> Callable[[], InertialSamples] | None:
         """Reads all inertial samples, if there are any."""
         return self.sensors.inertial
+
+    @property
+    def positions(self) -> Callable[[], Positions | None] | None:
+        """Reads the positions of a satellite receiver, if there are any."""
+        return self.sensors.positions
 
     @property
     def turned(self) -> int:

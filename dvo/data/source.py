@@ -18,6 +18,7 @@ from dvo.data.frame import Frame, StereoView
 from dvo.data.inertial import InertialSamples
 from dvo.data.interval import expected_frames
 from dvo.data.mask import Masks
+from dvo.data.positions import Positions
 from dvo.data.recording import EVERYTHING, ImageRecording, Log, RawFrame, Recording, Selection
 from dvo.data.sensors.depth import registered_depth, resized_depth
 from dvo.data.trajectory import Trajectory
@@ -59,6 +60,7 @@ class Reading:
         undistort: resample images, depth, masks and right images to pinhole cameras.
         doubts: guesses at opening, in sentences for the user.
         rig: reads the calibration of the right camera; None for that of the recording.
+        inertial: reads the inertial samples that frames carry, times on the clock of the frames; None for none.
     """
 
     recorded_camera: Camera
@@ -72,6 +74,7 @@ class Reading:
     undistort: bool = True
     doubts: tuple[str, ...] = ()
     rig: Callable[[], StereoRig | None] | None = None
+    inertial: Callable[[], InertialSamples] | None = None
 
 
 class Source:
@@ -140,6 +143,13 @@ class Source:
         """
         camera = calibration.camera(self.recorded_camera.width, self.recorded_camera.height)
         return self.changed(recorded_camera=camera, calibration=calibration, guess=None)
+
+    def at_recorded_size(self) -> Self:
+        """The same recording, its images not reduced."""
+        if self.reduction is None:
+            return self
+        masks = None if self.masks is None else self.masks.at_recorded_size()
+        return self.changed(selection=replace(self.reading.selection, reduction=None), masks=masks)
 
     def __len__(self) -> int:
         """``frame_count``.
@@ -221,7 +231,7 @@ class Source:
         depth = partial(self._depth, raw.depth, raw.origin) if raw.depth else None
         right = partial(self._right, raw.right) if raw.right else None
         inertial = None
-        if previous is not None and self.recording.inertial is not None:
+        if previous is not None and self.reading.inertial is not None:
             inertial = partial(self._inertial, previous, raw.timestamp)
         mask = self.masks(raw.index, self._undistorter) if self.masks else None
         return Frame(raw.index, raw.timestamp, image, self.camera, depth, right, inertial, mask, silence=raw.silence)
@@ -255,8 +265,22 @@ class Source:
         return StereoView(image, camera, rig.T_left_right)
 
     @cached_property
-    def _samples(self) -> InertialSamples | None:
-        return self.recording.inertial() if self.recording.inertial else None
+    def inertial(self) -> InertialSamples | None:
+        """All inertial samples, times on the clock of the frames, read when they are first wanted; None for none.
+
+        Raises:
+            DvoError: damaged samples.
+        """
+        return self.reading.inertial() if self.reading.inertial else None
+
+    @cached_property
+    def positions(self) -> Positions | None:
+        """Positions of a satellite receiver, read when they are first wanted; None for none. Poses do not use them.
+
+        Raises:
+            DvoError: damaged positions.
+        """
+        return self.recording.positions() if self.recording.positions else None
 
     def _inertial(self, previous: float, timestamp: float) -> InertialSamples | None:
-        return None if self._samples is None else self._samples.between(previous, timestamp)
+        return None if self.inertial is None else self.inertial.between(previous, timestamp)

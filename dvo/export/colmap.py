@@ -20,10 +20,10 @@ _TRACK = np.dtype([("image", "<i4"), ("index", "<i4")])
 
 
 def write_colmap(reconstruction: Reconstruction, folder: Path) -> None:
-    """Write ``images/``, ``sparse/0/`` with cameras.bin, images.bin and points3D.bin, and times.txt.
+    """Write ``images/``, ``masks/``, ``sparse/0/`` with cameras.bin, images.bin and points3D.bin, and times.txt.
 
     Args:
-        reconstruction: of one segment.
+        reconstruction: of one world.
         folder: an empty folder.
 
     Raises:
@@ -36,10 +36,10 @@ def write_colmap(reconstruction: Reconstruction, folder: Path) -> None:
 
 
 def write_colmap_text(reconstruction: Reconstruction, folder: Path) -> None:
-    """Write ``images/``, ``sparse/0/`` with cameras.txt, images.txt and points3D.txt, and times.txt.
+    """Write ``images/``, ``masks/``, ``sparse/0/`` with cameras.txt, images.txt and points3D.txt, and times.txt.
 
     Args:
-        reconstruction: of one segment.
+        reconstruction: of one world.
         folder: an empty folder.
 
     Raises:
@@ -56,11 +56,11 @@ def write_colmap_text(reconstruction: Reconstruction, folder: Path) -> None:
 
 
 def write_images(reconstruction: Reconstruction, folder: Path) -> None:
-    """Write the image files, and a file of their times.
+    """Write the image files, their masks, and a file of their times.
 
     Args:
-        reconstruction: of one segment.
-        folder: takes ``images/`` and ``times.txt``, rows ``seconds name``.
+        reconstruction: of one world.
+        folder: takes ``images/``, ``masks/`` if there are masks, and ``times.txt``, rows ``seconds name``.
 
     Raises:
         OSError: a file cannot be written.
@@ -68,9 +68,25 @@ def write_images(reconstruction: Reconstruction, folder: Path) -> None:
     (folder / "images").mkdir()
     for name, jpeg in zip(reconstruction.names, reconstruction.jpegs, strict=True):
         (folder / "images" / name).write_bytes(jpeg)
+    if reconstruction.masks:
+        (folder / "masks").mkdir()
+        for name, mask in zip(reconstruction.names, reconstruction.masks, strict=True):
+            (folder / mask_file(name)).write_bytes(mask)
     times = zip(reconstruction.timestamps.tolist(), reconstruction.names, strict=True)
     rows = "".join(f"{time:.9f} {name}\n" for time, name in times)
     (folder / "times.txt").write_text("# seconds name\n" + rows, encoding="ascii", newline="\n")
+
+
+def mask_file(name: str) -> str:
+    """Place of the mask of an image, as ``--ImageReader.mask_path masks`` of COLMAP looks for it.
+
+    Args:
+        name: of the image file.
+
+    Returns:
+        Path within the folder of the export.
+    """
+    return f"masks/{name}.png"
 
 
 def _folders(reconstruction: Reconstruction, folder: Path) -> Path:
@@ -81,8 +97,8 @@ def _folders(reconstruction: Reconstruction, folder: Path) -> Path:
 
 
 def _image_ids(reconstruction: Reconstruction) -> np.ndarray:
-    """``(N,)``; COLMAP's numbers begin with 1."""
-    return reconstruction.identifiers + 1
+    """``(N,)`` from 1 in the order of the names: the numbers that the database of COLMAP gives to these images."""
+    return np.arange(1, len(reconstruction.identifiers) + 1)
 
 
 def _poses(reconstruction: Reconstruction) -> np.ndarray:

@@ -146,8 +146,8 @@ def export_trajectory(trajectory: Trajectory, folder: Path | str, format: str = 
 def export_run(odometry: Odometry, result: Result, formats: Iterable[str], folder: Path) -> list[str]:
     """Write the exports of a run into a new folder ``folder/NAME`` each.
 
-    Map formats hold the longest segment. Trajectory formats hold the longest segment too, and with several segments
-    all of them in folders ``segment-0``, ``segment-1``, ...
+    Map formats hold the longest segment and those that share its world. Trajectory formats hold the longest segment,
+    and with several segments all of them in folders ``segment-0``, ``segment-1``, ...
 
     Args:
         odometry: finished.

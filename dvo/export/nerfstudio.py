@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dvo.export.colmap import write_images
+from dvo.export.colmap import mask_file, write_images
 from dvo.export.reconstruction import CORNER, Reconstruction
 from dvo.geometry.camera import Camera
 from dvo.odometry.protocol import SparseMap
@@ -28,10 +28,10 @@ POINTS = "sparse_pc.ply"
 
 
 def write_nerfstudio(reconstruction: Reconstruction, folder: Path) -> None:
-    """Write transforms.json, ``images/``, the points as sparse_pc.ply, and times.txt.
+    """Write transforms.json, ``images/``, ``masks/``, the points as sparse_pc.ply, and times.txt.
 
     Args:
-        reconstruction: of one segment.
+        reconstruction: of one world.
         folder: an empty folder.
 
     Raises:
@@ -46,6 +46,7 @@ def write_nerfstudio(reconstruction: Reconstruction, folder: Path) -> None:
     rows = zip(r.names, r.timestamps.tolist(), camera_matrices(r.T_cw).tolist(), r.camera_of.tolist(), strict=True)
     for name, time, matrix, camera in rows:
         own = {} if single else _intrinsics(r.cameras[camera])
+        own |= {"mask_path": mask_file(name)} if r.masks else {}
         frames.append({"file_path": f"images/{name}", "timestamp": time, **own, "transform_matrix": matrix})
     values = {
         "camera_model": "OPENCV",

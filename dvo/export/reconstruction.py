@@ -1,4 +1,4 @@
-"""Reconstruction of a segment: images, points and observations of a keyframe graph, which the map formats write.
+"""Reconstruction of a world: images, points and observations of a keyframe graph, which the map formats write.
 
 A feature-map pixel ``(u, v)`` is centred on the image pixel ``(4u, 4v)`` (:class:`dvo.nets.patch.encoder.Encoder`), so
 positions and intrinsics of the feature map times 4 are those of the working image, without a half pixel. Pixel centres
@@ -7,7 +7,9 @@ lie at integers here; a format that counts from the corner of the first pixel ad
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +27,10 @@ from dvo.nets.patch.config import ModelConfig
 CORNER = 0.5
 """Pixel coordinates counted from the corner of the first pixel, less those counted from its centre."""
 
+TIME_ROUNDING = 1e-5
+"""Largest difference of equal times, seconds; trajectory files have nine decimals, and times may be large."""
+_POSE_ROUNDING = 1e-5  # of entries of a matrix, over the largest one and 1
+
 _RANGES = {"max_error": (0, 1e6), "min_weight": (0, 1e6), "min_images": (1, 1000)}
 
 
@@ -33,7 +39,7 @@ class PointOptions:
     """Choice of the observations and points of a reconstruction.
 
     Attributes:
-        max_error: largest reprojection error of an observation, pixels of the working image.
+        max_error: largest reprojection error of an observation, pixels of the image.
         min_weight: smallest weight of a measurement in bundle adjustment, mean of both axes.
         min_images: smallest number of images in which a point is observed.
 
@@ -51,15 +57,15 @@ class PointOptions:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Images, points and observations of a segment, in its world and scale.
+    """Images, points and observations of the segments that share a world, in this world and its scale.
 
     Attributes:
         cameras: distinct pinhole cameras of the images; pixel centres at integers.
         camera_of: ``(N,)`` position in ``cameras`` of the camera of each image.
-        identifiers: ``(N,)`` identifier of the keyframe of each image, increasing.
+        identifiers: ``(N,)`` identifier of the keyframe of each image, or the number of the frame, increasing.
         timestamps: ``(N,)`` float64 seconds.
         T_cw: ``(N, 4, 4)`` float64 world to camera (x right, y down, z forward).
-        jpegs: content of the N files.
+        jpegs: content of the N files; a sequence may read each when it is asked for.
         points: ``(P, 3)`` float64 in the world.
         colors: ``(P, 3)`` uint8 RGB.
         errors: ``(P,)`` mean reprojection error of the observations of each point, pixels.
@@ -68,6 +74,7 @@ class Reconstruction:
         positions: ``(O, 2)`` observed positions, pixels with centres at integers.
         residuals: ``(O,)`` reprojection errors, pixels; 0 in the image that the patch of the point was taken from.
         without_image: number of keyframes left out because their image is not kept.
+        masks: content of N PNG files, white where the image is used and black where it is not; empty without masks.
     """
 
     cameras: tuple[Camera, ...]
@@ -75,7 +82,7 @@ class Reconstruction:
     identifiers: np.ndarray
     timestamps: np.ndarray
     T_cw: np.ndarray
-    jpegs: tuple[bytes, ...]
+    jpegs: Sequence[bytes]
     points: np.ndarray
     colors: np.ndarray
     errors: np.ndarray
@@ -84,10 +91,11 @@ class Reconstruction:
     positions: np.ndarray
     residuals: np.ndarray
     without_image: int = 0
+    masks: Sequence[bytes] = ()
 
     @property
     def names(self) -> list[str]:
-        """Names of the image files, by the identifiers of the keyframes."""
+        """Names of the image files, by their identifiers."""
         return [f"{identifier:06d}.jpg" for identifier in self.identifiers.tolist()]
 
     @property
@@ -167,21 +175,11 @@ def reconstruct(
     if not shown.any():
         remedy = "track with ArchiveConfig(images=True) and a larger max_bytes"
         raise DvoError("no keyframe has its image", field=f"segment {segment}", remedy=remedy)
-    T_cw = pose_matrices(graph.poses_cw(np.array([frame.identifier for frame in frames])).numpy())
-    intrinsics = ModelConfig.STRIDE * np.array([frame.intrinsics for frame in frames], dtype=np.float64)
-    patches = _patches(frames, T_cw, intrinsics)
-    frame_of, point_of, positions, residuals = _observations(
-        graph.archive.edges(), frames, T_cw, intrinsics, patches, sizes, options
-    )
-    views = np.bincount(point_of, minlength=len(patches.points))
-    seen = views >= options.min_images
-    chosen = seen[point_of]
-    frame_of, point_of, positions, residuals = (x[chosen] for x in (frame_of, point_of, positions, residuals))
-    point_of = (np.cumsum(seen) - 1)[point_of]
-    sums = np.bincount(point_of, residuals, minlength=int(seen.sum()))
+    T_cw, intrinsics = _poses(graph, frames), _intrinsics(frames)
     images = np.flatnonzero(shown)
     found = [_camera(intrinsics[image], sizes[image]) for image in images]
     cameras = tuple(dict.fromkeys(found))
+    image_of = np.where(shown, np.cumsum(shown) - 1, -1)
     return Reconstruction(
         cameras=cameras,
         camera_of=np.array([cameras.index(camera) for camera in found]),
@@ -189,15 +187,92 @@ def reconstruct(
         timestamps=np.array([frames[image].timestamp for image in images], dtype=np.float64),
         T_cw=T_cw[images],
         jpegs=tuple(contents[image] for image in images),
-        points=patches.points[seen],
-        colors=patches.colors[seen],
-        errors=sums / views[seen],
-        image_of=(np.cumsum(shown) - 1)[frame_of],
-        point_of=point_of,
-        positions=positions,
-        residuals=residuals,
         without_image=int((kept & ~shown).sum()),
+        **_content(graph, frames, T_cw, intrinsics, image_of, found, options),
     )
+
+
+def observe(
+    graph: KeyframeGraph,
+    segment: int,
+    images: Reconstruction,
+    options: PointOptions = PointOptions(max_error=1.5),  # noqa: B008 (frozen)
+) -> Reconstruction:
+    """Give other images of a recording the points and observations of the archive of a keyframe graph.
+
+    An image is one of a tracked frame, kept or dropped, if it has the time and the pose of one: its measurements are
+    then brought to the pixels of the image by the intrinsics of both. Points of kept keyframes that too few of the
+    images observe are there without observations.
+
+    Args:
+        graph: of the recording, finished.
+        segment: number of a segment of the world that the images are in.
+        images: undistorted, with poses.
+        options: thresholds.
+
+    Returns:
+        The images with points and observations; as they are, if none is of a frame of the graph.
+    """
+    frames = graph.members(segment)
+    if not frames or not len(images.timestamps):
+        return images
+    T_cw, intrinsics = _poses(graph, frames), _intrinsics(frames)
+    times = np.array([frame.timestamp for frame in frames])
+    nearest = np.searchsorted((images.timestamps[1:] + images.timestamps[:-1]) / 2, times)
+    found = images.T_cw[nearest]
+    same = np.abs(times - images.timestamps[nearest]) <= TIME_ROUNDING
+    same &= np.abs(T_cw - found).max(axis=(1, 2)) <= _POSE_ROUNDING * (1 + np.abs(found).max(axis=(1, 2)))
+    if not same.any():
+        return images
+    cameras = [images.cameras[number] for number in images.camera_of.tolist()]
+    image_of = np.where(same, nearest, -1)
+    return replace(images, **_content(graph, frames, T_cw, intrinsics, image_of, cameras, options, all_points=True))
+
+
+def _poses(graph: KeyframeGraph, frames: list[ArchivedKeyframe]) -> np.ndarray:
+    """``(F, 4, 4)`` world to camera."""
+    return pose_matrices(graph.poses_cw(np.array([frame.identifier for frame in frames])).numpy())
+
+
+def _intrinsics(frames: list[ArchivedKeyframe]) -> np.ndarray:
+    """``(F, 4)`` of the working images."""
+    return ModelConfig.STRIDE * np.array([frame.intrinsics for frame in frames], dtype=np.float64)
+
+
+def _content(
+    graph: KeyframeGraph,
+    frames: list[ArchivedKeyframe],
+    T_cw: np.ndarray,
+    intrinsics: np.ndarray,
+    image_of: np.ndarray,
+    cameras: list[Camera],
+    options: PointOptions,
+    all_points: bool = False,
+) -> dict[str, Any]:
+    """Points and observations of a reconstruction; ``image_of (F,)``: image of each frame, -1 for none, ``cameras``:
+    of each image, ``all_points``: those of kept keyframes without observations too."""
+    patches = _patches(frames, T_cw, intrinsics)
+    observed_in, point_of, positions, residuals = _observations(
+        graph.archive.edges(), frames, T_cw, intrinsics, patches, image_of, cameras, options
+    )
+    views = np.bincount(point_of, minlength=len(patches.points))
+    seen = views >= options.min_images
+    chosen = seen[point_of]
+    observed_in, point_of, positions, residuals = (x[chosen] for x in (observed_in, point_of, positions, residuals))
+    listed = seen
+    if all_points:
+        kept = np.array([frame.anchor is None for frame in frames], dtype=bool)
+        listed = seen | patches.usable & np.repeat(kept, np.diff(patches.start))
+    sums = np.bincount(point_of, residuals, minlength=len(patches.points))
+    return {
+        "points": patches.points[listed],
+        "colors": patches.colors[listed],
+        "errors": (sums / np.maximum(np.where(seen, views, 0), 1))[listed],
+        "image_of": observed_in,
+        "point_of": (np.cumsum(listed) - 1)[point_of],
+        "positions": positions,
+        "residuals": residuals,
+    }
 
 
 def _camera(intrinsics: np.ndarray, size: tuple[int, int] | None) -> Camera:
@@ -233,35 +308,39 @@ def _observations(
     T_cw: np.ndarray,
     intrinsics: np.ndarray,
     patches: _Patches,
-    sizes: list[tuple[int, int] | None],
+    image_of: np.ndarray,
+    cameras: list[Camera],
     options: PointOptions,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Frame ``(O,)``, patch ``(O,)``, position ``(O, 2)`` and reprojection error ``(O,)`` of each observation in an
-    image, ordered by frame, then by patch."""
+    """Image ``(O,)``, patch ``(O,)``, position ``(O, 2)`` and reprojection error ``(O,)`` of each observation in an
+    image, in its pixels, ordered by image, then by patch."""
     identifiers = np.array([frame.identifier for frame in frames])
-    shown = np.array([size is not None for size in sizes], dtype=bool)
+    shown = image_of >= 0
+    size = np.array([(camera.width, camera.height) for camera in cameras], dtype=np.float64)[image_of]
+    wanted = np.where(shown[:, None], np.array([camera.intrinsics for camera in cameras])[image_of], intrinsics)
+    scale = wanted[:, :2] / intrinsics[:, :2]  # from pixels of the working image to those of the image
+    shift = wanted[:, 2:] - scale * intrinsics[:, 2:]
     owner = np.repeat(np.arange(len(frames)), np.diff(patches.start))
     own = np.flatnonzero(patches.usable & shown[owner])
     edges = edges.select(np.isin(edges.source, identifiers) & np.isin(edges.target, identifiers))
     ii, jj = np.searchsorted(identifiers, edges.source), np.searchsorted(identifiers, edges.target)
     kk = patches.start[ii] + edges.patch
-    positions = ModelConfig.STRIDE * edges.position.astype(np.float64)
+    positions = scale[jj] * (ModelConfig.STRIDE * edges.position.astype(np.float64)) + shift[jj]
     in_camera = np.einsum("eij,ej->ei", T_cw[jj, :3, :3], patches.points[kk]) + T_cw[jj, :3, 3]
     in_front = in_camera[:, 2] > 0
     z = np.where(in_front, in_camera[:, 2], 1.0)[:, None]
-    projected = in_camera[:, :2] / z * intrinsics[jj, :2] + intrinsics[jj, 2:]
+    projected = in_camera[:, :2] / z * wanted[jj, :2] + wanted[jj, 2:]
     errors = np.linalg.norm(projected - positions, axis=1)
-    size = np.array([size or (0, 0) for size in sizes], dtype=np.float64)[jj]
-    inside = ((positions >= -CORNER) & (positions <= size - CORNER)).all(axis=1)
+    inside = ((positions >= -CORNER) & (positions <= size[jj] - CORNER)).all(axis=1)
     weights = edges.weight.astype(np.float64).mean(axis=1)
     good = (ii != jj) & shown[jj] & patches.usable[kk] & in_front & inside
     good &= (errors <= options.max_error) & (weights >= options.min_weight)  # NaN fails too
-    frame_of, point_of = np.concatenate([owner[own], jj[good]]), np.concatenate([own, kk[good]])
-    positions = np.concatenate([patches.centres[own], positions[good]])
+    observed_in, point_of = image_of[np.concatenate([owner[own], jj[good]])], np.concatenate([own, kk[good]])
+    positions = np.concatenate([scale[owner[own]] * patches.centres[own] + shift[owner[own]], positions[good]])
     residuals = np.concatenate([np.zeros(len(own)), errors[good]])
-    order = np.lexsort([residuals, point_of, frame_of])  # of several measurements of a patch in an image the best
-    pairs = np.column_stack([frame_of, point_of])[order]
+    order = np.lexsort([residuals, point_of, observed_in])  # of several measurements of a patch in an image the best
+    pairs = np.column_stack([observed_in, point_of])[order]
     first = np.ones(len(order), dtype=bool)
     first[1:] = (pairs[1:] != pairs[:-1]).any(axis=1)
     order = order[first]
-    return frame_of[order], point_of[order], positions[order], residuals[order]
+    return observed_in[order], point_of[order], positions[order], residuals[order]

@@ -164,6 +164,28 @@ def so3_exp(phi: np.ndarray) -> np.ndarray:
     return np.eye(3) + s * k + c * (k @ k)
 
 
+def rotation_vector(rotation: np.ndarray) -> np.ndarray:
+    """Logarithm of rotations of angles well below pi, accurate for tiny ones.
+
+    Args:
+        rotation: ``(..., 3, 3)``.
+
+    Returns:
+        ``(..., 3)`` rad.
+    """
+    twist = 0.5 * np.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )  # sin(angle) * axis
+    sine = np.linalg.norm(twist, axis=-1, keepdims=True)
+    cosine = (np.trace(rotation, axis1=-2, axis2=-1)[..., None] - 1) / 2
+    return twist * np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-300), 1.0)
+
+
 def se3_exp(xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exponential map of SE(3).
 

@@ -126,15 +126,19 @@ def result_of_log(
         rows.setdefault(number if segment.joined_to is None else segment.joined_to, []).append(segment.trajectory)
     in_map = [number for number in rows if segments[number].in_map]
     main = max(in_map or rows, key=lambda number: (sum(map(len, rows[number])), -number), default=0)
-    trajectory = _concatenated(rows[main]) if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
+    trajectory = joined(rows[main]) if segments else Trajectory(np.zeros(0), np.zeros((0, 7)))
     read, tracked = len(log.frames) - recording.frame, sum(len(segment) for segment in segments)
     breaks = breaks_of(log, recording.frame)
     predicted = tuple(r.timestamp for r in log.frames[recording.frame :] if r.inertial and not r.lost)
     return Result(trajectory, SparseMap(), read, read - tracked, info, segments, breaks, inertial=predicted), main
 
 
-def _concatenated(parts: Sequence[Trajectory]) -> Trajectory:
-    """One trajectory of several that follow each other in time."""
+def joined(parts: Sequence[Trajectory]) -> Trajectory:
+    """One trajectory of several that follow each other in time.
+
+    Args:
+        parts: at least one.
+    """
     if len(parts) == 1:
         return parts[0]
     return Trajectory(np.concatenate([p.timestamps for p in parts]), np.concatenate([p.poses_wc for p in parts]))

@@ -17,7 +17,7 @@ from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.data.trajectory import Trajectory, interpolate
 from dvo.odometry.protocol import Break, Estimate, Interim, Odometry, Result
-from dvo.odometry.segments import find_breaks
+from dvo.odometry.segments import find_breaks, joined
 from dvo.session.second_run import compare_again, is_due
 
 FrameCallback = Callable[[Frame, Estimate | None], None]
@@ -174,7 +174,8 @@ def over_source(
         The result with rows for skipped frames, each between two frames of one segment; with counts and breaks in
         frames of the source; and with the breaks that the rows show if the odometry reports none.
     """
-    longest, segments = result.longest, result.segments
+    segments, main = result.segments, result.trajectory.timestamps
+    together = [k for k, s in enumerate(segments) if len(s) and np.isin(s.trajectory.timestamps, main).all()]
     if len(skipped):
         segments = tuple(replace(s, trajectory=fill_skipped(s.trajectory, fed, skipped)) for s in segments)
     times = np.sort(np.concatenate([fed, skipped]))
@@ -191,7 +192,7 @@ def over_source(
         breaks = tuple(replace(b, frames=_count_between(lost, b.start, b.end)) for b in breaks)
     return replace(
         result,
-        trajectory=result.trajectory if longest is None else segments[longest].trajectory,
+        trajectory=joined([segments[k].trajectory for k in together]) if together else result.trajectory,
         frames_read=len(times),
         frames_lost=len(times) - sum(len(segment) for segment in segments),
         segments=segments,

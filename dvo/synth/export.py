@@ -1,4 +1,4 @@
-"""Export of sequences in the layouts of TUM RGB-D and TartanAir, and of scenes as triangles for other renderers."""
+"""Export of sequences in the layouts of TUM RGB-D, TartanAir and EuRoC, and of scenes as triangles."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import torch
 
 from dvo.core.errors import DvoError
 from dvo.data.files.output import new_folder, spelled_in_text
+from dvo.data.inertial import NOISE_PRESETS, ImuNoise
 from dvo.data.trajectory import Trajectory, write_tum
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import NED_FROM_CAMERA, invert_rodrigues, pose_matrices, poses_from_matrices, split
 from dvo.geometry.undistort import needs_undistortion
 from dvo.synth import salts
+from dvo.synth.euroc_tables import check_lens, nanoseconds, write_tables
 from dvo.synth.meshes.mesh import MeshScene
 from dvo.synth.motion.walks import long_path
 from dvo.synth.scenes.scene import Scene
@@ -25,7 +27,7 @@ from dvo.synth.sequence import SyntheticSequence
 from dvo.synth.specs import MotionSpec, SequenceFormat
 
 Array = np.ndarray
-Layout = Literal["tum", "tartanair"]
+Layout = Literal["tum", "tartanair", "euroc"]
 TUM_FACTOR = 5000  # units of a metre in TUM's 16-bit depth
 # TartanAir's codes of flow that has no counterpart.
 OCCLUDED, OUT_OF_VIEW = 1, 100
@@ -82,7 +84,12 @@ def mesh_sequence(
 
 
 def export_sequence(
-    sequence: SyntheticSequence, out: Path | str, layout: Layout, *, on_frame: Callable[[int], None] | None = None
+    sequence: SyntheticSequence,
+    out: Path | str,
+    layout: Layout,
+    *,
+    on_frame: Callable[[int], None] | None = None,
+    noise: ImuNoise | None = NOISE_PRESETS["euroc"],
 ) -> list[str]:
     """Write a sequence.
 
@@ -91,12 +98,15 @@ def export_sequence(
     with masks (0 valid, 1 occluded, 100 out of view), ``pose_left.txt`` (camera x forward, y right, z down; the world's
     z axis points up, unlike TartanAir's), ``imu/cam_time.txt``. Both: ``calib.txt`` with fx fy cx cy; of a lens with
     distortion (``tum`` only) also its coefficients, of a fisheye or a rolling shutter ``calib.yaml`` instead.
+    ``euroc``: ``mav0`` with ``cam0``, ``imu0`` (200 samples a second in the camera's axes) and
+    ``state_groundtruth_estimate0``, without depth.
 
     Args:
         sequence: rendered frame by frame while it is written.
         out: folder, new or empty.
-        layout: ``tum`` or ``tartanair``.
+        layout: ``tum``, ``tartanair`` or ``euroc``.
         on_frame: called with the number of frames written so far.
+        noise: of the inertial samples of ``euroc``; None for exact ones.
 
     Returns:
         Notes on content that the layout cannot hold.
@@ -104,16 +114,21 @@ def export_sequence(
     Raises:
         DvoError: an unknown layout, or a folder that is not empty or cannot be written.
     """
-    if layout not in ("tum", "tartanair"):
-        raise DvoError(f"no layout {layout!r}", field="layout", remedy="choose tum or tartanair")
+    if layout not in ("tum", "tartanair", "euroc"):
+        raise DvoError(f"no layout {layout!r}", field="layout", remedy="choose tum, tartanair or euroc")
+    if layout == "euroc":
+        check_lens(sequence.camera)
     if layout == "tartanair" and needs_undistortion(sequence.camera):
         raise DvoError("TartanAir's layout has no lens distortion", field="layout", remedy="choose tum")
     out = Path(out)
     try:
         with new_folder(out) as part:
-            write_calibration(sequence.camera, part)
-            write = _write_tum if layout == "tum" else _write_tartanair
-            notes = write(_frames(sequence, on_frame), sequence, part)
+            frames = _frames(sequence, on_frame)
+            if layout == "euroc":
+                notes = _write_euroc(frames, sequence, part, noise)
+            else:
+                write_calibration(sequence.camera, part)
+                notes = (_write_tum if layout == "tum" else _write_tartanair)(frames, sequence, part)
     except OSError as error:
         raise DvoError(f"cannot be written ({error.strerror})", file=out, remedy="name a folder elsewhere") from error
     return [*sequence.warnings, *notes]
@@ -226,6 +241,17 @@ def _write_tartanair(frames: Iterator[tuple[int, Array, Array]], sequence: Synth
             np.save(out / "flow" / f"{name}_flow.npy", flow)
             np.save(out / "flow" / f"{name}_mask.npy", mask)
         before = depth
+    return []
+
+
+def _write_euroc(
+    frames: Iterator[tuple[int, Array, Array]], sequence: SyntheticSequence, out: Path, noise: ImuNoise | None
+) -> list[str]:
+    (out / "mav0" / "cam0" / "data").mkdir(parents=True)
+    stamps = nanoseconds(sequence.groundtruth.timestamps)
+    for index, image, _ in frames:
+        _write_picture(out / "mav0" / "cam0" / "data" / f"{stamps[index]}.png", image)
+    write_tables(sequence, noise, out / "mav0")
     return []
 
 

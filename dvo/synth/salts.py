@@ -16,6 +16,7 @@ SCENE = 7101  # family and layout
 # Motion
 PATH = 7201  # short path of a training clip
 LONG_PATH = 7202  # long path of a sequence
+NATURAL_PATH = 7203  # motion of a hand or a quadrotor
 # Training clips
 CLIP = 7301  # path, intrinsics, sensor
 CLIP_DEGRADATION = 7302  # compression and exposure changes

@@ -15,11 +15,12 @@ from dvo.data.trajectory import Trajectory
 from dvo.geometry.camera import Camera
 from dvo.synth import salts
 from dvo.synth.motion.movers import random_bodies
+from dvo.synth.motion.natural import NATURAL_KINDS, natural_path
 from dvo.synth.motion.walks import long_path
 from dvo.synth.protocols import Motion
 from dvo.synth.render.lens import random_lens
 from dvo.synth.render.renderer import Rendering, render
-from dvo.synth.render.shot import Shot
+from dvo.synth.render.shot import Offset, Shot
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.families import random_scene
 from dvo.synth.scenes.repaint import reduce_texture
@@ -144,8 +145,11 @@ class SyntheticSequence:
 
     def _exposed(self, index: int) -> np.ndarray:
         """Image ``(H, W, 3)`` of the sensor."""
-        rendered = self.rendering(index)
-        images = self._covered(index, rendered)[0] if self.surroundings else rendered.images
+        if self.sensor is not None and bool(self.sensor.dark(self.groundtruth.timestamps[index : index + 1])[0]):
+            images = torch.zeros(1, 3, self.camera.height, self.camera.width)  # whatever is there, it is not seen
+        else:
+            rendered = self.rendering(index)
+            images = self._covered(index, rendered)[0] if self.surroundings else rendered.images
         if self.sensor is not None:
             rng = np.random.default_rng([self.seed, salts.NOISE, index])
             images = expose(images, self.sensor, rng, times=self.groundtruth.timestamps[index : index + 1])
@@ -206,20 +210,26 @@ class SyntheticSequence:
         """
         return tracks(self.shot, self.groundtruth.timestamps, count, seed=seed)
 
-    def imu(self, rate: float = 200.0, *, noise: ImuNoise | None = None, seed: int | None = None) -> Imu:
+    def imu(
+        self, rate: float = 200.0, *, noise: ImuNoise | None = None, seed: int | None = None,
+        T_camera_imu: np.ndarray | None = None, margin: float = 0.0,
+    ) -> Imu:  # fmt: skip
         """Inertial measurements from the first frame to the last.
 
         Args:
             rate: samples per second.
             noise: None for exact measurements.
             seed: of the noise; that of the sequence if None.
+            T_camera_imu: ``(7,)`` pose of the sensor in the camera, metres; at the camera and with its axes if None.
+            margin: seconds before the first frame and after the last one that are measured too; the path has to go on.
 
         Returns:
-            The samples.
+            The samples, in the frame of the sensor.
         """
-        first, last = self.time(0), self.time(-1)
+        first, last = self.time(0) - margin, self.time(-1) + margin
         times = first + np.arange(int(np.floor((last - first) * rate + 1e-9)) + 1) / rate
-        return measure_imu(self.path, times, noise=noise, seed=self.seed if seed is None else seed)
+        path = self.path if T_camera_imu is None else Offset(self.path, T_camera_imu)
+        return measure_imu(path, times, noise=noise, seed=self.seed if seed is None else seed)
 
     def stereo(self, baseline: float) -> SyntheticSequence:
         """Second camera of a rectified stereo pair, ``baseline`` metres to the right, with noise of its own.
@@ -316,7 +326,8 @@ def make_sequence(
     scene = random_scene(scene_seed, spec.scene.family, pool=pool)
     kind = spec.motion.kind or ("forward" if scene.hints.get("heading") is not None else "handheld")
     path_seed = int(rng.integers(2**31))
-    path = long_path(scene, path_seed, kind, duration, speed=spec.motion.speed, shake=spec.motion.shake)
+    plan = natural_path if kind in NATURAL_KINDS else long_path
+    path = plan(scene, path_seed, kind, duration, speed=spec.motion.speed, shake=spec.motion.shake)
     fx, fy, cx, cy = random_intrinsics(rng, form.height, form.width).tolist()
     pinhole = Camera(fx, fy, cx, cy, form.width, form.height)
     camera = random_lens(np.random.default_rng([seed, salts.LENS]), pinhole, spec.camera.lens)

@@ -99,7 +99,8 @@ class MotionSpec:
     """Choice of a camera path.
 
     Args:
-        kind: one of ``dvo.synth.LONG_KINDS``; if None, a drive in streets and corridors and a hand-held walk elsewhere.
+        kind: one of ``dvo.synth.LONG_KINDS`` or ``dvo.synth.NATURAL_KINDS``; if None, a drive in streets and corridors
+            and a hand-held walk elsewhere.
         speed: relative to a relaxed pace.
         shake: factor on the amplitude of the hand's shake.
 

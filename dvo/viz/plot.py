@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 INK, ACCENT, TRUTH, START, PAPER = "#22272e", "#e4572e", "#4a6fa5", "#2a9d5c", "#ffffff"
 COLOURS = (ACCENT, "#8e4ec6", "#b08900", "#00838f", "#c2185b", "#5d4037")  # of segments
 SIZE_INCHES, DPI = (7.6, 6.0), 150
+_INSET = 0.36  # side of the enlarged path in a plan view, of that of the view
 _WIDTH = 66  # letters in a line of a title
 
 
@@ -76,7 +77,7 @@ class Panel:
 
     Attributes:
         tracks: lines in one world; aligned with the reference if there is one.
-        points: ``(M, 3)`` map points in that world, drawn faintly behind the lines.
+        points: ``(M, 3)`` map points in that world, drawn behind the lines; the nearer half is within the view.
         reference: ground truth, camera to world, metres.
         loops: ``(L, 3)`` positions at which a loop was found, in that world.
     """
@@ -103,7 +104,7 @@ def plot_trajectory(
         path: image to write; the extension selects the format.
         estimate: camera to world, already aligned to the reference if there is one.
         reference: ground truth, camera to world, metres.
-        points: ``(M, 3)`` map points in the world of the estimate, drawn faintly behind it.
+        points: ``(M, 3)`` map points in the world of the estimate, drawn behind it.
         title, subtitle: texts above the plot.
         label: name of the estimate in the legend.
     """
@@ -157,10 +158,20 @@ def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:
     lines = [track.trajectory for track in panel.tracks if len(track.trajectory)]
     shown = lines if truth is None else [truth]
     axes = plan_axes(np.concatenate([line.positions for line in shown]) if shown else np.zeros((0, 3)))
-    _limits(plot, [line.positions for line in (*lines, truth) if line is not None], axes, ratio)
-    points = panel.points
-    if points is not None and len(points):
-        plot.scatter(points[:, axes[0]], points[:, axes[1]], s=1.2, color=INK, alpha=0.16, linewidths=0, zorder=1)
+    points = np.zeros((0, 2)) if panel.points is None else panel.points[:, axes]
+    points = points[np.isfinite(points).all(axis=1)]
+    _limits(plot, [line.positions for line in (*lines, truth) if line is not None], axes, ratio, points)
+    if len(points):
+        plot.scatter(points[:, 0], points[:, 1], s=7, color=INK, alpha=0.4, linewidths=0, label="map points", zorder=1)
+    _draw_lines(plot, panel, truth, axes)
+    path = np.concatenate([line.positions for line in shown])[:, axes] if shown else np.zeros((0, 2))
+    if len(path) and len(points):
+        _enlarge(plot, panel, truth, axes, path, points)
+    _decorate(plot, axes, "m" if truth is not None else "unit free")
+
+
+def _draw_lines(plot: Axes, panel: Panel, truth: Trajectory | None, axes: tuple[int, int]) -> None:
+    """Draw trajectories, starts and loops."""
     if truth is not None:
         plot.plot(*with_gaps(truth)[:, axes].T, color=TRUTH, lw=2.6, alpha=0.75, label="ground truth", zorder=2)
     for track in panel.tracks:
@@ -173,14 +184,41 @@ def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:
     if panel.loops is not None and len(panel.loops):
         name = f"{len(panel.loops)} loop{'s' * (len(panel.loops) > 1)}"
         plot.plot(*panel.loops[:, axes].T, "D", ms=5, mfc="none", mec=INK, mew=1.2, ls="none", label=name, zorder=5)
-    _decorate(plot, axes, "m" if truth is not None else "unit free")
 
 
-def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int], ratio: float) -> None:
-    """Set limits by the trajectories, not by the map: a few far points would make the path invisibly small."""
+def _enlarge(
+    plot: Axes, panel: Panel, truth: Trajectory | None, axes: tuple[int, int], path: np.ndarray, points: np.ndarray
+) -> None:
+    """Draw a path that is small beside its map once more, enlarged, in the corner with the fewest points."""
+    (left, right), (bottom, top) = plot.get_xlim(), plot.get_ylim()
+    size = np.array([right - left, top - bottom])
+    half = 0.6 * max(float((np.ptp(path, axis=0) / size).max()), 1e-9)  # of the enlarged part, of the view
+    if not 0.005 < half < _INSET / 4:
+        return
+    everything = (np.concatenate([points, path]) - [left, bottom]) / size
+    corners = [(x, y) for y in (0.02, 0.98 - _INSET) for x in (0.02, 0.98 - _INSET)]
+    covered = [((everything >= c) & (everything <= np.add(c, _INSET))).all(axis=1).sum() for c in corners]
+    inset = plot.inset_axes((*corners[int(np.argmin(covered))], _INSET, _INSET), facecolor=PAPER, zorder=6)
+    middle = (path.min(axis=0) + path.max(axis=0)) / 2
+    inset.set_xlim(middle[0] - half * size[0], middle[0] + half * size[0])
+    inset.set_ylim(middle[1] - half * size[1], middle[1] + half * size[1])
+    _draw_lines(inset, panel, truth, axes)
+    inset.set_xticks([])
+    inset.set_yticks([])
+    note = f"path, {_INSET / (2 * half):.0f} times"
+    inset.text(0.03, 0.97, note, fontsize=8, color=INK, ha="left", va="top", transform=inset.transAxes)
+    plot.indicate_inset_zoom(inset, edgecolor=INK, alpha=0.6)
+
+
+def _limits(plot: Axes, tracks: list[np.ndarray], axes: tuple[int, int], ratio: float, points: np.ndarray) -> None:
+    """Set limits around the trajectories and the nearer half of the map: with its far points the path would be
+    invisibly small, and without any the map of a camera that moves little would lie outside."""
     if not tracks:
         return
     both = np.concatenate(tracks)[:, axes]
+    if len(points):
+        far = np.linalg.norm(points - (both.min(axis=0) + both.max(axis=0)) / 2, axis=1)
+        both = np.concatenate([both, points[far <= np.median(far)]])
     middle, size = (both.min(axis=0) + both.max(axis=0)) / 2, np.ptp(both, axis=0)
     height = 1.2 * max(float(size[1]), float(size[0]) / ratio, 1e-6)
     plot.set_xlim(middle[0] - height * ratio / 2, middle[0] + height * ratio / 2)

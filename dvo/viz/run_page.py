@@ -26,6 +26,7 @@ from dvo.viz.plot import COLOURS
 
 ASSETS = Path(__file__).resolve().parent / "assets"
 MAX_FRAMES, MAX_POINTS, MAX_KEYFRAMES = 2400, 6000, 1500
+_DATA = '<script type="application/json" id="data">'
 _FAR = 20.0  # points further than this many radii of the trajectory are left out: they would only be specks
 
 
@@ -71,6 +72,7 @@ class RunPage:
 
     Attributes:
         title, subtitle: texts at the top.
+        verdict: word (``good``, ``doubtful`` or ``failed``) and reason of the verdict; empty without one.
         notices: warnings, a sentence each.
         facts: name and value of the figures at the top.
         tables: HTML of the tables.
@@ -78,6 +80,7 @@ class RunPage:
         rows: of the frames, in order of time.
         errors: ``(N,)`` distance from the true position of each frame, metres, nan where unknown.
         loops: times of the two visits of each loop, seconds.
+        images: time (seconds) and JPEG file of some frames, in order of time; small ones.
     """
 
     title: str
@@ -89,6 +92,8 @@ class RunPage:
     rows: Sequence[FrameRow]
     errors: np.ndarray
     loops: Sequence[tuple[float, float]]
+    verdict: tuple[str, str] = ("", "")
+    images: Sequence[tuple[float, bytes]] = ()
 
 
 def write_page(path: Path, page: RunPage) -> None:
@@ -106,6 +111,7 @@ def write_page(path: Path, page: RunPage) -> None:
         template.substitute(
             title=escape(page.title),
             subtitle=escape(page.subtitle),
+            verdict=_verdict(*page.verdict),
             notices="".join(f'<p class="notice">{escape(text)}</p>\n' for text in page.notices),
             facts="".join(facts),
             tables=page.tables,
@@ -115,6 +121,32 @@ def write_page(path: Path, page: RunPage) -> None:
         )
     )
     path.write_text(text, encoding="utf-8")
+
+
+def _verdict(word: str, reason: str) -> str:
+    if not word:
+        return ""
+    kind = word if word in ("good", "doubtful", "failed") else "doubtful"
+    return f'<p class="verdict {kind}"><strong>verdict: {escape(word)}</strong> {escape(reason)}</p>\n'
+
+
+def read_images(path: Path) -> list[tuple[float, bytes]]:
+    """Images of the frames in a page, for one that is written anew.
+
+    Args:
+        path: of the page; may be missing.
+
+    Returns:
+        As ``images`` of :class:`RunPage`; none of what is not a page of a run, or has none.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = json.loads(text.split(_DATA, 1)[1].split("</script>", 1)[0])
+        start = float(data["start"])
+        found = [(start + float(time), base64.b64decode(jpeg, validate=True)) for time, jpeg in data["images"]]
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
+    return [(time, jpeg) for time, jpeg in found if math.isfinite(time) and jpeg.startswith(b"\xff\xd8")]
 
 
 def page_data(page: RunPage) -> dict[str, Any]:
@@ -135,6 +167,7 @@ def page_data(page: RunPage) -> dict[str, Any]:
         "ribbons": _ribbons(page.rows, start),
         "keyframes": encode(keyframes[:: _every(len(keyframes), MAX_KEYFRAMES)] - start),
         "loops": [[new - start, old - start] for new, old in page.loops],
+        "images": [[round(time - start, 6), base64.b64encode(jpeg).decode("ascii")] for time, jpeg in page.images],
         "worlds": [_world(world, keyframes, start) for world in page.worlds],
     }
 
@@ -220,8 +253,11 @@ def _world(world: World, keyframes: np.ndarray, start: float) -> dict[str, Any]:
     centre = (extent.min(axis=0) + extent.max(axis=0)) / 2 if len(extent) else np.zeros(3)
     reach = float(np.linalg.norm(extent - centre, axis=1).max()) if len(extent) else 1.0
     points, colors = _near_points(world, centre, reach)
-    if len(points):  # a camera that hardly moves is shown in its map
-        reach = max(reach, 0.35 * float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.7)))
+    if len(points):  # the view holds the path and the nearer half of the map
+        far = np.linalg.norm(points - centre, axis=1)
+        shown = np.concatenate([extent, points[far <= np.median(far)]])
+        centre = (shown.min(axis=0) + shown.max(axis=0)) / 2
+        reach = float(np.linalg.norm(shown - centre, axis=1).max())
     reach = max(reach, 1e-6)
     basis = view_basis(world.tracks, extent - centre)
     total = sum(len(track.trajectory) for track in world.tracks)

@@ -29,7 +29,7 @@ from eval.systems.system import System
 KEY = "key.json"
 CONTENT_LIMIT = 64 * 2**20  # bytes of a sequence up to which its files are hashed; beyond, names, sizes and times
 # Fields of a sequence that change tables, or whose content is in the fingerprint; what is left chooses images.
-NOT_IN_KEY = ("name", "about", "judged_by", "path", "calib", "times", "groundtruth")
+NOT_IN_KEY = ("name", "about", "judged_by", "path", "calib", "times", "groundtruth", "clip")
 FORMAT = 3  # of a stored prediction: 3 has segments, and the frames without a view
 PASSING = ("unavailable", "no data")  # states that can change while the key stays
 

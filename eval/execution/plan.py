@@ -192,6 +192,16 @@ def groundtruth_file(out: Path, suite: str, sequence: str) -> Path:
     return out / GROUNDTRUTH / slug(suite) / f"{slug(sequence)}.txt"
 
 
+def inertial_file(out: Path, suite: str, sequence: str) -> Path:
+    """File with the copy of the truth about the inertial samples of a sequence.
+
+    Args:
+        out: folder of an evaluation.
+        suite, sequence: names.
+    """
+    return groundtruth_file(out, suite, sequence).with_suffix(".npz")
+
+
 def machine() -> str:
     """Name of the processor and number of its cores."""
     name = platform.processor() or platform.machine()

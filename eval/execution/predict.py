@@ -2,7 +2,8 @@
 
 Each run has its own process (:func:`predict`), so that peak memory is its own, a hang meets the time limit, and a crash
 of native code stays outside; its folder then holds ``trajectory.txt`` and ``prediction.json``. The trajectory holds the
-rows of all segments in order, a TUM file like any other; the record, which is written last, says where it is cut.
+rows of all segments in order, a TUM file like any other; the record, which is written last, says where it is cut. With
+inertial samples the estimates as they came are kept too (:mod:`eval.execution.streamed`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from dvo.metrics.segment_metrics import worlds_of
 from dvo.odometry.protocol import Estimate, Odometry, Segment
 from dvo.session.results import jsonable, peak_memory_mb
 from dvo.session.session import run
+from eval.execution.streamed import StreamLog
 from eval.scoring.blackout import dark_spans, is_dark, without_view
 from eval.suites.suite import ROOT, open_sequence
 from eval.suites.suite import Sequence as Recording
@@ -151,21 +153,25 @@ def predict_here(job: Job) -> Prediction:
         return write_prediction(job, Prediction("no data", str(error)))
     try:
         version = system.version()
-        prediction, segments = drive(system.build(job.seed, job.device), source)
+        log = StreamLog()
+        prediction, segments = drive(system.build(job.seed, job.device), source, log)
     except Exception as error:  # an error of a system is its result, and becomes a row
         return write_prediction(job, Prediction("crashed", f"{type(error).__name__}: {error}", version))
     prediction.version = version
     if prediction.status == "ok":
         write_segments(folder, segments)
+        if job.sequence.inertial is not None:
+            log.streamed().write(folder)
     return write_prediction(job, prediction)
 
 
-def drive(odometry: Odometry, source: Source) -> tuple[Prediction, tuple[Segment, ...]]:
+def drive(odometry: Odometry, source: Source, log: StreamLog | None = None) -> tuple[Prediction, tuple[Segment, ...]]:
     """Feed every frame of a source to an odometry, with a clock.
 
     Args:
         odometry: a fresh one; whatever it raises is passed on.
         source: of the sequence.
+        log: is given every estimate as it comes; None for none.
 
     Returns:
         The record, and the segments of the trajectory, camera to world.
@@ -175,8 +181,10 @@ def drive(odometry: Odometry, source: Source) -> tuple[Prediction, tuple[Segment
     unseen: list[float] = []
     resolution = ""
 
-    def look(frame: Frame, _: Estimate | None) -> None:
+    def look(frame: Frame, estimate: Estimate | None) -> None:
         nonlocal resolution
+        if log is not None and estimate is not None:
+            log.take(estimate)
         stamps.append(frame.timestamp)
         dark.append(is_dark(frame.image))
         if without_view(frame.image):

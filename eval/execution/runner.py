@@ -31,12 +31,13 @@ from eval.execution.plan import (
     Run,
     claim_folder,
     groundtruth_file,
+    inertial_file,
     prediction_folder,
     write_manifest,
 )
 from eval.execution.predict import Job, Prediction, predict, write_prediction
 from eval.suites.selection import is_rendered, settle
-from eval.suites.suite import Sequence, Suite, open_sequence
+from eval.suites.suite import Sequence, Suite, inertial_truth, open_sequence
 
 # Fields of a suite that change how it is judged and described, not its images.
 _JUDGING = ("label", "sequences", "alignment", "rpe_gap", "stride", "lost_below", "time_limit", "download")
@@ -128,6 +129,9 @@ def open_once(plan: Plan, suite: Suite, sequence: Sequence, say: Callable[[str],
         return Opened(sequence, "", f"{error}{f' The data: {suite.download}' if suite.download else ''}")
     truth_file.parent.mkdir(parents=True, exist_ok=True)
     write_tum(truth_file, truth)
+    about_samples = inertial_truth(there)
+    if about_samples is not None:
+        about_samples.write(inertial_file(plan.out, suite.name, sequence.name))
     return Opened(there, data_fingerprint(source, there), None)
 
 

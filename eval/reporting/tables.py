@@ -19,6 +19,7 @@ from eval.scoring.summary import (
     axis_cells,
     count_cell,
     error_cell,
+    inertial_columns,
     judged_cells,
     resource_cell,
     segment_columns,
@@ -82,7 +83,7 @@ def markdown(manifest: Manifest, suite: Suite, rows: list[Row]) -> str:
     """
     rows = [row for row in rows if row.suite == suite.name]
     systems = list(dict.fromkeys(row.system for row in rows))
-    extra = segment_columns(rows)
+    extra = [*inertial_columns(suite, rows), *segment_columns(rows)]
     figures = [*FIGURES, *(SCALE if suite.alignment == "se3" else ())]
     figures += RECOVERY if any(one.judged_by == "recovery_s" for one in suite.sequences) else ()
     names = ["sequence", "system", "runs failed", *(metric.title for metric in figures), METRICS["completeness"].title]

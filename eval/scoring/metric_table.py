@@ -27,6 +27,7 @@ from dvo.odometry.protocol import Segment
 if TYPE_CHECKING:  # these know the suites, which know the metrics that sequences are judged by
     from eval.execution.predict import Prediction
     from eval.scoring.errors import Errors
+    from eval.scoring.inertial import InertialErrors
     from eval.scoring.loops import LoopErrors
     from eval.suites.suite import Suite
 
@@ -51,6 +52,7 @@ class Scored:
         completeness: share of the frames that have a pose.
         scored: share of the frames that have a pose in a segment that counts for the ATE.
         status: ``ok``, or how the run failed.
+        inertial: errors of metric poses; all nan without inertial samples.
     """
 
     prediction: Prediction
@@ -63,6 +65,7 @@ class Scored:
     completeness: float
     scored: float
     status: str
+    inertial: InertialErrors
 
     def area(self, found: float) -> float:
         """Area under a recall curve: what a run did not do counts as not recalled; without data there is no curve.
@@ -119,6 +122,11 @@ def _false_poses(run: Scored) -> float:
     return false_pose_share(run.prediction.unseen, run.segments) if run.prediction.status == "ok" else math.nan
 
 
+def _inertial(name: str) -> Callable[[Scored], float]:
+    """Value of an attribute of :class:`eval.scoring.inertial.InertialErrors`."""
+    return lambda run: float(getattr(run.inertial, name))
+
+
 _OWN = (
     Metric("completeness", "complete %", "%", 0, lambda run: run.completeness, "high", 100.0),
     Metric("fps", "frames/s", "1/s", 1, lambda run: _number(run.prediction.fps), "high"),
@@ -159,6 +167,22 @@ _OWN = (
     # Percent by which the scale of the longest world is wrong, and the ATE without that error, under SE(3).
     Metric("scale_error", "scale error %", "%", 2, lambda run: run.errors.scale_error),
     Metric("ate_sim3_percent", "ATE %, Sim(3)", "%", 2, _shape_percent),
+    # See eval.scoring.inertial.InertialErrors.
+    Metric("scale_10s", "scale error at 10 s %", "%", 2, _inertial("scale_10s")),
+    Metric("gravity_deg", "gravity °", "°", 2, _inertial("gravity_deg")),
+    Metric("align_s", "s to alignment", "s", 1, _inertial("align_s")),
+    Metric("coverage", "coverage %", "%", 0, _inertial("coverage"), "high", 100.0),
+    Metric("nees_position", "NEES position", "", 2, _inertial("nees_position"), ""),
+    Metric("nees_orientation", "NEES orientation", "", 2, _inertial("nees_orientation"), ""),
+    Metric("nees_velocity", "NEES velocity", "", 2, _inertial("nees_velocity"), ""),
+    Metric("gyro_bias_error", "gyro bias °/s", "°/s", 3, _inertial("gyro_bias_error")),
+    Metric("accel_bias_error", "accel bias m/s²", "m/s²", 3, _inertial("accel_bias_error")),
+    Metric("offset_error_ms", "time offset ms", "ms", 2, _inertial("offset_error_ms")),
+    Metric("wrong_alignments", "wrong alignments", "", 0, _inertial("wrong_alignments")),
+    Metric("dark_tracked", "tracked in the dark", "", 0, _inertial("dark_tracked")),
+    Metric("dark_cm", "dark cm", "cm", 1, _inertial("dark_cm")),
+    Metric("dark_percent", "dark %", "%", 2, _inertial("dark_percent")),
+    Metric("dark_sigmas", "dark σ", "", 1, _inertial("dark_sigmas"), ""),
 )
 
 FOREIGN = Registry("metric", "dvo.metrics")
@@ -206,6 +230,13 @@ FIGURES = columns(
 """Of every table."""
 SCALE = columns("scale_error", "ate_sim3_percent")
 """Where the alignment leaves the scale to the systems."""
+INERTIAL = columns(
+    "scale_10s", "gravity_deg", "align_s", "coverage", "nees_position", "nees_orientation", "nees_velocity",
+    "gyro_bias_error", "accel_bias_error", "offset_error_ms", "wrong_alignments",
+)  # fmt: skip
+"""Where frames carry inertial samples whose truth is known."""
+DARK = columns("dark_tracked", "dark_cm", "dark_percent", "dark_sigmas")
+"""Where such a sequence goes dark."""
 RECOVERY = columns("recovery_s")
 """Where sequences are judged by it."""
 JUDGES = tuple(metric.name for metric in (*FIGURES, *RECOVERY) if metric.better == "low")

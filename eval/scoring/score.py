@@ -13,12 +13,15 @@ import numpy as np
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.metrics.segment_metrics import most_worlds, worlds_of
 from dvo.odometry.protocol import Segment
-from eval.execution.plan import Manifest, Run, groundtruth_file
+from eval.execution.plan import Manifest, Run, groundtruth_file, inertial_file
 from eval.execution.predict import RECORD, Prediction, read_prediction, read_segments
+from eval.execution.streamed import Streamed
 from eval.scoring.blackout import dark_spans
 from eval.scoring.errors import Errors, all_errors
+from eval.scoring.inertial import InertialErrors, inertial_errors
 from eval.scoring.loops import LoopErrors, loop_errors
 from eval.scoring.metric_table import METRICS, Scored
+from eval.suites.inertial import InertialTruth
 from eval.suites.suite import Sequence as Recording
 from eval.suites.suite import Suite, reference_for
 
@@ -65,18 +68,24 @@ def score_all(out: Path, manifest: Manifest) -> list[Row]:
     Returns:
         Rows in the order of the runs.
     """
-    truths: dict[tuple[str, str], Trajectory | None] = {}
+    truths: dict[tuple[str, str], tuple[Trajectory | None, InertialTruth | None]] = {}
     rows = []
     for run in manifest.runs:
         place = run.suite, run.sequence
         if place not in truths:
             file = groundtruth_file(out, *place)
-            truths[place] = read_tum(file) if file.is_file() else None
-        rows.append(score_run(out, manifest, run, truths[place]))
+            samples = inertial_file(out, *place)
+            truths[place] = (
+                read_tum(file) if file.is_file() else None,
+                InertialTruth.read(samples) if samples.is_file() else None,
+            )
+        rows.append(score_run(out, manifest, run, *truths[place]))
     return rows
 
 
-def score_run(out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory | None) -> Row:
+def score_run(
+    out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory | None, inertial: InertialTruth | None = None
+) -> Row:
     """One run of an evaluation as a row.
 
     An error while it is scored, for instance of the renderer that gives the truth about loops, makes this run a failed
@@ -87,6 +96,7 @@ def score_run(out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory |
         manifest: of the evaluation.
         run: to score.
         groundtruth: of the whole sequence; None where there are no data.
+        inertial: truth about its inertial samples; None without any.
     """
     suite = manifest.suite(run.suite)
     sequence = next(sequence for sequence in suite.sequences if sequence.name == run.sequence)
@@ -97,7 +107,7 @@ def score_run(out: Path, manifest: Manifest, run: Run, groundtruth: Trajectory |
         prediction, segments = Prediction("not run", "the evaluation was stopped before"), ()
     row = partial(score, system=run.system, suite=suite, sequence=sequence, seed=run.seed)
     try:
-        return row(prediction, segments, groundtruth)
+        return row(prediction, segments, groundtruth, streamed=Streamed.read(folder), inertial=inertial)
     except Exception as error:
         message = f"scoring ended by {type(error).__name__}: {' '.join(str(error).split())[:300]}"
         return row(replace(prediction, status="failed", reason=message), (), None)
@@ -112,6 +122,8 @@ def score(
     suite: Suite,
     sequence: Recording,
     seed: int,
+    streamed: Streamed | None = None,
+    inertial: InertialTruth | None = None,
 ) -> Row:
     """One row of the table. A run that failed is a row too.
 
@@ -122,6 +134,8 @@ def score(
         prediction: record of the run.
         segments: of its trajectory.
         groundtruth: of the whole sequence; None where the data are not there.
+        streamed: estimates as they came; None where they were not kept.
+        inertial: truth about the inertial samples; None without any.
     """
     stamps = np.array(prediction.stamps, dtype=np.float64)
     status, reason = prediction.status, prediction.reason
@@ -147,8 +161,10 @@ def score(
         if not math.isfinite(judged):
             status = "failed"
     run = Scored(
-        prediction, segments, reference, suite, errors, loops, len(worlds_of(segments)), completeness, scored, status
-    )
+        prediction, segments, reference, suite, errors, loops, len(worlds_of(segments)), completeness, scored, status,
+        InertialErrors() if inertial is None or reference is None or not ran
+        else inertial_errors(streamed, segments, reference, inertial, prediction.dark, prediction.unseen),
+    )  # fmt: skip
     return Row(
         system=system,
         version=prediction.version,

@@ -15,7 +15,7 @@ import numpy as np
 
 from dvo.metrics.table import Metric
 from eval.execution.plan import Manifest
-from eval.scoring.metric_table import FALSE_POSES, METRICS, SEGMENTS
+from eval.scoring.metric_table import DARK, FALSE_POSES, INERTIAL, METRICS, SEGMENTS
 from eval.scoring.metric_table import NEVER_MADE as VOID
 from eval.scoring.score import Row
 from eval.suites.suite import Sequence as Recording
@@ -162,6 +162,18 @@ def resource_cell(rows: Sequence[Row], field: str) -> Cell:
         field: column of results.csv.
     """
     return summarise([float(getattr(row, field)) for row in rows], failed=sum(row.failed for row in rows))
+
+
+def inertial_columns(suite: Suite, rows: Iterable[Row]) -> list[Metric]:
+    """Columns on metric poses that a table of some runs needs.
+
+    Args:
+        suite: of the table.
+        rows: of the table.
+    """
+    if all(sequence.inertial is None for sequence in suite.sequences):
+        return []
+    return [*INERTIAL, *(DARK if any(row.blackouts for row in rows) else ())]
 
 
 def segment_columns(rows: Iterable[Row]) -> list[Metric]:

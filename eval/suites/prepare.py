@@ -29,9 +29,8 @@ def prepare(suites: list[Suite]) -> list[Path]:
         for sequence in suite.sequences:
             if sequence.rendered is None:
                 continue
-            options = dict(sequence.rendered)
-            there = (place_of(sequence.name, options) / RECORD).is_file()
-            folder = rendered_folder(sequence.name, options)
+            there = (place_of(*sequence.rendering) / RECORD).is_file()
+            folder = rendered_folder(*sequence.rendering)
             facts = json.loads((folder / RECORD).read_text(encoding="utf-8"))
             made += not there
             took = (
@@ -62,7 +61,7 @@ def contact_sheet(folders: list[Path], columns: int = 6, width: int = 200) -> np
 
     rows = []
     for folder in folders:
-        files = sorted((folder / "rgb").iterdir())
+        files = sorted((folder / "rgb").iterdir(), key=lambda file: float(file.stem))  # in order of time
         chosen = [files[i] for i in np.linspace(0, len(files) - 1, columns).round().astype(int)]
         cells = [cv2.resize(cv2.imread(str(f)), (width, width * 3 // 4), interpolation=cv2.INTER_AREA) for f in chosen]
         name = folder.name.rsplit("-", 1)[0]

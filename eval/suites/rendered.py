@@ -2,7 +2,8 @@
 
 A folder of the cache has the layout of TUM RGB-D (``rgb.txt``, ``rgb/``, ``groundtruth.txt``) with ``calib.txt``, so
 that other people's tools read it too; with a rolling shutter ``calib.yaml`` instead, which states the readout. It
-appears under its name only when it is whole.
+appears under its name only when it is whole. Motions of hands and quadrotors have exact inertial samples beside the
+images (:mod:`eval.suites.inertial`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.readers.tum import RIGHT
 from dvo.data.trajectory import write_tum
+from eval.suites.inertial import write_exact
 
 RECORD = "sequence.json"
 STALE = 24 * 3600.0  # seconds after which an unfinished folder belongs to no running process
@@ -93,6 +95,7 @@ def _write_image(file: Path, image: np.ndarray) -> None:
 
 def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
     from dvo.synth.export import write_calibration, write_depth
+    from dvo.synth.motion.natural import NATURAL_KINDS
     from dvo.synth.sequence import make_sequence
 
     begin, clock = time.perf_counter(), time.process_time()
@@ -115,6 +118,8 @@ def _write(folder: Path, name: str, options: dict[str, Any]) -> None:
     (folder / "rgb.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
     write_tum(folder / "groundtruth.txt", sequence.groundtruth)
     write_calibration(sequence.camera, folder, baseline)
+    if options.get("kind") in NATURAL_KINDS:
+        write_exact(folder, sequence, options["kind"], options["frames"] / options["fps"])
     facts = {
         "name": name, "options": options, "scene": sequence.name, "frames": len(sequence),
         "path_m": round(sequence.groundtruth.path_length, 4), "seconds": round(time.perf_counter() - begin, 2),

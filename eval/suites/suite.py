@@ -13,17 +13,20 @@ from dvo.core.settings import Range, from_table
 from dvo.core.yaml_files import read_yaml
 from dvo.data.companions.depth_source import with_depth
 from dvo.data.companions.right_source import with_right
+from dvo.data.inertial import InertialSamples
 from dvo.data.open import open_source
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
 from dvo.metrics import Alignment, associate
 from eval.scoring.metric_table import JUDGES
 from eval.suites.axes import Axes, choose, expand, read_axes
+from eval.suites.inertial import InertialTruth, read_stream
 from eval.suites.rendered import rendered_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 SUITES = ROOT / "configs" / "eval"
-RENDERED = ("axes", "memory", "world")  # files of rendered suites; each is also the name of all suites in it
+RENDERED = ("axes", "memory", "world", "inertial")
+"""Files of rendered suites; each is also the name of all suites in it, unless one of them has this name."""
 LONGEST_NAME = 100
 Judge: Any = Literal[JUDGES]
 """Names of the metrics that can decide between systems."""
@@ -47,6 +50,9 @@ class Sequence:
         right: folder of the right images of a rectified stereo pair, ``baseline`` metres apart.
         rendered: options of :func:`dvo.synth.make_sequence` and ``version``, as pairs, for a sequence that is rendered
             into a cache (:mod:`eval.suites.rendered`) when it is first wanted; None for a recording.
+        clip: name of the sequence whose rendering it is, if that is another one.
+        inertial: options of :class:`eval.suites.inertial.Stream`, as pairs, of a rendered sequence whose frames carry
+            inertial samples; None for those of the recording.
     """
 
     name: str
@@ -62,6 +68,13 @@ class Sequence:
     right: str | None = None
     baseline: float | None = None
     rendered: tuple[tuple[str, Any], ...] | None = None
+    clip: str = ""
+    inertial: tuple[tuple[str, Any], ...] | None = None
+
+    @property
+    def rendering(self) -> tuple[str, dict[str, Any]]:
+        """Name and options of the rendering; of a rendered sequence."""
+        return self.clip or self.name, dict(self.rendered or ())
 
 
 @dataclass(frozen=True)
@@ -211,10 +224,7 @@ def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, 
     Raises:
         DvoError: the data are not there, or hold no ground truth.
     """
-    if sequence.rendered is not None:
-        place = rendered_folder(sequence.name, dict(sequence.rendered))
-    else:
-        place = data / sequence.path
+    place = data / sequence.path if sequence.rendered is None else rendered_folder(*sequence.rendering)
     source = open_source(
         place,
         calib=sequence.calib,
@@ -228,9 +238,30 @@ def open_sequence(sequence: Sequence, data: Path, stride: int) -> tuple[Source, 
         source = with_depth(source, sequence.depth)
     if sequence.right is not None:
         source = with_right(source, sequence.right, sequence.baseline)
+    if sequence.inertial is not None:
+        source = _with_stream(source, read_stream(place, dict(sequence.inertial))[0])
     if source.groundtruth is None:
         raise DvoError("no ground truth", file=place, remedy="name its file under 'groundtruth'")
     return source, source.groundtruth
+
+
+def inertial_truth(sequence: Sequence) -> InertialTruth | None:
+    """Truth about the inertial samples of a sequence; None without any that are known exactly.
+
+    Args:
+        sequence: of a suite.
+
+    Raises:
+        DvoError: it cannot be rendered.
+    """
+    if sequence.inertial is None:
+        return None
+    return read_stream(rendered_folder(*sequence.rendering), dict(sequence.inertial))[1]
+
+
+def _with_stream(source: Source, samples: InertialSamples) -> Source:
+    """The source with other inertial samples."""
+    return Source(source.recording, replace(source.reading, inertial=lambda: samples))
 
 
 def reference_for(groundtruth: Trajectory, stamps: np.ndarray, max_dt: float = 0.02) -> Trajectory:

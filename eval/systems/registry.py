@@ -48,7 +48,7 @@ CATALOGUE = (
            about="inertial filter: EKF over past poses (MSCKF with first-estimate Jacobians), in metres"),
     System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",
            about="ORB-SLAM3 (pyorbslam3), without the official vocabulary; monocular, or in metres with "
-           "sensor=stereo or sensor=rgbd; closes loops, unless loops=false",
+           "sensor=stereo, rgbd, imu_monocular or imu_stereo; closes loops, unless loops=false",
            version_from=f"{_PEERS}.orbslam3:version", missing_from=f"{_PEERS}.orbslam3:missing"),
     System("svo", f"{_PEERS}.svo:Svo", licence="GPL-3", about="SVO (svo-cpp)",
            version_from=f"{_PEERS}.svo:version", missing_from=f"{_PEERS}.svo:missing"),
@@ -57,6 +57,8 @@ CATALOGUE = (
            version_from=f"{_PEERS}.colmap:version", missing_from=f"{_PEERS}.colmap:missing"),
     System("null", "eval.systems.null:NullMotion",
            about="straight line at constant speed, no rotation, images unread"),
+    System("null-imu", "eval.systems.null_imu:DeadReckoning",
+           about="dead reckoning with an inertial sensor, images unread"),
 )  # fmt: skip
 SYSTEMS = Registry("system", "dvo.systems", {system.name: system.target for system in CATALOGUE})
 _described = {system.name: system for system in CATALOGUE}

@@ -78,6 +78,18 @@ def test_a_point_is_seen_half_a_pixel_further(view):
     np.testing.assert_allclose(seen, pixel + 0.5, atol=1e-3 / min(depth, 1))  # the point cloud is float32
 
 
+def test_every_frame_names_its_mask(tmp_path):
+    """Nerfstudio wants one for all frames, or for none."""
+    found = reconstruct(walk(4), 0)
+    masks = tuple(cv2.imencode(".png", np.full((SIDE, SIDE), 255 - k, np.uint8))[1].tobytes() for k in range(4))
+    write_nerfstudio(replace(found, masks=masks), tmp_path)
+    values, _, _ = read(tmp_path)
+    paths = [frame["mask_path"] for frame in values["frames"]]
+    levels = [cv2.imread(str(tmp_path / path), cv2.IMREAD_UNCHANGED)[0, 0] for path in paths]
+    assert levels == [255, 254, 253, 252]
+    assert paths == [f"masks/{Path(frame['file_path']).name}.png" for frame in values["frames"]], "COLMAP's names"
+
+
 def test_two_cameras_stand_at_their_frames(tmp_path):
     found = reconstruct(walk(6), 0)
     (first,) = found.cameras

@@ -12,6 +12,8 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import read_times
+from dvo.data.inertial_files.imu_calibration import read_imu_calibration
+from dvo.data.inertial_files.tables import read_inertial_table
 from dvo.data.open import open_source
 from dvo.data.readers.groundtruth import read_groundtruth
 from dvo.data.streams.streams import stream
@@ -214,6 +216,34 @@ def _one(name: str, file: str, rows: list[str], read: Any) -> Target:
     return Target(name, partial(_write, name=file, rows=rows), read, modules=MODULES)
 
 
+def _samples(mark: str) -> list[str]:
+    return [mark.join(f"{value:.4f}" for value in (0.01 * k, 0.1, 0.2 * k, 0.3, 0.1, 9.8, 0.2)) for k in range(30)]
+
+
+def _inertial(folder: Path, random: np.random.Generator | None, name: str = "imu.csv") -> None:
+    samples = read_inertial_table(folder / name)
+    check_times(samples.timestamps)
+    require(np.isfinite(samples.gyro).all() and np.isfinite(samples.accel).all(), "samples not finite")
+
+
+IMU_CALIBRATIONS = {
+    "kalibr": ["rostopic: /imu0", "update_rate: 200.0", "accelerometer_noise_density: 0.002",
+               "accelerometer_random_walk: 0.003", "gyroscope_noise_density: 0.0001",
+               "gyroscope_random_walk: 0.00002"],
+    "camchain": ["cam0:", "  T_cam_imu: [[0, 1, 0, 0.1], [0, 0, 1, 0.2], [1, 0, 0, 0.3], [0, 0, 0, 1]]",
+                 "  timeshift_cam_imu: 0.005", "  camera_model: pinhole", "  intrinsics: [50, 51, 31.5, 23.5]"],
+    "plain": ["preset: phone", "noise:", "  gyro_bias: 0.5", "noise_factor: 10", "time_offset: -0.01",
+              "T_camera_imu: [0.1, 0.2, 0.3, 0, 0, 0, 1]"],
+}  # fmt: skip
+
+
+def _imu_calibration(folder: Path, random: np.random.Generator | None) -> None:
+    found = read_imu_calibration(folder / "imu.yaml")
+    require(found.noise is None or np.isfinite(list(vars(found.noise).values())).all(), "noise not finite")
+    require(found.T_camera_imu is None or np.isfinite(found.T_camera_imu).all(), "pose not finite")
+    require(found.time_offset is None or np.isfinite(found.time_offset), "offset not finite")
+
+
 TARGETS = (
     *(_one(f"calibration_{name}", file, rows, partial(_calibration, name=file + SELECTED.get(name, "")))
       for name, (file, rows) in CALIBRATIONS.items()),
@@ -227,6 +257,13 @@ TARGETS = (
     _one("truth_kitti", "t.txt", [f"1 0 0 {0.1 * i} 0 1 0 0 0 0 1 {i}" for i in range(4)],
          partial(_truth, name="t.txt")),
     _one("truth_ned", "t.txt", [row.split(maxsplit=1)[1] for row in poses()], partial(_truth, name="t.txt")),
+    _one("inertial_table", "imu.csv", ["time [s],gx,gy,gz,ax,ay,az", *_samples(",")], _inertial),
+    _one("inertial_rows", "imu.csv", _samples(" "), _inertial),
+    _one("inertial_json", "data.jsonl", [
+        f'{{"time": {0.01 * k}, "sensor": {{"type": "{kind}", "values": [0.1, 9.8, 0.2]}}}}'
+        for k in range(20) for kind in ("gyroscope", "accelerometer")
+    ], partial(_inertial, name="data.jsonl")),
+    *(_one(f"imu_calibration_{name}", "imu.yaml", rows, _imu_calibration) for name, rows in IMU_CALIBRATIONS.items()),
     Target("addresses", _nothing, _address, _odd_address, MODULES),
     Target("options", _places, _options, _no_mutation, MODULES),
     Target("stream", _nothing, _stream, _odd_stream, MODULES),

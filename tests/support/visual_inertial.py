@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
-from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, so3_exp
-from dvo.odometry.inertial.smoother import GRAVITY, Smoother, VisualNodes, rotation_vector
+from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, rotation_vector, so3_exp
+from dvo.odometry.inertial.smoother import GRAVITY, Smoother, VisualNodes
 
 Array = np.ndarray
 RATE = 1000

@@ -11,6 +11,7 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.core.errors import DvoError
+from dvo.data.inertial import NOISE_PRESETS, ImuNoise
 from dvo.geometry.poses import look_rotation, pose_from
 from dvo.synth import mesh_scene
 from dvo.synth.export import OCCLUDED, OUT_OF_VIEW, Layout, export_sequence, mesh_sequence, static_flow
@@ -96,6 +97,41 @@ def test_mesh_sequence_reads_back_with_the_background_as_no_depth(tmp_path: Path
     assert (depth == 0).any() and (depth > 0).any()
     again = mesh_sequence(scene, 1, SequenceFormat(3, 48, 64, fps=10))
     assert np.array_equal(again.frame(2).image, sequence.frame(2).image)
+
+
+@pytest.mark.parametrize(("lens", "noise"), [("radtan", None), ("fisheye", NOISE_PRESETS["phone"])])
+def test_euroc_layout_reads_back(lens: str, noise: ImuNoise | None, tmp_path: Path) -> None:
+    """Images, camera, times, poses and every inertial sample are those that were rendered."""
+    sequence = make_sequence(6, frames=4, height=48, width=64, fps=12, family="street", sensor=False, lens=lens)
+    assert export_sequence(sequence, tmp_path / "s", "euroc", noise=noise) == []
+    source = dvo.open(tmp_path / "s", undistort=False)
+    assert (source.kind, source.warnings, source.camera.model) == ("euroc", [], lens)
+    for frame, original in zip(source, sequence, strict=True):
+        assert np.array_equal(frame.image, original.image)
+        assert frame.timestamp == pytest.approx(original.timestamp, abs=1e-9)
+        assert np.allclose(frame.camera.intrinsics, original.camera.intrinsics, atol=1e-12)
+        assert np.allclose(frame.camera.coefficients, original.camera.coefficients, atol=1e-12)
+    truth, imu, samples = source.groundtruth, sequence.imu(200.0, noise=noise), source.inertial
+    assert truth is not None and samples is not None
+    assert np.allclose(truth.poses_wc, sequence.groundtruth.poses_wc, atol=1e-9)
+    assert np.array_equal(samples.gyro, imu.gyro) and np.array_equal(samples.accel, imu.accel)
+    assert samples.timestamps == pytest.approx(imu.timestamps, abs=1e-9)
+    assert samples.T_camera_imu == pytest.approx([0, 0, 0, 0, 0, 0, 1])
+    stated = None if samples.noise is None else (samples.noise.gyro, samples.noise.accel_walk)
+    assert stated == (None if noise is None else (noise.gyro, noise.accel_walk))
+
+
+def test_states_of_the_euroc_layout(sequence: SyntheticSequence, tmp_path: Path) -> None:
+    """Velocities are those of the positions, biases those in the samples."""
+    export_sequence(sequence, tmp_path / "s", "euroc", noise=NOISE_PRESETS["phone"])
+    file = tmp_path / "s" / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    table = np.loadtxt(file, delimiter=",", comments="#")
+    time, p, v = table[:, 0] / 1e9, table[:, 1:4], table[:, 8:11]
+    middle = np.diff(p, axis=0) / np.diff(time)[:, None]
+    assert np.allclose(middle, (v[1:] + v[:-1]) / 2, atol=1e-3) and np.abs(v).max() > 0.05
+    imu = sequence.imu(200.0, noise=NOISE_PRESETS["phone"])
+    at = np.searchsorted(time, imu.timestamps - 1e-6)
+    assert np.allclose(table[at, 11:14], imu.gyro_bias) and np.allclose(table[at, 14:17], imu.accel_bias)
 
 
 def test_export_refuses_what_it_cannot_do(sequence: SyntheticSequence, tmp_path: Path) -> None:

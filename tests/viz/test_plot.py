@@ -54,6 +54,25 @@ def test_the_estimate_is_drawn_where_it_is(tmp_path):
     assert np.flatnonzero(near_truth.any(axis=1)).mean() > np.flatnonzero(near_accent.any(axis=1)).mean() + 30
 
 
+@pytest.mark.parametrize("reach", [0.0, 0.2, 3.0])
+def test_the_nearer_half_of_the_map_is_in_the_picture(tmp_path, monkeypatch, reach):
+    """Also of a camera that stands; far points do not make the path small."""
+    from matplotlib.figure import Figure
+
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
+    near = np.random.default_rng(0).uniform(-2, 2, (200, 3)) + [0, 0, 4.0]
+    points = np.concatenate([near, near[:150] + [0, 0, 500.0], np.full((3, 3), np.nan)])
+    plot_trajectory(tmp_path / "p.png", line(50, (reach / 50, 0, 0.3 * reach / 50)), points=points)
+    plot, insets = drawn[0].axes[0], drawn[0].axes[0].child_axes
+    assert bool(insets) == (0.02 < reach < 0.5), "a path that is small beside its map is drawn once more"
+    axes = plan_axes(line(50, (reach / 50, 0, 0.3 * reach / 50)).positions)
+    limits = np.array([plot.get_xlim(), plot.get_ylim()])
+    inside = ((points[:, axes] > limits[:, 0]) & (points[:, axes] < limits[:, 1])).all(axis=1)
+    assert inside.sum() >= 176 and np.ptp(limits, axis=1).max() < 12
+    assert "map points" in [text.get_text() for text in drawn[0].legends[0].get_texts()]
+
+
 def test_loops_are_marked_where_they_were_found(tmp_path):
     """The picture with a loop differs from that without one only around the pose, and in the legend."""
     track = Track(line(50, (1, 0, 0.3)), "dvo", 0)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dvo.data.trajectory import Trajectory
-from dvo.session.frame_table import FrameRow
+from dvo.session.frame_table import STATUSES, FrameRow
 from dvo.viz.run_page import (
     ASSETS,
     MAX_FRAMES,
@@ -24,6 +24,7 @@ from dvo.viz.run_page import (
     World,
     encode,
     page_data,
+    read_images,
     view_basis,
     write_page,
 )
@@ -111,7 +112,7 @@ def test_scripts_use_colours_that_the_style_defines_for_both_themes():
     used = set(
         re.findall(r"var\(--(\w+)\)", style + "".join(p.read_text(encoding="utf-8") for p in ASSETS.glob("*.js")))
     )
-    assert used <= light and {"tracking", "initialising", "lost", "skipped"} <= light
+    assert used <= light and set(STATUSES) <= light
 
 
 def test_data_of_a_short_run():
@@ -150,7 +151,48 @@ def test_a_long_run_stays_small_and_keeps_peaks(tmp_path):
     assert len(poses) <= MAX_FRAMES + 1
     np.testing.assert_allclose(poses[-1], trajectory.poses_wc[-1], atol=1e-6)
     write_page(tmp_path / "p.html", content)
-    assert (tmp_path / "p.html").stat().st_size < 500_000
+    assert (tmp_path / "p.html").stat().st_size < 500_000, "images, of at most MAX_BYTES, aside"
+
+
+IMAGES = [(50.0 + k, b"\xff\xd8" + bytes([k])) for k in range(4)]
+
+
+def test_the_images_of_a_page_are_read_back(tmp_path):
+    file = tmp_path / "p.html"
+    write_page(file, page(walk(30), images=IMAGES))
+    found = read_images(file)
+    assert [jpeg for _, jpeg in found] == [jpeg for _, jpeg in IMAGES]
+    np.testing.assert_allclose([time for time, _ in found], [time for time, _ in IMAGES], atol=1e-6)
+    write_page(file, page(walk(30)))
+    assert read_images(file) == [] and read_images(tmp_path / "none.html") == []
+
+
+@pytest.mark.parametrize("images", ['[["a", "b"]]', "[[1, 2, 3]]", '[[0, "%%"]]', "7", '[[0, "aGVsbG8="]]', "null"])
+def test_images_of_another_file_are_none(images, tmp_path):
+    text = f'<script type="application/json" id="data">{{"start": 1.0, "images": {images}}}</script>'
+    (tmp_path / "p.html").write_text(text)
+    assert read_images(tmp_path / "p.html") == []
+
+
+def test_the_verdict_stands_before_the_figures(tmp_path):
+    write_page(tmp_path / "p.html", page(walk(3), verdict=("doubtful", "waves & wind."), facts=[("frames / s", "3")]))
+    text = (tmp_path / "p.html").read_text(encoding="utf-8")
+    place = text.index('<p class="verdict doubtful"><strong>verdict: doubtful</strong> waves &amp; wind.</p>')
+    assert text.index("<h1>") < place < text.index("frames / s")
+    write_page(tmp_path / "p.html", page(walk(3)))
+    assert '<p class="verdict' not in (tmp_path / "p.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.05, 3.0])
+def test_the_view_holds_the_path_and_the_nearer_half_of_the_map(reach):
+    trajectory = walk(60)
+    trajectory.poses_wc[:, :3] *= reach
+    points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) + [0, 0, 4.0]
+    world = World("w", (TrackLine(trajectory, 0),), points=points, colors=np.zeros((200, 3), np.uint8))
+    found = page_data(page(trajectory, worlds=[world]))["worlds"][0]
+    inside = np.linalg.norm(points - found["centre"], axis=1) <= found["radius"] * 1.0001
+    assert inside.sum() >= 100 and found["radius"] < 8
+    assert (np.linalg.norm(trajectory.positions - found["centre"], axis=1) <= found["radius"] * 1.0001).all()
 
 
 def test_a_gap_is_not_bridged():

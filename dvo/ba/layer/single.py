@@ -49,10 +49,11 @@ class SinglePrecision(Factor):
 
     def normal_equations(self, state: State) -> tuple[NormalEquations, Any]:
         equations, memo = self.factor.normal_equations(_rounded(state))
-        return NormalEquations(*(getattr(equations, f.name).double() for f in fields(equations))), memo
+        doubled: dict[str, Tensor] = {f.name: getattr(equations, f.name).double() for f in fields(equations)}
+        return NormalEquations(**doubled), memo
 
     def phi(self, state: State, constants: AdjointConstants, memo: Any) -> Iterator[Tensor]:
-        numbers = {f.name: getattr(constants, f.name) for f in fields(constants)}
+        numbers: dict[str, Any] = {f.name: getattr(constants, f.name) for f in fields(constants)}
         single = replace(constants, **{name: x.float() for name, x in numbers.items() if x is not None})
         return self.factor.phi(_rounded(state), single, memo)
 

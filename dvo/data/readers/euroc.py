@@ -12,6 +12,7 @@ import re
 from array import array
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,8 @@ from dvo.data.files.files import (
 from dvo.data.files.listing import listed_file
 from dvo.data.files.stamps import choose_times, read_times
 from dvo.data.inertial import InertialSamples
+from dvo.data.inertial_files.imu_calibration import ImuCalibration, read_noise
+from dvo.data.inertial_files.tables import read_inertial_table
 from dvo.data.readers.folder import camera_images
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import SameName, Sensors
@@ -100,18 +103,19 @@ def _timed_rows(path: Path, columns: int, header: str) -> tuple[np.ndarray, np.n
     return np.array(times, dtype=np.int64), table, lines.tolist()
 
 
-def read_inertial(path: Path, T_camera_imu: np.ndarray | None = None) -> InertialSamples:
+def read_inertial(path: Path, calibration: ImuCalibration | None = None) -> InertialSamples:
     """Read inertial samples.
 
     Args:
         path: ``imu0/data.csv``, rows ``ns, wx, wy, wz, ax, ay, az`` in rad/s and m/s^2.
-        T_camera_imu: ``(7,)`` pose of the inertial sensor in the camera's coordinates, to go with the samples.
+        calibration: of the sensor, to go with the samples.
 
     Raises:
         DvoError: a malformed row, or times that do not increase.
     """
     nanoseconds, table, _ = _timed_rows(path, 6, "ns, wx, wy, wz, ax, ay, az")
-    return InertialSamples(nanoseconds / 1e9, table[:, :3], table[:, 3:], T_camera_imu)
+    samples = InertialSamples(nanoseconds / 1e9, table[:, :3], table[:, 3:], origin="imu0/data.csv")
+    return samples if calibration is None else calibration.applied(samples)
 
 
 def _camchain(mav: Path) -> Path | None:
@@ -120,15 +124,21 @@ def _camchain(mav: Path) -> Path | None:
     return next((option for option in options if is_file(option)), None)
 
 
+def _kalibr_camera(mav: Path, camera: str) -> tuple[dict[str, Any], Path] | None:
+    """Entries of a camera in Kalibr's camchain, and the file; None without them."""
+    chain = _camchain(mav)
+    data = None if chain is None else load_yaml(read_text(chain), chain)
+    entry = data.get(camera) if isinstance(data, dict) else None
+    return (entry, chain) if isinstance(entry, dict) and chain is not None else None
+
+
 def _body_camera(mav: Path, camera: str) -> np.ndarray | None:
     """Pose of a camera on the body, by ``sensor.yaml`` or Kalibr's ``T_cam_imu``; None if neither states it."""
     found = read_extrinsics(mav / camera / "sensor.yaml")
-    chain = _camchain(mav)
-    if found is not None or chain is None:
+    if found is not None or (kalibr := _kalibr_camera(mav, camera)) is None:
         return found
-    data = load_yaml(read_text(chain), chain)
-    entry = data.get(camera) if isinstance(data, dict) else None
-    if not isinstance(entry, dict) or entry.get("T_cam_imu") is None:
+    entry, chain = kalibr
+    if entry.get("T_cam_imu") is None:
         return None
     try:
         return invert_poses(pose_of_numbers(entry["T_cam_imu"], chain))
@@ -149,21 +159,30 @@ def _rig(mav: Path) -> StereoRig | None:
     return right_camera(calibration, "cam0") if found is None and calibration is not None else found
 
 
-def _inertial(mav: Path, camera: str) -> InertialSamples:
+def _inertial(mav: Path, camera: str, request: Request, *, rough: bool = False) -> InertialSamples:
     body_camera, body_imu = _body_camera(mav, camera), read_extrinsics(mav / "imu0" / "sensor.yaml")
     if body_imu is None and _camchain(mav) is not None:
         body_imu = np.array([0, 0, 0, 0, 0, 0, 1.0])
     T_camera_imu = None
     if body_camera is not None and body_imu is not None:
         T_camera_imu = compose_poses(invert_poses(body_camera), body_imu)
-    return read_inertial(mav / "imu0" / "data.csv", T_camera_imu)
+    stated = mav.parent / "dso" / "imu_config.yaml"  # of TUM-VI
+    noise = read_noise(mav / "imu0" / "sensor.yaml") or read_noise(stated)
+    given, offset = request.imu_calibration, None
+    if (given is None or given.time_offset is None) and (kalibr := _kalibr_camera(mav, camera)) is not None:
+        offset = kalibr[0].get("timeshift_cam_imu")
+        if offset is not None and not isinstance(offset, int | float):
+            field = f"{camera}.timeshift_cam_imu"
+            raise DvoError("no number", file=kalibr[1], field=field, remedy="give seconds, t_imu - t_cam")
+    calibration, table = ImuCalibration(noise, T_camera_imu, offset), mav / "imu0" / "data.csv"
+    return calibration.applied(read_inertial_table(table, rough=True)) if rough else read_inertial(table, calibration)
 
 
 def _sensors(mav: Path, camera: str, request: Request) -> Sensors:
     """Right images and inertial samples, where there are files of them; nothing is read yet."""
     # times that the user named need not be on the clock of the inertial sensor
     has_inertial = (mav / "imu0" / "data.csv").is_file() and request.times is None
-    inertial = partial(_inertial, mav, camera) if has_inertial else None
+    inertial = partial(_inertial, mav, camera, request) if has_inertial else None
     if camera != "cam0" or not (mav / "cam1" / "data").is_dir():
         return Sensors(inertial=inertial)
     return Sensors(right=SameName(mav / "cam1" / "data"), stereo=partial(_rig, mav), inertial=inertial)
@@ -237,6 +256,8 @@ def open_euroc(path: Path, request: Request) -> Recording:
         times = listed if request.times is None else read_times(request.times, len(images), warnings)
         if request.fps is not None:
             warnings.append(f"--fps was not used: the times come from {camera}/data.csv")
+    if request.times is not None and is_file(mav / "imu0" / "data.csv"):
+        warnings.append("inertial samples of imu0 are not used: the times of --times need not be on their clock")
     groundtruth = _groundtruth(mav, camera, times, warnings)
     name = mav.resolve().parent.name if mav.resolve().name == "mav0" else None
     if path.resolve().name == "data" and name is None:

@@ -8,6 +8,7 @@ with ``K_0N`` and ``D_0N``.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,9 +17,10 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.kitti import projection_calibration, projection_rig
-from dvo.data.files.files import is_file, parse_number, read_lines
-from dvo.data.files.stamps import choose_times
+from dvo.data.files.files import is_file, parse_number, read_lines, read_rows
+from dvo.data.files.stamps import choose_times, read_times
 from dvo.data.images.images import has_images, list_images
+from dvo.data.positions import Positions
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import SameName, Sensors
 
@@ -112,10 +114,45 @@ def open_kitti_raw(path: Path, request: Request) -> Recording:
         if is_rectified and number in _RIGHT and has_images(right):
             sensors = Sensors(right=SameName(right), stereo=partial(_rig, file, number, _RIGHT[number]))
     if (drive / "oxts").is_dir():
-        warnings.append("oxts has positions and inertial samples of the car; they are not used")
+        warnings.append("oxts has inertial samples of the car at the rate of the images; they are not used")
+    if is_file(drive / "oxts" / "timestamps.txt") and (drive / "oxts" / "data").is_dir():
+        sensors = replace(sensors, positions=partial(read_oxts, drive / "oxts"))
     return ImageRecording(
         "kitti_raw", path, images, times, calibration=calibration, warnings=warnings, name=drive.name, sensors=sensors
     )
+
+
+_FIELDS = 30  # of a row of oxts
+_MODES = ("none", "search", "doppler", "standard", "differential", "RTK float", "RTK integer")  # of OXTS receivers
+_FIRST_FIX = 3
+
+
+def read_oxts(folder: Path) -> Positions:
+    """Read the positions of the car: latitude, longitude, altitude, and of the 30 numbers of a row also the accuracy of
+    the position (24th, metres) and the mode of the receiver (28th).
+
+    Args:
+        folder: ``oxts`` with ``data/*.txt`` and ``timestamps.txt``.
+
+    Raises:
+        DvoError: a file without 30 numbers, or another number of times.
+    """
+    files = sorted((folder / "data").glob("*.txt"))
+    times = read_times(folder / "timestamps.txt", len(files))
+    table = np.zeros((len(files), _FIELDS))
+    for k, file in enumerate(files):
+        fields = next((row for _, row in read_rows(file, "use KITTI's oxts")), [])
+        try:
+            values = [parse_number(field) for field in fields]
+        except ValueError:
+            values = []
+        if len(values) != _FIELDS:
+            raise DvoError(f"not {_FIELDS} numbers", file=file, field="oxts", remedy="use KITTI's oxts")
+        table[k] = values
+    modes = table[:, 27].astype(int)
+    fix = tuple(_MODES[mode] if 0 <= mode < len(_MODES) else str(mode) for mode in modes.tolist())
+    has_fix = modes >= _FIRST_FIX
+    return Positions(times, table[:, :2], table[:, 2], has_fix, fix, table[:, 23], "m", "oxts")
 
 
 READER = Reader("kitti_raw", matches, open_kitti_raw)

@@ -1,12 +1,13 @@
 """Bags of ROS 1 (``.bag``) and ROS 2 (folder with ``metadata.yaml``, ``.mcap``, ``.db3``), read by the package rosbags.
 
 Times are the stamps of the headers. The calibration is that of the ``camera_info`` topic beside the image topic; frames
-carry the samples of the only ``sensor_msgs/Imu`` topic, without the pose of the sensor (no ``tf`` is read).
+carry the samples of the only ``sensor_msgs/Imu`` topic, or of the chosen one, without the pose of the sensor (no ``tf``
+is read).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
@@ -18,10 +19,12 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, StereoRig
 from dvo.data.calibration.values import from_values
-from dvo.data.files.files import MAX_NUMBER, is_file, lookups
+from dvo.data.files.files import is_file, lookups
 from dvo.data.files.stamps import checked_rate, read_times
 from dvo.data.images.images import used_bits
 from dvo.data.inertial import InertialSamples
+from dvo.data.inertial_files.tidy import joined, tidy
+from dvo.data.positions import Positions
 from dvo.data.readers.ros_images import decode_message, raw_levels
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
@@ -130,6 +133,7 @@ class BagRecording:
     turned = 0
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
+    positions: Callable[[], Positions | None] | None = None
 
     def __init__(self, path: Path, request: Request) -> None:
         self.path, self.name = path, path.resolve().stem
@@ -160,11 +164,15 @@ class BagRecording:
         has_clock = self._times is None and self._fps is None and self._stamped
         if not self._stamped and self._times is None and self._fps is None:
             self.warnings.append(f"headers of {self.topic} have no stamps: times of recording are used")
-        if len(imu) > 1:
-            self.warnings.append(f"several topics of inertial samples, none is used: {', '.join(sorted(imu))}")
-        is_usable = has_clock and len(imu) == 1
+        self.imu_topics = sorted(imu)
+        chosen = imu_topic_of(path, self.imu_topics, request.imu_topic)
+        if len(imu) > 1 and chosen is None:
+            listed = ", ".join(self.imu_topics)
+            self.warnings.append(f"several topics of inertial samples, none is used: {listed} (give --imu-topic)")
+        if chosen is not None and not has_clock:
+            self.warnings.append(f"inertial samples of {chosen} are not used: the images have no times on their clock")
         self.inertial: Callable[[], InertialSamples] | None = (
-            partial(read_inertial, path, imu[0]) if is_usable else None
+            partial(read_inertial, path, chosen) if has_clock and chosen is not None else None
         )
 
     def _used_bits(self, reader: Any) -> int:
@@ -316,27 +324,69 @@ def _first(reader: Any, topic: str) -> Any:
     return None
 
 
-def read_inertial(path: Path, topic: str) -> InertialSamples:
+def imu_topic_of(path: Path, topics: Sequence[str], asked: str | None) -> str | None:
+    """Topic of inertial samples, or two of them: RealSense has one for the gyroscope and one for the accelerometer.
+
+    Args:
+        path: of the bag, for messages.
+        topics: of type ``sensor_msgs/Imu`` that have messages.
+        asked: by the user; two names apart by a comma; None for the only one.
+
+    Returns:
+        The name, or two apart by a comma, that of the gyroscope first; None if there is none, or if it is not clear.
+
+    Raises:
+        DvoError: no such topic.
+    """
+    if asked is not None:
+        names = [f"/{name.strip().lstrip('/')}" for name in asked.split(",")]
+        unknown = next((name for name in names if name not in topics), None)
+        if unknown is not None or len(names) > 2:
+            message = f"{str(unknown or asked)[:80]} is no topic of inertial samples"
+            remedy = f"give one of {', '.join(topics) or 'none, there are none'}"
+            raise DvoError(message, file=path, field="imu_topic", remedy=remedy)
+        return ",".join(names)
+    if len(topics) == 2:
+        gyro, accel = ([name for name in topics if word in name.lower()] for word in ("gyro", "accel"))
+        if len(gyro) == len(accel) == 1 and gyro != accel:
+            return f"{gyro[0]},{accel[0]}"
+    return topics[0] if len(topics) == 1 else None
+
+
+def read_inertial(path: Path, topic: str | None = None, *, rough: bool = False) -> InertialSamples:
     """Read all samples of a topic.
 
     Args:
         path: of the bag.
-        topic: of type ``sensor_msgs/Imu``, rad/s and m/s^2.
+        topic: of type ``sensor_msgs/Imu``, rad/s and m/s^2; two apart by a comma, that of the gyroscope first; None for
+            the only one.
+        rough: in the order of the bag, for a check, see :func:`dvo.data.inertial_files.tidy.tidy`.
 
     Raises:
-        DvoError: the bag cannot be read.
+        DvoError: the bag cannot be read, the topic is not clear, or see :func:`dvo.data.inertial_files.tidy.tidy`.
     """
-    rows = []
     with _opened(path) as reader:
-        for connection, _, data in _messages(reader, topic):
-            message = reader.deserialize(data, connection.msgtype)
-            gyro, accel = message.angular_velocity, message.linear_acceleration
-            rows.append([_seconds(message), gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z])
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    table = table[(np.abs(table) <= MAX_NUMBER).all(axis=1)]  # false for nan too
-    _, first = np.unique(table[:, 0], return_index=True)  # sorted: messages may have been recorded out of order
-    table = table[first]
-    return InertialSamples(table[:, 0].copy(), table[:, 1:4].copy(), table[:, 4:].copy())
+        there = sorted(name for name, info in reader.topics.items() if info.msgtype == IMU and info.msgcount)
+        topic = imu_topic_of(path, there, topic)
+        if topic is None:
+            message = f"the topic of inertial samples is not clear; there are {', '.join(there) or 'none'}"
+            raise DvoError(message, file=path, field="imu_topic", remedy="give one with --imu-topic")
+        tables = [_imu_rows(reader, name) for name in topic.split(",")]
+    origin = f"topic {topic.replace(',', ' and ')}"
+    if len(tables) == 1:
+        return tidy(tables[0][:, 0], tables[0][:, 1:4], tables[0][:, 4:], path, origin, rough=rough)
+    gyro, accel = tables
+    return joined(gyro[:, 0], gyro[:, 1:4], accel[:, 0], accel[:, 4:], path, origin, rough=rough)
+
+
+def _imu_rows(reader: Any, topic: str) -> np.ndarray:
+    """``(K, 7)`` float64 seconds, gyroscope and accelerometer."""
+    rows = []
+    for connection, _, data in _messages(reader, topic):
+        message = reader.deserialize(data, connection.msgtype)
+        gyro, accel = message.angular_velocity, message.linear_acceleration
+        rows.append([_seconds(message), gyro.x, gyro.y, gyro.z, accel.x, accel.y, accel.z])
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
 def open_rosbag(path: Path, request: Request) -> Recording:

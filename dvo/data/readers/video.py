@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,9 @@ from dvo.data.files.stamps import NOMINAL_FPS, RATES, checked_rate, read_times
 from dvo.data.images.image_header import MAX_PIXELS
 from dvo.data.images.images import SUFFIXES, to_rgb8
 from dvo.data.inertial import InertialSamples
+from dvo.data.inertial_files.gopro import gopro_notes, read_gopro, read_gopro_positions
+from dvo.data.inertial_files.gpmf import has_telemetry
+from dvo.data.positions import Positions
 from dvo.data.readers.edit_list import shown_seconds
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Reader, Recording, Request, Selection
 from dvo.data.trajectory import Trajectory
@@ -158,6 +162,7 @@ class VideoRecording:
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
     inertial: Callable[[], InertialSamples] | None = None
+    positions: Callable[[], Positions | None] | None = None
 
     def __init__(self, path: Path, request: Request) -> None:
         import cv2
@@ -188,6 +193,13 @@ class VideoRecording:
             self.frame_count = max(1, min(self.frame_count, round(shown * rate)))
         self._times = self._read_times(request.times) if request.times is not None else None
         self._use_container = bool(request.fps is None and (np.diff(first) > 0).all() and np.isfinite(first).all())
+        if has_telemetry(path):
+            self.warnings += gopro_notes(path)
+            self.positions = partial(read_gopro_positions, path)
+            if request.times is None and request.fps is None and self._use_container:
+                self.inertial = partial(read_gopro, path, self.turned)
+            else:
+                self.warnings.append("inertial samples of the telemetry are not used: frames have no times of the file")
         self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
         self.rate = self._fps if self._times is None else None
         if self._times is None and not self._use_container and request.fps is None:

@@ -18,6 +18,7 @@ from dvo.data.calibration.calibration import StereoRig
 from dvo.data.files.files import is_file
 from dvo.data.images.images import list_images
 from dvo.data.inertial import InertialSamples
+from dvo.data.positions import Positions
 
 MILLIMETRES = 1000.0
 """Units of a metre in 16-bit depth images of a folder, unless it is a list in the layout of TUM RGB-D."""
@@ -36,6 +37,7 @@ class Sensors:
         right: right image of an image; needs ``stereo``.
         stereo: reads the calibration of the right camera; None from it if there is none.
         inertial: reads all samples of the recording.
+        positions: reads the positions of a satellite receiver.
     """
 
     depth: Finder | None = None
@@ -43,6 +45,7 @@ class Sensors:
     right: Finder | None = None
     stereo: Callable[[], StereoRig | None] | None = None
     inertial: Callable[[], InertialSamples] | None = None
+    positions: Callable[[], Positions | None] | None = None
 
 
 @dataclass(frozen=True)

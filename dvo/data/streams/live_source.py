@@ -26,6 +26,7 @@ from dvo.data.inertial import InertialSamples
 from dvo.data.interval import Bound, Interval
 from dvo.data.mask import open_masks
 from dvo.data.opening import check_invert, check_stride
+from dvo.data.positions import Positions
 from dvo.data.recording import EVERYTHING, Log, RawFrame, Selection
 from dvo.data.source import Reading, Source
 from dvo.data.streams.capture import STANDARD_INPUT, Capture, StreamClock, is_stream, shown
@@ -74,6 +75,7 @@ class LiveRecording(Generic[T]):
     groundtruth: Trajectory | None = None
     stereo: Callable[[], StereoRig | None] | None = None
     inertial: Callable[[], InertialSamples] | None = None
+    positions: Callable[[], Positions | None] | None = None
 
     def __init__(self, live: LiveFrames[T], decode: Callable[[T], RawFrame | None], times: str) -> None:
         self.live, self.decode, self.times = live, decode, times

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
-from dvo.geometry.poses import split
+from dvo.geometry.poses import rotation_vector, split
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.preintegration import preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
@@ -27,11 +27,11 @@ from dvo.odometry.inertial.smoother import (
     first_values,
     linear_start,
     motion_factors,
-    rotation_vector,
     smooth,
     upright,
 )
 from dvo.odometry.inertial.stream import SampleStream
+from dvo.odometry.inertial.temporal import align_imu
 from dvo.odometry.protocol import ScaleState
 
 Array = np.ndarray
@@ -53,6 +53,8 @@ GRAVITY_RANGE = (6.0, 16.0)
 """Median specific force of a camera that is moved by hand, by a vehicle or in flight, m/s^2."""
 MAX_TURN = 1.5
 """Root mean square difference of rotations between nodes, degrees, above which gyroscope and images disagree."""
+FOUND_EXTRINSIC = 0.02
+"""Deviation of a rotation between sensor and camera that was found from the motion, rad."""
 MAX_ROTATION_SIGMA = 0.01
 """Noise of visual orientations above which samples and images do not fit, rad."""
 MAX_SHIFT = 0.02
@@ -154,6 +156,7 @@ class InertialEstimator:
         self.noise: ImuNoise = NOISE_PRESETS["phone"]
         self.rotation_camera_imu: Array | None = None
         self.translation_camera_imu: Array = np.zeros(3)
+        self.first_offset = 0.0  # time offset that the first estimate begins with, seconds
         self._candidate: tuple[float, float] | None = None  # log scale and its deviation, of an estimate that passed
         self._failures, self._patience = 0, EVERY / 2
         self._next = -np.inf
@@ -269,7 +272,7 @@ class InertialEstimator:
         samples, turn = self.stream.samples(), self.rotation_camera_imu
         if samples is None or turn is None or not self.options.use:
             return None
-        offset = 0.0 if self.solution is None else self.solution.time_offset
+        offset = self.first_offset if self.solution is None else self.solution.time_offset
         bias = np.zeros(3) if self.solution is None else self.solution.gyro_bias[-1]
         times = np.array([before, after]) + offset
         if samples.timestamps[0] > times[0] or samples.timestamps[-1] < times[1] - 0.02:
@@ -327,8 +330,11 @@ class InertialEstimator:
         if samples is None or len(samples) < 2:
             return None, "too few samples"
         if turn is None:
-            return None, "the rotation between sensor and camera is not known"
-        offset = 0.0 if self.solution is None else self.solution.time_offset
+            reason = self._turn_between(nodes, samples)
+            turn = self.rotation_camera_imu
+            if turn is None:
+                return None, reason
+        offset = self.first_offset if self.solution is None else self.solution.time_offset
         lead = 0.03 + abs(offset)
         kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
         if not kept.all():
@@ -349,6 +355,19 @@ class InertialEstimator:
             at = int(np.abs(self.solution.times - nodes.times[0]).argmin())
             problem.gyro_bias, problem.accel_bias = self.solution.gyro_bias[at], self.solution.accel_bias[at]
         return problem, ""
+
+    def _turn_between(self, nodes: VisualNodes, samples: InertialSamples) -> str:
+        """Find the rotation between sensor and camera; why it is not found."""
+        unknown = "the rotation between sensor and camera is not known"
+        if len(nodes) < 10 or nodes.segment[0] != nodes.segment[-1]:
+            return unknown
+        found = align_imu(nodes.times, nodes.rotation, samples.timestamps, samples.gyro)
+        if found.reason or found.sigma_rotation.max() > MAX_TURN or not np.isfinite(found.sigma_offset):
+            return f"{unknown}, and {found.reason or 'the motion does not tell it'}: turn about several axes"
+        self.rotation_camera_imu, self.first_offset = found.rotation_camera_imu, found.time_offset
+        self._smoother = replace(self._smoother, extrinsic_sigma=FOUND_EXTRINSIC)
+        self.history.append({"time": float(nodes.times[-1]), "event": "rotation between sensor and camera found"})
+        return ""
 
     def _solved(self, problem: Smoother, worlds: list[int]) -> Smoothed | None:
         """The best solution from some starts."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dvo.data.inertial import ImuNoise, InertialSamples
-from dvo.geometry.poses import skew, so3_exp
+from dvo.geometry.poses import rotation_vector, skew, so3_exp
 from dvo.odometry.inertial.chain import ChainSystem, solve_chain
 from dvo.odometry.inertial.preintegration import Preintegration, preintegrate
 
@@ -342,28 +342,6 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
         Similarities(values.log_scale, values.world, values.translation), values.offset,
         problem.rotation_camera_imu @ so3_exp(values.extrinsic), covariance, cost, *errors,
     )  # fmt: skip
-
-
-def rotation_vector(rotation: Array) -> Array:
-    """Logarithm of rotations of angles below pi.
-
-    Args:
-        rotation: ``(..., 3, 3)``.
-
-    Returns:
-        ``(..., 3)`` rad.
-    """
-    axis = 0.5 * np.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )
-    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
-    cosine = (np.trace(rotation, axis1=-2, axis2=-1)[..., None] - 1) / 2
-    return axis * np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-300), 1.0)
 
 
 def _inverse_right_jacobian(phi: Array) -> Array:

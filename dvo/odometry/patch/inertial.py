@@ -18,13 +18,13 @@ from dvo.data.frame import Frame
 from dvo.data.inertial import InertialSamples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
-from dvo.geometry.poses import pose_from, slerp, split
+from dvo.geometry.poses import pose_from, rotation_vector, slerp, split
 from dvo.map.correction import re_express
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
 from dvo.odometry.inertial.options import InertialOptions
-from dvo.odometry.inertial.smoother import Smoothed, VisualNodes, rotation_vector
+from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
 from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState, Segment, Status
 
 GYRO_TRUST = 0.7

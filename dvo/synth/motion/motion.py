@@ -84,6 +84,7 @@ class SplinePath:
         control: ``(K, 6)`` x, y, z, yaw, pitch, roll (rad; yaw 0 looks along y, pitch up is positive).
         interval: seconds between control points.
         frequency, shake: as in :class:`Path`; added in body axes.
+        start: time at which the control points begin, seconds.
     """
 
     kind: str
@@ -91,28 +92,40 @@ class SplinePath:
     interval: float
     frequency: Array
     shake: Array
+    start: float = 0.0
 
     @property
     def duration(self) -> float:
         """Time covered by the control points, seconds."""
         return (len(self.control) - 3) * self.interval
 
+    @staticmethod
+    def weights(share: Array) -> Array:
+        """Weights of the four control points of a segment of a uniform cubic B-spline.
+
+        Args:
+            share: ``(T,)`` of the segment that has passed.
+
+        Returns:
+            ``(T, 4)``.
+        """
+        s = share
+        return np.stack([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3], -1) / 6
+
     def poses_wc(self, times: Array) -> Array:
         """Camera-to-world poses.
 
         Args:
-            times: ``(T,)`` seconds in [0, duration].
+            times: ``(T,)`` seconds in [start, start + duration].
 
         Returns:
             ``(T, 7)`` float64.
         """
         times = np.asarray(times, float)
-        # Just before 0 the first segment is extrapolated: a shutter opens before the time of its frame.
-        place = np.clip(times / self.interval, -0.2, len(self.control) - 3 - 1e-9)
+        # Just before the start the first segment is extrapolated: a shutter opens before the time of its frame.
+        place = np.clip((times - self.start) / self.interval, -0.2, len(self.control) - 3 - 1e-9)
         index = np.maximum(np.floor(place), 0).astype(int)
-        s = place - index
-        weight = np.stack([(1 - s) ** 3, 3 * s**3 - 6 * s**2 + 4, -3 * s**3 + 3 * s**2 + 3 * s + 1, s**3], -1) / 6
-        state = (weight[..., None] * self.control[index[:, None] + np.arange(4)]).sum(1)
+        state = (self.weights(place - index)[..., None] * self.control[index[:, None] + np.arange(4)]).sum(1)
         yaw, pitch, roll = state[:, 3:].T
         forward = np.stack([-np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], -1)
         rotation = np.stack([look_rotation(f, UP, r) for f, r in zip(forward, roll, strict=True)])

@@ -20,11 +20,13 @@ TURNS = 1.4  # rounds of a loop
 CONTROL_INTERVAL = 0.8  # seconds between control points
 
 
-def _yaw_towards(direction: Array) -> float:
+def yaw_towards(direction: Array) -> float:
+    """Yaw of a camera that looks along ``direction (3,)``, rad; 0 looks along y."""
     return float(np.arctan2(-direction[0], direction[1]))
 
 
-def _nearest_turn(angle: float, previous: float) -> float:
+def nearest_turn(angle: float, previous: float) -> float:
+    """Angle, rad, with those turns added that bring it within half a turn of ``previous``."""
     return previous + (angle - previous + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -98,7 +100,7 @@ def _draw_long(
     pace = 0.1 * scene.scale * speed * interval  # metres a control interval
     forward = start.rotation[:, 2]
     control = np.zeros((count, 6))
-    position, yaw = start.position.copy(), _yaw_towards(forward)
+    position, yaw = start.position.copy(), yaw_towards(forward)
     drift = rng.normal(size=3) * [1, 1, 0.4]
     direction = drift / np.linalg.norm(drift)
     low, high = scene.hints.get("focus", (scene.bounds[0], scene.bounds[1]))
@@ -107,8 +109,8 @@ def _draw_long(
     if hasty:
         pace, shake = 3 * pace, 2.5 * shake
     if kind == "straight" and heading is None:
-        direction, room = _longest_way(scene, rng, position)
-        pace, yaw = min(pace, 0.85 * room / count), _yaw_towards(direction)
+        direction, room = longest_way(scene, rng, position)
+        pace, yaw = min(pace, 0.85 * room / count), yaw_towards(direction)
     if heading is not None and kind in ("forward", "stop_and_go", "drone", "sideways", "straight"):
         along = scene.bounds[:, 1]
         pace *= 6 if scene.family == "street" else 1.5
@@ -116,7 +118,7 @@ def _draw_long(
         towards = float(rng.choice([-1, 1]))
         first = along[0] + 0.05 * np.ptp(along) if towards > 0 else along[1] - 0.05 * np.ptp(along)
         position = np.array([start.position[0] * 0.5, first, start.position[2]])
-        direction, yaw = heading * towards, _yaw_towards(heading * towards)
+        direction, yaw = heading * towards, yaw_towards(heading * towards)
         if kind == "sideways":
             yaw += side * np.pi / 2 * rng.uniform(0.4, 1)
     radius = float(np.linalg.norm((position - focus)[:2]))
@@ -128,7 +130,7 @@ def _draw_long(
             angle = np.arctan2(*(position - focus)[1::-1]) + side * rate
             target = focus + [radius * np.cos(angle), radius * np.sin(angle), position[2] - focus[2]]
             position = target + rng.normal(0, 0.1, 3) * pace
-            yaw = _nearest_turn(_yaw_towards(focus - position), yaw)
+            yaw = nearest_turn(yaw_towards(focus - position), yaw)
             pitch = float(np.arctan2(focus[2] - position[2], max(radius, 1e-3)))
         elif kind == "straight":
             position = position + direction * pace
@@ -136,8 +138,8 @@ def _draw_long(
         elif heading is not None and kind in ("forward", "stop_and_go", "drone", "sideways"):
             position = position + direction * pace * calm
             position[0] = np.clip(position[0] + rng.normal(0, 0.12) * pace, *(scene.bounds[:, 0] * 0.5))
-            wander = yaw if kind == "sideways" else _yaw_towards(direction)
-            yaw = yaw + 0.3 * (_nearest_turn(wander, yaw) - yaw) + rng.normal(0, 0.02)
+            wander = yaw if kind == "sideways" else yaw_towards(direction)
+            yaw = yaw + 0.3 * (nearest_turn(wander, yaw) - yaw) + rng.normal(0, 0.02)
             pitch = pitch * 0.7
         else:
             step = pace * calm * (0.15 if kind == "rotation" else 1.0)
@@ -155,12 +157,12 @@ def _draw_long(
             direction /= np.linalg.norm(direction)
             if rng.random() < (0.35 if hasty else 0.12):
                 focus = rng.uniform(low, high)
-            wanted = _yaw_towards(direction if kind == "forward" else focus - position)
+            wanted = yaw_towards(direction if kind == "forward" else focus - position)
             swing = 0.35 if kind == "rotation" else 0.5 if hasty else 0.15
             if kind == "rotation":
                 wanted = yaw + side
                 side = -side if rng.random() < 0.08 else side
-            yaw = yaw + float(np.clip(_nearest_turn(wanted, yaw) - yaw, -swing, swing))
+            yaw = yaw + float(np.clip(nearest_turn(wanted, yaw) - yaw, -swing, swing))
             pitch = 0.8 * pitch + rng.normal(0, 0.04)
         control[i] = [*position, yaw, pitch, 0.6 * control[i - 1, 5] + rng.normal(0, 0.015)]
     vehicle = scene.family == "street" and kind in ("forward", "stop_and_go", "straight")
@@ -176,8 +178,14 @@ def _shake(scene: Scene, rng: np.random.Generator, shake: float, vehicle: bool) 
     return hertz * 2 * np.pi, amplitude
 
 
-def _longest_way(scene: Scene, rng: np.random.Generator, position: Array) -> tuple[Array, float]:
-    """Level direction with the longest free way ahead, of sixteen, and its length."""
+def longest_way(scene: Scene, rng: np.random.Generator, position: Array) -> tuple[Array, float]:
+    """Level direction with the longest free way ahead, of sixteen, and its length.
+
+    Args:
+        scene: to move in.
+        rng: turns the sixteen.
+        position: ``(3,)``.
+    """
     reach = np.linspace(0, 6 * scene.scale, 60)[1:]
     best = (np.array([0.0, 1.0, 0.0]), 0.0)
     for angle in rng.uniform(0, 2 * np.pi) + np.arange(16) * np.pi / 8:
@@ -217,7 +225,7 @@ def _draw_loop(
         way = np.gradient(position, axis=0)
         yaw = np.unwrap(np.arctan2(-way[:, 0], way[:, 1])) + rng.choice([0.0, -0.7, 0.7])
     else:
-        yaw = _yaw_towards(forward) + rng.uniform(0.5, 0.9) * np.sin(angle + phase[2])
+        yaw = yaw_towards(forward) + rng.uniform(0.5, 0.9) * np.sin(angle + phase[2])
     pitch = 0.7 * float(np.clip(np.arcsin(forward[2]), -0.5, 0.4)) + 0.06 * np.sin(2 * angle + phase[0])
     control = np.column_stack([position, yaw, pitch, 0.02 * np.sin(angle + phase[1])])
     return SplinePath("loop", control, interval, *_shake(scene, rng, shake, False))

@@ -1,6 +1,6 @@
-"""Inertial measurements of a sensor at the camera, from the continuous path.
+"""Inertial measurements of a sensor on a continuous path.
 
-Model (that of Kalibr, and of Forster et al., "On-manifold preintegration", 2017, eq. 27-28), in the camera frame:
+Model (that of Kalibr, and of Forster et al., "On-manifold preintegration", 2017, eq. 27-28), in the frame of the path:
 
     gyro  = omega + bias_g + noise,    accel = R_wc^T (a_w - g_w) + bias_a + noise,
 
@@ -9,13 +9,13 @@ with white noise of density n (deviation ``n sqrt(rate)`` of a sample) and biase
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dvo.core.errors import DvoError
 from dvo.data.inertial import ImuNoise
-from dvo.geometry.poses import split
+from dvo.geometry.poses import rotation_vector, split
 from dvo.synth import salts
 from dvo.synth.protocols import Motion
 
@@ -26,7 +26,7 @@ STEP = 2e-4  # seconds on either side of a sample over which motion is different
 
 @dataclass(frozen=True)
 class Imu:
-    """Samples in the camera frame (x right, y down, z forward).
+    """Samples in the frame of the path (of a camera: x right, y down, z forward).
 
     Attributes:
         timestamps: ``(T,)`` seconds.
@@ -53,7 +53,7 @@ def measure_imu(
     1e-11 rad/s).
 
     Args:
-        path: camera to world, in metres.
+        path: sensor to world, in metres.
         times: ``(T,)`` evenly spaced, seconds.
         noise: None measures without noise and bias.
         seed: of the noise.
@@ -75,36 +75,29 @@ def measure_imu(
     omega = (np.swapaxes(now, -1, -2) @ before @ omega[..., None])[..., 0]
     acceleration = ((right - here) - (here - left)) / STEP**2
     accel = (np.swapaxes(now, -1, -2) @ (acceleration - gravity)[..., None])[..., 0]
-    biases = np.zeros((2, len(times), 3))
-    if noise is not None:
-        rng = np.random.default_rng([seed, salts.IMU])
-        rate = 1 / steps.mean()
-        for k, (start, walk) in enumerate(((noise.gyro_bias, noise.gyro_walk), (noise.accel_bias, noise.accel_walk))):
-            wander = rng.normal(0, walk / np.sqrt(rate), (len(times), 3))
-            wander[0] = rng.normal(0, start, 3)
-            biases[k] = np.cumsum(wander, 0)
-        omega = omega + biases[0] + rng.normal(0, noise.gyro * np.sqrt(rate), omega.shape)
-        accel = accel + biases[1] + rng.normal(0, noise.accel * np.sqrt(rate), accel.shape)
-    return Imu(times, omega, accel, biases[0], biases[1], np.asarray(gravity, float))
+    none = np.zeros((len(times), 3))
+    exact = Imu(times, omega, accel, none, none, np.asarray(gravity, float))
+    return exact if noise is None else with_noise(exact, noise, seed)
 
 
-def rotation_vector(rotation: Array) -> Array:
-    """Logarithm of rotations of angles well below pi, accurate for tiny ones.
+def with_noise(exact: Imu, noise: ImuNoise, seed: int) -> Imu:
+    """Samples with white noise and biases added.
 
     Args:
-        rotation: ``(..., 3, 3)``.
+        exact: evenly spaced samples.
+        noise: densities.
+        seed: same seed, same noise.
 
     Returns:
-        ``(..., 3)`` rad.
+        The samples, with the biases that they contain.
     """
-    twist = 0.5 * np.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )  # sin(angle) * axis
-    sine = np.linalg.norm(twist, axis=-1, keepdims=True)
-    cosine = (np.trace(rotation, axis1=-2, axis2=-1)[..., None] - 1) / 2
-    return twist * np.where(sine > 1e-12, np.arctan2(sine, cosine) / np.maximum(sine, 1e-300), 1.0)
+    rng = np.random.default_rng([seed, salts.IMU])
+    rate = 1 / np.diff(exact.timestamps).mean()
+    biases = []
+    for start, walk in ((noise.gyro_bias, noise.gyro_walk), (noise.accel_bias, noise.accel_walk)):
+        wander = rng.normal(0, walk / np.sqrt(rate), exact.gyro.shape)
+        wander[0] = rng.normal(0, start, 3)
+        biases.append(np.cumsum(wander, 0))
+    gyro = exact.gyro + biases[0] + rng.normal(0, noise.gyro * np.sqrt(rate), exact.gyro.shape)
+    accel = exact.accel + biases[1] + rng.normal(0, noise.accel * np.sqrt(rate), exact.accel.shape)
+    return replace(exact, gyro=gyro, accel=accel, gyro_bias=biases[0], accel_bias=biases[1])

@@ -10,6 +10,13 @@
     world.colors = decode(world.colors, Uint8Array);
     for (const track of world.tracks) [track.time, track.poses] = [decode(track.time), decode(track.poses)];
   }
+  for (const entry of data.images) {
+    const picture = new Image();
+    picture.addEventListener("load", () => view.redraw());
+    picture.src = `data:image/jpeg;base64,${entry[1]}`;
+    entry[1] = picture;
+  }
+  const imageTimes = data.images.map(([time]) => time);
   const find = (id) => document.getElementById(id);
   const view = new OrbitView(find("view"));
   const [cursor, readout, play, chooser] = [find("cursor"), find("readout"), find("play"), find("world")];
@@ -33,7 +40,8 @@
     const { layers } = view;
     const offered = [
       ["map", "map", world.points.length], ["truth", "ground truth", world.truth.length],
-      ["keyframes", "keyframes", world.keyframes.length], ["loops", "loops", world.loops.length], ["grid", "grid", 1],
+      ["keyframes", "keyframes", world.keyframes.length], ["loops", "loops", world.loops.length],
+      ["image", "image of the frame", imageTimes.length], ["grid", "grid", 1],
     ];
     find("layers").textContent = "";
     for (const [name, text, count] of offered) {
@@ -62,7 +70,12 @@
     if (Number.isFinite(frames.seconds[index])) parts.push(duration(frames.seconds[index]));
     if (Number.isFinite(frames.error[index])) parts.push(`error ${frames.error[index].toPrecision(3)} m`);
     readout.textContent = parts.join(" · ");
-    view.pose = null;
+    view.pose = view.picture = null;
+    if (imageTimes.length) {
+      const last = before(imageTimes, t);
+      const next = Math.min(last + 1, imageTimes.length - 1);
+      [view.pictureTime, view.picture] = data.images[imageTimes[next] - t < t - imageTimes[last] ? next : last];
+    }
     if (frames.segment[index] >= 0) {
       const has = (candidate) => candidate.tracks.find((track) => track.segment === frames.segment[index]);
       if (follow && !has(world) && data.worlds.some(has)) useWorld(data.worlds.findIndex(has));

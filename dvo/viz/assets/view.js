@@ -21,8 +21,10 @@ class OrbitView {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
-    this.layers = { map: true, truth: true, keyframes: true, loops: true, grid: true };
+    this.layers = { map: true, truth: true, keyframes: true, loops: true, image: true, grid: true };
     this.pose = null; // of the frame at the cursor: x y z qx qy qz qw
+    this.picture = null; // image of the frame at the cursor, or of the one with an image that is nearest in time
+    this.pictureTime = 0; // of that frame, seconds
     this.pending = false;
     this.listen();
   }
@@ -44,6 +46,7 @@ class OrbitView {
   }
 
   reset() {
+    this.side = undefined;
     this.yaw = -0.5;
     this.pitch = 0.55;
     this.zoom = 1;
@@ -105,6 +108,7 @@ class OrbitView {
     this.prepare();
     const { world, layers, palette } = this;
     if (layers.grid) this.drawGrid();
+    this.marks = []; // positions on the screen that an image should not cover, with their weights
     if (layers.map) this.drawPoints();
     if (layers.truth && world.truth.length) {
       this.drawLine(world.truth, 3, world.truthStarts, palette.truth, 3.5, 0.65);
@@ -115,7 +119,8 @@ class OrbitView {
     if (layers.keyframes) this.drawDots(world.keyframes, palette.ink, 2);
     if (layers.loops) this.drawLoops();
     for (const track of world.tracks) this.drawDots(track.poses.subarray(0, 3), palette.start, 5);
-    if (this.pose) this.drawCamera(this.pose);
+    const corners = this.pose ? this.drawCamera(this.pose) : null;
+    if (layers.image && this.picture && this.picture.complete && this.picture.naturalWidth) this.drawPicture(corners);
     this.drawAxes();
   }
 
@@ -143,10 +148,11 @@ class OrbitView {
   drawPoints() {
     const { points } = this.world;
     const few = points.length < 3 * 1500 ? 1.5 : 1;
-    const size = few * Math.max(1.6, Math.min(4, 2 * Math.sqrt(this.zoom)));
+    const size = few * Math.max(2, Math.min(4, 2 * Math.sqrt(this.zoom)));
     for (let k = 0; 3 * k < points.length; k++) {
       const p = this.at(points, k);
       if (!p || p[0] < 0 || p[1] < 0 || p[0] > this.width || p[1] > this.height) continue;
+      this.marks.push([p[0], p[1], 1]);
       this.context.fillStyle = this.pointColours[k];
       this.context.fillRect(p[0] - size / 2, p[1] - size / 2, size, size);
     }
@@ -161,8 +167,10 @@ class OrbitView {
     context.globalAlpha = alpha;
     context.beginPath();
     let down = false;
+    const weight = (150 * step) / Math.max(array.length, 1); // a line counts as 150 points, however many it has
     for (let k = 0; step * k < array.length; k++) {
       const p = this.at(array, k, step);
+      if (p) this.marks.push([p[0], p[1], weight]);
       if (p && down && !gaps.has(k)) context.lineTo(p[0], p[1]);
       else if (p) context.moveTo(p[0], p[1]);
       down = p !== null;
@@ -212,7 +220,7 @@ class OrbitView {
     }
   }
 
-  /** Frustum of a camera: x right, y down, z along the optical axis. */
+  /** Frustum of a camera: x right, y down, z along the optical axis; gives its corners on the screen, null if behind. */
   drawCamera(pose) {
     const size = 0.09 * this.world.radius / Math.sqrt(this.zoom);
     const [x, y, z, qx, qy, qz, qw] = pose;
@@ -225,7 +233,7 @@ class OrbitView {
         z + v[2] + qw * t[2] + qx * t[1] - qy * t[0],
       ], 0);
     });
-    if (corners.some((p) => !p)) return;
+    if (corners.some((p) => !p)) return null;
     const context = this.context;
     context.strokeStyle = this.palette.ink;
     context.lineWidth = 1.6;
@@ -240,6 +248,53 @@ class OrbitView {
     context.beginPath();
     context.arc(corners[0][0], corners[0][1], 3, 0, 2 * Math.PI);
     context.fill();
+    return corners;
+  }
+
+  /** Image beside the frustum, where it covers least; of a frame without a pose in a corner of the view. */
+  drawPicture(corners) {
+    const context = this.context;
+    const { naturalWidth, naturalHeight } = this.picture;
+    const scale = Math.min(0.28 * this.width / naturalWidth, 0.34 * this.height / naturalHeight, 1.2);
+    const [width, height] = [naturalWidth * scale, naturalHeight * scale];
+    let [x, y] = [this.width - width - 10, 10];
+    if (corners) {
+      const [left, right] = [Math.min(...corners.map((p) => p[0])), Math.max(...corners.map((p) => p[0]))];
+      const [top, bottom] = [Math.min(...corners.map((p) => p[1])), Math.max(...corners.map((p) => p[1]))];
+      const [column, row] = [(left + right - width) / 2, (top + bottom - height) / 2];
+      const places = [[right + 26, row], [left - 26 - width, row], [column, top - 44 - height], [column, bottom + 26]];
+      const inside = places.map(([a, b]) => [
+        Math.max(6, Math.min(this.width - width - 6, a)), Math.max(6, Math.min(this.height - height - 24, b)),
+      ]);
+      const costs = inside.map(([a, b]) => {
+        const covers = ([u, v]) => u > a - 4 && u < a + width + 4 && v > b - 4 && v < b + height + 22;
+        const frustum = corners.filter(covers).length;
+        return this.marks.reduce((sum, mark) => sum + (covers(mark) ? mark[2] : 0), 1000 * frustum);
+      });
+      const best = costs.indexOf(Math.min(...costs));
+      // While the frame moves, the image stays on its side unless another one is much better.
+      if (this.side === undefined || costs[best] + 20 < 0.7 * costs[this.side]) this.side = best;
+      [x, y] = inside[this.side];
+      context.strokeStyle = this.palette.soft;
+      context.lineWidth = 1;
+      context.beginPath();
+      context.moveTo((left + right) / 2, (top + bottom) / 2);
+      const within = (low, value, high) => Math.max(low, Math.min(high, value));
+      context.lineTo(within(x, (left + right) / 2, x + width), within(y, (top + bottom) / 2, y + height));
+      context.stroke();
+    }
+    context.drawImage(this.picture, x, y, width, height);
+    context.strokeStyle = this.palette.ink;
+    context.lineWidth = 1.2;
+    context.strokeRect(x, y, width, height);
+    context.font = "11px system-ui, sans-serif";
+    context.textAlign = "left";
+    context.textBaseline = "top";
+    const label = `image at ${this.pictureTime.toFixed(2)} s`;
+    context.fillStyle = this.palette.paper;
+    context.fillRect(x, y + height + 1, context.measureText(label).width + 8, 17);
+    context.fillStyle = this.palette.ink;
+    context.fillText(label, x + 4, y + height + 4);
   }
 
   /** Directions of the world's axes, and the size of a cell of the grid. */

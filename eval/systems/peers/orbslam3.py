@@ -1,7 +1,10 @@
 """ORB-SLAM3 (Campos et al. 2021) from the package ``pyorbslam3`` (GPL-3).
 
 It is monocular, or takes the right images of rectified stereo pairs or depth images of its frames, and is in metres
-then (``--systems orbslam3+sensor=stereo``, ``orbslam3+sensor=rgbd``).
+then (``--systems orbslam3+sensor=stereo``, ``orbslam3+sensor=rgbd``). With inertial samples (``sensor=imu_monocular``,
+``imu_stereo``) it is in metres with z up after its initialisation; poses of a single camera before that have a scale of
+their own, and are carried along with their keyframes at the end. It is given the noise that the samples state, else
+that of a phone, and stamps as they are. Poses that it predicts from the samples while it is lost are marked as such.
 
 Its threads race: fed faster than the camera delivers, mapping starves. So frames are fed no faster than their stamps
 say, and the waiting is inside ``track`` (``info["computing_fps"]`` is the speed without it). A machine that is busy
@@ -34,11 +37,12 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame, StereoView
+from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.data.trajectory import Trajectory, read_tum
 from dvo.geometry.camera import Camera
-from dvo.geometry.poses import pose_matrices, poses_from_matrices
+from dvo.geometry.poses import invert_poses, pose_matrices, poses_from_matrices
 from dvo.geometry.undistort import needs_undistortion
-from dvo.odometry.protocol import Estimate, Result, Status
+from dvo.odometry.protocol import Estimate, Result, ScaleState, Status
 from eval.systems.peers.common import Pictures, Row, missing_module, result, version_of
 
 VOCABULARY = "DVO_ORB_VOCABULARY"
@@ -47,7 +51,11 @@ KINECT_BASELINE = 0.08
 """Metres between projector and camera of a Kinect; ORB-SLAM3 makes a virtual right image of a depth image with it."""
 CLOSE = 40
 """Number of baselines up to which a point counts as close, with a depth of its own."""
-Sensor = Literal["monocular", "stereo", "rgbd"]
+IMU_RATE = 200.0
+"""Samples a second by which it turns densities of noise into variances."""
+Sensor = Literal["monocular", "stereo", "rgbd", "imu_monocular", "imu_stereo"]
+IMU = "imu_"
+"""How the names of sensors with inertial samples begin."""
 version = version_of("pyorbslam3")
 
 
@@ -89,7 +97,7 @@ class OrbSlam3:
     Args:
         loops: closes loops, merges maps and relocalises; see the module.
         pace: seconds of the recording that are fed in a second, at most.
-        sensor: of ``"stereo"`` and ``"rgbd"`` the trajectory is in metres.
+        sensor: of all but ``"monocular"`` the trajectory is in metres.
 
     Attributes:
         waited: seconds that ``track`` has slept so far.
@@ -109,12 +117,14 @@ class OrbSlam3:
             remedy = f"choose from {', '.join(get_args(Sensor))}"
             raise DvoError(f"no such sensor: {sensor}", field="sensor", remedy=remedy)
         self._sensor: Sensor = sensor
+        self._is_inertial, self._is_stereo = sensor.startswith(IMU), sensor.endswith("stereo")
         self._package, self._loops, self._pace = pyorbslam3, loops, pace
         self._vocabulary = vocabulary_file()
         self._folder = tempfile.TemporaryDirectory(prefix="orbslam3-")
         self._pictures, self._pictures_right = Pictures(), Pictures()
         self._slam: Any = None
         self._rows: list[Row] = []
+        self._predicted: list[float] = []
         self._keyframes: dict[int, Trajectory] = {}
         self._map_changes: list[float] = []
         self._frames = self._part = 0
@@ -126,10 +136,11 @@ class OrbSlam3:
         if self._slam is None:
             assert self._pictures.camera is not None
             file = Path(self._folder.name) / "settings.yaml"
-            baseline = None if self._sensor == "monocular" else KINECT_BASELINE
-            if self._sensor == "stereo":
+            baseline = KINECT_BASELINE if self._sensor == "rgbd" else None
+            if self._is_stereo:
                 baseline = rectified_view(frame).baseline
-            file.write_text(settings(self._pictures.camera, self._loops, baseline), encoding="utf-8")
+            samples = _samples(frame) if self._is_inertial else None
+            file.write_text(settings(self._pictures.camera, self._loops, baseline, samples), encoding="utf-8")
             sensor = getattr(self._package.Sensor, self._sensor.upper())
             self._slam = self._package.Slam(str(self._vocabulary), str(file), sensor, use_viewer=False)
             self._fed, self._stamp = time.perf_counter(), frame.timestamp
@@ -142,7 +153,9 @@ class OrbSlam3:
         start = self._fed = time.perf_counter()
         self.waited += start - before
         self._stamp = frame.timestamp
-        said = getattr(self._slam, f"track_{self._sensor}")(image, *second, frame.timestamp)
+        beside = {"imu": _table(_samples(frame))} if self._is_inertial else {}
+        track = getattr(self._slam, f"track_{self._sensor.removeprefix(IMU)}")
+        said = track(image, *second, frame.timestamp, **beside)
         self._computing += time.perf_counter() - start
         if self._slam.map_changed():
             self._map_changes.append(frame.timestamp)
@@ -152,14 +165,24 @@ class OrbSlam3:
             self._read_keyframes()
         if said.state in (states.NO_IMAGES_YET, states.NOT_INITIALIZED) and self._was_tracking:
             self._part, self._was_tracking = self._part + 1, False
-        # While it is RECENTLY_LOST the pose is the motion model's guess.
-        if not said.pose_valid or said.state not in (states.OK, states.OK_KLT):
+        scale = ScaleState.NONE
+        if self._is_inertial:
+            scale = ScaleState.ALIGNED if self._slam.imu_initialized() else ScaleState.INITIALISING
+        # While it is RECENTLY_LOST the pose is the guess of the motion model, or of aligned inertial samples.
+        is_seen = said.state in (states.OK, states.OK_KLT)
+        is_predicted = scale is ScaleState.ALIGNED and said.state == states.RECENTLY_LOST
+        if not said.pose_valid or not (is_seen or is_predicted):
             seen = self._was_tracking or self._part > 0
             return Estimate(frame.timestamp, None, Status.LOST if seen else Status.INITIALISING)
         self._was_tracking = True
         T_wc = np.array(said.pose_wc, np.float64)
         self._rows.append(Row(frame.timestamp, T_wc, self._part))
-        return Estimate(frame.timestamp, poses_from_matrices(T_wc), Status.TRACKING, 0.5, self._part)
+        if not is_seen:
+            self._predicted.append(frame.timestamp)
+        status = Status.TRACKING if is_seen else Status.INERTIAL
+        return Estimate(
+            frame.timestamp, poses_from_matrices(T_wc), status, 0.5 * is_seen, self._part, scale_state=scale
+        )
 
     def finish(self) -> Result:
         if self._slam is not None:
@@ -179,13 +202,13 @@ class OrbSlam3:
             "map_changes": self._map_changes,
             "computing_fps": self._frames / self._computing if self._computing else None,
         }
-        return result(rows, self._frames, info, worlds)
+        return replace(result(rows, self._frames, info, worlds), inertial=tuple(self._predicted))
 
     def _second(self, frame: Frame) -> tuple[np.ndarray, ...]:
         """Image that the sensor gives beside that of the frame, of the same size: none of a monocular one."""
-        if self._sensor == "monocular":
+        if self._sensor.endswith("monocular"):
             return ()
-        if self._sensor == "stereo":
+        if self._is_stereo:
             view = rectified_view(frame)
             return (self._pictures_right(replace(frame, image=view.image, camera=view.camera)),)
         assert self._pictures.camera is not None
@@ -273,13 +296,27 @@ def rectified_view(frame: Frame) -> StereoView:
     return view
 
 
+def _samples(frame: Frame) -> InertialSamples:
+    """Inertial samples of a frame, with the pose of their sensor."""
+    if frame.inertial is None or frame.inertial.T_camera_imu is None:
+        raise _lacks(frame, "inertial, with the pose of the sensor")
+    return frame.inertial
+
+
+def _table(samples: InertialSamples) -> np.ndarray:
+    """``(N, 7)`` rows of stamp, rates and forces."""
+    return np.column_stack([samples.timestamps, samples.gyro, samples.accel])
+
+
 def _lacks(frame: Frame, field: str) -> DvoError:
     return DvoError(
         "not there", field=f"frame {frame.index}: {field}", remedy="choose the sensor that the sequence has"
     )
 
 
-def settings(camera: Camera, loops: bool = True, baseline: float | None = None) -> str:
+def settings(
+    camera: Camera, loops: bool = True, baseline: float | None = None, samples: InertialSamples | None = None
+) -> str:
     """Text of its settings file.
 
     Args:
@@ -287,6 +324,7 @@ def settings(camera: Camera, loops: bool = True, baseline: float | None = None) 
         loops: recognises places: closes loops, merges maps, relocalises.
         baseline: metres between the cameras of rectified stereo pairs, or of the virtual pair of a depth image; None
             for a single camera.
+        samples: some inertial ones, with the pose of their sensor; None for a camera alone.
     """
     lines: dict[str, Any] = {
         "File.version": '"1.0"',
@@ -304,6 +342,7 @@ def settings(camera: Camera, loops: bool = True, baseline: float | None = None) 
         "ORBextractor.minThFAST": 7,
         "loopClosing": int(loops),
         **({} if baseline is None else _pair(camera, baseline)),
+        **({} if samples is None else _sensor(samples)),
         # The viewer is off, but its settings are required.
         **{f"Viewer.{name}": 0.1 for name in ("KeyFrameSize", "GraphLineWidth", "PointSize", "CameraSize")},
         **{f"Viewer.{name}": 1.0 for name in ("KeyFrameLineWidth", "CameraLineWidth", "ViewpointX", "ViewpointY")},
@@ -326,6 +365,22 @@ def _pair(camera: Camera, baseline: float) -> dict[str, Any]:
         "Stereo.b": baseline,
         "Stereo.ThDepth": float(CLOSE),
         "RGBD.DepthMapFactor": 1.0,
+    }
+
+
+def _sensor(samples: InertialSamples) -> dict[str, Any]:
+    """Settings of an inertial sensor."""
+    assert samples.T_camera_imu is not None
+    T_imu_camera = ", ".join(f"{value:.9f}" for value in pose_matrices(invert_poses(samples.T_camera_imu)).ravel())
+    noise = samples.noise or NOISE_PRESETS["phone"]
+    return {
+        "IMU.T_b_c1": f"!!opencv-matrix {{rows: 4, cols: 4, dt: f, data: [{T_imu_camera}]}}",
+        "IMU.NoiseGyro": noise.gyro,
+        "IMU.NoiseAcc": noise.accel,
+        "IMU.GyroWalk": noise.gyro_walk,
+        "IMU.AccWalk": noise.accel_walk,
+        "IMU.Frequency": IMU_RATE,
+        "IMU.InsertKFsWhenLost": 0,
     }
 
 

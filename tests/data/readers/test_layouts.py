@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import dvo
+from dvo.core.errors import DvoError
 from dvo.data.companions.right_source import with_right
 
 SENSOR = """sensor_type: camera
@@ -100,7 +101,20 @@ def test_kitti_raw(make, place):
     assert (source.kind, source.name, source.camera.fx) == ("kitti_raw", "2011_09_26_drive_0001_sync", 50)
     assert np.diff(source.timestamps) == pytest.approx([0.1, 0.1], abs=1e-6)
     assert next(iter(with_right(source))).right.T_left_right[0] == pytest.approx(0.5)
-    assert len(source.warnings) == 1 and "oxts" in source.warnings[0]
+    assert len(source.warnings) == 1 and "oxts" in source.warnings[0] and source.positions is None
+    rows = "".join(f"2011-09-26 13:02:25.{594 + 100 * i}360375\n" for i in range(3))
+    make.text(f"{drive}/oxts/timestamps.txt", rows)
+    for i in range(3):
+        values = [49.0 + 1e-5 * i, 8.0, 110.0, *[0.0] * 20, 0.5 + i, 0.1, 4, 9, 6 if i else 0, 6, 6]
+        make.text(f"{drive}/oxts/data/{i:010d}.txt", " ".join(map(str, values)))
+    positions = dvo.open(make.root / drive / place).positions
+    assert positions is not None and positions.has_fix.tolist() == [False, True, True]
+    facts = positions.summary()
+    assert facts["length"] == pytest.approx(1.112, abs=1e-3) and facts["precision"] == 1.5
+    assert facts["fix"] == {"RTK integer": 2, "none": 1} and facts["precision_unit"] == "m"
+    make.text(f"{drive}/oxts/data/0000000001.txt", "1 2 3")
+    with pytest.raises(DvoError, match="not 30 numbers"):
+        _ = dvo.open(make.root / drive / place).positions
 
 
 def test_kitti_raw_that_is_not_rectified(make):

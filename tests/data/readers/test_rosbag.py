@@ -52,8 +52,57 @@ def test_images_calibration_and_inertial_samples(make, kind):
     samples = frames[1].inertial
     assert np.allclose(samples.gyro[:, 0], samples.timestamps) and samples.T_camera_imu is None
     assert np.allclose(samples.accel, [0, 0, 9.8])
+    assert np.array_equal(source.reading.inertial.rough().timestamps, source.inertial.timestamps)
     assert [frame.index for frame in dvo.open(path, stride=4)] == [0, 4]
     assert [frame.timestamp for frame in dvo.open(path, fps=2)] == [0, 0.5, 1, 1.5, 2, 2.5]
+
+
+def test_a_topic_of_inertial_samples_is_chosen(make):
+    def two(bag):
+        for index in range(30):
+            bag.imu("/imu/raw", 100 + 0.02 * index)
+            bag.imu("/imu/filtered", 100.01 + 0.02 * index)
+
+    path = write(make, content=two)
+    calib = make.text("calib.txt", "50 51 31 23")
+    source = dvo.open(path, calib=calib)
+    assert source.inertial is None
+    assert sum("several topics of inertial samples, none is used: /imu/filtered, /imu/raw (give --imu-topic)" in note
+               for note in source.warnings) == 1  # fmt: skip
+    for topic, first in (("/imu/raw", 100.0), ("imu/filtered", 100.01)):
+        samples = dvo.open(path, calib=calib, imu_topic=topic).inertial
+        assert samples.timestamps[0] == pytest.approx(first) and samples.origin == f"topic /{topic.lstrip('/')}"
+    assert len(dvo.open(path, calib=calib, imu=path, imu_topic="/imu/raw").inertial) == 30
+    with pytest.raises(DvoError, match="/imu/x is no topic of inertial samples. Give one of /imu/filtered, /imu/raw"):
+        dvo.open(path, calib=calib, imu_topic="/imu/x")
+    with pytest.raises(DvoError, match="the topic of inertial samples is not clear"):
+        dvo.open(path, calib=calib, imu=path)
+
+
+def test_gyroscope_and_accelerometer_of_two_topics(make):
+    """RealSense: two topics of one type, the accelerometer at the times of the gyroscope."""
+
+    def two(bag):
+        for index in range(30):
+            bag.imu("/camera/gyro/sample", 100 + 0.02 * index)
+            bag.imu("/camera/accel/sample", 99.99 + 0.04 * index)
+
+    calib = make.text("calib.txt", "50 51 31 23")
+    samples = dvo.open(write(make, content=two), calib=calib).inertial
+    assert samples.origin == "topic /camera/gyro/sample and /camera/accel/sample"
+    assert len(samples) == 30 and np.allclose(samples.gyro[:, 0], samples.timestamps)
+    assert np.allclose(samples.accel, [0, 0, 9.8])
+
+
+def test_repeated_inertial_samples_are_told(make):
+    def content(bag):
+        for index in (0, 1, 2, 3, 3, 4):
+            bag.imu("/imu", 100 + 0.02 * index)
+
+    calib = make.text("calib.txt", "50 51 31 23")
+    samples = dvo.open(write(make, content=content), calib=calib).inertial
+    assert samples.timestamps == pytest.approx(100 + 0.02 * np.arange(5))
+    assert samples.notes == ("topic /imu: 1 row with the time of the one before dropped",)
 
 
 def test_the_file_inside_and_the_topic_beside_the_path(make):

@@ -163,6 +163,15 @@ def test_figures_survive_what_runs_leave_behind():
     assert "1 of 2 without a figure" in plot_speed({"a": [(3.0, 1.0), (3.0, math.inf)]}, "ATE %")
 
 
+def test_axes_keep_their_digits_and_coordinates_lose_theirs():
+    s, zero = np.linspace(0, 1, 50), np.zeros(50)
+    truth = Trajectory(s, np.column_stack([0.001 * s, zero, 0.004 * s, zero, zero, zero, zero + 1]))
+    drawn = plot_sequence(Suite("s", "l", ()), "ate_percent", truth, {"dvo-x": segments(truth)})
+    numbers = [float(word) for word in re.findall(r">([0-9.]+)</", drawn)]
+    assert {0.001, 0.002, 0.003} & set(numbers), f"ticks of 4 mm: {numbers}"
+    assert not re.search(r" (?:d|x|y)=\"[^\"]*\d\.\d{3}", drawn)
+
+
 def test_segments_are_told_apart_in_the_figure():
     """Each in its own world and scale; drawn on the truth, a ring at the start of the second, tiny ones left out."""
     s = np.linspace(0, 5, 200)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,6 +85,17 @@ def test_missing_samples_do_no_harm() -> None:
     s, kept = recording.samples, np.random.default_rng(0).random(len(recording.samples)) > 0.1
     estimator, _ = drive(recording.with_samples(s.timestamps[kept], s.gyro[kept], s.accel[kept]))
     assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.03)
+
+
+def test_a_rotation_between_sensor_and_camera_that_is_not_stated_is_found() -> None:
+    recording = record(8, seconds=8.0)
+    recording = replace(recording, samples=replace(recording.samples, T_camera_imu=None))
+    estimator, reasons = drive(recording)
+    assert any("rotation between sensor and camera" in reason for reason in reasons) or estimator.aligned
+    assert estimator.rotation_camera_imu is not None
+    off = estimator.rotation_camera_imu.T @ CAMERA_IMU
+    assert np.rad2deg(np.arccos(min((np.trace(off) - 1) / 2, 1.0))) < 1.0
+    assert estimator.worlds[0].scale == pytest.approx(SCALE, rel=0.06)  # the lever arm is not known
 
 
 def test_an_alignment_that_fails_later_is_withdrawn() -> None:

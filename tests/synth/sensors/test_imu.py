@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
-from dvo.geometry.poses import quaternion_to_matrix, so3_exp, split
+from dvo.geometry.poses import quaternion_to_matrix, rotation_vector, so3_exp, split
 from dvo.synth import (
     ImuNoise,
     Scene,
@@ -17,7 +17,7 @@ from dvo.synth import (
     random_scene,
 )
 from dvo.synth.render.shot import Rest
-from dvo.synth.sensors.imu import GRAVITY, rotation_vector
+from dvo.synth.sensors.imu import GRAVITY
 from dvo.synth.textures.texture import texture_pool
 
 

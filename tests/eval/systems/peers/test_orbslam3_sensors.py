@@ -16,6 +16,7 @@ import pytest
 
 from dvo.core.errors import DvoError
 from dvo.data.frame import Frame, StereoView
+from dvo.data.inertial import InertialSamples
 from dvo.geometry.camera import Camera
 from eval.systems.peers import orbslam3
 from eval.systems.registry import find_system
@@ -45,18 +46,30 @@ def fed(monkeypatch, tmp_path) -> list:
         def __getattr__(self, name):
             if not name.startswith("track_"):
                 raise AttributeError(name)
-            return lambda *images_and_stamp: self.keep(name, *images_and_stamp)
+            return lambda *images_and_stamp, **others: self.keep(name, *images_and_stamp, *others.values())
 
         def keep(self, name, *images_and_stamp):
             given.append((name, *images_and_stamp))
-            return SimpleNamespace(state="OK", pose_valid=True, pose_wc=np.eye(4))
+            state = "RECENTLY_LOST" if (images_and_stamp[0] > 250).all() else "OK"
+            return SimpleNamespace(state=state, pose_valid=True, pose_wc=np.eye(4))
 
         def map_changed(self):
             return False
 
+        def imu_initialized(self):
+            return True
+
+        def save_keyframe_trajectory_tum(self, file):
+            pass
+
+        def shutdown(self):
+            pass
+
     names = ("NO_IMAGES_YET", "NOT_INITIALIZED", "RECENTLY_LOST", "LOST", "OK", "OK_KLT")
     states = SimpleNamespace(**{name: name for name in names})
-    kinds = SimpleNamespace(MONOCULAR="one", STEREO="pair", RGBD="depth")
+    kinds = SimpleNamespace(
+        MONOCULAR="one", STEREO="pair", RGBD="depth", IMU_MONOCULAR="one and imu", IMU_STEREO="pair and imu"
+    )
     monkeypatch.setitem(sys.modules, "pyorbslam3", SimpleNamespace(Slam=Slam, Sensor=kinds, TrackingState=states))
     (tmp_path / "words.txt").write_text("10 6 0 0\n")
     monkeypatch.setenv(orbslam3.VOCABULARY, str(tmp_path / "words.txt"))
@@ -90,6 +103,50 @@ def test_it_is_given_depth_in_metres_and_0_where_it_is_unknown(fed):
     (sensor, _), (call, image, seen, _) = fed
     assert sensor == "depth" and call == "track_rgbd" and seen.shape == image.shape and seen.dtype == np.float32
     assert (seen[:2, :2] == 0).all() and (seen[2:] == 2.5).all()
+
+
+SAMPLES = InertialSamples(
+    np.array([0.01, 0.02]),
+    np.full((2, 3), 0.1),
+    np.full((2, 3), 9.0),
+    np.array([0.1, 0, 0, 0, 0, *np.sqrt([0.5, 0.5])]),
+)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "kind", "images"), [("imu_monocular", "one and imu", 1), ("imu_stereo", "pair and imu", 2)]
+)
+def test_it_is_given_inertial_samples(fed, tmp_path, sensor, kind, images):
+    frame = replace(frame_with(view()), inertial=SAMPLES)
+    find_system(f"orbslam3+sensor={sensor}").build(0, "cpu").track(frame)
+    (made, settings), (call, *given) = fed
+    assert made == kind and call == f"track_{sensor.removeprefix('imu_')}" and len(given) == images + 2
+    np.testing.assert_array_equal(given[-1], np.column_stack([SAMPLES.timestamps, SAMPLES.gyro, SAMPLES.accel]))
+    (tmp_path / "settings.yaml").write_text(settings)
+    storage = cv2.FileStorage(str(tmp_path / "settings.yaml"), cv2.FILE_STORAGE_READ)
+    # The sensor stands 0.1 m to the right of the camera and is turned a quarter about its axis.
+    expected = [[0, 1, 0, 0], [-1, 0, 0, 0.1], [0, 0, 1, 0], [0, 0, 0, 1]]
+    np.testing.assert_allclose(storage.getNode("IMU.T_b_c1").mat(), expected, atol=1e-6)
+    assert storage.getNode("IMU.NoiseGyro").real() == pytest.approx(1.7e-3), "that of a phone, as none is stated"
+    assert ("Stereo.b: 0.2" in settings) == (images == 2)
+
+
+@pytest.mark.parametrize(("sensor", "poses"), [("imu_monocular", 2), ("monocular", 1)])
+def test_poses_from_samples_alone_are_marked(fed, sensor, poses):
+    odometry = find_system(f"orbslam3+sensor={sensor}+pace=100").build(0, "cpu")
+    white = np.full((48, 64, 3), 255, np.uint8)
+    seen = odometry.track(replace(frame_with(), inertial=SAMPLES))
+    blind = odometry.track(replace(frame_with(), timestamp=0.1, image=white, inertial=SAMPLES))
+    assert seen.status == "tracking" and blind.status == ("inertial" if poses == 2 else "lost")
+    assert seen.scale_state == ("aligned" if poses == 2 else "none")
+    result = odometry.finish()
+    assert len(result.trajectory) == poses and result.frames_tracked == 1
+
+
+def test_frames_without_inertial_samples_are_refused(fed):
+    for samples in (None, replace(SAMPLES, T_camera_imu=None)):
+        with pytest.raises(DvoError, match="frame 7: inertial, with the pose of the sensor: not there"):
+            find_system("orbslam3+sensor=imu_monocular").build(0, "cpu").track(replace(frame_with(), inertial=samples))
 
 
 def test_without_a_sensor_it_reads_neither(fed):

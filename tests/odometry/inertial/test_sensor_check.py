@@ -1,0 +1,196 @@
+"""Faults of inertial samples, each of which the check names."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dvo.data.inertial import NOISE_PRESETS, InertialSamples
+from dvo.geometry.poses import invert_poses, so3_exp
+from dvo.odometry.inertial.findings import Level, SensorReport
+from dvo.odometry.inertial.sensor_check import check_sensor
+from dvo.odometry.inertial.vision_checks import clock_line
+from tests.support.hand_motion import CAMERA_IMU, frames, hand_motion, samples
+
+SECONDS = 20.0
+HARMLESS = {"no rest"}
+
+
+@cache
+def good() -> tuple[InertialSamples, np.ndarray, np.ndarray]:
+    path = hand_motion(21)
+    return samples(path, SECONDS, noise=NOISE_PRESETS["euroc"], seed=21), *frames(path, SECONDS, rate=20.0, seed=21)
+
+
+def checked(**changes: np.ndarray | None) -> SensorReport:
+    imu, times, rotations = good()
+    return check_sensor(replace(imu, **changes), times, rotations)
+
+
+def names(report: SensorReport) -> set[str]:
+    return {finding.name for finding in report.findings} - HARMLESS
+
+
+def test_good_samples_have_no_findings() -> None:
+    report = checked()
+    assert names(report) == set() and report.is_usable
+    assert report.values["rate, Hz"] == pytest.approx(200)
+    assert abs(report.values["time offset, ms"]) < 1
+    assert report.values["from the stated rotation, degrees"] < 0.3
+    assert report.values["gravity against vision, m/s^2"] == pytest.approx(9.81, abs=0.3)
+    assert abs(report.values["clock drift, ppm"]) < 200
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_wrong_units(is_seen: bool) -> None:
+    imu, times, rotations = good()
+    seen = (times, rotations) if is_seen else ()
+    in_g = check_sensor(replace(imu, accel=imu.accel / 9.80665), *seen)
+    finding = in_g.named("accelerometer unit")
+    assert finding is not None and "in g" in finding.text and "9.80665" in finding.remedy and not in_g.is_usable
+    in_degrees = check_sensor(replace(imu, gyro=np.degrees(imu.gyro)), *seen)
+    finding = in_degrees.named("gyroscope unit")
+    assert finding is not None and "deg/s" in finding.text and not in_degrees.is_usable
+    if is_seen:  # the rest is checked in the right units
+        assert abs(in_degrees.values["time offset, ms"]) < 1 and names(in_degrees) == {"gyroscope unit"}
+    without = check_sensor(replace(imu, accel=imu.accel - imu.accel.mean(0)), *seen)
+    assert without.named("no gravity") is not None and not without.is_usable
+
+
+def test_gyroscope_in_degrees_is_seen_without_gravity() -> None:
+    imu = good()[0]
+    report = checked(gyro=np.degrees(imu.gyro), accel=np.zeros_like(imu.accel) + 9.8)
+    assert "gyroscope unit" in names(report)
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "words"),
+    [
+        ((1, 2, 0), (1, 1, 1), "(z, x, y)"),
+        ((0, 1, 2), (-1, -1, 1), "(-x, -y, z)"),
+        ((1, 0, 2), (1, 1, 1), "(y, x, z)"),
+        ((0, 1, 2), (1, 1, -1), "(x, y, -z)"),
+    ],
+)
+def test_swapped_and_mirrored_axes(order: tuple[int, ...], signs: tuple[int, ...], words: str) -> None:
+    imu = good()[0]
+    finding = checked(gyro=imu.gyro[:, order] * signs, accel=imu.accel[:, order] * signs).named("axes")
+    assert finding is not None and finding.level == Level.UNUSABLE and words in finding.remedy
+
+
+def test_axes_of_one_sensor_alone() -> None:
+    imu = good()[0]
+    report = checked(accel=imu.accel[:, [1, 2, 0]])
+    finding = report.named("accelerometer axes")
+    assert finding is not None and "(z, x, y)" in finding.remedy and names(report) == {"accelerometer axes"}
+
+
+def test_extrinsics_inverse_off_and_missing() -> None:
+    T = good()[0].T_camera_imu
+    assert T is not None
+    inverse = checked(T_camera_imu=invert_poses(T)).named("axes")
+    assert inverse is not None and "inverse" in inverse.remedy
+    tilted = T.copy()
+    tilted[3:] = checked(T_camera_imu=None).values["rotation imu to camera, qx qy qz qw"]
+    assert names(checked(T_camera_imu=tilted)) == set()
+    missing = checked(T_camera_imu=None)
+    finding = missing.named("no extrinsics")
+    assert finding is not None and "T_camera_imu: [" in finding.remedy and missing.is_usable
+
+
+@pytest.mark.parametrize("offset", [0.1, -0.1, 0.02, 1.3])
+def test_constant_time_offset(offset: float) -> None:
+    report = checked(timestamps=good()[0].timestamps + offset)
+    finding = report.named("time offset")
+    assert finding is not None and names(report) == {"time offset"}
+    assert report.alignment is not None and report.alignment.time_offset == pytest.approx(offset, abs=1e-3)
+    assert f"time_offset: {report.alignment.time_offset:.4f}" in finding.remedy
+    assert report.is_usable == (abs(offset) < 0.05)
+
+
+@pytest.mark.parametrize("drift", [5e-4, -3e-3, 1e-2])
+def test_clock_that_drifts(drift: float) -> None:
+    report = checked(timestamps=good()[0].timestamps * (1 + drift))
+    finding = report.named("clock drift")
+    assert finding is not None and report.is_usable == (abs(drift) < 1e-3)
+    assert report.values["clock drift, ppm"] == pytest.approx(1e6 * drift, abs=150)
+    assert names(report) <= {"clock drift", "time offset"}
+
+
+def test_missing_samples_and_gaps() -> None:
+    imu = good()[0]
+    there = np.random.default_rng(0).random(len(imu)) > 0.1
+    report = check_sensor(
+        replace(imu, timestamps=imu.timestamps[there], gyro=imu.gyro[there], accel=imu.accel[there]), *good()[1:]
+    )
+    assert report.values["missing share"] == pytest.approx(0.1, abs=0.02)
+    assert names(report) == {"missing samples"} and report.is_usable
+    there = (imu.timestamps < 8) | (imu.timestamps > 8.4)
+    report = check_sensor(replace(imu, timestamps=imu.timestamps[there], gyro=imu.gyro[there], accel=imu.accel[there]))
+    assert report.values["gaps"] == 1 and report.values["longest gap, s"] == pytest.approx(0.4, abs=0.02)
+    assert "gaps" in names(report)
+
+
+def test_bias_of_a_dropped_sensor() -> None:
+    imu = good()[0]
+    report = checked(gyro=imu.gyro + np.array([0.3, -0.3, 0.1]), accel=imu.accel + np.array([0.0, 1.5, -1.5]))
+    assert names(report) == {"gyroscope bias", "accelerometer bias"} and not report.is_usable
+    assert np.allclose(report.values["accelerometer bias, m/s^2"], [0, 1.5, -1.5], atol=0.5)
+
+
+def test_bias_noise_and_gravity_at_rest() -> None:
+    rng, noise = np.random.default_rng(0), NOISE_PRESETS["phone"]
+    times = np.arange(1200) / 200
+    white = rng.normal(0, np.sqrt(200), (2, 1200, 3))
+    gyro = noise.gyro * white[0] + np.array([0.2, 0.0, 0.0])
+    accel = noise.accel * white[1] + np.array([0.0, -9.2, 0.0])
+    report = check_sensor(InertialSamples(times, gyro, accel, None, NOISE_PRESETS["euroc"]))
+    assert {"gyroscope bias", "accelerometer bias", "noise"} <= names(report)
+    assert report.values["gyro noise, rad/s/sqrt(Hz)"] == pytest.approx(noise.gyro, rel=0.3)
+    assert report.values["accel noise, m/s^2/sqrt(Hz)"] == pytest.approx(noise.accel, rel=0.3)
+    assert report.values["gravity at rest, m/s^2"] == pytest.approx(9.2, abs=0.02)
+
+
+def test_stamps_that_repeat_and_go_back() -> None:
+    stamps = good()[0].timestamps.copy()
+    stamps[100:104] = stamps[100]
+    stamps[[500, 501]] = stamps[[501, 500]]
+    report = checked(timestamps=stamps)
+    assert names(report) == {"duplicate stamps", "unordered stamps"} and report.is_usable
+    assert report.values["duplicate stamps"] == 3 and report.values["unordered stamps"] == 1
+    assert checked(timestamps=np.full(len(stamps), 1.0)).named("too few samples") is not None
+
+
+def test_saturation_and_held_samples() -> None:
+    imu = good()[0]
+    clipped = 4 * imu.gyro
+    report = check_sensor(replace(imu, gyro=clipped.clip(-2.2, 2.2)))
+    finding = report.named("saturation")
+    assert finding is not None and "2.2 rad/s" in finding.text
+    assert check_sensor(replace(imu, gyro=clipped)).named("saturation") is None
+    held = np.arange(len(imu)) // 2 * 2
+    assert check_sensor(replace(imu, gyro=imu.gyro[held])).named("repeated samples") is not None
+
+
+def test_motion_that_does_not_tell() -> None:
+    path = hand_motion(22, (0.0, 0.3, 0.0))
+    imu = samples(path, SECONDS, noise=NOISE_PRESETS["euroc"])
+    report = check_sensor(imu, *frames(path, SECONDS, rate=20.0))
+    finding = report.named("not told")
+    assert finding is not None and "one axis" in finding.text and report.is_usable
+    other = check_sensor(imu, *frames(hand_motion(23), SECONDS, rate=20.0)).named("not told")
+    assert other is not None and other.level == Level.WARNING
+    elsewhere = check_sensor(replace(imu, timestamps=imu.timestamps + 1000), *frames(path, SECONDS, rate=20.0))
+    assert elsewhere.named("other times") is not None and not elsewhere.is_usable
+
+
+def test_line_of_offsets_with_its_deviation() -> None:
+    imu, times, rotations = good()
+    line = clock_line(times, rotations, 0.03 + imu.timestamps * 1.001, imu.gyro, CAMERA_IMU @ so3_exp(np.full(3, 2e-3)))
+    assert line is not None and line.is_drifting
+    assert line.drift == pytest.approx(1e-3, abs=4 * line.sigma_drift)
+    assert np.allclose(line.corrected(0.03 + times * 1.001), times, atol=2e-3)
+    assert clock_line(times[:100], rotations[:100], imu.timestamps, imu.gyro, CAMERA_IMU) is None

@@ -18,9 +18,9 @@ import pytest
 import dvo
 from dvo.cli import main
 from dvo.commands.console import describe_status
-from dvo.commands.report import describe_breaks
-from dvo.data.trajectory import read_tum
-from dvo.odometry.protocol import Break, Estimate, Status
+from dvo.commands.report import advice_for_segments, describe_breaks
+from dvo.data.trajectory import Trajectory, read_tum
+from dvo.odometry.protocol import Break, Estimate, Result, Segment, SparseMap, Status
 from tests.support.command_line import arguments, errors, names, summary
 
 resource = pytest.importorskip("resource")
@@ -232,6 +232,18 @@ def test_breaks_as_text():
         describe_breaks(ends)
         == "2 breaks: until 0.50 s noise (15 frames); from 7.00 s to the end black image (3 frames)"
     )
+
+
+@pytest.mark.parametrize(
+    ("joined", "info", "told"),
+    [((None, None), {"loops": []}, True), ((None, 0), {"loops": []}, False), ((None, None), {}, False),
+     ((None,), {"loops": []}, False)],
+)  # fmt: skip
+def test_advice_for_segments_that_stay_apart(joined, info, told):
+    rows = Trajectory(np.arange(3.0), np.tile([0, 0, 0, 0, 0, 0, 1.0], (3, 1)))
+    parts = tuple(Segment(rows, 0.0, 2.0, joined_to=world) for world in joined)
+    advice = advice_for_segments(Result(rows, SparseMap(), 6, 0, info, parts))
+    assert ("overlap" in advice) == told and (told or not advice)
 
 
 def test_a_short_clip_ends_as_tracked(given, image_folder, tmp_path, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dvo.cli import main
-from dvo.commands.console import TrackingProgress
+from dvo.commands.console import TrackingProgress, spoken_time
 from dvo.commands.report import describe_seconds
 from dvo.data.frame import Frame
 from dvo.geometry.camera import Camera
@@ -62,3 +62,24 @@ def test_the_rounds_of_a_calibration_are_told(monkeypatch):
     dvo.calibrate(frames(6), on_round=lambda *numbers: rounds.append(numbers))
     assert rounds[0][:2] == (1, 5) or rounds[0][0] == 1
     assert [number for number, _, _ in rounds] == list(range(1, len(rounds) + 1)) and 0 < rounds[0][2] <= 300
+
+
+@pytest.mark.parametrize(
+    ("total", "second", "told"),
+    [(9000, 0.08, "about 12 min for 9,000 frames"), (700, 0.08, ""), (None, 5.0, ""), (20, 5.0, "")],
+)
+def test_a_long_run_is_told_in_advance(total, second, told, monkeypatch, capsys):
+    """Once, after the first frames, of which the very first one is not typical; nothing of a short or endless one."""
+    clock = [0.0]
+    monkeypatch.setattr("dvo.commands.console.time.perf_counter", lambda: clock[0])
+    progress = TrackingProgress(total)
+    for number in range(min(total or 100, 100)):
+        clock[0] += 40.0 if number == 0 else second
+        progress.update(FRAME, None)
+    lines = [line for line in capsys.readouterr().err.splitlines() if "about" in line]
+    assert lines == ([f"dvo: note: {told}"] if told else [])
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(61, "1 min"), (7140, "119 min"), (12000, "3 h 20 min")])
+def test_time_in_words(seconds, text):
+    assert spoken_time(seconds) == text

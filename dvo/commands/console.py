@@ -28,6 +28,9 @@ from dvo.odometry.protocol import Estimate, Result, Status
 
 PLAIN_INTERVAL = 10.0
 """Seconds between two lines about the progress where there is no terminal."""
+LONG_RUN = 60.0
+"""Seconds above which a run tells how long it will take, once the first :data:`ESTIMATED_AFTER` frames are tracked."""
+ESTIMATED_AFTER = 30
 GRACE = 1.5
 """Seconds after SIGTERM in which a frame is finished and results are written."""
 _COLOURS = {
@@ -211,7 +214,8 @@ class TrackingProgress:
             console=console,
         )
         self._task = self._progress.add_task(phase, total=total, rate=0.0, status="")
-        self._moments: deque[float] = deque([time.perf_counter()], maxlen=30)
+        self._moments: deque[float] = deque([time.perf_counter()], maxlen=ESTIMATED_AFTER)
+        self._untold = phase == "tracking"  # how long it will take
 
     def __enter__(self) -> TrackingProgress:
         with contextlib.suppress(OSError):
@@ -291,6 +295,10 @@ class TrackingProgress:
             fields["status"] = f"[{_COLOURS[estimate.status]}]{describe_status(estimate)}"
         with contextlib.suppress(OSError):
             self._progress.update(self._task, advance=1, **fields)
+        if self._untold and self._total is not None and self._done >= ESTIMATED_AFTER:
+            self._untold = False
+            if self._total / rate > LONG_RUN:
+                warn(f"about {spoken_time(self._total / rate)} for {self._total:,} frames", "note")
 
     def finish(self, result: Result) -> None:
         """Show the outcome in place of the state of the last frame: ``finish`` gives poses to earlier frames too.
@@ -303,6 +311,19 @@ class TrackingProgress:
         with contextlib.suppress(OSError):
             status = f"[{'green' if tracked else 'red'}]{tracked} tracked"
             self._progress.update(self._task, description="tracking", status=status)
+
+
+def spoken_time(seconds: float) -> str:
+    """Time in minutes, from two hours on in hours and minutes.
+
+    Args:
+        seconds: the time.
+
+    Returns:
+        Text such as ``12 min`` or ``3 h 20 min``.
+    """
+    minutes = max(1, round(seconds / 60))
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def describe_status(estimate: Estimate) -> str:

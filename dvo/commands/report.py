@@ -153,6 +153,21 @@ def _describe_break(found: Break) -> str:
     return f"{text}, new segment at {found.end:.2f} s" if found.new_segment and found.end is not None else text
 
 
+def advice_for_segments(result: Result) -> str:
+    """Advice for segments that stay apart although places are searched for.
+
+    Args:
+        result: with any number of segments.
+
+    Returns:
+        One sentence; empty if all share a world, or if no loops were searched for.
+    """
+    apart = sum(segment.joined_to is None and not segment.in_map for segment in result.segments)
+    if apart < 2 or "loops" not in result.info:
+        return ""
+    return "film with overlap, or return to a place seen before: segments that show the same place are joined"
+
+
 def describe_localisation(loop: Mapping[str, Any]) -> str:
     """Describe the loop by which a recording was recognised in a map.
 
@@ -234,6 +249,8 @@ def print_report(folder: Path, run: Run, scores: Scores, more: Sequence[str] = (
             f"{len(result.segments)} segments, {worlds}; {results.TRAJECTORY} and "
             f"{results.MAP} hold the longest, segment {result.longest}{whole}"
         )
+        if advice := advice_for_segments(result):
+            say(f"what may help: {advice}")
     if "localised" in result.info:
         found = result.info["localised"]
         outside = "not recognised in the map: the poses have a world and a scale of their own"

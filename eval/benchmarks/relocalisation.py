@@ -1,4 +1,4 @@
-"""Places that are found again: `python -m eval.benchmarks.relocalisation [maps|dark] [--seeds 3]`.
+"""Places that are found again: `python -m eval.benchmarks.relocalisation [maps|dark|jump] [--seeds 3]`.
 
 `maps`: each sequence of the suites `revisit` and `revisit/test` is tracked to a third and saved; the map is loaded, and
 frames are tracked in it: those that follow, and those of the second lap from 0.8 of the sequence on, which show the
@@ -10,6 +10,9 @@ map meets frames of the other sequences, in which the camera must not be found.
 window that keyframes leave soon and that no frame is joined with across the darkness: one room with the seeds 0 to 5 of
 the tracker, and six others. The table has the first frame after the darkness that was found, the segments that share
 a world, and the ATE of the poses that were told while tracking and of the result. Then six walks go on in another room.
+
+`jump`: walks in rendered rooms of 320x240 with a gap of two seconds, in which the camera is moved aside and turned
+(:data:`JUMPS`). The table has the segments that share a world, how the loops that joined them were found, and the ATE.
 """
 
 from __future__ import annotations
@@ -22,14 +25,17 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import dvo
 from dvo.core.command_line import OneLineParser
 from dvo.data.frame import Frame
 from dvo.data.source import Source
 from dvo.data.trajectory import Trajectory
+from dvo.geometry import se3
 from dvo.metrics import associate, evaluate, fit_alignment, transform
-from dvo.synth.sequence import make_sequence
+from dvo.synth.protocols import Motion
+from dvo.synth.sequence import film, make_sequence
 from eval.suites.selection import load_suites
 from eval.suites.suite import open_sequence, reference_for
 
@@ -94,6 +100,9 @@ def error_percent(estimate: dvo.Estimate, known: Trajectory, truth: Trajectory) 
 ROOMS = (63, 101, 102, 103, 104, 105, 106)
 LIT, DARK, FPS = 34, 10, 15.0
 SHORT = {"keyframe_motion": 0.5, "removal": 5, "lifetime": 4, "optimisation": 5, "join_inliers": 1.0}
+JUMPS = ((102, (0.5, 0.0, 0.0), 15.0), (103, (0.5, 0.0, 0.2), 15.0), (101, (0.8, 0.0, 0.0), 20.0))
+"""Room, translation in the camera (m) and turn to the right (degrees)."""
+BEFORE, BEHIND, GAP = 32, 40, 2.0
 LOOP = {"seconds": 1.0, "every": 2, "steps": 4, "delay": 4}
 
 
@@ -140,16 +149,67 @@ def dark() -> None:
     print(f"\nJoined with another room: {wrong} of {len(pairs)}")
 
 
+@dataclass(frozen=True)
+class Jump:
+    """Motion of a camera that is moved once.
+
+    Attributes:
+        path: without the jump.
+        time: of the first frame after it, seconds.
+        change: ``(7,)`` pose of the moved camera in the one that it would have been.
+    """
+
+    path: Motion
+    time: float
+    change: np.ndarray
+
+    def poses_wc(self, times: np.ndarray) -> np.ndarray:
+        """Camera-to-world poses ``(N, 7)`` at times in seconds."""
+        poses = torch.from_numpy(self.path.poses_wc(times))
+        moved = se3.compose(poses, torch.from_numpy(self.change).expand(len(poses), 7))
+        return np.where((np.asarray(times) >= self.time - 1e-6)[:, None], moved.numpy(), poses.numpy())
+
+
+def jumped(room: int, move: tuple[float, float, float], turn: float) -> tuple[list[Frame], Trajectory]:
+    """Frames of a room before and after a jump, and their truth."""
+    count = BEFORE + BEHIND
+    walk = make_sequence(
+        room, frames=count, family="room", kind="handheld", speed=1.0, height=240, width=320, fps=FPS, sensor=False
+    )
+    yaw = np.deg2rad(turn) / 2
+    path = Jump(walk.path, BEFORE / FPS, np.array([*move, 0.0, np.sin(yaw), 0.0, np.cos(yaw)]))
+    made = film(walk.scene, path, walk.camera, seed=walk.seed, times=np.arange(count) / FPS)
+    times = np.arange(count) / FPS + GAP * (np.arange(count) >= BEFORE)
+    frames = [replace(frame, timestamp=float(time)) for frame, time in zip(made, times, strict=True)]
+    return frames, Trajectory(times, made.groundtruth.poses_wc)
+
+
+def jumps() -> None:
+    """Table of the walks with a jump."""
+    print("| room | jump m | turn ° | segments | worlds | joined by | ATE % |\n|--:|--:|--:|--:|--:|---|--:|")
+    for room, move, turn in JUMPS:
+        frames, truth = jumped(room, move, turn)
+        odometry = dvo.load("small")
+        for frame in frames:
+            odometry.track(frame)
+        result = odometry.finish()
+        worlds = len({k if one.joined_to is None else one.joined_to for k, one in enumerate(result.segments)})
+        kinds = [loop["kind"] for loop in result.info["loops"] if loop["joins_segments"]]
+        far, ate = float(np.linalg.norm(move)), evaluate(result.trajectory, truth).ate_percent
+        cells = [room, f"{far:.2f}", f"{turn:.0f}", len(result.segments), worlds, ", ".join(kinds) or "-", f"{ate:.2f}"]
+        print(f"| {' | '.join(map(str, cells))} |", flush=True)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Command line."""
     parser = OneLineParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("mode", nargs="?", choices=("maps", "dark"), default="maps")
+    parser.add_argument("mode", nargs="?", choices=("maps", "dark", "jump"), default="maps")
     parser.add_argument("--suites", type=lambda text: text.split(","), default=["revisit", "revisit/test"])
     parser.add_argument("--sequences", type=lambda text: text.split(","), help="names with commas between")
     parser.add_argument("--seeds", type=int, default=3, help="of the tracker, 0 to N-1 (3)")
     options = parser.parse_args(arguments)
-    if options.mode == "dark":
-        dark()
+    if options.mode != "maps":
+        (dark if options.mode == "dark" else jumps)()
         return
     recorded = []
     for suite in load_suites(options.suites, options.sequences):

@@ -11,7 +11,7 @@ Definitions:
   ``e^T P^-1 e`` over its dimension, mean over the aligned frames, 1 if consistent. Yaw and position of the pose at the
   alignment are taken as right, as they cannot be observed.
 - An alignment is wrong if the scale of the poses that follow it, until the system withdraws it, is off by
-  :data:`WRONG_PERCENT` percent in the median of :data:`JUDGED` seconds with motion, or gravity by
+  :data:`WRONG_PERCENT` percent in the median of any :data:`JUDGED` seconds with motion, or gravity by
   :data:`WRONG_DEGREES` degrees.
 """
 
@@ -232,9 +232,9 @@ class _Run:
             until = times[end - 1]
             windows = np.arange(times[begin], max(until - JUDGED, times[begin]) + 1e-9, 1.0)
             scales = (pairs.scale(start, min(start + JUDGED, until)) for start in windows)
-            scale = next((value for value in scales if math.isfinite(value)), 1.0)
+            off = max((abs(value - 1) for value in scales if math.isfinite(value)), default=0.0)
             tilt = _tilt(self.true_rotation[begin:end], self.rotation[begin:end])
-            wrong += abs(scale - 1) > WRONG_PERCENT / 100 or tilt > WRONG_DEGREES
+            wrong += off > WRONG_PERCENT / 100 or tilt > WRONG_DEGREES
         return wrong
 
     def in_the_dark(self, spans: Sequence[Sequence[float]]) -> tuple[float, float, float]:

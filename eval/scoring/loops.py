@@ -113,7 +113,8 @@ def revisits_of(recording: Recording) -> Revisits | None:
     """
     if recording.rendered is None:
         return None
-    options = {key: value for key, value in recording.rendered if key != "version"}
+    others = ("version", "depth", "baseline")  # of the images beside those of the camera
+    options = {key: value for key, value in recording.rendered if key not in others}
     return Revisits(make_sequence(**options))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from itertools import islice
 from typing import Any
 
 import lightning as L
@@ -87,14 +88,25 @@ class BatchStream(ClipStream):
 
     def train_dataloader(self) -> DataLoader[dict[str, torch.Tensor]]:
         """Batches of this process, from the position on."""
+        return self._loader(self.workers)
+
+    def next_batches(self, count: int) -> Iterator[dict[str, torch.Tensor]]:
+        """The batches that training takes next, made in this process; the position stays.
+
+        Args:
+            count: of batches.
+        """
+        return islice(self._loader(0), count)
+
+    def _loader(self, workers: int) -> DataLoader[dict[str, torch.Tensor]]:
         processes, rank = (self.trainer.world_size, self.trainer.global_rank) if self.trainer else (1, 0)
         return DataLoader(
             self.clips(processes),
             batch_size=self.batch_size,
             sampler=StreamSampler(self.clips_seen, self.batch_size, processes, rank),
-            num_workers=self.workers,
+            num_workers=workers,
             worker_init_fn=start_worker,
-            persistent_workers=self.workers > 0,
+            persistent_workers=workers > 0,
         )
 
 

@@ -16,6 +16,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from dvo.core.errors import DvoError
 from dvo.core.settings import shown
+from train.engine.baseline import LossBeforeTraining
 from train.engine.build import program_factory
 from train.engine.callbacks import RefuseStandstill, StopGently
 from train.engine.config_files import check_files
@@ -114,7 +115,7 @@ class TaskCLI(LightningCLI):
         prepare(self.model, self.start, self.stop)
         given = self._get(self.config_init, "trainer")
         theirs = _as_list(given["callbacks"])
-        own: list[L.Callback] = [RefuseStandstill()]
+        own: list[L.Callback] = [RefuseStandstill(), LossBeforeTraining()]
         if given["enable_progress_bar"] is not False and not given["barebones"]:
             own.append(StepBar())
         if given["enable_checkpointing"] is not False and not any(isinstance(c, StopGently) for c in theirs):

@@ -76,6 +76,7 @@ class TrainingProgram(L.LightningModule):
         average: moving average of its weights.
         provenance: what the network has been trained on.
         new_run: take rates from the settings, and callbacks as they are, not from the state that is loaded.
+        from_trained: a new run that starts from trained weights.
 
     Raises:
         DvoError: a network that does not name its architecture and sizes.
@@ -103,7 +104,7 @@ class TrainingProgram(L.LightningModule):
         self._last_good = LastGood()
         origin = task.origin()
         self.provenance = Provenance() if origin is None else Provenance.of_weights(origin)
-        self.new_run = False
+        self.new_run = self.from_trained = False
         self._clock = time.perf_counter()
         as_network(self.net)
 

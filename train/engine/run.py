@@ -175,6 +175,7 @@ def prepare(program: TrainingProgram, start: Start, stop: int) -> None:
         program.check_task(start.state, start.file)
         check_tensors(program.net, tensors, start.file)
     program.new_run = not start.resumed
+    program.from_trained = program.new_run and (start.state is not None or start.weights is not None)
     rate, schedule = learning_rate(program, start), program.settings.schedule()
     steps = range(start.step, stop if stop >= 0 else start.step + 1_000_000)
     if not any(rate * schedule(step) > 0 for step in steps):

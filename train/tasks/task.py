@@ -57,6 +57,7 @@ class Task(Protocol):
     Attributes:
         data_type: class of the clips; its arguments are the settings under ``data:``.
         starts_from: names of other tasks whose training states a new run may start from; it takes the averaged weights.
+        units: of the measures that are printed before the first step of a run that starts from trained weights.
 
     Example:
         >>> class Regression(Task):
@@ -74,6 +75,7 @@ class Task(Protocol):
 
     data_type: ClassVar[type[L.LightningDataModule]]
     starts_from: ClassVar[tuple[str, ...]] = ()
+    units: ClassVar[Mapping[str, str]] = {}
 
     def network(self) -> nn.Module:
         """New network with random weights, see :class:`dvo.models.registry.Network`."""

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import copy
-import random
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import numpy as np
-import torch
 
 from dvo.data.files.root import data_root
 from dvo.data.frame import Frame
@@ -25,22 +21,11 @@ from dvo.odometry.load import build_odometry
 from dvo.odometry.protocol import Estimate, Odometry
 from dvo.odometry.registry import odometry_builder
 from dvo.session.session import Run
+from train.engine.baseline import undisturbed
 from train.validation.pictures import PatchFlow, draw, image_at, patch_flow
 from train.validation.validate import rendered_clip, track_sequence
 
 Clip = tuple[str, list[Frame], Trajectory]
-
-
-@contextmanager
-def undisturbed() -> Iterator[None]:
-    """Restore the random states of Python, numpy and torch (CPU) after whatever runs inside."""
-    python, numpy, torch_cpu = random.getstate(), np.random.get_state(), torch.random.get_rng_state()  # noqa: NPY002
-    try:
-        yield
-    finally:
-        random.setstate(python)
-        np.random.set_state(numpy)  # noqa: NPY002
-        torch.random.set_rng_state(torch_cpu)
 
 
 def track_with_flow(
@@ -98,12 +83,14 @@ class TrackWhileTraining(L.Callback):
         self._last = -1
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Check that there is an odometry for the network, before time is spent.
+        """Check that there is an odometry for the network, before time is spent, and validate trained weights.
 
         Raises:
             DvoError: there is none.
         """
         odometry_builder(pl_module.average.architecture)
+        if getattr(pl_module, "from_trained", False):
+            self._validate_now(trainer, pl_module)
         self._last = trainer.global_step
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
@@ -120,6 +107,9 @@ class TrackWhileTraining(L.Callback):
         if step % self.every or step == self._last:
             return
         self._last = step
+        self._validate_now(trainer, pl_module)
+
+    def _validate_now(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         start = time.perf_counter()
         if trainer.is_global_zero:
             with undisturbed():
@@ -153,6 +143,12 @@ class TrackWhileTraining(L.Callback):
         found["track/seconds"] = time.perf_counter() - start
         for logger in trainer.loggers:
             logger.log_metrics(found, step)
+        errors = ", ".join(
+            f"{name} {found[f'track/{name}/ate_percent']:.2f} %"
+            for name, _, _ in self._clips
+            if f"track/{name}/ate_percent" in found
+        )
+        print(f"validation at step {step:,}, ATE in % of the path: {errors or 'none'}", flush=True)
 
     def _rendered_clips(self) -> list[Clip]:
         clips = []

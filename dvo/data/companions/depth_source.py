@@ -83,5 +83,8 @@ def with_depth(
     else:
         file = files_of_frames(path, recording, _KIND)
         usual = DEPTH_SCALE if path is not None and path.is_file() else MILLIMETRES
+        inside = path is not None and path.resolve() == source.path.resolve()
+        if inside and isinstance(recording, ImageRecording):
+            usual = recording.sensors.depth_scale or usual
     stage = CompanionFiles("depth", file, partial(read_depth, scale=scale or usual))
     return source.changed(stages=(*source.reading.stages, stage), **changes)

@@ -6,6 +6,7 @@ import numpy as np
 
 _SIZE = 48  # pixels of the longer side of a half
 _ALIKE = 0.8  # least correlation of two halves that show the same
+_BLACK = 16  # grey level of the bars of a letterbox, at most
 _SHIFT = 0.15  # largest disparity, share of a half
 
 
@@ -21,6 +22,8 @@ def two_views(image: np.ndarray) -> str | None:
     import cv2
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    lit = grey > _BLACK  # the bars of a letterbox are alike in any two halves
+    grey = grey[lit.any(1)][:, lit.any(0)]
     height, width = (side // 2 * 2 for side in grey.shape)
     if min(height, width) < 32:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from dvo.data.images.images import list_images
 from dvo.data.readers.groups import Streams, split_streams
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import MILLIMETRES, Sensors
+
+REPLICA_SCALE = 6553.5
+"""Units of a metre in the depth images of the Replica renderings of NICE-SLAM (its ``cam_params.json``)."""
 
 
 def matches(path: Path) -> bool:
@@ -74,8 +78,19 @@ def open_folder(path: Path, request: Request) -> Recording:
     if not streams.images:  # before a times file can complain about their number
         return ImageRecording("folder", path, [], np.zeros(0))
     times = choose_times(streams.images, path, times=request.times, fps=request.fps, warnings=warnings)
-    sensors = Sensors(depth=streams.depth, depth_scale=MILLIMETRES, right=streams.right)
+    scale = REPLICA_SCALE if streams.depth is not None and _is_replica(streams.images[0]) else MILLIMETRES
+    if scale == REPLICA_SCALE:
+        warnings.append(f"laid out as the Replica renderings of NICE-SLAM: --depth takes {scale:g} units for a metre")
+    sensors = Sensors(depth=streams.depth, depth_scale=scale, right=streams.right)
     return ImageRecording("folder", path, streams.images, times, warnings=warnings, sensors=sensors)
+
+
+def _is_replica(image: Path) -> bool:
+    """True for ``SCENE/results/frame000000.jpg`` beside ``depth000000.png``, with ``SCENE/traj.txt``."""
+    depth = image.with_name(image.name.replace("frame", "depth", 1)).with_suffix(".png")
+    named = re.fullmatch(r"frame\d{6}\.jpg", image.name) and depth.is_file()
+    folder = image.absolute().parent
+    return bool(named) and folder.name == "results" and (folder.parent / "traj.txt").is_file()
 
 
 READER = Reader("folder", matches, open_folder)

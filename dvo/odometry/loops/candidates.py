@@ -32,7 +32,8 @@ class Candidate:
 
     Attributes:
         old, new: identifiers of the earlier and the later keyframe.
-        kind: ``"retrieval"`` by the likeness of the images, ``"proximity"`` by the poses.
+        kind: ``"retrieval"`` by the likeness of the images, ``"proximity"`` by the poses, ``"break"`` for the last
+            keyframe before a break in which the world of the later one began.
         pose_cw: ``(7,)`` pose ``T_cw`` of the later one to start from, in the world of the earlier.
     """
 

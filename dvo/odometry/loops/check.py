@@ -38,7 +38,8 @@ def is_loop(match: Match, pair: Pair, limits: Limits = Limits()) -> bool:  # noq
     Many inliers suffice. Fewer may come from another place with the same texture: bundle adjustment fits them as well,
     but to a pose that has nothing to do with the present one. They count only if both agree, as two loops that confirm
     each other have to; where the present poses have drifted further, a view with many inliers has to come first.
-    Between segments with worlds of their own there are no present poses to agree with.
+    Between segments with worlds of their own there are no present poses to agree with; a pose from corners, which the
+    network has no part in, takes their place where there is one.
 
     Args:
         match: of the pair.

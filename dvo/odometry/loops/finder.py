@@ -27,6 +27,7 @@ from dvo.odometry.loops.guess import Pair, order_pairs
 from dvo.odometry.loops.joint_window import Group, GroupMatcher, Match
 from dvo.odometry.loops.options import LoopOptions
 from dvo.odometry.loops.place_descriptors import PlaceDescriptor
+from dvo.odometry.loops.wide_baseline import find_pose
 from dvo.odometry.maintenance.background import all_steps
 
 UPDATES = (2, 2, 8)
@@ -34,6 +35,10 @@ UPDATES = (2, 2, 8)
 with too few for a loop is, and further ones of a loop."""
 HOPEFUL = 0.03
 """Share of inliers among all patches of both visits."""
+BREAK = "break"
+"""Kind of the candidate from before a break, see :class:`dvo.odometry.loops.candidates.Candidate`."""
+AFTER_BREAK = 16
+"""Kept keyframes after a break that are compared with the last one before it."""
 _RECENT = 256  # descriptors beside the index above which those without a keyframe are dropped
 
 
@@ -44,7 +49,7 @@ class Loop:
     Attributes:
         old, new: identifiers of the earlier and the later keyframe.
         old_time, new_time: their timestamps, seconds.
-        kind: source of the candidate, ``"proximity"`` or ``"retrieval"``.
+        kind: source of the candidate, ``"proximity"``, ``"retrieval"`` or ``"break"``.
         inliers: share of the edges between the visits that are inliers.
         measurement: ``(8,)`` similarity from the camera of the earlier to that of the later keyframe, each in the unit
             that its segment had when the loop was found.
@@ -202,7 +207,7 @@ class LoopFinder:
                 continue
             joins = graph.world_of(graph.segment_of(candidate.old)) != graph.world_of(graph.segment_of(new))
             old_cw, present_cw = graph.poses_cw(np.array(old)), None if joins else poses_cw[group.index(new)]
-            pairs.append(Pair(candidate, self._frames(old), self._frames(group), old_cw, moved, present_cw))
+            pairs.append(Pair(candidate, self._frames(old), self._frames(group), old_cw, moved, present_cw, joins))
             predicted += known
         return Search(new, tuple(pairs), predicted)
 
@@ -219,10 +224,12 @@ class LoopFinder:
         decisions = tuple(zip(UPDATES, (HOPEFUL, least, least), strict=True))
         ahead, others = search.pairs[: search.predicted], search.pairs[search.predicted :]
         try:
-            for chosen in (_given(ahead), self._promising(others)):
+            across = [pair for pair in others if pair.candidate.kind == BREAK]
+            for chosen in (_given(ahead), self._promising(others), self._from_corners(across)):
                 for pair in (yield from chosen):
                     match = yield from self.matcher.match(pair.old, pair.new, pair.start, decisions)
                     if match is not None and is_loop(match, pair, self.limits):
+                        match = replace(match, scale=match.scale * pair.scale)
                         return _loop(pair.candidate, pair.old, pair.new, match, pair.joins)
             return None
         finally:
@@ -236,6 +243,16 @@ class LoopFinder:
             yield
         maps = self.matcher.maps.maps(pairs[0].later)
         return () if maps is None else (yield from order_pairs(maps, pairs))
+
+    def _from_corners(self, pairs: Sequence[Pair]) -> Generator[None, None, Sequence[Pair]]:
+        """Pairs whose pose is found from corners, and is what the network has to agree with."""
+        stride, found = int(self.matcher.model.config.STRIDE), []
+        for pair in pairs:
+            later = [one.identifier for one in pair.new].index(pair.candidate.new)
+            wide = yield from find_pose(pair.old, pair.old_cw, pair.new, pair.moved, later, stride)
+            if wide is not None:
+                found.append(pair.placed(wide.pose_cw, wide.scale))
+        return found
 
     def agree(self, first: Loop, second: Loop) -> bool:
         """Find out if two loops ask for the same correction.
@@ -306,6 +323,19 @@ class LoopFinder:
         for candidate in by_likeness(graph, self.places, self.descriptor, new, earlier):
             if candidate.old not in seen:
                 yield candidate, False
+        last = self._before_break(new)
+        if last is not None:
+            yield Candidate(last, new, BREAK, graph.poses_cw(np.array([last]))[0]), False
+
+    def _before_break(self, new: int) -> int | None:
+        """Last kept keyframe before the segment of a keyframe, if this is one of its first and has its own world."""
+        graph, at, segment = self.graph, bisect_left(self.kept, new), self.graph.segment_of(new)
+        near = range(max(0, at - AFTER_BREAK + 1), at + 1)
+        first = next((k for k in near if graph.segment_of(self.kept[k]) == segment), 0)
+        last = self.kept[first - 1] if first else -1
+        if last < graph.recording.keyframe or graph.segment_of(last) < 0:
+            return None
+        return None if graph.world_of(graph.segment_of(last)) == graph.world_of(segment) else last
 
 
 def _given(pairs: Sequence[Pair]) -> Generator[None, None, Sequence[Pair]]:

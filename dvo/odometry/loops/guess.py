@@ -66,7 +66,7 @@ def guess_pose(
     for frame, pose in zip(frames, poses_cw, strict=True):
         if frame.matching is not None:
             patches.append(torch.from_numpy(frame.matching))
-            points.append(se3.act(se3.inverse(pose), _points(frame)))
+            points.append(se3.act(se3.inverse(pose), points_of(frame)))
     if not patches:
         return None
     places, lead = find_patches(maps, torch.cat(patches))
@@ -94,7 +94,10 @@ class Pair:
         old, new: both with their neighbours.
         old_cw: ``(n, 7)`` poses ``T_cw`` of ``old``.
         moved: ``(m, 7)`` transforms from the camera of the later keyframe to those of ``new``.
-        present_cw: ``(7,)`` pose ``T_cw`` of the later keyframe by the present poses; None if it is of another world.
+        present_cw: ``(7,)`` pose ``T_cw`` of the later keyframe that is known otherwise: by the present poses, or, in
+            another world, by corners (:mod:`dvo.odometry.loops.wide_baseline`); None if there is none.
+        joins: the two are of different worlds.
+        scale: of the lengths of ``new`` here, in the unit of their segment.
     """
 
     candidate: Candidate
@@ -103,11 +106,20 @@ class Pair:
     old_cw: Tensor
     moved: Tensor
     present_cw: Tensor | None
+    joins: bool = False
+    scale: float = 1.0
 
-    @property
-    def joins(self) -> bool:
-        """The two are of different worlds."""
-        return self.present_cw is None
+    def placed(self, pose_cw: Tensor, scale: float) -> Pair:
+        """Pair whose newer group starts from a pose and a scale that its match has to agree with.
+
+        Args:
+            pose_cw: ``(7,)`` of the later keyframe.
+            scale: of the lengths of its group.
+        """
+        moved = torch.cat([self.moved[:, :3] * scale, self.moved[:, 3:]], -1)
+        new = tuple(replace(one, inverse_depth=one.inverse_depth / np.float32(scale)) for one in self.new)
+        candidate = replace(self.candidate, pose_cw=pose_cw)
+        return replace(self, candidate=candidate, new=new, moved=moved, present_cw=pose_cw, scale=scale)
 
     @property
     def later(self) -> ArchivedKeyframe:
@@ -179,8 +191,15 @@ def find_patches(maps: Tensor, patches: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([column, row], -1).float() + (side - 1) / 2, best - second
 
 
-def _points(frame: ArchivedKeyframe) -> Tensor:
-    """Centres ``(M, 3)`` float64 of the patches in the camera of their keyframe."""
+def points_of(frame: ArchivedKeyframe) -> Tensor:
+    """Points of a keyframe.
+
+    Args:
+        frame: with its patches.
+
+    Returns:
+        ``(M, 3)`` float64 centres of its patches in its camera.
+    """
     fx, fy, cx, cy = torch.from_numpy(frame.intrinsics).double()
     x, y = torch.from_numpy(frame.centres).double().unbind(-1)
     depth = 1.0 / torch.from_numpy(frame.inverse_depth).double().clamp(min=1e-6)

@@ -52,6 +52,21 @@ def test_the_stream_of_colour_or_the_left_one_is_tracked(make, patterns, option)
             assert np.array_equal(frames[2].right.image, make.image(2)[..., ::-1])
 
 
+@pytest.mark.parametrize(
+    ("folder", "beside", "units"),
+    [("results", "traj.txt", 6553.5), ("results", "other.txt", 1000), ("clip", "traj.txt", 1000)],
+)  # fmt: skip
+def test_the_unit_of_depth_in_a_folder_of_replica(make, folder, beside, units):
+    images = write(make, folder, "frame{:06d}.jpg", "depth{:06d}.png")
+    (make.root / beside).write_text("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n" * 4)
+    source = dvo.open(images, calib=make.calib(), fps=10)
+    assert any("Replica" in warning for warning in source.warnings) == (units != 1000)
+    for place in (None, images):
+        frame = next(iter(with_depth(source, place)))
+        assert np.nanmean(frame.depth) == pytest.approx(DEEP.mean() / units)
+    assert np.nanmean(next(iter(with_depth(source, None, 500))).depth) == pytest.approx(DEEP.mean() / 500)
+
+
 def test_streams_of_left_and_right_stamps(make):
     names = [f"{side}_{1305031102175304 + 33000 * i + late}.png" for side, late in (("left", 0), ("right", 7)) for i in
              range(3)]  # fmt: skip

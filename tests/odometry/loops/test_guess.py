@@ -119,7 +119,7 @@ def pairs():
     for old, kind in ((40, "retrieval"), (10, "retrieval"), (70, "proximity"), (55, "retrieval")):
         group = tuple(replace(frame, identifier=old + k) for k, frame in enumerate(frames))
         later = tuple(replace(frame, identifier=100 + k) for k, frame in enumerate(frames))
-        made.append(Pair(Candidate(old, 101, kind, poses[0]), group, later, poses, moved, new_cw))
+        made.append(Pair(Candidate(old, 101, kind, poses[0]), group, later, poses, moved, new_cw, new_cw is None))
     return made
 
 
@@ -161,3 +161,17 @@ def test_the_groups_start_where_the_guess_has_the_later_keyframe(pairs):
     there.moved[1, 6] = 1
     assert torch.equal(there.start[:3], pair.old_cw) and torch.allclose(there.start[4], pose)
     assert torch.allclose(there.start[3], se3.compose(step, pose)) and there.later.identifier == 101
+
+
+def test_a_pair_is_placed_in_another_unit(pairs):
+    """Camera centres of the newer group and its points are scaled about the later keyframe."""
+    pair = pairs[0]
+    moved = pair.moved.clone()
+    moved[2, 0] += 0.4
+    pose = se3.exp(torch.tensor([0.3, 0.1, -0.2, 0.1, 0.2, 0.0], dtype=torch.float64))
+    placed = replace(pair, moved=moved).placed(pose, 2.5)
+    assert torch.equal(placed.start[: len(pair.old)], pair.old_cw)
+    assert torch.allclose(placed.moved[:, :3], 2.5 * moved[:, :3]) and torch.equal(placed.moved[:, 3:], moved[:, 3:])
+    for before, after in zip(pair.new, placed.new, strict=True):
+        np.testing.assert_allclose(after.inverse_depth, before.inverse_depth / 2.5, rtol=1e-6)
+    assert torch.equal(placed.present_cw, pose) and torch.equal(placed.candidate.pose_cw, pose) and placed.scale == 2.5

@@ -64,7 +64,7 @@ def test_a_run_is_begun_resumed_and_the_start_of_another(fit, refused, capsys, t
     fit("--name", "a", "--steps", 2)
     said = capsys.readouterr().out
     assert "runs/train/a: step 0 + 2; new run from random weights\nclips: rendered\n" in said
-    assert "step 0 + 2 of 2" in said
+    assert "step 0 + 2 of 2" in said and "before the first step" not in said
     assert {path.name for path in tmp_path.iterdir()} == {"settings.yaml", "runs"}
     assert {path.name for path in (tmp_path / "runs/train").iterdir()} == {"a"}
     assert {"last.ckpt", "csv", "tensorboard"} < {path.name for path in (tmp_path / "runs/train/a").iterdir()}
@@ -72,14 +72,16 @@ def test_a_run_is_begun_resumed_and_the_start_of_another(fit, refused, capsys, t
     assert "--resume to go on with it, or --name RUN" in refused("--name", "a", "--steps", 2)
     assert read_state("runs/train/a/last.ckpt")["global_step"] == 2
     fit("--name", "a", "--steps", 1, "--resume")
-    assert "step 2 + 1 of 1" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "step 2 + 1 of 1" in said and "before the first step" not in said
     assert read_state("runs/train/a/last.ckpt")["global_step"] == 3
 
     state = "runs/train/a/last.ckpt"
     line = refused("--name", "b", "--from", state, "--trainer.max_steps", 3)
     assert f"{state}: trainer.max_steps: 3 is not beyond step 3" in line and "--steps N" in line
     fit("--name", "b", "--from", state, "--steps", 2, "--model.learning_rate", "1e-3")
-    assert "step 3 + 2 of 2" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert said.index("before the first step: loss ") < said.index("step 3 + 1 of 2") and "step 3 + 2 of 2" in said
     found = read_state("runs/train/b/last.ckpt")
     assert found["global_step"] == found["Renderings"]["clips_seen"] == found["provenance"]["rendered"] == 5
     assert found["lr_schedulers"][0]["base_lrs"] == [1e-3] and read_state(state)["global_step"] == 3

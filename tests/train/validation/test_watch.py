@@ -47,3 +47,11 @@ def test_random_states_are_put_back():
     with undisturbed():
         random.random(), np.random.rand(), torch.rand(3)  # noqa: NPY002
     assert (random.random(), np.random.rand(), float(torch.rand(()))) == expected  # noqa: NPY002
+
+
+def test_trained_weights_are_validated_before_the_first_step(tmp_path, runs, capsys):
+    program = runs.module()
+    program.from_trained = True
+    runs.fit(tmp_path, 1, program, callbacks=[TrackWhileTraining(str(tmp_path), every=1000, **QUICK)])
+    lines = [row for row in capsys.readouterr().out.splitlines() if row.startswith("validation at step ")]
+    assert len(lines) == 1 and lines[0].startswith("validation at step 0, ATE in % of the path: rendered0 ")

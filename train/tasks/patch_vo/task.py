@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -63,6 +63,9 @@ class PatchVOTask(Task):
     """
 
     data_type = Renderings
+    units: ClassVar[Mapping[str, str]] = {
+        "flow": "px of the feature map", "rotation_deg": "degrees", "translation": "median depths",
+    }  # fmt: skip
     starts_from = ("distil",)
 
     def __init__(

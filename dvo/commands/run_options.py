@@ -39,7 +39,7 @@ def add_tracking_options(parser: argparse.ArgumentParser) -> None:
     system = parser.add_mutually_exclusive_group()
     system.add_argument("--weights", metavar="NAME|FILE", default="small", help="default: %(default)s")
     system.add_argument(
-        "--system", metavar="NAME", help="an odometry without weights: keyframe, klt-pnp, direct or monoslam"
+        "--system", metavar="NAME", help="an odometry without weights: keyframe, klt-pnp, direct, monoslam or msckf"
     )
     parser.add_argument(
         "--device", metavar="D", default="auto", help="torch device (default: accelerator if available)"

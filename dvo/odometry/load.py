@@ -41,8 +41,8 @@ def load(
 
     Args:
         weights: name of weights that ship with dvo, or a file; or name of a system without weights
-            (:data:`dvo.odometry.registry.SYSTEMS`): ``keyframe``, ``klt-pnp``, ``direct``, ``monoslam``. Weights that
-            ship with dvo win over a system of their name.
+            (:data:`dvo.odometry.registry.SYSTEMS`): ``keyframe``, ``klt-pnp``, ``direct``, ``monoslam``, ``msckf``.
+            Weights that ship with dvo win over a system of their name.
         device: of all computation; a system without weights computes on the CPU.
         seed: of all random numbers of the odometry. The same seed on the same machine gives the same trajectory, bit
             for bit on the CPU with a fixed number of threads.

@@ -41,6 +41,7 @@ SYSTEMS = Registry(
         "keyframe": f"{_CLASSICAL}.keyframe.system:KeyframeOdometry",
         "direct": f"{_CLASSICAL}.direct.system:DirectOdometry",
         "monoslam": f"{_CLASSICAL}.monoslam.slam:MonoSlam",
+        "msckf": f"{_CLASSICAL}.msckf.system:Msckf",
     },
 )
 """Name to ``"module:Class"`` of an odometry without weights, called with its settings and, if it takes it, the seed."""

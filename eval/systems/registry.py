@@ -44,6 +44,8 @@ CATALOGUE = (
            about="keyframe with loop closure: ORB matches, PnP, pose graph in Sim(3)"),
     System("direct", f"{_CLASSICAL}.direct.system:DirectOdometry",
            about="semi-dense: photometric alignment to keyframes with filtered inverse depth (after LSD-SLAM)"),
+    System("msckf", f"{_CLASSICAL}.msckf.system:Msckf",
+           about="inertial filter: EKF over past poses (MSCKF with first-estimate Jacobians), in metres"),
     System("orbslam3", f"{_PEERS}.orbslam3:OrbSlam3", licence="GPL-3",
            about="ORB-SLAM3 (pyorbslam3), without the official vocabulary; monocular, or in metres with "
            "sensor=stereo, rgbd, imu_monocular or imu_stereo; closes loops, unless loops=false",

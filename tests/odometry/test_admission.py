@@ -6,13 +6,27 @@ import numpy as np
 import pytest
 
 from dvo.core.errors import DvoError
+from dvo.data.inertial import InertialSamples
 from dvo.geometry.camera import Camera
 from dvo.odometry.load import build_odometry, load
 from dvo.odometry.protocol import Status
 from dvo.odometry.registry import SYSTEMS
-from tests.support.tiny_members import MEMBERS, SETTINGS, frames, network
+from tests.support import tiny_members
+from tests.support.tiny_members import MEMBERS, SETTINGS, network
 
 EVERY = (*MEMBERS, *sorted(SYSTEMS))
+
+
+def frames(seed, name="", **options):
+    """Walls that move; of the system that needs inertial samples, with those of a sensor that lies still."""
+    found = tiny_members.frames(seed, **options)
+    if name != "msckf":
+        return found
+    times, here = np.arange(10) / 100, np.array([0.0, 0, 0, 0, 0, 0, 1])
+    force, still = np.tile([0, -9.81, 0], (10, 1)), np.zeros((10, 3))
+    return [
+        replace(frame, inertial=InertialSamples(frame.timestamp - 0.09 + times, still, force, here)) for frame in found
+    ]
 
 
 def build(name):
@@ -24,18 +38,18 @@ def changed(frame, **changes):
 
 
 def test_the_odometries_without_weights_are_here():
-    assert {"klt-pnp", "keyframe", "direct", "monoslam"} <= set(EVERY)
+    assert {"klt-pnp", "keyframe", "direct", "monoslam", "msckf"} <= set(EVERY)
 
 
 @pytest.mark.parametrize("name", EVERY)
 def test_a_frame_that_may_not_be_tracked_is_refused(name):
-    odometry, clip = build(name), frames(0)
+    odometry, clip = build(name), frames(0, name)
     for frame in clip[:2]:
         odometry.track(frame)
     bent = Camera(80.0, 80.0, 48.0, 36.0, 96, 72, model="radtan", coefficients=(0.1, 0.0, 0.0, 0.0))
     for frame, words in (
         (changed(clip[2], timestamp=clip[1].timestamp), "does not come after"),
-        (changed(frames(0, size=(112, 72))[2]), "112x72"),
+        (changed(frames(0, name, size=(112, 72))[2]), "112x72"),
         (changed(clip[2], camera=bent), "radtan"),
         (changed(clip[2], timestamp=float("nan")), "not finite"),
         (changed(clip[2], image=clip[2].image.astype(np.int32)), "int32"),
@@ -60,7 +74,7 @@ def test_a_frame_that_may_not_be_tracked_is_refused(name):
 
 @pytest.mark.parametrize("name", EVERY)
 def test_an_image_without_content_is_lost_and_says_why(name):
-    odometry, clip = build(name), frames(0)
+    odometry, clip = build(name), frames(0, name)
     dark = [changed(frame, image=np.zeros_like(frame.image)) for frame in clip[:2]]
     white = changed(clip[7], image=np.full_like(clip[7].image, 255))
     estimates = [odometry.track(frame) for frame in (*dark, *clip[2:7], white)]
@@ -78,7 +92,7 @@ def test_an_image_without_content_is_lost_and_says_why(name):
 @pytest.mark.parametrize("name", [name for name in EVERY if name != "monoslam"])
 def test_a_repeated_image_has_the_pose_and_the_state_of_the_first(name):
     """MonoSLAM measures it: its filter has to learn that the camera stands."""
-    odometry, clip = build(name), frames(0)
+    odometry, clip = build(name), frames(0, name)
     for number, frame in enumerate(clip):
         first = odometry.track(changed(frame, timestamp=0.2 * number))
         again = odometry.track(changed(frame, timestamp=0.2 * number + 0.1))
@@ -94,7 +108,7 @@ def test_a_repeated_image_has_the_pose_and_the_state_of_the_first(name):
 
 @pytest.mark.parametrize("name", EVERY)
 def test_times_are_numbers_whatever_was_given(name):
-    odometry, clip = build(name), frames(0)
+    odometry, clip = build(name), frames(0, name)
     for number, frame in enumerate(clip[:4]):
         estimate = odometry.track(changed(frame, timestamp=np.float32(number)))
         assert type(estimate.timestamp) is float and estimate.timestamp == number

@@ -91,7 +91,7 @@ def test_shipped_weights_win_over_a_system_of_their_name():
 
 def test_odometries_without_weights_are_loaded_by_name():
     sequence = make_sequence(4, frames=16, family="room", kind="sideways", height=120, width=160, fps=15.0)
-    for name in ("keyframe", "klt-pnp", "direct", "monoslam"):
+    for name in ("keyframe", "klt-pnp", "direct", "monoslam", "msckf"):
         assert name in SYSTEMS and dvo.load(name).name == name
     result = dvo.run(dvo.load("keyframe", seed=2, corners=300), sequence).result
     assert len(result.trajectory) == 16

@@ -73,7 +73,7 @@ def test_an_own_context_restores_everything():
         assert torch.is_autocast_enabled("cpu") and np.geterr()["divide"] == "raise"
 
 
-@pytest.mark.parametrize("build", [tracker, *(lambda name=name: dvo.load(name) for name in SYSTEMS)])
+@pytest.mark.parametrize("build", [tracker, *(lambda name=name: dvo.load(name) for name in (*SYSTEMS, "msckf"))])
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_an_odometry_is_not_copied(build, duplicate):
     with pytest.raises(DvoError, match="is not copied or pickled"):
@@ -87,7 +87,7 @@ def test_results_and_estimates_are_copied():
 
 def test_what_is_printed_is_short():
     estimates, result = run(tracker(), frames(10))
-    shown = [*estimates, result, *result.segments, tracker(), *map(dvo.load, SYSTEMS)]
+    shown = [*estimates, result, *result.segments, tracker(), *map(dvo.load, (*SYSTEMS, "msckf"))]
     assert all(len(repr(one)) < 120 and "\n" not in repr(one) and " at 0x" not in repr(one) for one in shown)
     assert repr(result).startswith("Result(10 of 10 frames tracked, 1 segment, ")
     assert "initialising, too few keyframes" in repr(estimates[0])

@@ -68,7 +68,7 @@ def test_settings_are_arguments_and_part_of_the_name(tmp_path):
     assert (system.name, system.settings) == ("klt-pnp+corners=400+refill=0.5", {"corners": 400, "refill": 0.5})
     odometry = system.build(3, "cpu")
     assert (odometry.config.corners, odometry.config.refill, odometry.seed) == (400, 0.5, 3)
-    for name in ("monoslam+fewest=7", "keyframe+corners=300", "direct+patience=3"):
+    for name in ("monoslam+fewest=7", "keyframe+corners=300", "direct+patience=3", "msckf+clones=9"):
         assert isinstance(find_system(name).build(0, "cpu"), Odometry)
     assert find_system("klt-pnp+seed=5").build(0, "cpu").seed == 5
     with pytest.raises(DvoError, match="colour: unknown setting"):

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3, sim3
-from dvo.geometry.poses import pose_from
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import Map
 
@@ -61,43 +60,13 @@ def rescale(graph: Map, segment: int, factor: float) -> dict[int, float]:
     Returns:
         Scale of the similarity of each kept keyframe, see :func:`apply_similarities`: ``1 / factor``.
     """
-    mine = _keyframes_of(graph, segment)
+    world = graph.world_of(segment)
+    kept = [f.identifier for f in graph.archive if f.anchor is None]
+    mine = np.array([k for k in kept if graph.segment_of(k) >= 0 and graph.world_of(graph.segment_of(k)) == world], int)
     if not len(mine):
         return {}
     apply_similarities(graph, mine, sim3.from_se3(graph.poses_cw(mine), 1 / factor))
     return dict.fromkeys(mine.tolist(), 1 / factor)
-
-
-def re_express(
-    graph: Map, segment: int, scale: float, rotation: np.ndarray, translation: np.ndarray
-) -> dict[int, float]:
-    """Change the coordinates of the world of a segment to ``scale rotation x + translation``.
-
-    Args:
-        graph: all keyframes of the world are archived; changed in place.
-        segment: number of any segment with this world.
-        scale: of lengths, new over old.
-        rotation: ``(3, 3)``.
-        translation: ``(3,)``, in the new unit.
-
-    Returns:
-        As of :func:`rescale`.
-    """
-    mine = _keyframes_of(graph, segment)
-    if not len(mine):
-        return {}
-    pose = torch.from_numpy(pose_from(np.asarray(rotation, float), np.asarray(translation, float)))
-    change = torch.cat([pose, torch.tensor([scale], dtype=torch.float64)])
-    poses_cw = sim3.from_se3(graph.poses_cw(mine))
-    apply_similarities(graph, mine, sim3.compose(poses_cw, sim3.inverse(change).expand_as(poses_cw)))
-    return dict.fromkeys(mine.tolist(), 1 / scale)
-
-
-def _keyframes_of(graph: Map, segment: int) -> np.ndarray:
-    """Identifiers of the kept keyframes of the world of a segment."""
-    world = graph.world_of(segment)
-    kept = [f.identifier for f in graph.archive if f.anchor is None]
-    return np.array([k for k in kept if graph.segment_of(k) >= 0 and graph.world_of(graph.segment_of(k)) == world], int)
 
 
 def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> None:

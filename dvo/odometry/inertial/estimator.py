@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
-from dvo.geometry.poses import rotation_vector, split
+from dvo.geometry.poses import rotation_vector, so3_exp, split
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.preintegration import preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
@@ -39,10 +39,8 @@ EVERY = 1.0
 """Seconds from one estimate to the next; half of it before the alignment."""
 STARTS = (1.0, 0.4, 2.5)
 """Factors of the scale of the linear solution that the first estimate begins with."""
-REVISED = (5.0, 15.0)
-"""Seconds after the alignment at which poses take the scale and the vertical of the present estimate (Campos et al.,
-2021, III-D); then every :data:`REVISED_EVERY`."""
-REVISED_EVERY = 15.0
+REFINED_AFTER = 15.0
+"""Seconds after the alignment at which scale and vertical are called refined (Campos et al., 2021, III-D)."""
 MAX_GRAVITY_SIGMA = 1.5
 """Standard deviation of the vertical that an alignment needs, degrees."""
 NOTHING_TOLD = 0.5
@@ -163,7 +161,7 @@ class InertialEstimator:
         self._failures, self._patience = 0, EVERY / 2
         self._next = -np.inf
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
-        self._revised = np.nan
+        self._past: list[tuple[float, Array, Array]] = []  # time, covariance and position of states that were newest
         self._smoother = SmootherOptions()
         self._known: list[int] = []  # worlds of the solution, in its order
 
@@ -258,8 +256,24 @@ class InertialEstimator:
             return None
         return BodyState(
             float(s.times[-1]), s.rotation[-1], s.position[-1], s.velocity[-1], s.gyro_bias[-1], s.accel_bias[-1],
-            s.covariance[:STATE, :STATE],
+            s.covariance[:STATE, :STATE] + self._before(s),
         )  # fmt: skip
+
+    def _before(self, found: Smoothed) -> Array:
+        """Covariance ``(15, 15)`` of the newest state by position and heading of the oldest node, which are held."""
+        added = np.zeros((STATE, STATE))
+        past = [entry for entry in self._past if entry[0] <= found.times[0] + 1e-6]
+        if not past:
+            return added
+        _, covariance, position = past[-1]
+        turn, up = found.rotation[-1], np.array([0.0, 0.0, 1.0])
+        heading = float(covariance[:3, :3].trace()) / 3  # of the vertical axis, about
+        by_heading = np.concatenate(
+            [turn.T @ up, np.cross(up, found.position[-1] - position), np.cross(up, found.velocity[-1]), np.zeros(6)]
+        )
+        added += heading * np.outer(by_heading, by_heading)
+        added[3:6, 3:6] += covariance[3:6, 3:6]
+        return added
 
     def turn_between(self, before: float, after: float) -> Array | None:
         """Rotation of the camera between two frames by the gyroscope.
@@ -426,7 +440,6 @@ class InertialEstimator:
         old = np.abs(known.times[same] - times) < 1e-6
         for values, solved in (
             (start.rotation, known.rotation), (start.position, known.position), (start.velocity, known.velocity),
-            (start.drift, known.drift),
         ):  # fmt: skip
             values[old] = solved[same[old]]
         later, state = np.flatnonzero(times > known.times[-1] + 1e-6), self.last_state()
@@ -439,8 +452,26 @@ class InertialEstimator:
                 state.accel_bias, GRAVITY,
             )  # fmt: skip
             start.rotation[later], start.position[later], start.velocity[later] = (part[1:] for part in found)
-            start.drift[later] = known.drift[-1]
+        start.world, start.log_scale, start.drift = self._drifts(problem, start, known)
         return start
+
+    @staticmethod
+    def _drifts(problem: Smoother, start: Values, known: Smoothed) -> tuple[Array, Array, Array]:
+        """Worlds and scales of the segments at their first nodes, and the drift of the others."""
+        nodes = problem.nodes
+        body = problem.rotation_camera_imu @ so3_exp(start.extrinsic)
+        begins = np.flatnonzero(np.concatenate([[True], nodes.segment[1:] != nodes.segment[:-1]]))
+        first = begins[nodes.segment]
+        world = start.rotation[begins] @ np.swapaxes(nodes.rotation[begins] @ body, -1, -2)
+        drift = np.zeros((len(nodes), 4))
+        drift[:, :3] = rotation_vector(
+            np.swapaxes(world[nodes.segment] @ nodes.rotation @ body, -1, -2) @ start.rotation
+        )
+        scales = start.log_scale[nodes.segment]
+        inside = (nodes.times >= known.times[0] - 1e-6) & (nodes.times <= known.times[-1] + 1e-6)
+        scales[inside] = np.interp(nodes.times[inside], known.times, known.log_scale)
+        drift[:, 3] = scales - scales[first]
+        return world, scales[begins], drift
 
     def _known_similarity(self, world: int) -> Similarity | None:
         """Present estimate of a world."""
@@ -539,7 +570,7 @@ class InertialEstimator:
         if self._failures >= FAILURES and reason not in _WAITING:
             self.history.append({"time": time, "event": "withdrawn", "reason": reason})
             self.state, self.reason = ScaleState.INITIALISING, f"withdrawn: {reason}"
-            self.worlds, self.solution, self._known, self._failures = {}, None, [], 0
+            self.worlds, self.solution, self._known, self._failures, self._past = {}, None, [], 0, []
 
     def _accept(self, found: Smoothed, worlds: list[int], time: float) -> None:
         """Take an estimate that has passed; the first one has to be confirmed by another."""
@@ -551,29 +582,26 @@ class InertialEstimator:
             if before is None or abs(now[0] - before[0]) > AGREEMENT + 3 * before[1]:
                 self.reason = "the estimate waits for another that confirms it"
                 return
-            self.state, self.reason, self._aligned, self._revised = ScaleState.ALIGNED, "", time, time
+            self.state, self.reason, self._aligned = ScaleState.ALIGNED, "", time
             self._offset = found.time_offset
             self._take(found, worlds)
             self.history.append({"time": time, "event": "aligned", "scale_sigma": found.scale_sigma})
             return
-        new = any(world not in self.worlds for world in worlds)
-        passed = time - self._aligned
-        due = (
-            any(self._revised - self._aligned < at <= passed for at in REVISED) or time - self._revised > REVISED_EVERY
-        )
-        self.solution, self._known = found, list(worlds[: len(found.worlds.log_scale)])
-        sure = found.scale_sigma <= 2 * self.options.max_scale_sigma
-        if (new and sure) or due:
+        new = worlds[-1] not in self.worlds
+        if not new or found.scale_sigma <= 2 * self.options.max_scale_sigma:
             self._take(found, worlds)
-            if due:
-                self._revised = time
-            if passed >= REVISED[-1]:
-                self.state = ScaleState.REFINED
+        else:  # a new segment, whose scale is not sure yet
+            self.solution, self._known = found, list(worlds[: len(found.worlds.log_scale)])
+        if time - self._aligned >= REFINED_AFTER:
+            self.state = ScaleState.REFINED
 
     def _take(self, found: Smoothed, worlds: list[int]) -> None:
         """Let poses follow an estimate."""
         self.solution = found
         self._known = list(worlds[: len(found.worlds.log_scale)])
+        state = self.last_state()
+        assert state is not None
+        self._past.append((state.time, state.covariance, state.position))
         for k, world in enumerate(self._known):
             w = found.worlds
             self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])

@@ -35,7 +35,7 @@ class InertialOptions:
     window: float = 20.0
     first: float = 2.0
     min_excitation: float = 0.25
-    max_scale_sigma: float = 0.025
+    max_scale_sigma: float = 0.04
     longest: float = 10.0
 
     def __post_init__(self) -> None:

@@ -1,11 +1,11 @@
 """Metric trajectory from a visual one and inertial samples: maximum a posteriori of a chain of body states.
 
-The visual trajectory of each segment is known up to a similarity, with a little white noise and a drift that walks.
-Unknown are, at nodes a fraction of a second apart, orientation, position, velocity and biases of the sensor in a world
-whose z axis points up, and the drift of the visual pose; and, for all nodes, the similarity of each segment, the time
-offset, and the rotation between sensor and camera. Preintegrated samples tie consecutive nodes (Forster et al., 2017,
-eq. 45), also across an interval without images, so that a segment after it is joined to the one before. It is the
-inertial-only estimation of ORB-SLAM3 (Campos et al., 2021, III-D), with the noise of the visual poses in it.
+A visual trajectory has an unknown scale that drifts, and orientations and displacements with noise. Unknown are, at
+nodes a fraction of a second apart, orientation, position, velocity and biases of the sensor in a world whose z axis
+points up, and the drift of the visual orientation and of the logarithm of the scale; and, for all nodes, scale and
+orientation of each segment's world, the time offset, and the rotation between sensor and camera. Preintegrated samples
+tie consecutive nodes (Forster et al., 2017, eq. 45), also across an interval without images, so that a segment after
+it is joined to the one before.
 
 Errors: ``R_wb = R Exp(phi)`` and additive positions, velocities and biases, as in that paper; ``A <- Exp(alpha) A`` of
 the rotation of a segment's world.
@@ -27,11 +27,13 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 """Acceleration of a falling body in the world, m/s^2; z is up."""
 STATE = 15
 """Unknowns of the body at a node: rotation, position, velocity, gyroscope and accelerometer bias."""
-NODE = 21
-"""Those, and the drift of the visual rotation and position."""
-_TIME, _EXTRINSIC, _SEGMENT = 0, slice(1, 4), 4  # unknowns that all nodes share; 7 for each segment after them
+NODE = 19
+"""Those, and the drift of the visual orientation and of the log scale."""
+_TIME, _EXTRINSIC, _SEGMENT = 0, slice(1, 4), 4  # unknowns that all nodes share; 4 for each segment after them
 SHIFT = 5e-4
 """Change of the time offset, seconds, after which samples are integrated anew."""
+WIDTH = 6.0
+"""Of the robust kernel of visual residuals, deviations."""
 _FIXED = 1e18  # information of an unknown that is held
 _UNKNOWN = 1e12  # variance of a motion without samples
 
@@ -71,18 +73,22 @@ class SmootherOptions:
     """Noise of the visual trajectory, and what is known before.
 
     Attributes:
-        rotation_sigma, position_sigma: white noise of visual orientations, rad, and positions, in depths of the scene.
-        rotation_walk, position_walk: their drift in a second, rad and depths of the scene.
+        rotation_sigma: white noise of visual orientations, rad.
+        rotation_walk: their drift in a second, rad.
+        position_sigma, position_walk: noise of visual displacements: of their ends, and of a second, in depths of the
+            scene.
         rotation_factor, position_factor: of both kinds of noise.
+        scale_walk: drift of the scale in a second, relative.
         extrinsic_sigma: of the rotation between sensor and camera, rad.
         offset_sigma: of the time offset, seconds.
         iterations: of Gauss-Newton, at most.
     """
 
     rotation_sigma: float = 4e-4
-    position_sigma: float = 3e-4
     rotation_walk: float = 2e-3
+    position_sigma: float = 3e-4
     position_walk: float = 1.5e-3
+    scale_walk: float = 1.5e-2
     rotation_factor: float = 1.0
     position_factor: float = 1.0
     extrinsic_sigma: float = 5e-3
@@ -92,7 +98,9 @@ class SmootherOptions:
 
 @dataclass(frozen=True)
 class Similarities:
-    """Similarities from the world of each segment to the common one: ``x = scale A x_segment + translation``.
+    """Similarities from the world of each segment, near its newest node, to the common one.
+
+    ``x = scale A x_segment + translation``.
 
     Attributes:
         log_scale: ``(S,)`` of metres in a unit of the segment.
@@ -114,12 +122,13 @@ class Smoothed:
         rotation: ``(N, 3, 3)`` body to world.
         position, velocity: ``(N, 3)`` of the body, metres and m/s.
         gyro_bias, accel_bias: ``(N, 3)``.
-        drift: ``(N, 6)`` of the visual rotation, rad, and position, units of the segment.
+        log_scale: ``(N,)`` of metres in a unit of the segment, at each node.
         worlds: of the segments.
         time_offset: seconds to add to a time of the camera for that of the sensor.
         rotation_camera_imu: ``(3, 3)``.
-        covariance: ``(21 + m, 21 + m)`` of the newest node (rotation, position, velocity, biases, drift) and the shared
-            unknowns (time offset, extrinsic rotation, and log scale, rotation, translation of each segment).
+        lever: ``(3,)`` centre of the camera in the coordinates of the sensor, metres.
+        covariance: ``(19 + m, 19 + m)`` of the newest node (rotation, position, velocity, biases, drift) and the shared
+            unknowns (time offset, extrinsic rotation, and log scale and rotation of each segment).
         cost: half of the sum of squares.
         inertial_error: mean squared whitened residual of the preintegrated motion.
         visual_error: ``(2,)`` mean squared whitened residual of visual orientations and positions, and their drift.
@@ -131,10 +140,11 @@ class Smoothed:
     velocity: Array
     gyro_bias: Array
     accel_bias: Array
-    drift: Array
+    log_scale: Array
     worlds: Similarities
     time_offset: float
     rotation_camera_imu: Array
+    lever: Array
     covariance: Array
     cost: float
     inertial_error: float
@@ -142,13 +152,15 @@ class Smoothed:
 
     @property
     def scale_sigma(self) -> float:
-        """Standard deviation of the scale of the newest segment, relative."""
-        return float(np.sqrt(self.covariance[-7, -7]))
+        """Standard deviation of the scale at the newest node, relative."""
+        part = self.covariance[np.ix_([NODE - 1, -4], [NODE - 1, -4])]
+        return float(np.sqrt(part.sum()))
 
     @property
     def gravity_sigma(self) -> float:
-        """Standard deviation of the vertical in the newest segment, degrees."""
-        return float(np.rad2deg(np.sqrt(self.covariance[-6, -6] + self.covariance[-5, -5])))
+        """Standard deviation of the vertical at the newest node, degrees."""
+        turned = self.rotation[-1] @ self.covariance[:3, :3] @ self.rotation[-1].T
+        return float(np.rad2deg(np.sqrt(turned[0, 0] + turned[1, 1])))
 
 
 @dataclass
@@ -159,12 +171,15 @@ class Values:
     position: Array
     velocity: Array
     bias: Array  # (N, 6)
-    drift: Array  # (N, 6) of the visual rotation (rad) and position (units of the segment)
+    drift: Array  # (N, 4) of the visual orientation (rad) and of the log scale
     offset: float
     extrinsic: Array  # (3,) rotation vector after the given rotation
     log_scale: Array
     world: Array
-    translation: Array
+
+    def scales(self, segment: Array) -> Array:
+        """``(N,)`` log scale of each node."""
+        return self.log_scale[segment] + self.drift[:, 3]
 
 
 @dataclass
@@ -217,7 +232,7 @@ class Smoother:
 
 def _moved(problem: Smoother, values: Values, states: Array, shared: Array) -> Values:
     """Values after a step. A node with another time offset is a state at another time."""
-    by_segment, late = shared[_SEGMENT:].reshape(-1, 7), float(shared[_TIME])
+    by_segment, late = shared[_SEGMENT:].reshape(-1, 4), float(shared[_TIME])
     rates, speeding = problem.rates(values), problem.accelerations(values)
     return Values(
         values.rotation @ so3_exp(states[:, :3]) @ so3_exp(rates * late),
@@ -226,7 +241,6 @@ def _moved(problem: Smoother, values: Values, states: Array, shared: Array) -> V
         values.bias + states[:, 9:STATE], values.drift + states[:, STATE:], values.offset + late,
         values.extrinsic + shared[_EXTRINSIC],
         values.log_scale + by_segment[:, 0], so3_exp(by_segment[:, 1:4]) @ values.world,
-        values.translation + by_segment[:, 4:],
     )  # fmt: skip
 
 
@@ -252,9 +266,8 @@ def first_values(problem: Smoother, worlds: Similarities) -> Values:
             velocity[mine] = np.gradient(position[mine], nodes.times[mine], axis=0)
     bias = np.tile(np.concatenate([problem.gyro_bias, problem.accel_bias]), (len(nodes), 1))
     return Values(
-        rotation, position, velocity, bias, np.zeros((len(nodes), 6)), problem.offset, np.zeros(3),
-        worlds.log_scale.copy(),
-        worlds.rotation.copy(), worlds.translation.copy(),
+        rotation, position, velocity, bias, np.zeros((len(nodes), 4)), problem.offset, np.zeros(3),
+        worlds.log_scale.copy(), worlds.rotation.copy(),
     )  # fmt: skip
 
 
@@ -271,8 +284,8 @@ def linear_start(problem: Smoother) -> tuple[float, Array, Array]:
     nodes = problem.nodes
     body = nodes.rotation @ problem.rotation_camera_imu
     start = Values(
-        body, nodes.position, nodes.position, *np.zeros((2, len(nodes), 6)), problem.offset, np.zeros(3), np.zeros(1),
-        np.eye(3)[None], np.zeros((1, 3)),
+        body, nodes.position, nodes.position, np.zeros((len(nodes), 6)), np.zeros((len(nodes), 4)), problem.offset,
+        np.zeros(3), np.zeros(1), np.eye(3)[None],
     )  # fmt: skip
     bias = problem.gyro_bias
     for _ in range(2):
@@ -351,9 +364,20 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
     covariance = solve_chain(system).covariance
     return Smoothed(
         problem.nodes.times, values.rotation, values.position, values.velocity, values.bias[:, :3], values.bias[:, 3:],
-        values.drift, Similarities(values.log_scale, values.world, values.translation), values.offset,
-        problem.rotation_camera_imu @ so3_exp(values.extrinsic), covariance, cost, *errors,
+        values.scales(problem.nodes.segment), _worlds(problem, values), values.offset,
+        problem.rotation_camera_imu @ so3_exp(values.extrinsic), problem.lever, covariance, cost, *errors,
     )  # fmt: skip
+
+
+def _worlds(problem: Smoother, values: Values) -> Similarities:
+    """Similarity of each segment at its newest node."""
+    nodes = problem.nodes
+    last = np.array([np.flatnonzero(nodes.segment == k)[-1] for k in range(problem.segments)])
+    body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
+    rotation = values.rotation[last] @ _turn(nodes.rotation[last] @ body)
+    scales = values.scales(nodes.segment)[last]
+    camera = values.position[last] + _apply(values.rotation[last], np.broadcast_to(problem.lever, (len(last), 3)))
+    return Similarities(scales, rotation, camera - np.exp(scales)[:, None] * _apply(rotation, nodes.position[last]))
 
 
 def _inverse_right_jacobian(phi: Array) -> Array:
@@ -375,7 +399,7 @@ def _linearise(
 ) -> tuple[ChainSystem, float, tuple[float, Array]]:
     """Normal equations, half of the sum of squares, and mean squared inertial and visual residual."""
     count, segments = len(problem.nodes), problem.segments
-    system = ChainSystem.zeros(count, NODE, _SEGMENT + 7 * segments)
+    system = ChainSystem.zeros(count, NODE, _SEGMENT + 4 * segments)
     cost, inertial = _add_motion(problem, values, motion, system)
     more, visual = _add_visual(problem, values, system)
     return system, cost + more + _add_priors(problem, values, system), (inertial, visual)
@@ -431,14 +455,21 @@ def _add_motion(problem: Smoother, values: Values, motion: Preintegration, syste
     return 0.5 * (cost + float((drift**2).sum())), cost / residual.size
 
 
-def _add_pairs(system: ChainSystem, residual: Array, before: Array, after: Array, first: int = 0) -> None:
-    """Add residuals of consecutive nodes, by their unknowns from ``first`` on."""
+def _add_pairs(
+    system: ChainSystem, residual: Array, before: Array, after: Array, first: int = 0, shared: Array | None = None
+) -> None:
+    """Add residuals of consecutive nodes, by their unknowns from ``first`` on and by the shared ones."""
     mine = slice(first, first + before.shape[-1])
     system.diagonal[:-1, mine, mine] += _turn(before) @ before
     system.diagonal[1:, mine, mine] += _turn(after) @ after
     system.upper[:, mine, mine] += _turn(before) @ after
     system.right[:-1, mine] -= _apply(_turn(before), residual)
     system.right[1:, mine] -= _apply(_turn(after), residual)
+    if shared is not None:
+        system.border[:-1, mine] += _turn(before) @ shared
+        system.border[1:, mine] += _turn(after) @ shared
+        system.shared += (_turn(shared) @ shared).sum(0)
+        system.right_shared -= _apply(_turn(shared), residual).sum(0)
 
 
 def _add_walk(system: ChainSystem, values: Array, sigma: Array, first: int) -> Array:
@@ -451,72 +482,86 @@ def _add_walk(system: ChainSystem, values: Array, sigma: Array, first: int) -> A
     return residual
 
 
-def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> tuple[float, Array]:
-    """Visual poses, through the similarity of their segment."""
-    nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
-    count = len(nodes)
-    world, scale = values.world[segment], np.exp(values.log_scale[segment])[:, None]
-    body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
-    rates = problem.rates(values)
-    turn = rotation_vector(_turn(world @ nodes.rotation @ body) @ values.rotation)
-    arm = _apply(values.rotation, np.broadcast_to(problem.lever, (count, 3)))
-    place = values.position + arm - values.translation[segment]
-    back = _turn(world)
-    seen = _apply(back, place) / scale
-    depth = nodes.depth[segment][:, None]
-    sigma = options.position_sigma * options.position_factor * depth
-    angle = options.rotation_sigma * options.rotation_factor
-    residual = np.concatenate(
-        [(turn - values.drift[:, :3]) / angle, (seen - nodes.position - values.drift[:, 3:]) / sigma], -1
-    )
-    states = np.zeros((count, 6, NODE))
-    shared = np.zeros((count, 6, _SEGMENT + 7 * problem.segments))
-    back_body = _turn(values.rotation)
-    states[:, :3, :3] = np.eye(3)
-    states[:, :, STATE:] = -np.eye(6)
-    shared[:, :3, _TIME] = rates
-    shared[:, :3, _EXTRINSIC] = -np.eye(3)
-    states[:, 3:, 3:6] = back / scale[..., None]
-    states[:, 3:, :3] = -back @ values.rotation @ skew(problem.lever) / scale[..., None]
-    speed = values.velocity + _apply(values.rotation, np.cross(rates, problem.lever))
-    shared[:, 3:, _TIME] = _apply(back, speed) / scale
-    for k in range(problem.segments):
-        mine, start = segment == k, _SEGMENT + 7 * k
-        shared[mine, 3:, start] = -seen[mine]
-        shared[mine, :3, start + 1 : start + 4] = -back_body[mine]
-        shared[mine, 3:, start + 1 : start + 4] = back[mine] @ skew(place[mine]) / scale[mine][..., None]
-        shared[mine, 3:, start + 4 : start + 7] = -back[mine] / scale[mine][..., None]
-    weight = np.concatenate([np.full((count, 3), 1 / angle), np.repeat(1 / sigma, 3, 1)], 1)[..., None]
-    states, shared = states * weight, shared * weight
-    # Cauchy's weights, so that single wrong poses count less.
+def _robust(residual: Array) -> tuple[Array, float]:
+    """Square roots ``(K, 1)`` of Cauchy's weights, so that single wrong poses count less, and the cost."""
     squares = (residual**2).sum(-1)
-    robust = np.sqrt(1 / (1 + squares / 36))[:, None]
-    residual, states, shared = residual * robust, states * robust[..., None], shared * robust[..., None]
+    return np.sqrt(1 / (1 + squares / WIDTH**2))[:, None], float(0.5 * WIDTH**2 * np.log1p(squares / WIDTH**2).sum())
+
+
+def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> tuple[float, Array]:
+    """Visual orientations and displacements, and their drift; cost, and mean squares of both."""
+    nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
+    steps = np.sqrt(np.diff(nodes.times))[:, None]
+    begins = np.concatenate([[True], segment[1:] != segment[:-1]])
+    held, index = np.flatnonzero(begins), np.arange(STATE, NODE)
+    system.diagonal[held[:, None], index, index] += _FIXED  # the drift of a segment begins with its first node
+    walk = np.array([options.rotation_walk * options.rotation_factor] * 3 + [options.scale_walk]) * steps
+    walk[begins[1:]] = _UNKNOWN
+    drift = _add_walk(system, values.drift, walk, STATE)
+    turns, by_turns = _add_orientations(problem, values, system)
+    moves, by_moves = _add_displacements(problem, values, system)
+    rotation = (float((turns**2).sum()) + float((drift[:, :3] ** 2).sum())) / max(turns.size + drift[:, :3].size, 1)
+    position = float((moves**2).mean()) if moves.size else 0.0
+    return by_turns + by_moves + 0.5 * float((drift**2).sum()), np.array([rotation, position])
+
+
+def _add_orientations(problem: Smoother, values: Values, system: ChainSystem) -> tuple[Array, float]:
+    """Orientations of the camera in the world of a segment."""
+    nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
+    body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
+    turn = rotation_vector(_turn(values.world[segment] @ nodes.rotation @ body) @ values.rotation)
+    angle = options.rotation_sigma * options.rotation_factor
+    residual = (turn - values.drift[:, :3]) / angle
+    robust, cost = _robust(residual)
+    weight = robust[..., None] / angle
+    states = np.zeros((len(nodes), 3, NODE))
+    shared = np.zeros((len(nodes), 3, _SEGMENT + 4 * problem.segments))
+    states[:, :, :3], states[:, :, STATE : STATE + 3] = np.eye(3), -np.eye(3)
+    shared[:, :, _TIME], shared[:, :, _EXTRINSIC] = problem.rates(values), -np.eye(3)
+    for k in range(problem.segments):
+        start = _SEGMENT + 4 * k + 1
+        shared[segment == k, :, start : start + 3] = -_turn(values.rotation[segment == k])
+    states, shared, weighted = states * weight, shared * weight, residual * robust
     system.diagonal += _turn(states) @ states
     system.border += _turn(states) @ shared
     system.shared += (_turn(shared) @ shared).sum(0)
-    system.right -= _apply(_turn(states), residual)
-    system.right_shared -= _apply(_turn(shared), residual).sum(0)
-    # The drift of a segment begins with its first node.
-    begins = np.concatenate([[True], segment[1:] != segment[:-1]])
-    held = np.flatnonzero(begins)
-    index = np.arange(STATE, NODE)
-    system.diagonal[held[:, None], index, index] += _FIXED
-    walk = (
-        np.concatenate(
-            [
-                np.full((count, 3), options.rotation_walk * options.rotation_factor),
-                np.repeat(options.position_walk * options.position_factor * depth, 3, 1),
-            ],
-            1,
-        )[1:]
-        * np.sqrt(np.diff(nodes.times))[:, None]
-    )
-    walk[begins[1:]] = _UNKNOWN
-    drift = _add_walk(system, values.drift, walk, STATE)
-    errors = np.array([(residual[:, k] ** 2).sum() + (drift[:, k] ** 2).sum() for k in (slice(3), slice(3, 6))])
-    cost = 18 * np.log1p(squares / 36).sum() + 0.5 * (drift**2).sum()
-    return float(cost), errors / max(residual[:, :3].size + drift[:, :3].size, 1)
+    system.right -= _apply(_turn(states), weighted)
+    system.right_shared -= _apply(_turn(shared), weighted).sum(0)
+    return residual, cost
+
+
+def _add_displacements(problem: Smoother, values: Values, system: ChainSystem) -> tuple[Array, float]:
+    """Displacements of the camera between consecutive nodes of a segment, in the axes of the body at the first."""
+    nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
+    body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
+    seen = _apply(_turn(nodes.rotation[:-1] @ body), np.diff(nodes.position, axis=0))
+    lever, rates = np.broadcast_to(problem.lever, values.position.shape), problem.rates(values)
+    camera = values.position + _apply(values.rotation, lever)
+    back = _turn(values.rotation[:-1])
+    moved = _apply(back, np.diff(camera, axis=0))
+    shrunk = np.exp(-values.scales(segment)[:-1])[:, None]
+    noise = options.position_walk**2 * np.diff(nodes.times) + 2 * options.position_sigma**2
+    sigma = (options.position_factor * nodes.depth[segment[:-1]] * np.sqrt(noise))[:, None]
+    residual = (moved * shrunk - seen) / sigma
+    robust, cost = _robust(residual)
+    across = segment[1:] != segment[:-1]
+    if across.any():
+        residual[across], robust[across] = 0.0, 0.0
+        cost = _robust(residual)[1]
+    before, after = np.zeros((2, len(moved), 3, NODE))
+    after[:, :, 3:6], before[:, :, 3:6] = back, -back
+    after[:, :, :3] = -back @ values.rotation[1:] @ skew(problem.lever)
+    before[:, :, :3] = skew(moved) + skew(problem.lever)
+    before[:, :, NODE - 1] = -moved
+    speed = values.velocity + _apply(values.rotation, np.cross(rates, lever))
+    shared = np.zeros((len(moved), 3, _SEGMENT + 4 * problem.segments))
+    shared[:, :, _TIME] = _apply(back, np.diff(speed, axis=0)) + np.cross(moved, rates[:-1])
+    for k in range(problem.segments):
+        mine = segment[:-1] == k
+        shared[mine, :, _SEGMENT + 4 * k] = -moved[mine]
+    weight = (robust * shrunk / sigma)[..., None]
+    _add_pairs(system, residual * robust, before * weight, after * weight, 0, shared * weight)
+    return residual[~across], cost
 
 
 def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float:
@@ -535,9 +580,10 @@ def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float
     index = np.arange(1, 4)
     system.shared[index, index] += 1 / options.extrinsic_sigma**2
     system.right_shared[_EXTRINSIC] -= tilt / options.extrinsic_sigma
-    held = _SEGMENT + np.arange(3, 7)
-    system.shared[held, held] += _FIXED
+    system.shared[_SEGMENT + 3, _SEGMENT + 3] += _FIXED
+    index = np.arange(3, 6)
+    system.diagonal[0, index, index] += _FIXED
     # Very weak, so that a scale without any measurement does not run away.
-    scales = _SEGMENT + 7 * np.arange(problem.segments)
+    scales = _SEGMENT + 4 * np.arange(problem.segments)
     system.shared[scales, scales] += 1e-2
     return 0.5 * float((off**2).sum() + late**2 + (tilt**2).sum())

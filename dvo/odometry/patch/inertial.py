@@ -7,7 +7,7 @@ the frame at which scale and vertical are known for sure. At the end of a sequen
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,14 @@ from dvo.data.frame import Frame
 from dvo.data.inertial import InertialSamples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
-from dvo.geometry.poses import pose_from, rotation_vector, slerp, split
-from dvo.map.correction import re_express
+from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, rotation_vector, slerp, split
+from dvo.map.correction import apply_similarities
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
+from dvo.odometry.loops.closure import LoopCloser
 from dvo.odometry.protocol import Estimate, InertialEstimate, Result, ScaleState, Segment, Status
 
 GYRO_TRUST = 0.7
@@ -37,11 +38,6 @@ FORGET = 0.9
 """Weight of the past in these errors, from frame to frame."""
 MOST_NODES = 400
 """Nodes of the estimate at the end of a sequence."""
-DRIFT = 2e-3
-"""Standard deviation of visual positions after a way, relative to it, of which the covariance of the world consists."""
-TURN_DRIFT = 2e-3
-"""Likewise of visual orientations, rad for the square root of a minute."""
-BRIDGED = "bridged by inertial samples"
 
 
 class InertialTracking:
@@ -163,10 +159,13 @@ class InertialTracking:
             map=replace(result.map, points=points),
         )  # fmt: skip
 
-    def settle(self, metric: bool) -> dict[str, Any]:
+    def settle(self, loops: LoopCloser, *, metric: bool) -> dict[str, Any]:
         """Bring the map of a finished sequence to metres, and give frames that were bridged their poses.
 
+        Each keyframe follows the smoothed trajectory: where the scale of the images has drifted, its own is taken.
+
         Args:
+            loops: whose measurements are scaled along.
             metric: it is in metres already, by another source of the scale.
 
         Returns:
@@ -179,22 +178,39 @@ class InertialTracking:
             return {"inertial": estimator.information()}
         nodes, worlds = self._nodes(-np.inf)
         smoothed = estimator.settle(nodes, worlds)
-        first, entries = None, []
+        units: dict[int, float] = {}
         for world, similarity in sorted(estimator.worlds.items()):
-            re_express(graph, world, similarity.scale, similarity.rotation, similarity.translation)
+            path = None if smoothed is None else _path(smoothed, nodes, np.isin(nodes.segment, worlds.index(world)))
+            units |= self._follow(world, _Path.constant(similarity) if path is None else path)
+        loops.moved(units)
+        begun, entries = graph.recording.segment, []
+        for world, similarity in sorted(estimator.worlds.items()):
             graph.metric[world] = "inertial"
-            first = world if first is None else first
-            if world != first:
-                graph.join(world, first)
+            if world != min(estimator.worlds):
+                graph.join(world, min(estimator.worlds))
             sigma = None if smoothed is None else smoothed.scale_sigma
             entries.append(
-                {"segment": world - graph.recording.segment, "source": "inertial", "factor": similarity.scale,
+                {"segment": world - begun, "source": "inertial", "factor": similarity.scale,
                  "deviation": sigma, "observations": len(nodes)}
             )  # fmt: skip
         if smoothed is not None:
             self._fill(smoothed)
         scale = {"source": "inertial", "unit": "metres", "segments": entries}
         return {"inertial": estimator.information(), **({"scale": scale} if entries else {})}
+
+    def _follow(self, world: int, path: _Path) -> dict[int, float]:
+        """Move the kept keyframes of a world; the scale of the similarity of each."""
+        graph = self.graph
+        kept = [f for f in graph.members(world) if f.anchor is None]
+        if not kept:
+            return {}
+        identifiers = np.array([frame.identifier for frame in kept])
+        poses_wc = se3.inverse(graph.poses_cw(identifiers)).numpy()
+        moved, scales = path.moved(np.array([frame.timestamp for frame in kept]), poses_wc)
+        poses_cw = se3.inverse(torch.from_numpy(moved))
+        inverse = torch.from_numpy(1 / scales)[:, None]
+        apply_similarities(graph, identifiers, torch.cat([poses_cw[:, :3] * inverse, poses_cw[:, 3:], inverse], 1))
+        return dict(zip(identifiers.tolist(), (1 / scales).tolist(), strict=True))
 
     # ------------------------------------------------------------------------------------------------------------------
 
@@ -287,7 +303,7 @@ class InertialTracking:
             covariance = unit @ covariance @ unit
         return replace(
             estimate, pose_wc=pose, covariance=covariance, scale_state=self.estimator.state,
-            inertial=self._beside(estimate.timestamp, pose),
+            inertial=self._beside(estimate.timestamp),
         )  # fmt: skip
 
     def _bridged(self, estimate: Estimate, state: BodyState) -> Estimate:
@@ -302,7 +318,7 @@ class InertialTracking:
         own = np.zeros((6, 15))
         own[:3, 3:6], own[3:, :3] = rotation.T, turn
         known = anchor.covariance.copy()
-        known[:6], known[:, :6] = 0.0, 0.0
+        known[3:6], known[:, 3:6] = 0.0, 0.0
         relative = replace(anchor, covariance=known)
         grown = estimator.predict(relative, np.array([state.time]))[0].covariance if state.time > anchor.time else known
         reason = estimate.reason or "the images have no scale yet"
@@ -311,31 +327,18 @@ class InertialTracking:
             covariance=own @ grown @ own.T, reference=anchor.time, scale_state=estimator.state,
             inertial=InertialEstimate(
                 state.velocity, state.gyro_bias, state.accel_bias, estimator.solution.scale_sigma,
-                _ordered(state.covariance) + self._drift(state.position),
+                _ordered(state.covariance),
             ),
         )  # fmt: skip
 
-    def _beside(self, time: float, pose_wc: np.ndarray) -> InertialEstimate | None:
+    def _beside(self, time: float) -> InertialEstimate | None:
         """Velocity, biases and covariance at a frame with a visual pose."""
         estimator, last = self.estimator, self.estimator.last_state()
         if last is None or estimator.solution is None:
             return None
         state = estimator.predict(last, np.array([time]))[0] if time > last.time else last
-        covariance = _ordered(state.covariance)
-        # The pose is the visual one: its position is as good as the scale and the vertical.
-        sigma, tilt = estimator.solution.scale_sigma, np.deg2rad(estimator.solution.gravity_sigma) / np.sqrt(2)
-        x, y, z = pose_wc[:3]
-        level = np.array([[0.0, z], [-z, 0.0], [y, -x]])
-        by_scale = np.outer(pose_wc[:3], pose_wc[:3]) * sigma**2
-        covariance[:3, :3] = by_scale + tilt**2 * level @ level.T + 1e-6 * np.eye(3)
-        return InertialEstimate(
-            state.velocity, state.gyro_bias, state.accel_bias, sigma, covariance + self._drift(pose_wc[:3])
-        )
-
-    def _drift(self, position: np.ndarray) -> np.ndarray:
-        """Covariance ``(9, 9)`` by the drift of the visual trajectory since its beginning."""
-        del position
-        return np.zeros((9, 9))
+        sigma = estimator.solution.scale_sigma
+        return InertialEstimate(state.velocity, state.gyro_bias, state.accel_bias, sigma, _ordered(state.covariance))
 
     def _visual_cw(self, state: BodyState, similarity: Similarity) -> Tensor:
         """Pose ``T_cw`` of a state, in the units of the images."""
@@ -374,6 +377,51 @@ class InertialTracking:
                 record = log.frames[record_number]
                 log.place(record_number, anchor, se3.inverse(torch.from_numpy(pose_wc)).numpy())
                 record.segment, record.reason = log.frames[begin - 1].segment, ""
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Similarities from the world of visual poses to the metric one, that change over time."""
+
+    times: np.ndarray
+    log_scale: np.ndarray
+    rotation: np.ndarray  # (N, 4) quaternions
+    translation: np.ndarray
+
+    @classmethod
+    def constant(cls, similarity: Similarity) -> _Path:
+        quaternion = pose_from(similarity.rotation, np.zeros(3))[3:]
+        return cls(np.zeros(1), np.log([similarity.scale]), quaternion[None], similarity.translation[None])
+
+    def moved(self, times: np.ndarray, poses_wc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses ``(K, 7)`` at times between the nodes, in metres, and the scale of each."""
+        after = np.searchsorted(self.times, times).clip(0, len(self.times) - 1)
+        before = (after - 1).clip(0)
+        span = np.maximum(self.times[after] - self.times[before], 1e-9)
+        share = np.clip((times - self.times[before]) / span, 0, 1)
+        scale = np.exp((1 - share) * self.log_scale[before] + share * self.log_scale[after])
+        turn = slerp(self.rotation[before], self.rotation[after], share)
+        rotation, position = split(poses_wc)
+
+        def placed(k: np.ndarray) -> np.ndarray:
+            turned = (quaternion_to_matrix(self.rotation[k]) @ position[..., None])[..., 0]
+            return np.exp(self.log_scale[k])[:, None] * turned + self.translation[k]
+
+        where = (1 - share)[:, None] * placed(before) + share[:, None] * placed(after)
+        return pose_from(quaternion_to_matrix(turn) @ rotation, where), scale
+
+
+def _path(smoothed: Smoothed, nodes: VisualNodes, mine: np.ndarray) -> _Path | None:
+    """Similarity at each node of a segment; None without nodes."""
+    shared = np.flatnonzero(np.isin(np.round(nodes.times, 6), np.round(smoothed.times, 6)) & mine)
+    if not len(shared):
+        return None
+    at = np.searchsorted(smoothed.times, nodes.times[shared] - 1e-6)
+    rotation = smoothed.rotation[at] @ np.swapaxes(nodes.rotation[shared] @ smoothed.rotation_camera_imu, -1, -2)
+    camera = smoothed.position[at] + smoothed.rotation[at] @ smoothed.lever
+    scale = np.exp(smoothed.log_scale[at])[:, None]
+    translation = camera - scale * (rotation @ nodes.position[shared][..., None])[..., 0]
+    return _Path(nodes.times[shared], smoothed.log_scale[at], matrix_to_quaternion(rotation), translation)
 
 
 def _ordered(covariance: np.ndarray) -> np.ndarray:

@@ -226,7 +226,7 @@ class PatchOdometry:
             self.loops.complete(state.adjustable)
             state.info |= finish_segments(self.graph, state, self.config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
-            state.info |= self.inertial.settle(metric=self.config.scale.source != "none")
+            state.info |= self.inertial.settle(self.loops, metric=self.config.scale.source != "none")
         return replace(self._result({}), quality=state.quality)
 
     @torch.inference_mode()

@@ -42,10 +42,10 @@ def align(odometry: PatchOdometry, time: float) -> None:
     estimator.worlds = {0: Similarity(2.0, UPRIGHT, np.zeros(3))}
     worlds = Similarities(np.log([2.0]), UPRIGHT[None], np.zeros((1, 3)))
     rows, zero = np.zeros((1, 3)), np.zeros((1, 3))
-    covariance = 1e-6 * np.eye(21 + 11)
+    covariance = 1e-6 * np.eye(19 + 8)
     estimator.solution = Smoothed(
-        np.array([time]), UPRIGHT[None], rows, SPEED[None], zero, zero, np.zeros((1, 6)), worlds, 0.0, np.eye(3),
-        covariance, 0.0, 0.0, np.zeros(2),
+        np.array([time]), UPRIGHT[None], rows, SPEED[None], zero, zero, np.log([2.0]), worlds, 0.0, np.eye(3),
+        np.zeros(3), covariance, 0.0, 0.0, np.zeros(2),
     )  # fmt: skip
     estimator.update = lambda nodes, worlds: None  # type: ignore[method-assign]
     estimator.settle = lambda nodes, worlds: estimator.solution  # type: ignore[method-assign]

@@ -79,7 +79,7 @@ def corners_of(frame: ArchivedKeyframe, stride: int) -> Corners | None:
     image = frame.image()
     if image is None:
         return None
-    sift = cv2.SIFT_create(nfeatures=_CORNERS, contrastThreshold=_CONTRAST)
+    sift = cv2.SIFT.create(nfeatures=_CORNERS, contrastThreshold=_CONTRAST)
     points, found = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
     if found is None or not len(points):
         return None

@@ -41,6 +41,8 @@ STARTS = (1.0, 0.4, 2.5)
 """Factors of the scale of the linear solution that the first estimate begins with."""
 REFINED_AFTER = 15.0
 """Seconds after the alignment at which scale and vertical are called refined (Campos et al., 2021, III-D)."""
+ROUNDS, FINAL_ITERATIONS = 3, 25
+"""Estimates at the end of a recording, and Gauss-Newton steps of each."""
 MAX_GRAVITY_SIGMA = 1.5
 """Standard deviation of the vertical that an alignment needs, degrees."""
 NOTHING_TOLD = 0.5
@@ -318,8 +320,10 @@ class InertialEstimator:
     def settle(self, nodes: VisualNodes, worlds: list[int]) -> Smoothed | None:
         """Estimate of a whole recording at its end, whose similarities are the final ones.
 
+        The poses have been adjusted: their noise is estimated anew, and a recording that was never aligned may be now.
+
         Args:
-            nodes: visual poses of the recording.
+            nodes: visual poses of the recording; of one segment, if there was no alignment.
             worlds: number of the world of each segment of the nodes.
 
         Returns:
@@ -328,13 +332,28 @@ class InertialEstimator:
         problem, _ = self._problem(nodes)
         if problem is None:
             return None
-        options = replace(self._smoother, iterations=8)
+        found: Smoothed | None = None
         try:
-            found = smooth(replace(problem, options=options), self._start(problem, worlds))
-        except np.linalg.LinAlgError:
+            for _ in range(ROUNDS):  # each with the noise that the one before has found
+                problem = replace(problem, options=replace(self._smoother, iterations=FINAL_ITERATIONS))
+                start = None if self.solution is None else self._start(problem, worlds)
+                found = self._solved(problem, worlds) if start is None else smooth(problem, start)
+                if found is None:
+                    return None
+                self._adapt(found)
+                reason = self._doubt(problem, found)
+                if reason:
+                    self.reason = self.reason if self.aligned else reason
+                    return None
+                self.solution, self._known = found, list(worlds)
+        except (np.linalg.LinAlgError, _DisagreementError):
             return None
-        if self._doubt(problem, found):
-            return None
+        assert found is not None
+        if not self.aligned:
+            self.state, self.reason, self._aligned = ScaleState.ALIGNED, "", float(found.times[-1])
+            self.history.append(
+                {"time": self._aligned, "event": "aligned at the end", "scale_sigma": found.scale_sigma}
+            )
         self._take(found, worlds)
         return found
 
@@ -354,10 +373,7 @@ class InertialEstimator:
         lead = 0.03 + abs(offset)
         kept = (nodes.times + lead <= samples.timestamps[-1] + 0.03) & (nodes.times - lead >= samples.timestamps[0])
         if not kept.all():
-            nodes = replace(
-                nodes, times=nodes.times[kept], segment=nodes.segment[kept], rotation=nodes.rotation[kept],
-                position=nodes.position[kept],
-            )  # fmt: skip
+            nodes = nodes.where(kept)
         enough = self.options.first if not self.aligned else 2 * self.options.interval
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < enough:
             return None, "too few poses"
@@ -391,12 +407,7 @@ class InertialEstimator:
             return smooth(
                 replace(problem, options=replace(problem.options, iterations=4)), self._start(problem, worlds)
             )
-        last = problem.nodes.segment == problem.segments - 1  # a first alignment needs one segment alone
-        nodes = problem.nodes
-        nodes = VisualNodes(
-            nodes.times[last], np.zeros(int(last.sum()), int), nodes.rotation[last], nodes.position[last],
-            nodes.depth[-1:],
-        )  # fmt: skip
+        nodes = problem.nodes.of(problem.segments - 1)  # a first alignment needs one segment alone
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < self.options.first:
             return None
         problem.nodes = nodes

@@ -59,13 +59,17 @@ class VisualNodes:
     def __len__(self) -> int:
         return len(self.times)
 
-    def after(self, time: float) -> VisualNodes:
-        """Nodes later than a time."""
-        keep = self.times > time
+    def where(self, keep: Array) -> VisualNodes:
+        """Nodes that are chosen by a mask ``(N,)``."""
         return replace(
             self, times=self.times[keep], segment=self.segment[keep], rotation=self.rotation[keep],
             position=self.position[keep],
         )  # fmt: skip
+
+    def of(self, segment: int) -> VisualNodes:
+        """Nodes of one segment, which becomes the only one."""
+        chosen = self.where(self.segment == segment)
+        return replace(chosen, segment=np.zeros(len(chosen), int), depth=self.depth[segment : segment + 1])
 
 
 @dataclass(frozen=True)

@@ -174,10 +174,15 @@ class InertialTracking:
         if not self.active:
             return {}
         graph, estimator = self.graph, self.estimator
-        if not estimator.aligned or metric:
+        if metric:
             return {"inertial": estimator.information()}
         nodes, worlds = self._nodes(-np.inf)
-        smoothed = estimator.settle(nodes, worlds)
+        if not estimator.aligned and len(nodes):  # of the longest world alone
+            longest = int(np.bincount(nodes.segment).argmax())
+            nodes, worlds = nodes.of(longest), [worlds[longest]]
+        smoothed = estimator.settle(nodes, worlds) if len(nodes) else None
+        if not estimator.aligned:
+            return {"inertial": estimator.information()}
         units: dict[int, float] = {}
         for world, similarity in sorted(estimator.worlds.items()):
             path = None if smoothed is None else _path(smoothed, nodes, np.isin(nodes.segment, worlds.index(world)))

@@ -66,7 +66,7 @@ class Recording:
 
 
 def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] = (0, 0, 0), grade: str = "euroc",
-           seconds: float = 14.0, turning: bool = True) -> Recording:  # fmt: skip
+           seconds: float = 14.0, turning: bool = True, drift: float = 0.0) -> Recording:  # fmt: skip
     """Recording of a hand that moves about.
 
     Args:
@@ -76,6 +76,7 @@ def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] =
         grade: of the noise.
         seconds: length.
         turning: it rotates before ``still`` has passed, too.
+        drift: change of the logarithm of the unit of the images in a second.
     """
     rng = np.random.default_rng(seed)
     count = int(seconds * RATE) + 1
@@ -104,7 +105,9 @@ def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] =
     frames = np.arange(100, count - 100, 50)
     turn = so3_exp(rng.normal(size=3))
     seen = turn @ camera[frames] @ so3_exp(rng.normal(0, 1e-3, (len(frames), 3)))
-    places = ((path[frames] + rng.normal(0, 1e-3 * DEPTH, (len(frames), 3))) @ turn.T) / SCALE
+    grown = np.exp(-drift * (time[frames] - time[frames[0]]))[:, None]
+    steps = np.diff(path[frames], axis=0, prepend=path[frames[:1]]) * grown
+    places = ((path[frames[0]] + np.cumsum(steps, 0) + rng.normal(0, 1e-3 * DEPTH, (len(frames), 3))) @ turn.T) / SCALE
     samples = InertialSamples(stamps + OFFSET, gyro, accel, extrinsic, noise)
     return Recording(samples, time[frames], seen, places, turn, (rotation[frames], position[frames], velocity[frames]))
 

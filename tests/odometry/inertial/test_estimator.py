@@ -146,3 +146,43 @@ def test_what_stands_still_does_not_drift() -> None:
 class _Solution:
     time_offset = 0.0
     rotation_camera_imu = CAMERA_IMU
+
+
+def test_at_the_end_a_recording_is_aligned_that_was_not_before() -> None:
+    recording = record(9, seconds=9.0)
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples)
+    assert estimator.settle(recording.nodes(0.1, 8.5), [3]) is not None
+    assert estimator.aligned and estimator.history[-1]["event"] == "aligned at the end"
+    assert estimator.worlds[3].scale == pytest.approx(SCALE, rel=0.03)
+
+
+def test_at_the_end_motion_that_does_not_tell_is_refused() -> None:
+    recording = record(1, still=30.0, turning=False, seconds=6.0)
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples)
+    assert estimator.settle(recording.nodes(0.1, 5.5), [0]) is None
+    assert not estimator.aligned and "acceleration" in estimator.reason
+
+
+def test_drift_of_the_scale_of_the_images_is_taken_back() -> None:
+    recording = record(7, seconds=14.0, drift=0.03)
+    estimator, _ = drive(recording)
+    nodes = recording.nodes(0.1, 13.5)
+    found = estimator.settle(nodes, [0])
+    assert found is not None
+    shown = np.searchsorted(recording.times, found.times - 1e-6)
+    truth = recording.body[1][shown]
+    smoothed = found.position
+    visual = nodes.position[np.isin(nodes.times, found.times)]
+    assert _error(smoothed, truth) < 0.02
+    assert _error(smoothed, truth) < 0.4 * _error(visual * SCALE, truth)
+    assert found.log_scale[-1] - found.log_scale[0] == pytest.approx(0.03 * np.ptp(found.times), abs=0.12)
+
+
+def _error(path: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square distance after rotation and translation, metres."""
+    a, b = path - path.mean(0), truth - truth.mean(0)
+    left, _, right = np.linalg.svd(b.T @ a)
+    turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    return float(np.sqrt(((a @ turn.T - b) ** 2).sum(1).mean()))

@@ -47,6 +47,7 @@ class InertialEstimate:
         scale_sigma: standard deviation of the scale, relative.
         covariance: ``(9, 9)`` of the errors of position in the world (m), orientation (right tangent, rad) and velocity
             in the world (m/s), where heading and position of the world are held.
+        time_offset: seconds by which the stamps of the samples are late.
     """
 
     velocity_w: np.ndarray
@@ -54,6 +55,7 @@ class InertialEstimate:
     accel_bias: np.ndarray
     scale_sigma: float
     covariance: np.ndarray
+    time_offset: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -332,7 +332,7 @@ class InertialTracking:
             covariance=own @ grown @ own.T, reference=anchor.time, scale_state=estimator.state,
             inertial=InertialEstimate(
                 state.velocity, state.gyro_bias, state.accel_bias, estimator.solution.scale_sigma,
-                _ordered(state.covariance),
+                _ordered(state.covariance), estimator.solution.time_offset,
             ),
         )  # fmt: skip
 
@@ -343,7 +343,8 @@ class InertialTracking:
             return None
         state = estimator.predict(last, np.array([time]))[0] if time > last.time else last
         sigma = estimator.solution.scale_sigma
-        return InertialEstimate(state.velocity, state.gyro_bias, state.accel_bias, sigma, _ordered(state.covariance))
+        covariance, offset = _ordered(state.covariance), estimator.solution.time_offset
+        return InertialEstimate(state.velocity, state.gyro_bias, state.accel_bias, sigma, covariance, offset)
 
     def _visual_cw(self, state: BodyState, similarity: Similarity) -> Tensor:
         """Pose ``T_cw`` of a state, in the units of the images."""

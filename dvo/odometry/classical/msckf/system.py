@@ -319,7 +319,12 @@ class Msckf:
         T_wc = np.linalg.inv(self._T_cw(state.motion, e))
         R_bc, p_bc = e.filter.R_bc, e.filter.p_bc
         inertial = InertialEstimate(
-            state.motion.v, state.bias[:3], state.bias[3:], sigma, world_covariance(state, R_bc, p_bc)
+            state.motion.v,
+            state.bias[:3],
+            state.bias[3:],
+            sigma,
+            world_covariance(state, R_bc, p_bc),
+            e.filter.offset,
         )
         reference = -1 if problem else 0  # by samples alone, the newest clone is the last image that told the pose
         return Estimate(

@@ -16,6 +16,8 @@ T = TypeVar("T")
 
 METHODS = ("track", "finish", "current", "reset", "save", "adjust")
 """Methods of an odometry that read or change its state."""
+UNLOCKED = ("add_inertial",)
+"""Methods that any thread may call while another one is in one of those: they wait for nothing."""
 
 
 def exclusive(cls: type[T]) -> type[T]:

@@ -68,7 +68,7 @@ def test_a_map_of_masked_frames_is_saved(tmp_path):
 
 
 def test_other_sensors_are_not_read():
-    """Depth, right image and inertial samples of a frame are functions until they are asked for."""
+    """Depth, right image and unused inertial samples of a frame are functions until they are asked for."""
 
     def unwanted():
         raise AssertionError("loaded")
@@ -76,7 +76,10 @@ def test_other_sensors_are_not_read():
     (frame,) = frames(1, count=1)
     full = np.ones((72, 96), bool)
     lazy = Frame(0, 0.0, frame.image, frame.camera, unwanted, unwanted, unwanted, full)
-    assert tracker().track(lazy).status is Status.INITIALISING
+    unused = build_odometry(network("patch_vo"), **SETTINGS["patch_vo"], inertial={"use": False})
+    assert unused.track(lazy).status is Status.INITIALISING
+    samples = Frame(0, 0.0, frame.image, frame.camera, unwanted, unwanted, None, full)
+    assert tracker().track(samples).status is Status.INITIALISING
 
 
 def test_too_little_is_left():

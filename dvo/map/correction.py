@@ -60,13 +60,26 @@ def rescale(graph: Map, segment: int, factor: float) -> dict[int, float]:
     Returns:
         Scale of the similarity of each kept keyframe, see :func:`apply_similarities`: ``1 / factor``.
     """
-    world = graph.world_of(segment)
-    kept = [f.identifier for f in graph.archive if f.anchor is None]
-    mine = np.array([k for k in kept if graph.segment_of(k) >= 0 and graph.world_of(graph.segment_of(k)) == world], int)
+    mine = keyframes_of(graph, segment)
     if not len(mine):
         return {}
     apply_similarities(graph, mine, sim3.from_se3(graph.poses_cw(mine), 1 / factor))
     return dict.fromkeys(mine.tolist(), 1 / factor)
+
+
+def keyframes_of(graph: Map, segment: int) -> np.ndarray:
+    """Kept keyframes of a world that are archived, those without patches included.
+
+    Args:
+        graph: any.
+        segment: number of any segment with this world.
+
+    Returns:
+        ``(N,)`` increasing identifiers.
+    """
+    world = graph.world_of(segment)
+    kept = [f.identifier for f in graph.archive if f.anchor is None]
+    return np.array([k for k in kept if graph.segment_of(k) >= 0 and graph.world_of(graph.segment_of(k)) == world], int)
 
 
 def move_window(graph: KeyframeGraph, before_cw: Tensor, similarity: Tensor) -> None:

@@ -104,15 +104,15 @@ class KeyframeLog:
         return self.frames[-1]
 
     def place(self, frame: int, anchor: int, T_cw: np.ndarray) -> None:
-        """Give a frame its pose, relative to a keyframe that has one.
+        """Give a frame its pose, relative to a keyframe that has one, or to the one that carries it if it was removed.
 
         Args:
             frame: position in :attr:`frames`.
             anchor: keyframe.
             T_cw: pose of the frame.
         """
-        record = self.frames[frame]
-        record.anchor, record.relative = anchor, _compose(T_cw, _inverse(self._poses[anchor]))
+        record, (kept, _) = self.frames[frame], self._carrier(anchor)
+        record.anchor, record.relative = kept, _compose(T_cw, _inverse(self._poses[kept]))
         record.lost = False
 
     def rows(self, segment: int, first: int = 0, last: float = math.inf) -> list[FrameRecord]:

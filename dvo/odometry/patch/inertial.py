@@ -19,7 +19,7 @@ from dvo.data.inertial import InertialSamples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, rotation_vector, slerp, split
-from dvo.map.correction import apply_similarities
+from dvo.map.correction import apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
@@ -206,12 +206,11 @@ class InertialTracking:
     def _follow(self, world: int, path: _Path) -> dict[int, float]:
         """Move the kept keyframes of a world; the scale of the similarity of each."""
         graph = self.graph
-        kept = [f for f in graph.members(world) if f.anchor is None]
-        if not kept:
+        identifiers = keyframes_of(graph, world)
+        if not len(identifiers):
             return {}
-        identifiers = np.array([frame.identifier for frame in kept])
         poses_wc = se3.inverse(graph.poses_cw(identifiers)).numpy()
-        moved, scales = path.moved(np.array([frame.timestamp for frame in kept]), poses_wc)
+        moved, scales = path.moved(np.array([graph.archive[k].timestamp for k in identifiers.tolist()]), poses_wc)
         poses_cw = se3.inverse(torch.from_numpy(moved))
         inverse = torch.from_numpy(1 / scales)[:, None]
         apply_similarities(graph, identifiers, torch.cat([poses_cw[:, :3] * inverse, poses_cw[:, 3:], inverse], 1))

@@ -122,6 +122,17 @@ def test_frames_without_a_view_are_predicted_and_never_counted_as_tracked() -> N
     assert set(result.inertial) == {frame.timestamp for frame in images[12:]}
 
 
+def test_frames_after_a_dropped_keyframe_are_bridged_too() -> None:
+    """With a threshold that no motion passes, the keyframe before the dark is dropped later."""
+    odometry = tracker(replace(SMALL, keyframe_motion=1e9))
+    for k, frame in enumerate(with_samples(dark(frames(24), 12, 14))):
+        odometry.track(frame)
+        if k == 11:
+            align(odometry, frame.timestamp)
+    result = odometry.finish()
+    assert len(result.inertial) == 2 and len(result.trajectory) == 24
+
+
 def test_darkness_that_lasts_is_lost() -> None:
     odometry = tracker(replace(SMALL, inertial={"longest": 0.25}))
     statuses = []

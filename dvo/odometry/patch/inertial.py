@@ -183,16 +183,20 @@ class InertialTracking:
         smoothed = estimator.settle(nodes, worlds) if len(nodes) else None
         if not estimator.aligned:
             return {"inertial": estimator.information()}
+        # A segment may have been joined to an earlier world since its similarity was found.
+        found = {graph.world_of(world): estimator.worlds[world] for world in sorted(estimator.worlds, reverse=True)}
         units: dict[int, float] = {}
-        for world, similarity in sorted(estimator.worlds.items()):
-            path = None if smoothed is None else _path(smoothed, nodes, np.isin(nodes.segment, worlds.index(world)))
+        for world, similarity in found.items():
+            path = None
+            if smoothed is not None and world in worlds:
+                path = _path(smoothed, nodes, nodes.segment == worlds.index(world))
             units |= self._follow(world, _Path.constant(similarity) if path is None else path)
         loops.moved(units)
         begun, entries = graph.recording.segment, []
-        for world, similarity in sorted(estimator.worlds.items()):
+        for world, similarity in sorted(found.items()):
             graph.metric[world] = "inertial"
-            if world != min(estimator.worlds):
-                graph.join(world, min(estimator.worlds))
+            if world != min(found):
+                graph.join(world, min(found))
             sigma = None if smoothed is None else smoothed.scale_sigma
             entries.append(
                 {"segment": world - begun, "source": "inertial", "factor": similarity.scale,

@@ -133,6 +133,19 @@ def test_frames_after_a_dropped_keyframe_are_bridged_too() -> None:
     assert len(result.inertial) == 2 and len(result.trajectory) == 24
 
 
+def test_a_world_that_is_not_there_any_more_moves_nothing() -> None:
+    once, twice = tracker(), tracker()
+    for odometry in (once, twice):
+        for k, frame in enumerate(with_samples(frames(14))):
+            odometry.track(frame)
+            if k == 9:
+                align(odometry, frame.timestamp)
+    twice.inertial.estimator.worlds[5] = Similarity(9.0, np.eye(3), np.ones(3))
+    twice.graph.worlds[5] = 0  # joined by a loop since
+    expected, result = once.finish(), twice.finish()
+    np.testing.assert_allclose(result.trajectory.poses_wc, expected.trajectory.poses_wc, atol=1e-9)
+
+
 def test_darkness_that_lasts_is_lost() -> None:
     odometry = tracker(replace(SMALL, inertial={"longest": 0.25}))
     statuses = []

@@ -45,6 +45,8 @@ ROUNDS, FINAL_ITERATIONS = 3, 25
 """Estimates at the end of a recording, and Gauss-Newton steps of each."""
 MAX_GRAVITY_SIGMA = 1.5
 """Standard deviation of the vertical that an alignment needs, degrees."""
+LOST_SCALE = 0.2
+"""Relative deviation of the scale of a world that was aligned above which it is not known any more."""
 NOTHING_TOLD = 0.5
 """Relative deviation of the scale above which the motion tells nothing of it."""
 MAX_ERROR = 6.0
@@ -227,6 +229,8 @@ class InertialEstimator:
             return
         self._adapt(found)
         reason = self._doubt(problem, found)
+        if not reason and worlds[-1] in self.worlds and found.scale_sigma > LOST_SCALE:
+            reason = f"the scale is uncertain by {100 * found.scale_sigma:.0f} %"
         if reason:
             self._refuse(reason, time)
             return
@@ -562,8 +566,6 @@ class InertialEstimator:
                 return f"the scale is uncertain by {100 * found.scale_sigma:.1f} %: move on, with changes of speed"
             if found.gravity_sigma > MAX_GRAVITY_SIGMA:
                 return f"the vertical is uncertain by {found.gravity_sigma:.1f} degrees"
-        elif found.scale_sigma > 0.2:
-            return f"the scale is uncertain by {100 * found.scale_sigma:.0f} %"
         return ""
 
     def _refuse(self, reason: str, time: float) -> None:

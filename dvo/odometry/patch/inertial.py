@@ -290,9 +290,13 @@ class InertialTracking:
             self.estimator.update(*self._nodes(self._last[0] - self.options.window))
             if not self.estimator.aligned:
                 return None
-            self._anchor = self._state = self.estimator.last_state()
+        newest = self.estimator.last_state()
+        if newest is None:
+            return None
+        if self._anchor is None or newest.time > self._anchor.time:  # of a new segment, whose scale is not sure yet
+            self._anchor = self._state = newest
         state = self._state
-        if state is None or self._anchor is None or time - self._anchor.time > self.options.longest:
+        if state is None or time - self._anchor.time > self.options.longest:
             return None
         if time > state.time:
             self._state = self.estimator.predict(state, np.array([time]))[0]

@@ -10,6 +10,7 @@ import pytest
 from dvo.geometry.poses import so3_exp
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator
 from dvo.odometry.inertial.options import InertialOptions
+from dvo.odometry.inertial.smoother import VisualNodes
 from dvo.odometry.protocol import ScaleState
 from tests.support.visual_inertial import CAMERA_IMU, SCALE, Recording, record
 
@@ -186,3 +187,29 @@ def _error(path: np.ndarray, truth: np.ndarray) -> float:
     left, _, right = np.linalg.svd(b.T @ a)
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     return float(np.sqrt(((a @ turn.T - b) ** 2).sum(1).mean()))
+
+
+def test_a_new_segment_after_the_dark_is_joined_and_withdraws_nothing() -> None:
+    recording = record(11, seconds=14.0)
+    estimator, _ = drive(recording, until=7.0)
+    assert estimator.aligned
+    turn, unit = so3_exp(np.array([0.4, -0.3, 0.8])), 2.5
+    late = recording.times >= 9.0
+    for time in recording.times[late & (recording.times < 13.0)]:
+        estimator.add(recording.samples.between(estimator.stream.end, time))
+        if not estimator.due(time):
+            continue
+        old, new = recording.nodes(0.0, 7.0), recording.nodes(9.0, time)
+        both = VisualNodes(
+            np.concatenate([old.times, new.times]),
+            np.concatenate([old.segment, new.segment + 1]),
+            np.concatenate([old.rotation, turn @ new.rotation]),
+            np.concatenate([old.position, unit * new.position @ turn.T]),
+            np.array([old.depth[0], unit * old.depth[0]]),
+        )
+        estimator.update(both, [0, 4])
+    assert estimator.aligned and [entry["event"] for entry in estimator.history] == ["aligned"]
+    assert estimator.worlds[4].scale == pytest.approx(SCALE / unit, rel=0.05)
+    shown = recording.position[late][0]
+    first, second = estimator.worlds[0].points(shown), estimator.worlds[4].points(unit * turn @ shown)
+    assert np.linalg.norm(first - second) < 0.3

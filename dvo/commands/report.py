@@ -213,7 +213,8 @@ def describe_inertial(result: Result) -> list[str]:
     told, said = result.info["inertial"], []
     if told["state"] not in ("aligned", "refined"):
         reason = f": {told['reason']}" if told.get("reason") else ""
-        said.append(f"inertial samples give no metres{reason}; `dvo imu check` looks at the sensor")
+        check = "" if told["state"] == "none" else "; `dvo imu check` looks at the sensor"
+        said.append(f"inertial samples give no metres{reason}{check}")
     if result.inertial:
         count = len(result.inertial)
         said.append(f"{count} frames without a pose by their images have one by inertial samples, marked in frames.csv")

@@ -291,16 +291,14 @@ class InertialEstimator:
             ``(3, 3)`` from the camera after to the camera before; None if samples do not cover the time, or the
             rotation between sensor and camera is not known.
         """
-        samples, turn = self.stream.samples(), self.rotation_camera_imu
-        if samples is None or turn is None or not self.options.use:
+        turn = self.rotation_camera_imu
+        if turn is None:
             return None
         offset = self.first_offset if self.solution is None else self.solution.time_offset
         bias = np.zeros(3) if self.solution is None else self.solution.gyro_bias[-1]
         times = np.array([before, after]) + offset
-        if samples.timestamps[0] > times[0] or samples.timestamps[-1] < times[1] - 0.02:
-            return None
-        near = samples.between(times[0] - 0.1, times[1] + 0.1)
-        if len(near) < 2:
+        near = self.stream.near(times[0] - 0.1, times[1] + 0.1)
+        if near is None or len(near) < 2:
             return None
         motion = preintegrate(near, times, bias, np.zeros(3), self.noise)
         if not motion.covered.all():
@@ -572,7 +570,9 @@ class InertialEstimator:
         """Note why there is no estimate; an alignment that fails again and again is withdrawn."""
         self._candidate = None
         if not self.aligned:
-            if reason == self.reason and reason not in _WAITING:  # the same again and again: look more rarely
+            if (
+                _words(reason) == _words(self.reason) and reason not in _WAITING
+            ):  # the same again and again: look more rarely
                 self._patience = min(2 * self._patience, MOST_PATIENCE)
             else:
                 self._patience = EVERY / 2
@@ -618,6 +618,11 @@ class InertialEstimator:
         for k, world in enumerate(self._known):
             w = found.worlds
             self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
+
+
+def _words(reason: str) -> str:
+    """A reason without its numbers."""
+    return "".join(letter for letter in reason if not letter.isdigit())
 
 
 def _step(state: BodyState, time: float, offset: float, samples: InertialSamples, noise: ImuNoise) -> BodyState:

@@ -46,9 +46,22 @@ class SampleStream:
         """All samples that are kept; None before the first."""
         with self._lock:
             if self._whole is None and self._parts:
-                self._whole = self._merged()
+                self._whole = self._merged(self._parts)
                 self._parts = [self._whole]
             return self._whole
+
+    def near(self, after: float, until: float) -> InertialSamples | None:
+        """Samples of a short time, without a copy of the others.
+
+        Args:
+            after, until: seconds; see :meth:`dvo.data.inertial.InertialSamples.between`.
+
+        Returns:
+            The samples; None if there are none.
+        """
+        with self._lock:
+            parts = [part for part in self._parts if part.timestamps[-1] > after and part.timestamps[0] <= until]
+        return self._merged([part.between(after, until) for part in parts]) if parts else None
 
     def __len__(self) -> int:
         return sum(len(part) for part in self._parts)
@@ -59,12 +72,12 @@ class SampleStream:
         with self._lock:
             return max((float(part.timestamps[-1]) for part in self._parts), default=-np.inf)
 
-    def _merged(self) -> InertialSamples:
-        times = np.concatenate([part.timestamps for part in self._parts])
-        values = np.concatenate([np.concatenate([part.gyro, part.accel], 1) for part in self._parts])
+    def _merged(self, parts: list[InertialSamples]) -> InertialSamples:
+        times = np.concatenate([part.timestamps for part in parts])
+        values = np.concatenate([np.concatenate([part.gyro, part.accel], 1) for part in parts])
         if not (np.diff(times) > 0).all():  # some came late, or twice
             times, order = np.unique(times, return_index=True)
             values = values[order]
         recent = times >= times[-1] - self.seconds
-        last = self._parts[-1]
+        last = parts[-1]
         return InertialSamples(times[recent], values[recent, :3], values[recent, 3:], last.T_camera_imu, last.noise)

@@ -46,13 +46,15 @@ class InertialTracking:
     Args:
         options: settings.
         graph: of the tracker.
+        metric: the scale has another source: the samples predict rotations alone.
 
     Attributes:
         estimator: of scale, vertical, velocity and biases.
     """
 
-    def __init__(self, options: InertialOptions, graph: KeyframeGraph) -> None:
-        self.options, self.graph = options, graph
+    def __init__(self, options: InertialOptions, graph: KeyframeGraph, *, metric: bool = False) -> None:
+        self.options, self.graph, self.metric = options, graph, metric
+        self._unused = ""  # why samples are not used
         self.estimator = InertialEstimator(options)
         self._errors: tuple[float, float] | None = None  # squared, of the gyroscope and of the motion model, rad^2
         self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
@@ -81,7 +83,9 @@ class InertialTracking:
         Args:
             samples: of the sensor.
         """
-        if self.options.use and self.graph.recording.segment == 0:  # a map has a world and a unit of its own
+        if self.options.use and self.graph.recording.segment > 0 and len(samples):
+            self._unused = "a map that is tracked in keeps its own unit and axes"
+        elif self.options.use:
             self.estimator.add(samples)
 
     def predicted(self, time: float, pose_cw: Tensor) -> Tensor:
@@ -125,6 +129,8 @@ class InertialTracking:
         time, estimator = record.timestamp, self.estimator
         if estimate.pose_wc is not None:
             self._compare(time, estimate.pose_wc)
+            if self.metric:
+                return estimate
             if estimator.due(time) or self._anchor is not None:
                 estimator.update(*self._nodes(time - self.options.window))
             similarity = self._similarity()
@@ -159,23 +165,23 @@ class InertialTracking:
             map=replace(result.map, points=points),
         )  # fmt: skip
 
-    def settle(self, loops: LoopCloser, *, metric: bool) -> dict[str, Any]:
+    def settle(self, loops: LoopCloser) -> dict[str, Any]:
         """Bring the map of a finished sequence to metres, and give frames that were bridged their poses.
 
         Each keyframe follows the smoothed trajectory: where the scale of the images has drifted, its own is taken.
 
         Args:
             loops: whose measurements are scaled along.
-            metric: it is in metres already, by another source of the scale.
 
         Returns:
             Entries for run.json: ``inertial``, and ``scale``.
         """
+        if self._unused or (self.active and self.metric):
+            reason = self._unused or "metres come from another source"
+            return {"inertial": {"state": ScaleState.NONE.value, "reason": reason}}
         if not self.active:
             return {}
         graph, estimator = self.graph, self.estimator
-        if metric:
-            return {"inertial": estimator.information()}
         nodes, worlds = self._nodes(-np.inf)
         if not estimator.aligned and len(nodes):  # of the longest world alone
             longest = int(np.bincount(nodes.segment).argmax())

@@ -127,7 +127,7 @@ class PatchOdometry:
         if config.aligned_motion > 0 and not self.sensors:
             self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)
         self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
-        self.inertial = InertialTracking(config.inertial, self.graph)
+        self.inertial = InertialTracking(config.inertial, self.graph, metric=config.scale.source != "none")
 
     @property
     def window(self) -> Window:
@@ -226,7 +226,7 @@ class PatchOdometry:
             self.loops.complete(state.adjustable)
             state.info |= finish_segments(self.graph, state, self.config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
-            state.info |= self.inertial.settle(self.loops, metric=self.config.scale.source != "none")
+            state.info |= self.inertial.settle(self.loops)
         return replace(self._result({}), quality=state.quality)
 
     @torch.inference_mode()

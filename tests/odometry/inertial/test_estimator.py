@@ -91,8 +91,7 @@ def test_missing_samples_do_no_harm() -> None:
 def test_a_rotation_between_sensor_and_camera_that_is_not_stated_is_found() -> None:
     recording = record(8, seconds=8.0)
     recording = replace(recording, samples=replace(recording.samples, T_camera_imu=None))
-    estimator, reasons = drive(recording)
-    assert any("rotation between sensor and camera" in reason for reason in reasons) or estimator.aligned
+    estimator, _ = drive(recording)
     assert estimator.rotation_camera_imu is not None
     off = estimator.rotation_camera_imu.T @ CAMERA_IMU
     assert np.rad2deg(np.arccos(min((np.trace(off) - 1) / 2, 1.0))) < 1.0

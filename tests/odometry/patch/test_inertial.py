@@ -79,6 +79,18 @@ def test_samples_are_ignored_on_request() -> None:
     assert "inertial" not in odometry.finish().info
 
 
+def test_another_source_of_metres_is_left_alone() -> None:
+    plain, aided = tracker(), tracker(replace(SMALL, scale={"distances": [[0.5, 1.0, 2.0]]}))
+    for k, (frame, other) in enumerate(zip(frames(12), with_samples(frames(12)), strict=True)):
+        a, b = plain.track(frame), aided.track(other)
+        if k == 9:
+            align(aided, other.timestamp)
+        assert a.pose_wc is None or b.pose_wc is None or a.pose_wc.tobytes() == b.pose_wc.tobytes()
+    result = aided.finish()
+    assert result.info["inertial"]["reason"] == "metres come from another source"
+    assert result.info["scale"]["source"] == "distance"
+
+
 def test_poses_turn_upright_and_metric_and_so_does_the_result() -> None:
     plain, aided = tracker(), tracker()
     for k, (frame, other) in enumerate(zip(frames(14), with_samples(frames(14)), strict=True)):

@@ -211,7 +211,7 @@ def describe_inertial(result: Result) -> list[str]:
         Sentences, none where poses are in metres and all by images.
     """
     told, said = result.info["inertial"], []
-    if told["state"] not in ("aligned", "refined"):
+    if told.get("state") in ("none", "initialising"):
         reason = f": {told['reason']}" if told.get("reason") else ""
         check = "" if told["state"] == "none" else "; `dvo imu check` looks at the sensor"
         said.append(f"inertial samples give no metres{reason}{check}")

@@ -347,6 +347,8 @@ def track(
             progress.finish(done.result)
         for warning in new_warnings:
             warn(warning)
+        if facts.get("inertial") and "inertial" not in done.result.info:
+            warn("the inertial samples are not used by this odometry with these settings", "note")
         print_report(folder, done, scores, [CALIBRATION] * (facts.get("calibration_file") is not None))
         for observer in observers:
             file = getattr(observer, "file", None)

@@ -89,7 +89,8 @@ class Helper:
         self._process.kill()
         self._process.wait()
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # what it was told last is not read any more
+        with self._changed, contextlib.suppress(OSError):  # what it was told last is not read any more
+            self._gone = True  # what listens may not have seen the end yet
             self._process.stdin.close()
 
 

@@ -65,6 +65,13 @@ def test_waits_for_what_is_started_and_takes_over_what_is_not():
     assert not helper.brings("d")
 
 
+def test_one_that_is_closed_is_told_nothing():
+    helper = started(STUCK, "a")
+    with helper._changed:  # the thread that listens does not see the end before the question
+        helper.close()
+        assert not helper.brings("b")
+
+
 def test_one_that_does_not_run_is_given_up(monkeypatch):
     monkeypatch.setattr(ahead, "PATIENCE", 0.2)
     helper = started(STUCK, "a")

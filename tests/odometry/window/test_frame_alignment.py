@@ -22,10 +22,14 @@ from dvo.odometry.window.frame_alignment import noise, solve_pose, solve_pose_pl
 from dvo.synth.sequence import make_sequence
 
 SETTINGS = {"loops": False, "estimate_readout": False, "network_motion": 1.2}
+FEW = SETTINGS | {"patches": 32, "initial_updates": 6}  # where no accuracy is asked for
 CAMERA = np.array([300.0, 310.0, 160.0, 120.0])
 
 
-def film(count: int = 40, **options) -> tuple[list[Frame], object]:
+START = 16  # frames before another picture is shown
+
+
+def film(count: int = 32, **options) -> tuple[list[Frame], object]:
     values = {"family": "room", "kind": "handheld", "speed": 0.6, "fps": 30.0, "height": 240, "width": 320} | options
     sequence = make_sequence(77, frames=count, **values)
     return list(sequence), sequence.groundtruth
@@ -81,9 +85,10 @@ def test_again_the_same_bytes(walk):
 
 def test_a_fast_camera_is_measured_by_the_network():
     frames, _ = film(14, speed=8.0, fps=8.0, height=120, width=160)
-    odometry = dvo.load("small", **SETTINGS)
+    odometry = dvo.load("small", **FEW)
     for frame in frames:
         odometry.track(frame)
+    assert odometry.state.initialised
     odometry.finish()
     assert len(aligned(odometry)) <= 2
 
@@ -91,9 +96,10 @@ def test_a_fast_camera_is_measured_by_the_network():
 def test_bare_surfaces_are_measured_by_the_network():
     """Edges alone tell no motion along themselves, however well the windows correlate."""
     frames, _ = film(24, texture=0.02)
-    odometry = dvo.load("small", **SETTINGS)
+    odometry = dvo.load("small", **FEW)
     for frame in frames:
         odometry.track(frame)
+    assert odometry.state.initialised
     odometry.finish()
     assert len(aligned(odometry)) <= len(frames) // 4
 
@@ -103,26 +109,26 @@ def test_another_picture_is_not_aligned(walk):
     _, before, _, frames, _ = walk
     other, _ = film(4, family="street")
     odometry = dvo.load("small", **SETTINGS)
-    for frame, same in zip(frames[:24], before, strict=False):
+    for frame, same in zip(frames[:START], before, strict=False):
         estimate = odometry.track(frame)
         assert estimate.status is same.status and np.array_equal(estimate.pose_wc, same.pose_wc)
     assert odometry.state.initialised
 
     @torch.inference_mode()
     def seen(image: np.ndarray):
-        camera = frames[24].camera.intrinsics
-        return odometry.aligner.align(image, camera, None, frames[24].timestamp, limit=5.0)
+        camera = frames[START].camera.intrinsics
+        return odometry.aligner.align(image, camera, None, frames[START].timestamp, limit=5.0)
 
-    image = frames[24].image
+    image = frames[START].image
     assert seen(image) is not None
     assert seen((image * 0.8).astype(np.uint8)) is None and seen(cv2.add(image, (20,) * 3)) is None
     assert seen(cv2.GaussianBlur(image, (0, 0), 2.0)) is None
     count = len(aligned(odometry))
-    for number, view in enumerate(other, 24):
+    for number, view in enumerate(other, START):
         estimate = odometry.track(Frame(number, frames[number].timestamp, view.image, frames[0].camera))
         assert estimate.status is Status.LOST and estimate.pose_wc is None
     assert len(aligned(odometry)) == count
-    assert odometry.track(frames[28]).status is Status.TRACKING
+    assert odometry.track(frames[START + 4]).status is Status.TRACKING
 
 
 def test_their_measurements_take_part_in_the_final_adjustment(walk):

@@ -22,7 +22,7 @@ from dvo.odometry.window.frame_alignment import noise, solve_pose, solve_pose_pl
 from dvo.synth.sequence import make_sequence
 
 SETTINGS = {"loops": False, "estimate_readout": False, "network_motion": 1.2}
-FEW = SETTINGS | {"patches": 32, "initial_updates": 6}  # where no accuracy is asked for
+FEW = SETTINGS | {"patches": 16, "initial_updates": 6}  # where no accuracy is asked for
 CAMERA = np.array([300.0, 310.0, 160.0, 120.0])
 
 

@@ -267,9 +267,7 @@ def make_clip(
     rng = np.random.default_rng([seed, salts.CLIP, index])
     plan, intrinsics = _draw_plan(scene, rng, spec, index)
     poses_wc = plan.path.poses_wc(plan.times)
-    conditions = draw_conditions(
-        seed, index, spec.movers, spec.low_light, spec.surroundings, spec.bare, spec.blurred
-    )
+    conditions = draw_conditions(seed, index, spec.movers, spec.low_light, spec.surroundings, spec.bare, spec.blurred)
     if conditions.texture < 1:
         scene = reduce_texture(scene, conditions.texture, conditions.seed)
     seconds = (plan.times - plan.times[0]) * (conditions.step * (spec.frames - 1) / (plan.times[-1] - plan.times[0]))

@@ -40,6 +40,7 @@ class Request:
         topic: of the images, in a bag of ROS.
         imu_topic: of the inertial samples, in a bag of ROS.
         imu_calibration: of the inertial sensor, that the user named; wins over the data set's own.
+        groundtruth: file that the user named; where nothing else tells the times of images, its rows do.
     """
 
     times: Path | None = None
@@ -48,6 +49,7 @@ class Request:
     topic: str | None = None
     imu_topic: str | None = None
     imu_calibration: ImuCalibration | None = None
+    groundtruth: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -137,6 +137,24 @@ def test_groundtruth_option(make):
         open_source(folder, calib=make.calib(), groundtruth=make.text("bad.txt", "1 2 3\n"))
 
 
+def test_a_truth_with_a_row_for_each_image_has_their_times(make):
+    """Unless something else has them: at an assumed rate poses would be compared with those of other images."""
+    folder = make.images("clip", ["0.png", "1.png", "2.png"])
+    tum = make.text("gt.txt", "".join(f"{0.1 * k} {k} 2 3 0 0 0 1\n" for k in range(3)))
+
+    def times(source, **options):
+        opened = open_source(source, calib=make.calib(), groundtruth=tum, **options)
+        return [frame.timestamp for frame in opened], " ".join(opened.warnings)
+
+    found, notes = times(folder)
+    assert found == [0, 0.1, 0.2] and "taking those of gt.txt" in notes and "assuming" not in notes
+    assert times(folder, fps=20)[0] == [0, 0.05, 0.1]
+    assert times(folder, times=make.text("t.txt", "0\n0.2\n0.4\n"))[0] == [0, 0.2, 0.4]
+    assert times(make.images("named/images", ["0.png", "1.png", "2.png"]).parent)[0] == [0, 0.1, 0.2]
+    make.images("clip", ["3.png"])
+    assert times(folder)[0] == pytest.approx([0, 1 / 30, 2 / 30, 0.1])
+
+
 def test_importing_the_readers_is_light():
     code = "import sys, dvo.data; print([m for m in ('cv2', 'torch', 'yaml', 'scipy') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -31,9 +31,7 @@ _BUILT_IN = {
 DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUILT_IN))
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
-_NUMBERED = frozenset(
-    ["numpy", "colmap", "kitti raw", "json", "yaml", "xml"]
-)  # those whose files may have several cameras
+_NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "json", "yaml", "xml"])  # that may have several cameras
 _BINARY = (".bin", *SUFFIXES)
 _LARGEST = 64 * 1024**2  # of a JSON file, which may list thousands of images beside the camera
 
@@ -43,14 +41,15 @@ def read_calibration(path: Path | str) -> Calibration:
 
     docs/inputs.md has the table of dialects and lens models. Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5
     k6]]]`` (radial-tangential) separated by blanks or commas, ``#`` comments; the same by name, ``fx=525 fy=525 cx=320
-    cy=240``, or in two lines; or a matrix K of 3x3, 3x4 or 4x4 numbers; ROS's ``ost.txt``; the text of DSO; KITTI's ``calib.txt``, if
-    all its cameras have the same intrinsics, and ``calib_cam_to_cam.txt``. YAML, JSON and OpenCV's XML: ``fx, fy, cx,
-    cy`` with optional ``width, height, model, coefficients``, at the top or in a mapping within; EuRoC, Kalibr, ROS,
-    OpenCV, ORB-SLAM, VINS, basalt, nerfstudio. These may state ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``) and
-    ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too; and ``readout``, the seconds
-    from the first to the last row of a rolling shutter (0, a global one, if it is left out; Kalibr's ``line_delay`` is
-    not read). COLMAP's ``cameras.txt`` and ``cameras.bin``. Of a file of several cameras the first or the left one is
-    read, or that of the number in ``FILE:NUMBER``; COLMAP's have no first one. NumPy's ``.npz`` of named arrays.
+    cy=240``, or in two lines; or a matrix K of 3x3, 3x4 or 4x4 numbers; ROS's ``ost.txt``; the text of DSO; KITTI's
+    ``calib.txt``, if all its cameras have the same intrinsics, and ``calib_cam_to_cam.txt``. YAML, JSON and OpenCV's
+    XML: ``fx, fy, cx, cy`` with optional ``width, height, model, coefficients``, at the top or in a mapping within;
+    EuRoC, Kalibr, ROS, OpenCV, ORB-SLAM, VINS, basalt, nerfstudio. These may state ``depth_scale`` (ORB-SLAM:
+    ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too; and
+    ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global one, if it is left out;
+    Kalibr's ``line_delay`` is not read). COLMAP's ``cameras.txt`` and ``cameras.bin``. Of a file of several cameras the
+    first or the left one is read, or that of the number in ``FILE:NUMBER``; COLMAP's have no first one. NumPy's
+    ``.npz`` of named arrays.
 
     Args:
         path: of the file.

@@ -545,8 +545,10 @@ def test_tables_and_arrays_in_text(make, text):
     assert found.coefficients[:4] == (0.1, -0.2, 0, 0) and not any(found.coefficients[4:])
 
 
-@pytest.mark.parametrize("text", ["[[500.   0. 320.]\n [  0. 510. 240.]\n [  0.   0.   1.]]",
-                                  "array([[500.,   0., 320.],\n       [  0., 510., 240.],\n       [  0.,   0.,   1.]])"])  # fmt: skip
+@pytest.mark.parametrize("text", [
+    "[[500.   0. 320.]\n [  0. 510. 240.]\n [  0.   0.   1.]]",
+    "array([[500.,   0., 320.],\n       [  0., 510., 240.],\n       [  0.,   0.,   1.]])",
+])  # fmt: skip
 def test_a_matrix_as_numpy_prints_it(make, text):
     found = read_calibration(make.text("k.txt", text))
     assert (found.fx, found.fy, found.cx, found.cy, found.model) == (500, 510, 320, 240, "none")

@@ -33,6 +33,12 @@ def test_no_images(tmp_path):
         open_source(tmp_path, calib=Calibration(50, 50, 31, 23))
 
 
+def test_a_folder_of_videos_names_them(make):
+    video = make.video("my clip.mp4", "mp4v")
+    with pytest.raises(DvoError, match="no images in it, but videos: my clip.mp4. Give a video"):
+        open_source(video.parent, guess=True)
+
+
 def test_no_image_that_decodes(make):
     folder = make.images("clip", ["0.png", "1.png"])
     for image in folder.iterdir():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import re
 import time
@@ -70,7 +71,7 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:
-        if not capture.isOpened() and (other := _no_video(head)) is not None:
+        if not capture.isOpened() and (other := _no_video(path, head)) is not None:
             raise DvoError(f"{other} is no video", file=path, remedy="give a video or the folder that holds the images")
         if not capture.isOpened():
             raise DvoError(
@@ -92,12 +93,19 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         capture.release()
 
 
-def _no_video(head: bytes) -> str | None:
-    """What a file is by its first bytes, if that is text, an archive or nothing."""
+def _no_video(path: Path, head: bytes) -> str | None:
+    """What a file is by its content, if that is sound, text, an archive or nothing."""
     if not head:
         return "an empty file"
     if head.startswith((b"PK\x03\x04", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
         return "an archive"
+    if head.startswith((b"ID3", b"fLaC", b"OggS", b"\xff\xfb")) or head[8:12] in (b"WAVE", b"M4A ", b"M4B "):
+        return "a recording of sound"
+    if head[4:8] == b"ftyp":
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            kinds = set(re.findall(rb"hdlr.{8}(soun|vide)", content, re.DOTALL))
+        if kinds == {b"soun"}:
+            return "a recording of sound"
     return None if re.search(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]", head) else "a text file"
 
 

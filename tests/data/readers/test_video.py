@@ -190,6 +190,8 @@ def test_parts_with_clocks_of_their_own(make, monkeypatch):
 
 @pytest.mark.parametrize(("content", "what"), [
     (b"frame000.png\nframe001.png\n", "a text file"), (b"PK\x03\x04" + bytes(40), "an archive"), (b"", "an empty file"),
+    (b"RIFF\x24\x00\x00\x00WAVEfmt " + bytes(40), "a recording of sound"),
+    (bytes(3) + b"\x14ftypisom" + bytes(11) + b"\x21hdlr" + bytes(8) + b"soun" + bytes(12), "a recording of sound"),
 ])  # fmt: skip
 def test_files_that_are_no_video_at_all_are_named(tmp_path, content, what):
     (tmp_path / "clip.txt").write_bytes(content)

@@ -51,6 +51,26 @@ def test_motion_that_does_not_tell_is_refused_with_the_reason(options: dict[str,
     assert any(word in reason for reason in reasons)
 
 
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+@pytest.mark.parametrize(
+    "options",
+    [{"turning": False}, {"turning": False, "speed": (0.5, 0.1, 0.0)}, {}, {"turning": False, "swing": 0.17}],
+    ids=["still", "constant velocity", "pure rotation", "one axis"],
+)
+def test_no_alignment_is_wrong_during_and_after_such_motion(options: dict[str, object], grade: str) -> None:
+    recording = record(40, still=4.0, seconds=10.0, grade=grade, walk=2e-3, **options)  # type: ignore[arg-type]
+    estimator, before = InertialEstimator(InertialOptions()), -np.inf
+    for time in recording.times:
+        estimator.add(recording.samples.between(before, time))
+        before = time
+        if estimator.due(time):
+            estimator.update(recording.nodes(time - 20.0, time), [0])
+        for world in estimator.worlds.values():
+            assert world.scale == pytest.approx(SCALE, rel=0.1)
+            assert (world.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(5.0))
+    assert estimator.aligned
+
+
 def test_alignment_follows_a_stretch_that_does_not_tell() -> None:
     estimator, _ = drive(record(2, still=5.0, turning=False, seconds=11.0))
     assert estimator.aligned

@@ -73,6 +73,8 @@ FAILURES = 3
 MOST_PATIENCE = 2.0
 """Seconds from one estimate to the next where all that is known speaks against one."""
 _WAITING = ("too few poses", "too few samples")
+LONGEST_GAP = 0.02
+"""Between samples that tell a rotation within a readout, seconds."""
 STILL = (0.02, 0.15)
 """Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
 STILL_FOR = 0.4
@@ -344,6 +346,36 @@ class InertialEstimator:
         if not motion.covered.all():
             return None
         return turn @ motion.rotation[0] @ turn.T
+
+    def turns(self, times: Array, offsets: Array) -> Array:
+        """Rotations of the camera about the times of frames by the gyroscope, less its bias.
+
+        Args:
+            times: ``(N,)`` of the frames, seconds, clock of the camera.
+            offsets: ``(s,)`` seconds, a few hundredths at most.
+
+        Returns:
+            ``(N, s, 3)`` rotation vectors from the camera at a time to the camera later by an offset, rad; nan without
+            an alignment, and where samples do not cover the time.
+        """
+        found, solution, samples = np.full((len(times), len(offsets), 3), np.nan), self.solution, self.stream.samples()
+        if solution is None or samples is None or not self._past:
+            return found
+        stamps = samples.timestamps - solution.time_offset
+        known = [state.time for state in self._past]
+        biases = np.stack([state.gyro_bias for state in self._past])
+        bias = np.stack([np.interp(times, known, column) for column in biases.T], -1)
+        steps = 0.5 * (samples.gyro[1:] + samples.gyro[:-1]) * np.diff(stamps)[:, None]
+        angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        ends = np.concatenate([times[:, None] + offsets, times[:, None]], 1)
+        after = np.searchsorted(stamps, ends).clip(1, len(stamps) - 1)
+        gap = stamps[after] - stamps[after - 1]
+        covered = (ends >= stamps[0]) & (ends <= stamps[-1]) & (gap < LONGEST_GAP)
+        turned = np.stack([np.interp(ends, stamps, column) for column in angle.T], -1)
+        turned = turned[:, :-1] - turned[:, -1:] - bias[:, None] * offsets[:, None]
+        rows = covered.all(1)
+        found[rows] = -turned[rows] @ solution.rotation_camera_imu.T
+        return found
 
     def information(self) -> dict[str, Any]:
         """Entries of run.json."""

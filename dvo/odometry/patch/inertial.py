@@ -22,6 +22,7 @@ from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_ma
 from dvo.map.correction import apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
+from dvo.odometry.global_ba.rolling_shutter import Turns
 from dvo.odometry.inertial.estimator import (
     BodyState,
     InertialEstimator,
@@ -73,6 +74,11 @@ class InertialTracking:
     def active(self) -> bool:
         """True if there are samples, and they are used."""
         return self.estimator.state is not ScaleState.NONE
+
+    @property
+    def turns(self) -> Turns | None:
+        """Rotations by the gyroscope, for the readout of a rolling shutter; None before an alignment."""
+        return self.estimator.turns if self.estimator.aligned else None
 
     def observe(self, frame: Frame) -> None:
         """Take the samples of a frame.

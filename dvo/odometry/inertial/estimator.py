@@ -6,7 +6,9 @@ that fails is a reason that is told.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,7 @@ from dvo.odometry.inertial.smoother import (
     upright,
 )
 from dvo.odometry.inertial.stream import SampleStream
-from dvo.odometry.inertial.temporal import align_imu
+from dvo.odometry.inertial.temporal import ImuAlignment, align_imu
 from dvo.odometry.protocol import ScaleState
 
 Array = np.ndarray
@@ -73,6 +75,9 @@ FAILURES = 3
 MOST_PATIENCE = 2.0
 """Seconds from one estimate to the next where all that is known speaks against one."""
 _WAITING = ("too few poses", "too few samples")
+SURE_OFFSET, SURE_TURN = 3e-3, 0.5
+"""Deviation of the time offset, seconds, and of rotations over a third of a second, degrees, of a gyroscope that tells
+the rotation within a readout."""
 LONGEST_GAP = 0.02
 """Between samples that tell a rotation within a readout, seconds."""
 STILL = (0.02, 0.15)
@@ -347,35 +352,24 @@ class InertialEstimator:
             return None
         return turn @ motion.rotation[0] @ turn.T
 
-    def turns(self, times: Array, offsets: Array) -> Array:
-        """Rotations of the camera about the times of frames by the gyroscope, less its bias.
+    def turns(self, nodes: VisualNodes) -> Callable[[Array, Array], Array] | None:
+        """What the gyroscope tells of rotations about the times of frames, also without an alignment.
 
         Args:
-            times: ``(N,)`` of the frames, seconds, clock of the camera.
-            offsets: ``(s,)`` seconds, a few hundredths at most.
+            nodes: visual poses of the recording; the longest segment tells time offset and bias.
 
         Returns:
-            ``(N, s, 3)`` rotation vectors from the camera at a time to the camera later by an offset, rad; nan without
-            an alignment, and where samples do not cover the time.
+            Rotation vectors ``(N, s, 3)`` from the camera at times ``(N,)`` to that ``(s,)`` seconds later, nan without
+            samples; None where time offset and bias are not told for sure.
         """
-        found, solution, samples = np.full((len(times), len(offsets), 3), np.nan), self.solution, self.stream.samples()
-        if solution is None or samples is None or not self._past:
-            return found
-        stamps = samples.timestamps - solution.time_offset
-        known = [state.time for state in self._past]
-        biases = np.stack([state.gyro_bias for state in self._past])
-        bias = np.stack([np.interp(times, known, column) for column in biases.T], -1)
-        steps = 0.5 * (samples.gyro[1:] + samples.gyro[:-1]) * np.diff(stamps)[:, None]
-        angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        ends = np.concatenate([times[:, None] + offsets, times[:, None]], 1)
-        after = np.searchsorted(stamps, ends).clip(1, len(stamps) - 1)
-        gap = stamps[after] - stamps[after - 1]
-        covered = (ends >= stamps[0]) & (ends <= stamps[-1]) & (gap < LONGEST_GAP)
-        turned = np.stack([np.interp(ends, stamps, column) for column in angle.T], -1)
-        turned = turned[:, :-1] - turned[:, -1:] - bias[:, None] * offsets[:, None]
-        rows = covered.all(1)
-        found[rows] = -turned[rows] @ solution.rotation_camera_imu.T
-        return found
+        samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if samples is None or turn is None or not len(nodes):
+            return None
+        longest = nodes.of(int(np.bincount(nodes.segment).argmax()))
+        found = align_imu(longest.times, longest.rotation, samples.timestamps, samples.gyro, turn, fixed=True)
+        if found.reason or found.sigma_offset > SURE_OFFSET or found.residual > SURE_TURN:
+            return None
+        return partial(_turns, samples, found)
 
     def information(self) -> dict[str, Any]:
         """Entries of run.json."""
@@ -717,6 +711,19 @@ def _from_first_camera(found: Smoothed) -> Smoothed:
     origin = found.worlds.translation[-1]
     worlds = replace(found.worlds, translation=found.worlds.translation - origin)
     return replace(found, position=found.position - origin, worlds=worlds)
+
+
+def _turns(samples: InertialSamples, sensor: ImuAlignment, times: Array, offsets: Array) -> Array:
+    """Rotation vectors ``(N, s, 3)`` from the camera at times to the camera later by offsets; nan without samples."""
+    stamps = samples.timestamps - sensor.time_offset
+    steps = 0.5 * (samples.gyro[1:] + samples.gyro[:-1]) * np.diff(stamps)[:, None]
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    ends = np.concatenate([times[:, None] + offsets, times[:, None]], 1)
+    after = np.searchsorted(stamps, ends).clip(1, len(stamps) - 1)
+    covered = (ends >= stamps[0]) & (ends <= stamps[-1]) & (stamps[after] - stamps[after - 1] < LONGEST_GAP)
+    turned = np.stack([np.interp(ends, stamps, column) for column in angle.T], -1)
+    turned = turned[:, :-1] - turned[:, -1:] - sensor.gyro_bias * offsets[:, None]
+    return np.where(covered.all(1)[:, None, None], -turned @ sensor.rotation_camera_imu.T, np.nan)
 
 
 def _words(reason: str) -> str:

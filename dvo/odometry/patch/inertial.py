@@ -75,10 +75,9 @@ class InertialTracking:
         """True if there are samples, and they are used."""
         return self.estimator.state is not ScaleState.NONE
 
-    @property
     def turns(self) -> Turns | None:
-        """Rotations by the gyroscope, for the readout of a rolling shutter; None before an alignment."""
-        return self.estimator.turns if self.estimator.aligned else None
+        """Rotations by the gyroscope, for the readout of a rolling shutter; None if it does not tell them."""
+        return self.estimator.turns(self._nodes(-np.inf)[0]) if self.active else None
 
     def observe(self, frame: Frame) -> None:
         """Take the samples of a frame.

@@ -227,6 +227,26 @@ def test_at_the_end_motion_that_does_not_tell_is_refused() -> None:
     assert not estimator.aligned and "acceleration" in estimator.reason
 
 
+def test_the_gyroscope_tells_rotations_about_the_times_of_frames_without_an_alignment() -> None:
+    recording = record(12, seconds=9.0, grade="phone")
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples.between(-np.inf, 8.0))
+    turns = estimator.turns(recording.nodes(0.1, 7.5))
+    assert turns is not None and not estimator.aligned
+    camera, step = recording.body[0] @ CAMERA_IMU.T, float(np.diff(recording.times).mean())
+    found = turns(recording.times, np.array([-step, step]))
+    inside = recording.times[1:-1] < 7.5
+    for k, other in enumerate((slice(None, -2), slice(2, None))):
+        true = rotation_vector(np.swapaxes(camera[other], -1, -2) @ camera[1:-1])
+        assert np.linalg.norm(true, axis=-1)[inside].max() > 0.02
+        assert np.linalg.norm(found[1:-1, k] - true, axis=-1)[inside].max() < 2e-3
+    assert np.isnan(found[-1]).all()
+    swapped = recording.with_samples(gyro=recording.samples.gyro[:, [1, 0, 2]])
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(swapped.samples)
+    assert estimator.turns(recording.nodes(0.1, 7.5)) is None
+
+
 def test_drift_of_the_scale_of_the_images_is_taken_back() -> None:
     recording = record(7, seconds=14.0, drift=0.03)
     estimator, _ = drive(recording)

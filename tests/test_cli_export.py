@@ -103,7 +103,7 @@ def test_the_only_segment_has_the_number_0(given, image_folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [(["--to", "obj"], "--to: no export format 'obj'. Use one or more of colmap, colmap-text, nerfstudio, tum, kitti, euroc"),
+    [(["--to", "obj"], "--to: no export format 'obj'. Use one or more of colmap, colmap-text, nerfstudio, tum, kitti"),
      (["--to", "tum", "--segment", "2"], "no segment 2"), (["--to", "tum", "--segment", "-1"], "must be 0 or more"),
      ([], "--to")],
 )  # fmt: skip

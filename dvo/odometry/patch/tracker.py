@@ -224,6 +224,7 @@ class PatchOdometry:
                 self._begin_segment()
             self._close_segment()
             self.loops.complete(state.adjustable)
+            state.shutter = replace(state.shutter, turns=self.inertial.turns())
             state.info |= finish_segments(self.graph, state, self.config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
             state.info |= self.inertial.settle(self.loops)

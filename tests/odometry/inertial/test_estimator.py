@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvo.geometry.poses import so3_exp
+from dvo.geometry.poses import rotation_vector, so3_exp
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import VisualNodes
 from dvo.odometry.protocol import ScaleState
-from tests.support.visual_inertial import CAMERA_IMU, SCALE, Recording, record
+from tests.support.visual_inertial import CAMERA_IMU, LEVER, SCALE, Recording, record
 
 
 def drive(recording: Recording, until: float = np.inf) -> tuple[InertialEstimator, list[str]]:
@@ -49,6 +49,26 @@ def test_motion_that_does_not_tell_is_refused_with_the_reason(options: dict[str,
     assert estimator.state is ScaleState.INITIALISING
     assert not estimator.worlds
     assert any(word in reason for reason in reasons)
+
+
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+@pytest.mark.parametrize(
+    "options",
+    [{"turning": False}, {"turning": False, "speed": (0.5, 0.1, 0.0)}, {}, {"turning": False, "swing": 0.17}],
+    ids=["still", "constant velocity", "pure rotation", "one axis"],
+)
+def test_no_alignment_is_wrong_during_and_after_such_motion(options: dict[str, object], grade: str) -> None:
+    recording = record(40, still=4.0, seconds=10.0, grade=grade, walk=2e-3, **options)  # type: ignore[arg-type]
+    estimator, before = InertialEstimator(InertialOptions()), -np.inf
+    for time in recording.times:
+        estimator.add(recording.samples.between(before, time))
+        before = time
+        if estimator.due(time):
+            estimator.update(recording.nodes(time - 20.0, time), [0])
+        for world in estimator.worlds.values():
+            assert world.scale == pytest.approx(SCALE, rel=0.1)
+            assert (world.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(5.0))
+    assert estimator.aligned
 
 
 def test_alignment_follows_a_stretch_that_does_not_tell() -> None:
@@ -109,6 +129,48 @@ def test_an_alignment_that_fails_later_is_withdrawn() -> None:
     assert [entry["event"] for entry in estimator.history][:2] == ["aligned", "withdrawn"]
 
 
+def _consistency(recording: Recording, window: float) -> np.ndarray:
+    """NEES ``(K, 3)`` of position, orientation and velocity of poses as they come, from the one at the alignment on."""
+    estimator, before, rows = InertialEstimator(InertialOptions(window=window)), -np.inf, []
+    upright, origin = np.eye(3), None
+    for k, time in enumerate(recording.times):
+        estimator.add(recording.samples.between(before, time))
+        before = time
+        if estimator.due(time):
+            estimator.update(recording.nodes(time - window, time), [0])
+        if not estimator.aligned:
+            continue
+        world, (true, body, velocity) = estimator.worlds[0], (part[k] for part in recording.body)
+        rotation, position = world.rotation @ recording.rotation[k], world.points(recording.position[k])
+        camera, place = true @ CAMERA_IMU.T, body + true @ LEVER
+        if origin is None:
+            turn = camera @ rotation.T
+            yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+            upright = so3_exp(np.array([0.0, 0.0, yaw]))
+            origin = place - upright @ position
+        elif k % 5 == 0:
+            state, covariance = estimator.beside(time, rotation, position)
+            errors = (
+                upright.T @ (place - origin) - position,
+                rotation_vector(rotation.T @ upright.T @ camera),
+                upright.T @ velocity - state.velocity,
+            )
+            parts = (covariance[i : i + 3, i : i + 3] for i in (0, 3, 6))
+            rows.append([e @ np.linalg.solve(part, e) / 3 for e, part in zip(errors, parts, strict=True)])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+def test_poses_err_as_much_as_their_covariance_says(grade: str) -> None:
+    """Also when the window has left the alignment behind, with images whose heading and unit drift."""
+    found = [
+        _consistency(record(20 + seed, seconds=16.0, grade=grade, walk=2e-3, unit=1.5e-2), window=6.0)
+        for seed in range(4)
+    ]
+    assert (np.mean([rows.mean(0) for rows in found], 0) > 0.35).all()
+    assert (np.mean([rows.mean(0) for rows in found], 0) < 2.0).all()
+
+
 def test_prediction_in_the_dark_is_within_its_covariance() -> None:
     squares = []
     for seed in range(3):
@@ -163,6 +225,26 @@ def test_at_the_end_motion_that_does_not_tell_is_refused() -> None:
     estimator.add(recording.samples)
     assert estimator.settle(recording.nodes(0.1, 5.5), [0]) is None
     assert not estimator.aligned and "acceleration" in estimator.reason
+
+
+def test_the_gyroscope_tells_rotations_about_the_times_of_frames_without_an_alignment() -> None:
+    recording = record(12, seconds=9.0, grade="phone")
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples.between(-np.inf, 8.0))
+    turns = estimator.turns(recording.nodes(0.1, 7.5))
+    assert turns is not None and not estimator.aligned
+    camera, step = recording.body[0] @ CAMERA_IMU.T, float(np.diff(recording.times).mean())
+    found = turns(recording.times, np.array([-step, step]))
+    inside = recording.times[1:-1] < 7.5
+    for k, other in enumerate((slice(None, -2), slice(2, None))):
+        true = rotation_vector(np.swapaxes(camera[other], -1, -2) @ camera[1:-1])
+        assert np.linalg.norm(true, axis=-1)[inside].max() > 0.02
+        assert np.linalg.norm(found[1:-1, k] - true, axis=-1)[inside].max() < 2e-3
+    assert np.isnan(found[-1]).all()
+    swapped = recording.with_samples(gyro=recording.samples.gyro[:, [1, 0, 2]])
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(swapped.samples)
+    assert estimator.turns(recording.nodes(0.1, 7.5)) is None
 
 
 def test_drift_of_the_scale_of_the_images_is_taken_back() -> None:

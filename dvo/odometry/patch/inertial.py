@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dvo.data.frame import Frame
-from dvo.data.inertial import InertialSamples
+from dvo.data.inertial import InertialSamples, checked_samples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, rotation_vector, slerp, split
@@ -94,7 +94,7 @@ class InertialTracking:
         Args:
             samples: of the sensor.
         """
-        if self.options.use and self.graph.recording.segment > 0 and len(samples):
+        if self.options.use and self.graph.recording.segment > 0 and len(checked_samples(samples)):
             self._unused = "a map that is tracked in keeps its own unit and axes"
         elif self.options.use:
             self.estimator.add(samples)

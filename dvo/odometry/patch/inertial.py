@@ -22,6 +22,7 @@ from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_ma
 from dvo.map.correction import apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
+from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
@@ -47,15 +48,22 @@ class InertialTracking:
         options: settings.
         graph: of the tracker.
         metric: the scale has another source: the samples predict rotations alone.
+        variance: of a visual measurement of weight 1, feature pixels squared.
+        optimised: number of newest keyframes whose poses move in the window.
 
     Attributes:
         estimator: of scale, vertical, velocity and biases.
+        coupling: measurements for the window.
     """
 
-    def __init__(self, options: InertialOptions, graph: KeyframeGraph, *, metric: bool = False) -> None:
+    def __init__(
+        self, options: InertialOptions, graph: KeyframeGraph, *, metric: bool = False, variance: float = 1.0,
+        optimised: int = 8,
+    ) -> None:  # fmt: skip
         self.options, self.graph, self.metric = options, graph, metric
         self._unused = ""  # why samples are not used
         self.estimator = InertialEstimator(options)
+        self.coupling = InertialCoupling(self.estimator, self._similarity, variance, optimised)
         self._errors: tuple[float, float] | None = None  # squared, of the gyroscope and of the motion model, rad^2
         self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
         self._before: tuple[float, np.ndarray] | None = None  # and of the one before it

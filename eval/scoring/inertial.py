@@ -9,7 +9,7 @@ Definitions:
   to the first time from which the scale stays within :data:`SCALE_PERCENT` percent, whatever the system says of itself.
 - NEES (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, 5.4.2) is
   ``e^T P^-1 e`` over its dimension, mean over the aligned frames, 1 if consistent. Yaw and position of the pose at the
-  alignment are taken as right, as they cannot be observed.
+  alignment are taken as right, as they cannot be observed; also after segments that share its world.
 - An alignment is wrong if the scale of the poses that follow it, until the system withdraws it, is off by
   :data:`WRONG_PERCENT` percent in the median of any :data:`JUDGED` seconds with motion, or gravity by
   :data:`WRONG_DEGREES` degrees.
@@ -130,7 +130,7 @@ def inertial_errors(
     for begin, end in dark:
         spent |= (streamed.timestamps > begin - SAME_FRAME) & (streamed.timestamps < end + SAME_FRAME)
     tracked = streamed.status == "tracking"
-    position, orientation, velocity = run.nees(aligned)
+    position, orientation, velocity = run.nees(aligned, _worlds(streamed, segments))
     dark_cm, dark_percent, dark_sigmas = run.in_the_dark(dark)
     return InertialErrors(
         scale_10s=100 * abs(pairs.scale(origin + 10, origin + 15) - 1),
@@ -202,10 +202,10 @@ class _Run:
         upright = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1.0]])
         return upright, self.true_position[at] - upright @ self.position[at]
 
-    def nees(self, aligned: np.ndarray) -> tuple[float, float, float]:
-        """Of position, orientation and velocity, over the aligned frames that have a covariance."""
+    def nees(self, aligned: np.ndarray, worlds: np.ndarray) -> tuple[float, float, float]:
+        """Of position, orientation and velocity, over the aligned frames that have a covariance; worlds ``(N,)``."""
         found: list[list[float]] = [[], [], []]
-        for begin, end in _stretches_of(aligned, self.streamed.segment):
+        for begin, end in _stretches_of(aligned, worlds):
             if not (np.isfinite(self.position[begin]).all() and np.isfinite(self.true_position[begin]).all()):
                 continue
             upright, shift = self.gauge(begin)
@@ -288,6 +288,16 @@ def _time_to_alignment(pairs: Pairs, origin: float, stamps: np.ndarray) -> float
         return math.inf
     wrong = np.flatnonzero(~right)
     return float(centres[known[wrong[-1] + 1 if len(wrong) else 0]] - origin)
+
+
+def _worlds(streamed: Streamed, segments: Sequence[Segment]) -> np.ndarray:
+    """``(N,)`` number of the world of each frame: streamed segments whose rows are in one world share it."""
+    worlds = streamed.segment.astype(np.int64).copy()
+    for number, members in enumerate(worlds_of(segments)):
+        rows = np.concatenate([segments[k].trajectory.timestamps for k in members])
+        mine = np.isin(np.round(streamed.timestamps / SAME_FRAME), np.round(rows / SAME_FRAME))
+        worlds[np.isin(streamed.segment, np.unique(streamed.segment[mine]))] = -1 - number
+    return worlds
 
 
 def _stretches_of(aligned: np.ndarray, segment: np.ndarray) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, rotation_vector, so3_exp
-from dvo.odometry.inertial.smoother import GRAVITY, Smoother, VisualNodes
+from dvo.odometry.inertial.smoother import GRAVITY, SHIFTED, Smoother, VisualNodes
 
 Array = np.ndarray
 RATE = 1000
@@ -40,9 +40,9 @@ class Recording:
     body: tuple[Array, Array, Array]
 
     def nodes(self, start: float, end: float, step: int = 4) -> VisualNodes:
-        """Every few frames of an interval."""
+        """Every few frames of an interval, its first and its last one."""
         inside = np.flatnonzero((self.times >= start) & (self.times <= end))
-        chosen = np.union1d(inside[inside % step == 0], inside[-1:])
+        chosen = np.union1d(inside[inside % step == 0], inside[[0, -1]])
         none = np.zeros(len(chosen), int)
         depth = np.array([DEPTH / SCALE])
         return VisualNodes(self.times[chosen], none, self.rotation[chosen], self.position[chosen], depth)
@@ -66,8 +66,11 @@ class Recording:
 
 
 def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] = (0, 0, 0), grade: str = "euroc",
-           seconds: float = 14.0, turning: bool = True, drift: float = 0.0) -> Recording:  # fmt: skip
+           seconds: float = 14.0, turning: bool = True, drift: float = 0.0, swing: float = 0.0,
+           walk: float = 0.0, unit: float = 0.0) -> Recording:  # fmt: skip
     """Recording of a hand that moves about.
+
+    Images tell a turn and a shift sideways apart by parallax alone: a wrong orientation comes with a wrong place.
 
     Args:
         seed: of everything.
@@ -77,13 +80,19 @@ def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] =
         seconds: length.
         turning: it rotates before ``still`` has passed, too.
         drift: change of the logarithm of the unit of the images in a second.
+        swing: motion along one axis before ``still`` has passed, metres.
+        walk: random walk of the orientation of the images, rad in the root of a second.
+        unit: random walk of the logarithm of their unit, in the root of a second.
     """
-    rng = np.random.default_rng(seed)
+    rng, further = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     count = int(seconds * RATE) + 1
     time = np.arange(count) / RATE
     rise = np.clip((time - still + 1) / 2, 0, 1)[:, None] if still else np.ones((count, 1))
     rise = rise**3 * (10 - 15 * rise + 6 * rise**2)
     path = 0.25 * _wander(rng, count) * rise + np.outer(time, speed)
+    if swing:
+        axis = further.normal(size=3)
+        path = path + swing * _wander(further, count)[:, :1] * (1 - rise) * axis / np.linalg.norm(axis)
     turns = 0.35 * _wander(rng, count) * (1 if turning else rise)
     camera = so3_exp(turns)
     rotation, position = camera @ CAMERA_IMU, path - camera @ CAMERA_IMU @ LEVER
@@ -104,10 +113,22 @@ def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] =
     extrinsic = np.concatenate([SHIFT, matrix_to_quaternion(CAMERA_IMU)])
     frames = np.arange(100, count - 100, 50)
     turn = so3_exp(rng.normal(size=3))
-    seen = turn @ camera[frames] @ so3_exp(rng.normal(0, 1e-3, (len(frames), 3)))
-    grown = np.exp(-drift * (time[frames] - time[frames[0]]))[:, None]
-    steps = np.diff(path[frames], axis=0, prepend=path[frames[:1]]) * grown
-    places = ((path[frames[0]] + np.cumsum(steps, 0) + rng.normal(0, 1e-3 * DEPTH, (len(frames), 3))) @ turn.T) / SCALE
+    drifted = turn @ camera[frames]  # each step of the camera, and an error that stays
+    spans = np.sqrt(np.diff(time[frames]))[:, None]
+    errors = so3_exp(walk * spans * further.normal(size=(len(spans), 3)))
+    for k, error in enumerate(errors):
+        step = camera[frames[k]].T @ camera[frames[k + 1]]
+        drifted[k + 1] = drifted[k] @ step @ error
+    wrong = rng.normal(0, 1e-3, (len(frames), 3))
+    seen, shifts = drifted @ so3_exp(wrong), SHIFTED * DEPTH * np.cross([0.0, 0.0, 1.0], wrong)
+    logs = drift * (time[frames] - time[frames[0]])
+    logs[1:] += np.cumsum(unit * spans[:, 0] * further.normal(size=len(spans)))
+    steps = np.diff(path[frames], axis=0, prepend=path[frames[:1]]) * np.exp(-logs)[:, None]
+    bent = drifted @ np.swapaxes(turn @ camera[frames], -1, -2) @ turn
+    steps[0] = path[frames[0]]
+    shown = np.cumsum((bent @ steps[..., None])[..., 0], 0)
+    noise_of_places = rng.normal(0, 1e-3 * DEPTH, (len(frames), 3)) @ turn.T
+    places = (shown + noise_of_places + (drifted @ shifts[..., None])[..., 0]) / SCALE
     samples = InertialSamples(stamps + OFFSET, gyro, accel, extrinsic, noise)
     return Recording(samples, time[frames], seen, places, turn, (rotation[frames], position[frames], velocity[frames]))
 

@@ -54,19 +54,23 @@ class ChainSolution:
         states: ``(N, n)``.
         shared: ``(m,)``.
         covariance: ``(n + m, n + m)`` of the last state and the shared unknowns, jointly.
+        pairs: ``(N - 1, 2 n + m, 2 n + m)`` covariance of each state, the one after it and the shared unknowns; None if
+            not asked for.
     """
 
     states: Array
     shared: Array
     covariance: Array
+    pairs: Array | None = None
 
 
-def solve_chain(system: ChainSystem, damping: float = 0.0) -> ChainSolution:
+def solve_chain(system: ChainSystem, damping: float = 0.0, *, pairs: bool = False) -> ChainSolution:
     """Solve the normal equations.
 
     Args:
         system: positive definite.
         damping: share of each diagonal entry that is added to it (Levenberg and Marquardt).
+        pairs: the covariances of all states are wanted.
 
     Returns:
         Solution, and covariance of the newest state and the shared unknowns.
@@ -111,4 +115,20 @@ def solve_chain(system: ChainSystem, damping: float = 0.0) -> ChainSolution:
     joint[:n, :n] = inverses[-1].T
     joint[:n, n:] = -inverses[-1].T @ coupled[-1, :, :m] @ root.T
     joint[n:, n:] = root.T
-    return ChainSolution(states, common, joint @ joint.T)
+    covariance = joint @ joint.T
+    return ChainSolution(states, common, covariance, _pairs(inverses, coupled, covariance) if pairs else None)
+
+
+def _pairs(inverses: Array, coupled: Array, last: Array) -> Array:
+    """Covariances of consecutive states, from the last one backwards."""
+    count, n = inverses.shape[:2]
+    size = len(last)
+    found, after = np.empty((count - 1, n + size, n + size)), last
+    for k in reversed(range(count - 1)):
+        back = inverses[k].T
+        follows = -back @ coupled[k, :, :size]
+        across, pair = follows @ after, found[k]
+        pair[:n, :n] = back @ back.T + across @ follows.T
+        pair[:n, n:], pair[n:, :n], pair[n:, n:] = across, across.T, after
+        after = np.delete(np.delete(pair, np.s_[n : 2 * n], 0), np.s_[n : 2 * n], 1)
+    return found

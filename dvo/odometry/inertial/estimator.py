@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
-from dvo.geometry.poses import rotation_vector, so3_exp, split
+from dvo.geometry.poses import rotation_vector, skew, so3_exp, split
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.preintegration import preintegrate, propagate
 from dvo.odometry.inertial.smoother import (
     GRAVITY,
+    NODE,
     STATE,
     Similarities,
     Smoothed,
@@ -67,12 +68,9 @@ MAX_BIASES = (0.15, 1.0)
 """Biases that no working sensor has, rad/s and m/s^2."""
 AGREEMENT = 0.03
 """Difference of the scales of two estimates in a row that agree, relative, beyond three of their deviations."""
-FIT = 0.5
-"""Mean squared whitened residual of visual poses that their noise is chosen by: white noise and drift are two unknowns
-for each measurement."""
 FAILURES = 3
 """Estimates in a row that fail the tests, after which an alignment is withdrawn."""
-MOST_PATIENCE = 4.0
+MOST_PATIENCE = 2.0
 """Seconds from one estimate to the next where all that is known speaks against one."""
 _WAITING = ("too few poses", "too few samples")
 STILL = (0.02, 0.15)
@@ -114,7 +112,8 @@ class BodyState:
         rotation: ``(3, 3)`` body to world.
         position, velocity: ``(3,)`` metres and m/s.
         gyro_bias, accel_bias: ``(3,)``.
-        covariance: ``(15, 15)`` of rotation, position, velocity and biases.
+        covariance: ``(15, 15)`` of rotation, position, velocity and biases; with rows of further unknowns after
+            these, which do not change with time.
     """
 
     time: float
@@ -165,7 +164,8 @@ class InertialEstimator:
         self._failures, self._patience = 0, EVERY / 2
         self._next = -np.inf
         self._aligned, self._offset = np.nan, 0.0  # time of the alignment, and time offset then
-        self._past: list[tuple[float, Array, Array]] = []  # time, covariance and position of states that were newest
+        self._past: list[BodyState] = []  # states that were newest
+        self._held = np.nan  # time of the node whose heading and position are held
         self._smoother = SmootherOptions()
         self._known: list[int] = []  # worlds of the solution, in its order
 
@@ -213,6 +213,9 @@ class InertialEstimator:
             return
         time = float(nodes.times[-1])
         self._next = time + (EVERY if self.aligned else EVERY / 2)
+        if self.solution is not None:  # the window begins with a node that is known
+            known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
+            nodes = nodes.where(np.arange(len(nodes)) >= int(known.argmax()))
         problem, doubt = self._problem(nodes)
         if problem is None:
             self._refuse(doubt, time)
@@ -234,6 +237,7 @@ class InertialEstimator:
         if reason:
             self._refuse(reason, time)
             return
+        self._held = float(found.times[problem.held])
         self._accept(found, worlds, time)
 
     def predict(self, start: BodyState, times: Array) -> list[BodyState]:
@@ -257,29 +261,84 @@ class InertialEstimator:
 
     def last_state(self) -> BodyState | None:
         """State of the newest node of the solution; None without one."""
-        s = self.solution
-        if s is None:
-            return None
-        return BodyState(
-            float(s.times[-1]), s.rotation[-1], s.position[-1], s.velocity[-1], s.gyro_bias[-1], s.accel_bias[-1],
-            s.covariance[:STATE, :STATE] + self._before(s),
-        )  # fmt: skip
+        return None if self.solution is None else _newest(self.solution, self._covariance()[:STATE, :STATE])
 
-    def _before(self, found: Smoothed) -> Array:
-        """Covariance ``(15, 15)`` of the newest state by position and heading of the oldest node, which are held."""
-        added = np.zeros((STATE, STATE))
-        past = [entry for entry in self._past if entry[0] <= found.times[0] + 1e-6]
+    def state_at(self, time: float) -> BodyState | None:
+        """State at a time within the solution, or soon after it; None without one.
+
+        Args:
+            time: seconds, clock of the camera.
+
+        Returns:
+            The node before, carried on by samples; its covariance is that of the newest node.
+        """
+        s, last = self.solution, self.last_state()
+        if s is None or last is None or time < s.times[0] or time > last.time + self.options.longest:
+            return None
+        at = int(np.searchsorted(s.times, time + 1e-9, "right")) - 1
+        state = replace(
+            last, time=float(s.times[at]), rotation=s.rotation[at], position=s.position[at], velocity=s.velocity[at],
+            gyro_bias=s.gyro_bias[at], accel_bias=s.accel_bias[at],
+        )  # fmt: skip
+        return state if time <= state.time + 1e-6 else self.predict(state, np.array([time]))[0]
+
+    def beside(self, time: float, rotation: Array, position: Array) -> tuple[BodyState, Array]:
+        """State at a frame whose pose is that of the images in metres, and what is known of both.
+
+        Args:
+            time: of the frame, seconds; the newest node is as late, or a little earlier.
+            rotation, position: ``(3, 3)`` and ``(3,)`` of the camera, as given.
+
+        Returns:
+            The state, and the covariance ``(9, 9)`` of position and orientation (right tangent) of the camera, and of
+            the velocity of the sensor.
+        """
+        s, noise = self.solution, self._smoother
+        assert s is not None
+        # The pose follows similarity and pose of the newest node, and the images from there on.
+        size = len(s.covariance)
+        kept = np.zeros(
+            (STATE + 10, size)
+        )  # the state; rotation and position of the node, extrinsic rotation, log scale
+        kept[:STATE, :STATE], kept[STATE : STATE + 6, :6] = np.eye(STATE), np.eye(6)
+        kept[STATE + 6 : STATE + 9, NODE + 1 : NODE + 4], kept[STATE + 9, [NODE - 1, -4]] = np.eye(3), 1
+        state = _newest(s, kept @ self._covariance() @ kept.T)
+        moved = position - state.position - state.rotation @ s.lever
+        turned = np.hstack([state.rotation, np.zeros((3, 3)), -state.rotation, np.zeros((3, 1))])
+        chain = np.zeros((9, STATE + 10))
+        chain[:3, STATE:] = -skew(moved) @ turned
+        chain[:3, STATE : STATE + 3] -= state.rotation @ skew(s.lever)
+        chain[:3, STATE + 3 : STATE + 6], chain[:3, -1] = np.eye(3), moved
+        chain[3:6, STATE:], chain[6:, 6:9] = rotation.T @ turned, np.eye(3)
+        late = max(time - state.time, 0.0)
+        state = self.predict(state, np.array([time]))[0] if late > 0 else state
+        covariance = chain @ state.covariance @ chain.T
+        turns, moves = noise.variances(late, s.depth)
+        covariance[range(6), range(6)] += np.repeat([moves, turns], 3)
+        covariance[:3, :3] += (noise.scale_factor * noise.scale_walk) ** 2 * late / 3 * np.outer(moved, moved)
+        return replace(state, covariance=state.covariance[:STATE, :STATE]), covariance
+
+    def _covariance(self) -> Array:
+        """Covariance of the newest node and the shared unknowns, with heading and position of the node that is held.
+
+        They were those of the alignment at first. Later they are those of an older estimate, which is a window away:
+        what it did not know of them, when that node was its newest, is of other measurements.
+        """
+        found = self.solution
+        assert found is not None
+        past = [state for state in self._past if state.time <= self._held + 1e-6]
         if not past:
-            return added
-        _, covariance, position = past[-1]
-        turn, up = found.rotation[-1], np.array([0.0, 0.0, 1.0])
-        heading = float(covariance[:3, :3].trace()) / 3  # of the vertical axis, about
-        by_heading = np.concatenate(
-            [turn.T @ up, np.cross(up, found.position[-1] - position), np.cross(up, found.velocity[-1]), np.zeros(6)]
-        )
-        added += heading * np.outer(by_heading, by_heading)
-        added[3:6, 3:6] += covariance[3:6, 3:6]
-        return added
+            return found.covariance
+        state, up = past[-1], np.array([0.0, 0.0, 1.0])
+        told = np.zeros((4, STATE))  # heading and position of that state
+        told[0, :3], told[1:, 3:6] = state.rotation[2], np.eye(3)
+        follows = np.zeros((len(found.covariance), 4))  # the newest state by these
+        follows[:3, 0] = found.rotation[-1][2]
+        follows[3:6, 0] = np.cross(up, found.position[-1] - state.position)
+        follows[6:9, 0] = np.cross(up, found.velocity[-1])
+        follows[3:6, 1:] = np.eye(3)
+        chain = follows @ told
+        return found.covariance + chain @ state.covariance @ chain.T
 
     def turn_between(self, before: float, after: float) -> Array | None:
         """Rotation of the camera between two frames by the gyroscope.
@@ -334,6 +393,8 @@ class InertialEstimator:
         problem, _ = self._problem(nodes)
         if problem is None:
             return None
+        if self.solution is None:
+            problem.held = 0  # the origin is the place of the first camera
         found: Smoothed | None = None
         try:
             for _ in range(ROUNDS):  # each with the noise that the one before has found
@@ -385,8 +446,11 @@ class InertialEstimator:
             return None, f"the median specific force is {force:.3g} m/s^2 where gravity is 9.81: units, or axes"
         lever = -turn.T @ self.translation_camera_imu
         problem = Smoother(nodes, near, self.noise, turn, lever, self._smoother, offset=offset)
-        if self.solution is not None:
+        if self.solution is None:
+            problem.held = len(nodes) - 1
+        else:
             at = int(np.abs(self.solution.times - nodes.times[0]).argmin())
+            problem.held = self._common(nodes)
             problem.gyro_bias, problem.accel_bias = self.solution.gyro_bias[at], self.solution.accel_bias[at]
         return problem, ""
 
@@ -412,7 +476,7 @@ class InertialEstimator:
         nodes = problem.nodes.of(problem.segments - 1)  # a first alignment needs one segment alone
         if len(nodes) < 3 or nodes.times[-1] - nodes.times[0] < self.options.first:
             return None
-        problem.nodes = nodes
+        problem.nodes, problem.held = nodes, len(nodes) - 1 if problem.held else 0
         scale, gravity, bias = linear_start(problem)
         problem.gyro_bias = bias
         self._turned_apart(problem, nodes, np.tile(bias, (len(nodes), 1)), np.zeros((len(nodes), 3)), problem.offset)
@@ -478,13 +542,19 @@ class InertialEstimator:
         world = start.rotation[begins] @ np.swapaxes(nodes.rotation[begins] @ body, -1, -2)
         drift = np.zeros((len(nodes), 4))
         drift[:, :3] = rotation_vector(
-            np.swapaxes(world[nodes.segment] @ nodes.rotation @ body, -1, -2) @ start.rotation
+            start.rotation @ np.swapaxes(world[nodes.segment] @ nodes.rotation @ body, -1, -2)
         )
         scales = start.log_scale[nodes.segment]
         inside = (nodes.times >= known.times[0] - 1e-6) & (nodes.times <= known.times[-1] + 1e-6)
         scales[inside] = np.interp(nodes.times[inside], known.times, known.log_scale)
         drift[:, 3] = scales - scales[first]
         return world, scales[begins], drift
+
+    def _common(self, nodes: VisualNodes) -> int:
+        """The node that is held: of those that the last solution has, the nearest to the one held there."""
+        assert self.solution is not None
+        known = np.isin(np.round(nodes.times, 6), np.round(self.solution.times, 6))
+        return int(np.where(known, np.abs(nodes.times - self._held), np.inf).argmin())
 
     def _known_similarity(self, world: int) -> Similarity | None:
         """Present estimate of a world."""
@@ -529,10 +599,11 @@ class InertialEstimator:
 
     def _adapt(self, found: Smoothed) -> None:
         """Follow the noise of the visual poses."""
-        factors = np.clip(np.sqrt(found.visual_error / FIT), 0.7, 1.4)
-        now = self._smoother.rotation_factor, self._smoother.position_factor
-        rotation, position = np.clip(np.array(now) * factors, *NOISE_RANGE).tolist()
-        self._smoother = replace(self._smoother, rotation_factor=rotation, position_factor=position)
+        factors = np.clip(np.sqrt(found.visual_error), 0.7, 1.4)
+        known = self._smoother
+        now = np.array([known.rotation_factor, known.position_factor, known.scale_factor])
+        rotation, position, scale = np.clip(now * factors, *NOISE_RANGE).tolist()
+        self._smoother = replace(known, rotation_factor=rotation, position_factor=position, scale_factor=scale)
 
     def _doubt(self, problem: Smoother, found: Smoothed) -> str:
         """Why an estimate is not believed; empty if it is."""
@@ -570,9 +641,9 @@ class InertialEstimator:
         """Note why there is no estimate; an alignment that fails again and again is withdrawn."""
         self._candidate = None
         if not self.aligned:
-            if (
-                _words(reason) == _words(self.reason) and reason not in _WAITING
-            ):  # the same again and again: look more rarely
+            # The same again and again: look more rarely, but not where a little more motion is all that is missing.
+            again = _words(reason) == _words(self.reason) and reason not in _WAITING
+            if again and "is uncertain" not in reason:
                 self._patience = min(2 * self._patience, MOST_PATIENCE)
             else:
                 self._patience = EVERY / 2
@@ -597,7 +668,7 @@ class InertialEstimator:
                 return
             self.state, self.reason, self._aligned = ScaleState.ALIGNED, "", time
             self._offset = found.time_offset
-            self._take(found, worlds)
+            self._take(_from_first_camera(found), worlds)
             self.history.append({"time": time, "event": "aligned", "scale_sigma": found.scale_sigma})
             return
         new = worlds[-1] not in self.worlds
@@ -614,10 +685,25 @@ class InertialEstimator:
         self._known = list(worlds[: len(found.worlds.log_scale)])
         state = self.last_state()
         assert state is not None
-        self._past.append((state.time, state.covariance, state.position))
+        self._past.append(state)
         for k, world in enumerate(self._known):
             w = found.worlds
             self.worlds[world] = Similarity(float(np.exp(w.log_scale[k])), w.rotation[k], w.translation[k])
+
+
+def _newest(found: Smoothed, covariance: Array) -> BodyState:
+    """State of the newest node."""
+    return BodyState(
+        float(found.times[-1]), found.rotation[-1], found.position[-1], found.velocity[-1], found.gyro_bias[-1],
+        found.accel_bias[-1], covariance,
+    )  # fmt: skip
+
+
+def _from_first_camera(found: Smoothed) -> Smoothed:
+    """An estimate of one segment, whose origin moves to the place of the first camera."""
+    origin = found.worlds.translation[-1]
+    worlds = replace(found.worlds, translation=found.worlds.translation - origin)
+    return replace(found, position=found.position - origin, worlds=worlds)
 
 
 def _words(reason: str) -> str:
@@ -644,9 +730,9 @@ def _step(state: BodyState, time: float, offset: float, samples: InertialSamples
     bias = np.tile(np.concatenate([state.gyro_bias, state.accel_bias]), (2, 1))
     _, before, after, own = motion_factors(motion, *pair, bias)
     back = np.linalg.inv(after[0, :, :9])
-    forward = np.eye(STATE)
-    forward[:9] = -back @ before[0]
-    added = np.zeros((STATE, STATE))
+    size = len(state.covariance)
+    forward, added = np.eye(size), np.zeros((size, size))
+    forward[:9, :STATE] = -back @ before[0]
     added[:9, :9] = back @ own[0] @ back.T
     walk = np.repeat([noise.gyro_walk, noise.accel_walk], 3) ** 2 * (time - state.time)
     added[range(9, STATE), range(9, STATE)] = walk
@@ -673,3 +759,17 @@ def camera_pose(state: BodyState, rotation_camera_imu: Array, translation_camera
     """Camera to world of a body state: rotation ``(3, 3)`` and position ``(3,)``."""
     rotation = state.rotation @ rotation_camera_imu.T
     return rotation, state.position - rotation @ translation_camera_imu
+
+
+def camera_covariance(state: BodyState, rotation_camera_imu: Array, translation_camera_imu: Array) -> Array:
+    """Covariance ``(9, 9)`` of position and orientation (right tangent) of the camera, and of velocity of the sensor.
+
+    Args:
+        state: of the sensor.
+        rotation_camera_imu, translation_camera_imu: pose of the sensor in the camera.
+    """
+    chain = np.zeros((9, STATE))
+    chain[:3, :3] = state.rotation @ skew(rotation_camera_imu.T @ translation_camera_imu)
+    chain[:3, 3:6] = chain[6:, 6:9] = np.eye(3)
+    chain[3:6, :3] = rotation_camera_imu
+    return chain @ state.covariance @ chain.T

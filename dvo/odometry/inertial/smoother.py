@@ -8,7 +8,8 @@ tie consecutive nodes (Forster et al., 2017, eq. 45), also across an interval wi
 it is joined to the one before.
 
 Errors: ``R_wb = R Exp(phi)`` and additive positions, velocities and biases, as in that paper; ``A <- Exp(alpha) A`` of
-the rotation of a segment's world.
+the rotation of a segment's world. The drift of the visual orientation is in the axes of the world, where it stays as
+the camera turns. How noisy a visual trajectory is, its residuals tell (:attr:`Smoothed.visual_error`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 
 from dvo.data.inertial import ImuNoise, InertialSamples
 from dvo.geometry.poses import rotation_vector, skew, so3_exp
-from dvo.odometry.inertial.chain import ChainSystem, solve_chain
+from dvo.odometry.inertial.chain import ChainSolution, ChainSystem, solve_chain
 from dvo.odometry.inertial.preintegration import Preintegration, preintegrate
 
 Array = np.ndarray
@@ -36,7 +37,10 @@ WIDTH = 6.0
 """Of the robust kernel of visual residuals, deviations."""
 SHIFTED = 0.8
 """Visual shift that goes with a visual turn that is wrong, in usual depths of the scene."""
+USUAL = 10.0
+"""Measurements that the usual noise of visual poses counts for, where it is estimated."""
 _FIXED = 1e18  # information of an unknown that is held
+_HELD = 1e14  # of the heading that is held, one direction of three: more would drown the others in rounding errors
 _UNKNOWN = 1e12  # variance of a motion without samples
 
 
@@ -83,8 +87,8 @@ class SmootherOptions:
         rotation_walk: their drift in a second, rad.
         position_sigma, position_walk: noise of visual displacements: of their ends, and of a second, in depths of the
             scene.
-        rotation_factor, position_factor: of both kinds of noise.
         scale_walk: drift of the scale in a second, relative.
+        rotation_factor, position_factor, scale_factor: of the noise of these.
         extrinsic_sigma: of the rotation between sensor and camera, rad.
         offset_sigma: of the time offset, seconds.
         iterations: of Gauss-Newton, at most.
@@ -97,9 +101,24 @@ class SmootherOptions:
     scale_walk: float = 1.5e-2
     rotation_factor: float = 1.0
     position_factor: float = 1.0
+    scale_factor: float = 1.0
     extrinsic_sigma: float = 5e-3
     offset_sigma: float = 2e-2
     iterations: int = 12
+
+    def variances(self, span: float | Array, depth: float | Array) -> tuple[float | Array, float | Array]:
+        """Variances of what the images tell of a motion, on each axis.
+
+        Args:
+            span: between the two poses, seconds.
+            depth: of the scene, in any unit.
+
+        Returns:
+            Of the rotation, rad^2, and of the displacement, squared units of the depth.
+        """
+        turn = self.rotation_walk**2 * span + 2 * self.rotation_sigma**2
+        move = self.position_walk**2 * span + 2 * self.position_sigma**2
+        return self.rotation_factor**2 * turn, (self.position_factor * depth) ** 2 * move
 
 
 @dataclass(frozen=True)
@@ -133,11 +152,13 @@ class Smoothed:
         time_offset: seconds to add to a time of the camera for that of the sensor.
         rotation_camera_imu: ``(3, 3)``.
         lever: ``(3,)`` centre of the camera in the coordinates of the sensor, metres.
+        depth: usual depth of the scene of the newest segment, metres.
         covariance: ``(19 + m, 19 + m)`` of the newest node (rotation, position, velocity, biases, drift) and the shared
             unknowns (time offset, extrinsic rotation, and log scale and rotation of each segment).
         cost: half of the sum of squares.
         inertial_error: mean squared whitened residual of the preintegrated motion.
-        visual_error: ``(2,)`` mean squared whitened residual of visual orientations and positions, and their drift.
+        visual_error: ``(3,)`` sum of squared whitened residuals of visual orientations with their drift, of visual
+            displacements, and of the drift of the scale, over its expectation: 1 if the noise is that of the options.
     """
 
     times: Array
@@ -151,6 +172,7 @@ class Smoothed:
     time_offset: float
     rotation_camera_imu: Array
     lever: Array
+    depth: float
     covariance: Array
     cost: float
     inertial_error: float
@@ -177,7 +199,7 @@ class Values:
     position: Array
     velocity: Array
     bias: Array  # (N, 6)
-    drift: Array  # (N, 4) of the visual orientation (rad) and of the log scale
+    drift: Array  # (N, 4) of the visual orientation (rad, axes of the world) and of the log scale
     offset: float
     extrinsic: Array  # (3,) rotation vector after the given rotation
     log_scale: Array
@@ -201,6 +223,7 @@ class Smoother:
         options: noise of the rest.
         gyro_bias, accel_bias: ``(3,)`` known before.
         offset: time offset known before, seconds.
+        held: node whose heading and position are held, as the samples do not tell them.
     """
 
     nodes: VisualNodes
@@ -212,6 +235,7 @@ class Smoother:
     gyro_bias: Array = field(default_factory=lambda: np.zeros(3))
     accel_bias: Array = field(default_factory=lambda: np.zeros(3))
     offset: float = 0.0
+    held: int = 0
 
     @property
     def segments(self) -> int:
@@ -348,7 +372,7 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
         numpy.linalg.LinAlgError: the equations are singular.
     """
     values, damping, motion, offset = start, 1e-6, problem.preintegrated(start), start.offset
-    system, cost, errors = _linearise(problem, values, motion)
+    system, cost, error = _linearise(problem, values, motion)
     for iteration in range(problem.options.iterations):
         step = solve_chain(system, damping)
         moved = _moved(problem, values, step.states, step.shared)
@@ -364,14 +388,15 @@ def smooth(problem: Smoother, start: Values) -> Smoothed:
         done = cost - lower < 1e-4 * cost + 1e-6
         if again:
             motion, offset = motion_then, moved.offset
-        values, system, cost, errors, damping = moved, further, lower, found, damping / 10
+        values, system, cost, error, damping = moved, further, lower, found, damping / 10
         if done:
             break
-    covariance = solve_chain(system).covariance
+    solved, scales = solve_chain(system, pairs=True), values.scales(problem.nodes.segment)
     return Smoothed(
         problem.nodes.times, values.rotation, values.position, values.velocity, values.bias[:, :3], values.bias[:, 3:],
-        values.scales(problem.nodes.segment), _worlds(problem, values), values.offset,
-        problem.rotation_camera_imu @ so3_exp(values.extrinsic), problem.lever, covariance, cost, *errors,
+        scales, _worlds(problem, values), values.offset, problem.rotation_camera_imu @ so3_exp(values.extrinsic),
+        problem.lever, float(np.exp(scales[-1]) * problem.nodes.depth[-1]), solved.covariance, cost, error,
+        _visual_error(problem, values, solved),
     )  # fmt: skip
 
 
@@ -400,15 +425,13 @@ def _apply(a: Array, v: Array) -> Array:
     return (a @ v[..., None])[..., 0]
 
 
-def _linearise(
-    problem: Smoother, values: Values, motion: Preintegration
-) -> tuple[ChainSystem, float, tuple[float, Array]]:
-    """Normal equations, half of the sum of squares, and mean squared inertial and visual residual."""
+def _linearise(problem: Smoother, values: Values, motion: Preintegration) -> tuple[ChainSystem, float, float]:
+    """Normal equations, half of the sum of squares, and mean squared inertial residual."""
     count, segments = len(problem.nodes), problem.segments
     system = ChainSystem.zeros(count, NODE, _SEGMENT + 4 * segments)
     cost, inertial = _add_motion(problem, values, motion, system)
-    more, visual = _add_visual(problem, values, system)
-    return system, cost + more + _add_priors(problem, values, system), (inertial, visual)
+    cost += _add_visual(problem, values, system) + _add_priors(problem, values, system)
+    return system, cost, inertial
 
 
 def motion_factors(
@@ -494,50 +517,103 @@ def _robust(residual: Array) -> tuple[Array, float]:
     return np.sqrt(1 / (1 + squares / WIDTH**2))[:, None], float(0.5 * WIDTH**2 * np.log1p(squares / WIDTH**2).sum())
 
 
-def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> tuple[float, Array]:
-    """Visual orientations and displacements, and their drift; cost, and mean squares of both."""
-    nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
-    steps = np.sqrt(np.diff(nodes.times))[:, None]
-    begins = np.concatenate([[True], segment[1:] != segment[:-1]])
-    held, index = np.flatnonzero(begins), np.arange(STATE, NODE)
+@dataclass(frozen=True)
+class _Residuals:
+    """Whitened residuals of ``K`` measurements by the unknowns of a node, of the one after it, and the shared ones."""
+
+    residual: Array  # (K, 3)
+    weight: Array  # (K, 1) roots of the robust weights
+    before: Array  # (K, 3, NODE)
+    after: Array  # (K, 3, NODE), zero of a measurement of one node
+    shared: Array  # (K, 3, m)
+
+    def weighted(self) -> tuple[Array, Array, Array, Array]:
+        """Residuals and Jacobians with the robust weights."""
+        weight = self.weight[..., None]
+        return self.residual * self.weight, self.before * weight, self.after * weight, self.shared * weight
+
+
+def _drift_sigma(problem: Smoother) -> Array:
+    """``(N - 1, 4)`` deviations of the drift of visual orientation and log scale between nodes."""
+    nodes, options = problem.nodes, problem.options
+    scale = options.scale_walk * options.scale_factor
+    walk = np.array([options.rotation_walk * options.rotation_factor] * 3 + [scale])
+    sigma = walk * np.sqrt(np.diff(nodes.times))[:, None]
+    sigma[nodes.segment[1:] != nodes.segment[:-1]] = _UNKNOWN
+    return sigma
+
+
+def _add_visual(problem: Smoother, values: Values, system: ChainSystem) -> float:
+    """Visual orientations and displacements, and their drift; cost."""
+    segment = problem.nodes.segment
+    held, index = np.flatnonzero(np.concatenate([[True], segment[1:] != segment[:-1]])), np.arange(STATE, NODE)
     system.diagonal[held[:, None], index, index] += _FIXED  # the drift of a segment begins with its first node
-    walk = np.array([options.rotation_walk * options.rotation_factor] * 3 + [options.scale_walk]) * steps
-    walk[begins[1:]] = _UNKNOWN
-    drift = _add_walk(system, values.drift, walk, STATE)
-    turns, by_turns = _add_orientations(problem, values, system)
-    moves, by_moves = _add_displacements(problem, values, system)
-    rotation = (float((turns**2).sum()) + float((drift[:, :3] ** 2).sum())) / max(turns.size + drift[:, :3].size, 1)
-    position = float((moves**2).mean()) if moves.size else 0.0
-    return by_turns + by_moves + 0.5 * float((drift**2).sum()), np.array([rotation, position])
-
-
-def _add_orientations(problem: Smoother, values: Values, system: ChainSystem) -> tuple[Array, float]:
-    """Orientations of the camera in the world of a segment."""
-    nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
-    body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
-    turn = rotation_vector(_turn(values.world[segment] @ nodes.rotation @ body) @ values.rotation)
-    angle = options.rotation_sigma * options.rotation_factor
-    residual = (turn - values.drift[:, :3]) / angle
-    robust, cost = _robust(residual)
-    weight = robust[..., None] / angle
-    states = np.zeros((len(nodes), 3, NODE))
-    shared = np.zeros((len(nodes), 3, _SEGMENT + 4 * problem.segments))
-    states[:, :, :3], states[:, :, STATE : STATE + 3] = np.eye(3), -np.eye(3)
-    shared[:, :, _TIME], shared[:, :, _EXTRINSIC] = problem.rates(values), -np.eye(3)
-    for k in range(problem.segments):
-        start = _SEGMENT + 4 * k + 1
-        shared[segment == k, :, start : start + 3] = -_turn(values.rotation[segment == k])
-    states, shared, weighted = states * weight, shared * weight, residual * robust
+    drift = _add_walk(system, values.drift, _drift_sigma(problem), STATE)
+    turns, by_turns = _orientations(problem, values)
+    residual, states, _, shared = turns.weighted()
     system.diagonal += _turn(states) @ states
     system.border += _turn(states) @ shared
     system.shared += (_turn(shared) @ shared).sum(0)
-    system.right -= _apply(_turn(states), weighted)
-    system.right_shared -= _apply(_turn(shared), weighted).sum(0)
-    return residual, cost
+    system.right -= _apply(_turn(states), residual)
+    system.right_shared -= _apply(_turn(shared), residual).sum(0)
+    moves, by_moves = _displacements(problem, values)
+    residual, before, after, shared = moves.weighted()
+    _add_pairs(system, residual, before, after, 0, shared)
+    return by_turns + by_moves + 0.5 * float((drift**2).sum())
 
 
-def _add_displacements(problem: Smoother, values: Values, system: ChainSystem) -> tuple[Array, float]:
-    """Displacements of the camera between consecutive nodes of a segment, in the axes of the body at the first."""
+def _visual_error(problem: Smoother, values: Values, solved: ChainSolution) -> Array:
+    """Squared residuals of the images over their expectation (Förstner's estimate of components of variance).
+
+    Each residual is expected to be as large as its noise, less what the solution has adapted to it.
+    """
+    options, pairs = problem.options, solved.pairs
+    inside = problem.nodes.segment[1:] == problem.nodes.segment[:-1]
+    if pairs is None or not inside.any():
+        return np.ones(3)
+    turns, moves = _orientations(problem, values)[0], _displacements(problem, values)[0]
+    sigma = _drift_sigma(problem)[inside]
+    steps = np.diff(values.drift, axis=0)[inside] / sigma
+    by_step = np.zeros((4, pairs.shape[1]))
+    by_step[:, STATE:NODE], by_step[:, NODE + STATE : 2 * NODE] = -np.eye(4), np.eye(4)
+    drifts = 1 - _spread(np.tile(by_step, (len(steps), 1, 1)), pairs[inside]) / sigma**2
+    second = np.s_[NODE : 2 * NODE]
+    nodes = np.concatenate([np.delete(np.delete(pairs, second, 1), second, 2), solved.covariance[None]])
+    oriented = 1 - _spread(np.concatenate([turns.before, turns.shared], -1), nodes)
+    displaced = 1 - _spread(np.concatenate([moves.before, moves.after, moves.shared], -1)[inside], pairs[inside])
+    turned, moved, (rotation, scale) = turns.residual, moves.residual[inside], np.split(steps, [3], axis=1)
+    squares = np.array([(turned**2).sum() + (rotation**2).sum(), (moved**2).sum(), (scale**2).sum()])
+    expected = np.array([oriented.sum() + drifts[:, :3].sum(), displaced.sum(), drifts[:, 3].sum()])
+    usual = np.array([options.rotation_factor, options.position_factor, options.scale_factor]) ** -2.0
+    return (squares + USUAL * usual) / (np.maximum(expected, 0) + USUAL)
+
+
+def _spread(jacobians: Array, covariances: Array) -> Array:
+    """Variances ``(K, 3)`` of what depends on unknowns by ``(K, 3, D)``."""
+    return ((jacobians @ covariances) * jacobians).sum(-1)
+
+
+def _orientations(problem: Smoother, values: Values) -> tuple[_Residuals, float]:
+    """Orientations of the camera in the world of a segment, and their cost."""
+    nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
+    body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
+    turn = rotation_vector(values.rotation @ _turn(values.world[segment] @ nodes.rotation @ body))
+    angle = options.rotation_sigma * options.rotation_factor
+    residual = (turn - values.drift[:, :3]) / angle
+    robust, cost = _robust(residual)
+    states = np.zeros((len(nodes), 3, NODE))
+    shared = np.zeros((len(nodes), 3, _SEGMENT + 4 * problem.segments))
+    states[:, :, :3], states[:, :, STATE : STATE + 3] = values.rotation, -np.eye(3)
+    shared[:, :, _TIME] = _apply(values.rotation, problem.rates(values))
+    shared[:, :, _EXTRINSIC] = -values.rotation
+    for k in range(problem.segments):
+        start = _SEGMENT + 4 * k + 1
+        shared[segment == k, :, start : start + 3] = -np.eye(3)
+    return _Residuals(residual, robust, states / angle, np.zeros_like(states), shared / angle), cost
+
+
+def _displacements(problem: Smoother, values: Values) -> tuple[_Residuals, float]:
+    """Displacements of the camera between nodes of a segment, in the axes of the body at the first, and their cost."""
     nodes, options, segment = problem.nodes, problem.options, problem.nodes.segment
     body = problem.rotation_camera_imu @ so3_exp(values.extrinsic)
     seen = _apply(_turn(nodes.rotation[:-1] @ body), np.diff(nodes.position, axis=0))
@@ -546,19 +622,17 @@ def _add_displacements(problem: Smoother, values: Values, system: ChainSystem) -
     back = _turn(values.rotation[:-1])
     moved = _apply(back, np.diff(camera, axis=0))
     shrunk = np.exp(-values.scales(segment)[:-1])[:, None]
-    noise = options.position_walk**2 * np.diff(nodes.times) + 2 * options.position_sigma**2
-    sigma = (options.position_factor * nodes.depth[segment[:-1]] * np.sqrt(noise))[:, None]
+    sigma = np.sqrt(options.variances(np.diff(nodes.times), nodes.depth[segment[:-1]])[1])[:, None]
     # Images tell a turn and a shift sideways apart by parallax alone: where the visual turn is wrong, so is the shift.
     turned = nodes.rotation @ body
     between = _turn(values.rotation[:-1]) @ values.rotation[1:]
     wrong = rotation_vector(_turn(turned[:-1]) @ turned[1:] @ _turn(between))
     arm = SHIFTED * nodes.depth[segment[:-1], None, None] * skew(body[2])
     residual = (moved * shrunk - seen + _apply(arm, wrong)) / sigma
-    robust, cost = _robust(residual)
     across = segment[1:] != segment[:-1]
-    if across.any():
-        residual[across], robust[across] = 0.0, 0.0
-        cost = _robust(residual)[1]
+    residual[across] = 0.0
+    robust, cost = _robust(residual)
+    robust[across] = 0.0
     before, after = np.zeros((2, len(moved), 3, NODE))
     after[:, :, 3:6], before[:, :, 3:6] = back, -back
     after[:, :, :3] = -back @ values.rotation[1:] @ skew(problem.lever)
@@ -574,13 +648,12 @@ def _add_displacements(problem: Smoother, values: Values, system: ChainSystem) -
     for k in range(problem.segments):
         mine = segment[:-1] == k
         shared[mine, :, _SEGMENT + 4 * k] = -moved[mine]
-    weight = (robust * shrunk / sigma)[..., None]
-    _add_pairs(system, residual * robust, before * weight, after * weight, 0, shared * weight)
-    return residual[~across], cost
+    weight = (shrunk / sigma)[..., None]
+    return _Residuals(residual, robust, before * weight, after * weight, shared * weight), cost
 
 
 def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float:
-    """Biases of the first node, time offset, extrinsic rotation; heading and origin of the first segment are held."""
+    """Biases of the first node, time offset, extrinsic rotation; heading and position of one node are held."""
     noise, options = problem.noise, problem.options
     known = np.concatenate([problem.gyro_bias, problem.accel_bias])
     sigma = np.repeat([noise.gyro_bias, noise.accel_bias], 3)
@@ -595,9 +668,9 @@ def _add_priors(problem: Smoother, values: Values, system: ChainSystem) -> float
     index = np.arange(1, 4)
     system.shared[index, index] += 1 / options.extrinsic_sigma**2
     system.right_shared[_EXTRINSIC] -= tilt / options.extrinsic_sigma
-    system.shared[_SEGMENT + 3, _SEGMENT + 3] += _FIXED
-    index = np.arange(3, 6)
-    system.diagonal[0, index, index] += _FIXED
+    index, up = np.arange(3, 6), values.rotation[problem.held][2]
+    system.diagonal[problem.held, index, index] += _FIXED
+    system.diagonal[problem.held, :3, :3] += _HELD * np.outer(up, up)
     # Very weak, so that a scale without any measurement does not run away.
     scales = _SEGMENT + 4 * np.arange(problem.segments)
     system.shared[scales, scales] += 1e-2

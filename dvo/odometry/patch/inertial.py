@@ -23,7 +23,13 @@ from dvo.map.correction import apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.inertial.coupling import InertialCoupling
-from dvo.odometry.inertial.estimator import BodyState, InertialEstimator, Similarity, camera_pose
+from dvo.odometry.inertial.estimator import (
+    BodyState,
+    InertialEstimator,
+    Similarity,
+    camera_covariance,
+    camera_pose,
+)
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import Smoothed, VisualNodes
 from dvo.odometry.loops.closure import LoopCloser
@@ -322,14 +328,14 @@ class InertialTracking:
         if self._anchor is not None:
             self._anchor = self._state = None
         rotation, position = split(estimate.pose_wc)
-        pose = pose_from(similarity.rotation @ rotation, similarity.points(position))
+        rotation, position = similarity.rotation @ rotation, similarity.points(position)
         scale, covariance = similarity.scale, estimate.covariance
         if covariance is not None:
             unit = np.diag([scale] * 3 + [1.0] * 3)
             covariance = unit @ covariance @ unit
         return replace(
-            estimate, pose_wc=pose, covariance=covariance, scale_state=self.estimator.state,
-            inertial=self._beside(estimate.timestamp),
+            estimate, pose_wc=pose_from(rotation, position), covariance=covariance, scale_state=self.estimator.state,
+            inertial=self._beside(estimate.timestamp, rotation, position),
         )  # fmt: skip
 
     def _bridged(self, estimate: Estimate, state: BodyState) -> Estimate:
@@ -353,19 +359,19 @@ class InertialTracking:
             covariance=own @ grown @ own.T, reference=anchor.time, scale_state=estimator.state,
             inertial=InertialEstimate(
                 state.velocity, state.gyro_bias, state.accel_bias, estimator.solution.scale_sigma,
-                _ordered(state.covariance), estimator.solution.time_offset,
+                camera_covariance(state, turn, estimator.translation_camera_imu), estimator.solution.time_offset,
             ),
         )  # fmt: skip
 
-    def _beside(self, time: float) -> InertialEstimate | None:
-        """Velocity, biases and covariance at a frame with a visual pose."""
-        estimator, last = self.estimator, self.estimator.last_state()
-        if last is None or estimator.solution is None:
+    def _beside(self, time: float, rotation: np.ndarray, position: np.ndarray) -> InertialEstimate | None:
+        """Velocity, biases and covariance at a frame with a visual pose, that is given in metres."""
+        solution = self.estimator.solution
+        if solution is None:
             return None
-        state = estimator.predict(last, np.array([time]))[0] if time > last.time else last
-        sigma = estimator.solution.scale_sigma
-        covariance, offset = _ordered(state.covariance), estimator.solution.time_offset
-        return InertialEstimate(state.velocity, state.gyro_bias, state.accel_bias, sigma, covariance, offset)
+        state, covariance = self.estimator.beside(time, rotation, position)
+        return InertialEstimate(
+            state.velocity, state.gyro_bias, state.accel_bias, solution.scale_sigma, covariance, solution.time_offset
+        )
 
     def _visual_cw(self, state: BodyState, similarity: Similarity) -> Tensor:
         """Pose ``T_cw`` of a state, in the units of the images."""
@@ -449,12 +455,6 @@ def _path(smoothed: Smoothed, nodes: VisualNodes, mine: np.ndarray) -> _Path | N
     scale = np.exp(smoothed.log_scale[at])[:, None]
     translation = camera - scale * (rotation @ nodes.position[shared][..., None])[..., 0]
     return _Path(nodes.times[shared], smoothed.log_scale[at], matrix_to_quaternion(rotation), translation)
-
-
-def _ordered(covariance: np.ndarray) -> np.ndarray:
-    """``(9, 9)`` of position, rotation and velocity, from that of rotation, position, velocity and biases."""
-    order = [3, 4, 5, 0, 1, 2, 6, 7, 8]
-    return covariance[np.ix_(order, order)].copy()
 
 
 def _spaced(times: np.ndarray, worlds: Sequence[int], spacing: float) -> list[int]:

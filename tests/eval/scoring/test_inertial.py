@@ -92,6 +92,18 @@ def test_nees_is_one_for_errors_of_the_stated_covariance() -> None:
     assert sure.nees_position == pytest.approx(4 * found.nees_position)
 
 
+def test_a_segment_in_the_same_world_has_no_origin_of_its_own() -> None:
+    reference, truth = truth_of()
+    poses, late = reference.poses_wc.copy(), TIMES >= 15
+    poses[late, 0] += 0.1
+    run = replace(streamed_of(poses, truth), segment=late.astype(int))
+    parts = [Segment(Trajectory(TIMES[mine], poses[mine]), 0.0, 30.0) for mine in (~late, late)]
+    apart = inertial_errors(run, tuple(parts), reference, truth)
+    joined = inertial_errors(run, (parts[0], replace(parts[1], joined_to=0)), reference, truth)
+    assert apart.nees_position < 1e-3
+    assert joined.nees_position == pytest.approx(0.5 * 0.1**2 / 1e-4 / 3, rel=0.05)
+
+
 def test_time_to_alignment_and_scale() -> None:
     reference, truth = truth_of()
     run = streamed_of(scaled(reference.poses_wc, np.where(TIMES < 6, 3.0, 1.02)), truth)

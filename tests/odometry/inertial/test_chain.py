@@ -31,6 +31,11 @@ def test_solution_and_covariance_are_those_of_the_dense_system(count: int, share
     np.testing.assert_allclose(np.concatenate([found.states.ravel(), found.shared]), expected, atol=1e-9)
     kept = slice((count - 1) * n, None)
     np.testing.assert_allclose(found.covariance, np.linalg.inv(dense)[kept, kept], atol=1e-9)
+    everything, covariance = solve_chain(system, pairs=True), np.linalg.inv(dense)
+    assert found.pairs is None and everything.pairs is not None and len(everything.pairs) == count - 1
+    for k, pair in enumerate(everything.pairs):
+        kept = np.r_[k * n : (k + 2) * n, count * n : size]
+        np.testing.assert_allclose(pair, covariance[np.ix_(kept, kept)], atol=1e-9)
     damped = solve_chain(system, 0.5)
     expected = np.linalg.solve(dense + 0.5 * np.diag(np.diag(dense)), right)
     np.testing.assert_allclose(np.concatenate([damped.states.ravel(), damped.shared]), expected, atol=1e-9)

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvo.geometry.poses import so3_exp
+from dvo.geometry.poses import rotation_vector, so3_exp
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import VisualNodes
 from dvo.odometry.protocol import ScaleState
-from tests.support.visual_inertial import CAMERA_IMU, SCALE, Recording, record
+from tests.support.visual_inertial import CAMERA_IMU, LEVER, SCALE, Recording, record
 
 
 def drive(recording: Recording, until: float = np.inf) -> tuple[InertialEstimator, list[str]]:
@@ -107,6 +107,48 @@ def test_an_alignment_that_fails_later_is_withdrawn() -> None:
     gyro[late], accel[late] = s.gyro[late] @ turned, s.accel[late] @ turned
     estimator, _ = drive(recording.with_samples(gyro=gyro, accel=accel))
     assert [entry["event"] for entry in estimator.history][:2] == ["aligned", "withdrawn"]
+
+
+def _consistency(recording: Recording, window: float) -> np.ndarray:
+    """NEES ``(K, 3)`` of position, orientation and velocity of poses as they come, from the one at the alignment on."""
+    estimator, before, rows = InertialEstimator(InertialOptions(window=window)), -np.inf, []
+    upright, origin = np.eye(3), None
+    for k, time in enumerate(recording.times):
+        estimator.add(recording.samples.between(before, time))
+        before = time
+        if estimator.due(time):
+            estimator.update(recording.nodes(time - window, time), [0])
+        if not estimator.aligned:
+            continue
+        world, (true, body, velocity) = estimator.worlds[0], (part[k] for part in recording.body)
+        rotation, position = world.rotation @ recording.rotation[k], world.points(recording.position[k])
+        camera, place = true @ CAMERA_IMU.T, body + true @ LEVER
+        if origin is None:
+            turn = camera @ rotation.T
+            yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+            upright = so3_exp(np.array([0.0, 0.0, yaw]))
+            origin = place - upright @ position
+        elif k % 5 == 0:
+            state, covariance = estimator.beside(time, rotation, position)
+            errors = (
+                upright.T @ (place - origin) - position,
+                rotation_vector(rotation.T @ upright.T @ camera),
+                upright.T @ velocity - state.velocity,
+            )
+            parts = (covariance[i : i + 3, i : i + 3] for i in (0, 3, 6))
+            rows.append([e @ np.linalg.solve(part, e) / 3 for e, part in zip(errors, parts, strict=True)])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+def test_poses_err_as_much_as_their_covariance_says(grade: str) -> None:
+    """Also when the window has left the alignment behind, with images whose heading and unit drift."""
+    found = [
+        _consistency(record(20 + seed, seconds=16.0, grade=grade, walk=2e-3, unit=1.5e-2), window=6.0)
+        for seed in range(4)
+    ]
+    assert (np.mean([rows.mean(0) for rows in found], 0) > 0.35).all()
+    assert (np.mean([rows.mean(0) for rows in found], 0) < 2.0).all()
 
 
 def test_prediction_in_the_dark_is_within_its_covariance() -> None:

@@ -43,6 +43,27 @@ def test_newest_state_is_within_its_covariance() -> None:
     assert 0.2 < np.mean(squares) / 3 < 5
 
 
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+def test_noise_of_the_images_is_found_beside_that_of_the_sensor(grade: str) -> None:
+    found = {}
+    for factor in (0.5, 1.0):
+        errors = []
+        for seed in range(3):
+            problem = record(30 + seed, grade=grade, walk=2e-3, unit=1.5e-2).problem(0.1, 12.0)
+            problem.options = smoother.SmootherOptions(
+                rotation_sigma=1e-3, position_sigma=1e-3, position_walk=0.0, rotation_factor=factor,
+                position_factor=factor,
+            )  # fmt: skip
+            scale, gravity, problem.gyro_bias = linear_start(problem)
+            worlds = Similarities(np.array([np.log(scale)]), upright(gravity)[None], np.zeros((1, 3)))
+            errors.append(smooth(problem, first_values(problem, worlds)).visual_error)
+        found[factor] = np.mean(errors, 0)
+    rotation, position, scale = found[1.0]
+    assert rotation == pytest.approx(1.0, abs=0.2) and scale == pytest.approx(1.0, abs=0.2)
+    assert 0.7 < position < 1.5  # consecutive differences of positions with noise are not independent
+    assert (found[0.5][:2] > 2.5 * found[1.0][:2]).all()
+
+
 def test_jacobians_are_those_of_finite_differences(monkeypatch: pytest.MonkeyPatch) -> None:
     recording = record(3, seconds=4.0)
     problem = recording.problem(0.5, 2.0)

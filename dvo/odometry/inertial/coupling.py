@@ -1,9 +1,14 @@
 """Preintegrated samples between the keyframes of a window, once the scale is known.
 
-A window alone holds its unit by the parallax of a few keyframes. Samples hold it too: how the velocity changes is known
-in metres, and so is what it changes from, by the keyframes whose poses are held. Each keyframe has a velocity and
-biases (:class:`dvo.ba.inertial_factor.InertialFactor`); the scale is that of the aligned world, a choice of the unit
-that the window keeps, and the vertical too: what is not known of it acts as a bias of the accelerometer.
+A window alone holds its unit by the parallax of a few keyframes, which a fast turn replaces within half a second.
+Samples hold it longer: the velocity of the first keyframe whose pose moves is known by the smoother, from the seconds
+before, and how it changes from there on by the samples (:class:`dvo.ba.inertial_factor.InertialFactor`). Scale and
+vertical are those of the aligned world. The scale is no assumption, but the unit that the window is led to: forces are
+in metres. What is not known of the vertical acts as a bias of the accelerometer.
+
+Velocities are in the unit of the window, in which an error of the scale is none. Poses that are held take no part: a
+difference of two neighbours is too noisy to tell a velocity. Turns have a noise beyond that of the samples: the images
+go on to tell the bias of the gyroscope to the smoother.
 """
 
 from __future__ import annotations
@@ -30,7 +35,7 @@ from dvo.odometry.inertial.preintegration import Preintegration, preintegrate
 from dvo.odometry.inertial.smoother import GRAVITY, NODE, Smoothed
 
 LEAST_TURN_SIGMA = 5e-4
-"""Error of the rotation of an interval beyond the noise of the samples, rad: clocks, axes, shutter."""
+"""Deviation of the rotation of an interval at least, rad; that of visual rotations is about 1e-3."""
 LEAST_SHIFT = 2e-4
 """Deviation of the time offset at least, seconds."""
 WIDTH = 6.0
@@ -77,17 +82,14 @@ class InertialCoupling:
             return {}
         times = np.array([frame.timestamp for frame in window.frames])
         centres = se3.inverse(window.poses_cw.double()).cpu().numpy()[:, :3]
-        moving, usual = torch.from_numpy(np.gradient(centres, times, axis=0)), torch.from_numpy(made.bias)
-        device = window.poses_cw.device
-
-        def known(name: str, otherwise: list[Tensor]) -> Tensor:
-            values = [frame.states.get(name, other) for frame, other in zip(window.frames, otherwise, strict=True)]
-            return torch.stack([value.to(device, torch.float64) for value in values])[None]
-
+        moving, device = torch.from_numpy(np.gradient(centres, times, axis=0)), window.poses_cw.device
+        known = [frame.states.get(VELOCITY, other) for frame, other in zip(window.frames, moving, strict=True)]
+        velocity = torch.stack([value.to(device, torch.float64) for value in known])[None]
+        bias = torch.from_numpy(made.bias).to(device).expand(1, len(window), 6)
         # Unknown are the velocities in the chain of intervals, and biases that all of its keyframes share.
         chain, free = torch.zeros(len(window), dtype=torch.bool, device=device), len(made.first) + 1
         chain[int(made.first[0]) : int(made.first[0]) + free] = True
-        blocks = inertial_blocks(known(VELOCITY, list(moving)), known(IMU_BIAS, [usual] * len(window)))
+        blocks = inertial_blocks(velocity, bias)
         places = {VELOCITY: (chain.cumsum(0) - 1, free), IMU_BIAS: (torch.zeros_like(chain, dtype=torch.long), 1)}
         return {
             name: replace(blocks[name], slot=torch.where(chain, place, count), free=count)
@@ -108,11 +110,14 @@ class InertialCoupling:
         )  # fmt: skip
         known = [
             VectorPrior(
-                name, torch.from_numpy(value)[None, None], torch.from_numpy(self.variance / variance)[None, None],
+                name,
+                torch.from_numpy(value)[None, None],
+                torch.from_numpy(self.variance / variance)[None, None],
                 first[:1],
             )  # fmt: skip
             for name, value, variance in (
-                (VELOCITY, made.velocity, np.full(3, made.velocity_variance)), (IMU_BIAS, made.bias, made.bias_variance)
+                (VELOCITY, made.velocity, np.full(3, made.velocity_variance)),
+                (IMU_BIAS, made.bias, made.bias_variance),
             )
         ]
         # Weights of a window are confidences, of which 1 stands for `variance`.
@@ -131,9 +136,9 @@ class InertialCoupling:
 
     def _made_of(self, solution: Smoothed, similarity: Similarity, times: np.ndarray) -> _Intervals | None:
         begin = max(len(times) - self.optimised, 0)
-        start = self.estimator.state_at(times[begin])
+        start, newest = self.estimator.state_at(times[begin]), self.estimator.last_state()
         samples = self.estimator.stream.near(times[begin] - 1.0, times[-1] + 1.0)
-        if start is None or samples is None or len(samples) < 2 or not (np.diff(times) > 0).all():
+        if start is None or newest is None or samples is None or len(samples) < 2 or not (np.diff(times) > 0).all():
             return None
         bias = start.gyro_bias, start.accel_bias
         motion = preintegrate(samples, times[begin:] + solution.time_offset, *bias, self.estimator.noise)
@@ -142,7 +147,7 @@ class InertialCoupling:
             return None
         first, scale = begin + np.flatnonzero(covered), similarity.scale
         motion = _where(motion, covered)
-        late = max(float(np.sqrt(solution.covariance[_TIME, _TIME])), LEAST_SHIFT)
+        late = max(float(np.sqrt(solution.covariance[NODE, NODE])), LEAST_SHIFT)
         change = late * (motion.rates[:, 1] - motion.rates[:, 0])
         covariance = motion.covariance.copy()
         covariance[:, :3, :3] += change[:, :, None] * change[:, None] + LEAST_TURN_SIGMA**2 * np.eye(3)
@@ -159,14 +164,12 @@ class InertialCoupling:
         by[3:6, :3] = -skew(solution.rotation[-1].T @ GRAVITY)
         by[6:, NODE - 1] = by[6:, -4] = -solution.velocity[-1]
         variance = np.diag(by @ solution.covariance @ by.T)
+        speed = float(variance[6:].mean()) + float(np.trace((start.covariance - newest.covariance)[6:9, 6:9])) / 3
         extrinsics = pose_from(solution.rotation_camera_imu, self.estimator.translation_camera_imu / scale)
         return _Intervals(
-            motion, first, similarity.rotation.T @ start.velocity / scale, float(variance[6:].mean()) / scale**2,
+            motion, first, similarity.rotation.T @ start.velocity / scale, speed / scale**2,
             np.concatenate(bias), variance[:6], similarity.rotation.T @ GRAVITY / scale, extrinsics,
         )  # fmt: skip
-
-
-_TIME = 19  # of the time offset in the covariance of a solution
 
 
 def _where(motion: Preintegration, keep: np.ndarray) -> Preintegration:

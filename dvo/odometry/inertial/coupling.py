@@ -38,6 +38,9 @@ LEAST_TURN_SIGMA = 5e-4
 """Deviation of the rotation of an interval at least, rad; that of visual rotations is about 1e-3."""
 LEAST_SHIFT = 2e-4
 """Deviation of the time offset at least, seconds."""
+MAX_FORCE_SIGMA = 0.025
+"""Deviation of the acceleration, m/s^2, by bias and vertical together, above which samples hold a velocity no better
+than images do, and are no measurement for the window."""
 WIDTH = 6.0
 """Of the robust kernel of an interval, deviations."""
 
@@ -164,6 +167,8 @@ class InertialCoupling:
         by[3:6, :3] = -skew(solution.rotation[-1].T @ GRAVITY)
         by[6:, NODE - 1] = by[6:, -4] = -solution.velocity[-1]
         variance = np.diag(by @ solution.covariance @ by.T)
+        if variance[3:6].mean() > MAX_FORCE_SIGMA**2:
+            return None
         speed = float(variance[6:].mean()) + float(np.trace((start.covariance - newest.covariance)[6:9, 6:9])) / 3
         extrinsics = pose_from(solution.rotation_camera_imu, self.estimator.translation_camera_imu / scale)
         return _Intervals(

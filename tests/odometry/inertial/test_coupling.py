@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -76,6 +77,13 @@ def test_without_an_alignment_nothing_is_measured(aligned) -> None:
     assert coupled(recording, waiting).factors(window) == () and coupled(recording, waiting).blocks(window) == {}
     window.frames[0] = replace(window.frames[0], guest=True)  # of a map, with a unit of its own
     assert coupled(recording, estimator).factors(window) == ()
+
+
+def test_samples_that_hold_no_velocity_are_no_measurement(aligned) -> None:
+    recording, estimator = aligned
+    vague = copy(estimator)
+    vague.solution = replace(estimator.solution, covariance=100 * estimator.solution.covariance)
+    assert coupled(recording, vague).factors(window_at(recording, 9.9)) == ()
 
 
 @pytest.mark.parametrize("last", [9.9, 10.3])  # before the newest node of the estimate, and after it

@@ -281,6 +281,24 @@ def test_a_clip_played_through_the_node_comes_back_as_poses(ros):
     assert status == 0, robot.log.read_text()
 
 
+@pytest.mark.ros
+def test_the_node_ends_whatever_it_is_doing(ros, tmp_path):
+    """A frame that never ends stands for one that takes long, or for weights that are being loaded."""
+    waiting = """
+import os, signal, threading
+import rclpy
+from dvo_ros import node
+def wait_for_ever(self):
+    os.kill(os.getpid(), signal.SIGTERM)
+    threading.Event().wait()
+node.Tracker.__init__ = wait_for_ever
+node.main()
+"""
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAIN), "ROS_LOG_DIR": str(tmp_path)}
+    environment["PYTHONPATH"] = os.pathsep.join(map(str, (PACKAGE, PACKAGE.parents[1])))
+    assert subprocess.run([sys.executable, "-c", waiting], env=environment, timeout=PATIENCE).returncode == 0
+
+
 def check_odometry(odometries, clip, count):
     """Against the truth, aligned by the first pose and a scale."""
     headers = {(odometry.header.frame_id, odometry.child_frame_id) for odometry in odometries}

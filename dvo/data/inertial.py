@@ -50,8 +50,10 @@ class InertialSamples:
         origin: what all samples of a recording come from, for messages, such as ``imu0/data.csv``.
         notes: repairs and guesses of the reader, a sentence each.
 
+    What NumPy reads as numbers is converted.
+
     Raises:
-        DvoError: arrays whose shapes do not match.
+        DvoError: not numbers, or shapes that do not match.
     """
 
     timestamps: np.ndarray
@@ -63,13 +65,24 @@ class InertialSamples:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        count = len(self.timestamps)
-        if self.timestamps.shape != (count,) or self.gyro.shape != (count, 3) or self.accel.shape != (count, 3):
+        for name in ("timestamps", "gyro", "accel", "T_camera_imu"):
+            value = getattr(self, name)
+            if value is not None or name != "T_camera_imu":
+                object.__setattr__(self, name, _numbers(value, name))
+        if self.timestamps.ndim != 1 or not self.gyro.shape == self.accel.shape == (*self.timestamps.shape, 3):
             raise DvoError(
                 f"times {self.timestamps.shape}, gyro {self.gyro.shape} and accel {self.accel.shape} do not match",
                 field="inertial",
                 remedy="give (K,), (K, 3) and (K, 3) arrays",
             )
+        if self.T_camera_imu is not None and self.T_camera_imu.shape != (7,):
+            raise DvoError(
+                f"shape {self.T_camera_imu.shape}", field="inertial: T_camera_imu",
+                remedy="give tx ty tz qx qy qz qw, inertial sensor to camera",
+            )  # fmt: skip
+        if not isinstance(self.noise, ImuNoise | None):
+            remedy = "give dvo.data.inertial.ImuNoise(...), or None"
+            raise DvoError(f"got {type(self.noise).__name__}", field="inertial: noise", remedy=remedy)
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -88,3 +101,42 @@ class InertialSamples:
         first, last = np.searchsorted(self.timestamps, [after, until], side="right")
         part = slice(int(first), int(last))
         return InertialSamples(self.timestamps[part], self.gyro[part], self.accel[part], self.T_camera_imu, self.noise)
+
+
+def checked_samples(samples: object) -> InertialSamples:
+    """Check samples that a caller gives.
+
+    Args:
+        samples: to check.
+
+    Returns:
+        The same object.
+
+    Raises:
+        DvoError: another type, times that do not increase, or values that are not finite.
+    """
+    if not isinstance(samples, InertialSamples):
+        raise DvoError(
+            f"expected InertialSamples, got {type(samples).__name__}", field="inertial",
+            remedy="give dvo.data.inertial.InertialSamples(timestamps, gyro, accel, T_camera_imu), or None",
+        )  # fmt: skip
+    finite = all(np.isfinite(part).all() for part in (samples.timestamps, samples.gyro, samples.accel))
+    pose = samples.T_camera_imu
+    if pose is not None and not (np.isfinite(pose).all() and np.linalg.norm(pose[3:]) > 0.5):
+        remedy = "give metres and a unit quaternion"
+        raise DvoError(f"{pose} is not a pose", field="inertial: T_camera_imu", remedy=remedy)
+    if not finite or not (np.diff(samples.timestamps) > 0).all():
+        remedy = "give finite values in order of time"
+        raise DvoError("times do not increase, or values are not finite", field="inertial", remedy=remedy)
+    return samples
+
+
+def _numbers(value: object, name: str) -> np.ndarray:
+    """A float64 array; the value itself if it is one."""
+    try:
+        found = np.asarray(value)
+        if found.dtype.kind not in "fiu":
+            raise TypeError(f"{found.dtype} is no number")
+        return found.astype(np.float64, copy=False)
+    except (TypeError, ValueError) as error:
+        raise DvoError(f"not numbers ({error})", field=f"inertial: {name}", remedy="give an array of floats") from error

@@ -136,6 +136,7 @@ def open_source(
         topic,
         imu_topic,
         imu_calibration_of(imu_calib, path),
+        None if groundtruth is None else locate(groundtruth, path, "groundtruth"),
     )
     with lookups(path):
         recording = find_reader(path, reader).open(path, request)
@@ -170,8 +171,8 @@ def open_source(
     if mask is not None:
         masks = open_masks(locate(mask, path, "mask"), recording, size, mask_invert, reduction)
     truth = recording.groundtruth
-    if groundtruth is not None:
-        truth = read_groundtruth(locate(groundtruth, path, "groundtruth"), recording.timestamps)
+    if request.groundtruth is not None:
+        truth = read_groundtruth(request.groundtruth, recording.timestamps)
     inertial, told = choose_inertial(recording, imu, request, first.timestamp)
     doubts += told
     try:

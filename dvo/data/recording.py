@@ -26,6 +26,8 @@ from dvo.data.sensors.depth import read_depth
 from dvo.data.sensors.sensors import Sensors
 from dvo.data.trajectory import Trajectory
 
+_NO_IMAGES = "give a video, a folder of images or a sequence"
+_VIDEO_NAMES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".3gp", ".wmv")
 _LOOKED_AT = 7  # images of 16 bits whose largest values are compared
 
 
@@ -40,6 +42,7 @@ class Request:
         topic: of the images, in a bag of ROS.
         imu_topic: of the inertial samples, in a bag of ROS.
         imu_calibration: of the inertial sensor, that the user named; wins over the data set's own.
+        groundtruth: file that the user named; where nothing else tells the times of images, its rows do.
     """
 
     times: Path | None = None
@@ -48,6 +51,7 @@ class Request:
     topic: str | None = None
     imu_topic: str | None = None
     imu_calibration: ImuCalibration | None = None
+    groundtruth: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -224,6 +228,14 @@ class Reader:
     open: Callable[[Path, Request], Recording]
 
 
+def _videos_in(path: Path) -> str:
+    """Names of videos in a folder, as the end of a sentence."""
+    videos = (
+        sorted(file.name for file in path.iterdir() if file.suffix.lower() in _VIDEO_NAMES) if path.is_dir() else []
+    )
+    return f", but videos: {_few(videos)}" if videos else ""
+
+
 class ImageRecording:
     """A list of image files. Rows whose time is not later than the one before are dropped, with a warning.
 
@@ -259,7 +271,7 @@ class ImageRecording:
         sensors: Sensors | None = None,
     ) -> None:
         if not images:
-            raise DvoError("no images in it", file=path, remedy="give a video, a folder of images or a sequence")
+            raise DvoError(f"no images in it{_videos_in(path)}", file=path, remedy=_NO_IMAGES)
         self.kind, self.path, self.name = kind, path, name or path.resolve().name
         if not np.isfinite(timestamps).all():
             raise DvoError("times that are not finite", file=path, field="times", remedy="give times with --times")

@@ -45,8 +45,8 @@ class InertialEstimate:
         velocity_w: ``(3,)`` of the sensor in the world, m/s.
         gyro_bias, accel_bias: ``(3,)`` rad/s and m/s^2.
         scale_sigma: standard deviation of the scale, relative.
-        covariance: ``(9, 9)`` of the errors of position in the world (m), orientation (right tangent, rad) and velocity
-            in the world (m/s), where heading and position of the world are held.
+        covariance: ``(9, 9)`` of the errors of position in the world (m) and orientation (right tangent, rad) of the
+            camera, and of the velocity (m/s), where heading and position of the pose at the alignment are held.
         time_offset: seconds by which the stamps of the samples are late.
     """
 

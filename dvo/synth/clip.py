@@ -23,6 +23,7 @@ from dvo.synth.render.quality import Quality
 from dvo.synth.render.renderer import Rendering, render, render_depth
 from dvo.synth.scenes.bodies import Stage
 from dvo.synth.scenes.families import random_scene
+from dvo.synth.scenes.repaint import reduce_texture
 from dvo.synth.scenes.scene import Scene
 from dvo.synth.sensors.sensor import (
     Sensor,
@@ -61,6 +62,9 @@ class ClipSpec:
         surroundings: probability of a clip with one or two kinds of :data:`dvo.synth.surroundings.SURROUNDINGS`, which
             count as moving; clips of which they would cover more than four fifths of a frame stay without. Some of
             these clips are H.264 video, in others the crop of a stabilised video floats.
+        bare: probability of a clip whose surfaces keep 5 to 50 % of their texture.
+        blurred: probability of a clip with an exposure of 30 to 80 % of the frame interval; without a sensor it has no
+            effect.
 
     Raises:
         DvoError: sizes or flow range out of order, or a probability that is none.
@@ -77,13 +81,15 @@ class ClipSpec:
     movers: float = 0.0
     low_light: float = 0.0
     surroundings: float = 0.0
+    bare: float = 0.0
+    blurred: float = 0.0
 
     def __post_init__(self) -> None:
         if self.frames < 2 or self.height < 16 or self.width < 16:
             raise DvoError("a clip needs 2 frames or more of 16x16 pixels or more", field="frames, height, width")
         if not 0 < self.flow_range[0] <= self.flow_range[1]:
             raise DvoError(f"not a range: {self.flow_range}", field="flow_range", remedy="give low <= high, in pixels")
-        for name in ("movers", "low_light", "surroundings"):
+        for name in ("movers", "low_light", "surroundings", "bare", "blurred"):
             check_share(name, getattr(self, name))
 
 
@@ -261,7 +267,9 @@ def make_clip(
     rng = np.random.default_rng([seed, salts.CLIP, index])
     plan, intrinsics = _draw_plan(scene, rng, spec, index)
     poses_wc = plan.path.poses_wc(plan.times)
-    conditions = draw_conditions(seed, index, spec.movers, spec.low_light, spec.surroundings)
+    conditions = draw_conditions(seed, index, spec.movers, spec.low_light, spec.surroundings, spec.bare, spec.blurred)
+    if conditions.texture < 1:
+        scene = reduce_texture(scene, conditions.texture, conditions.seed)
     seconds = (plan.times - plan.times[0]) * (conditions.step * (spec.frames - 1) / (plan.times[-1] - plan.times[0]))
     every = np.tile(intrinsics, (spec.frames, 1))
     if conditions.stabilised:
@@ -278,6 +286,8 @@ def make_clip(
         flow: torch.Tensor | None = None
         if conditions.light < 1:
             camera = low_light(camera, conditions.light)
+        if conditions.shutter:
+            camera = replace(camera, shutter=conditions.shutter)
         if camera.shutter > 0:
             # Bodies are blurred as if they stood still: by the motion of the camera at their depth.
             field, _ = flow_field(rendering.depth.cpu().numpy(), poses_wc, intrinsics)

@@ -17,6 +17,8 @@ Array = np.ndarray
 MOST_BODIES = 8
 LIGHT = (0.03, 0.3)  # share of the usual light that arrives in a clip with little of it
 PACE = (0.4, 2.0)  # motion of bodies against that of the camera, in pixels a frame
+CONTRAST = (0.05, 0.5)  # share of the textures' contrast that is kept in a clip with bare surfaces
+SHUTTER = (0.3, 0.8)  # share of the frame interval that a long exposure takes
 BODY_SPEED = 0.4  # of a body of random_bodies: share of its distance to the camera that it moves in a second, about
 SURROUNDINGS_STEP = (0.015, 0.15)  # seconds between frames under the clock of the surroundings
 CODED, CRF = 0.3, (22, 38)  # share of the clips with surroundings that are H.264 video, and its rate factors
@@ -37,6 +39,8 @@ class Conditions:
         step: seconds between frames, in mean, under the clock of the surroundings.
         h264: constant rate factor of the video; 0 for images.
         stabilised: offset of the crop of a stabilised video, share of the width.
+        texture: share of the textures' contrast that is kept, in (0, 1].
+        shutter: share of the frame interval of a long exposure; 0 for that of the sensor.
     """
 
     bodies: int = 0
@@ -47,6 +51,8 @@ class Conditions:
     step: float = 0.05
     h264: int = 0
     stabilised: float = 0.0
+    texture: float = 1.0
+    shutter: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,10 @@ class Clocked:
         return self.motion.poses_wc(self.start + self.rate * np.asarray(times, float))
 
 
-def draw_conditions(seed: int, index: int, movers: float, low_light: float, surroundings: float = 0.0) -> Conditions:
+def draw_conditions(
+    seed: int, index: int, movers: float, low_light: float, surroundings: float = 0.0, bare: float = 0.0,
+    blurred: float = 0.0,
+) -> Conditions:  # fmt: skip
     """Draw the conditions of a clip.
 
     Args:
@@ -84,6 +93,8 @@ def draw_conditions(seed: int, index: int, movers: float, low_light: float, surr
         movers: probability of moving bodies.
         low_light: probability of little light.
         surroundings: probability of one or two kinds of them, and of a video that is coded or stabilised.
+        bare: probability of bare surfaces.
+        blurred: probability of a long exposure.
 
     Returns:
         The conditions; a clip that is chosen at some probability is chosen, with the same bodies and the same light,
@@ -97,6 +108,12 @@ def draw_conditions(seed: int, index: int, movers: float, low_light: float, surr
     pace = float(np.exp(rng.uniform(*np.log(PACE))))
     light = float(np.exp(rng.uniform(*np.log(LIGHT))))
     conditions = Conditions(bodies if with_bodies < movers else 0, body_seed, pace, light if dark < low_light else 1.0)
+    rng = np.random.default_rng([seed, salts.CLIP_BARE, index])
+    with_bare, with_blur = rng.random(2)
+    contrast, shutter = float(np.exp(rng.uniform(*np.log(CONTRAST)))), float(rng.uniform(*SHUTTER))
+    conditions = replace(
+        conditions, texture=contrast if with_bare < bare else 1.0, shutter=shutter if with_blur < blurred else 0.0
+    )
     rng = np.random.default_rng([seed, salts.CLIP_SURROUNDINGS, index])
     if rng.random() >= surroundings:
         return conditions

@@ -23,6 +23,7 @@ CLIP_DEGRADATION = 7302  # compression and exposure changes
 CLIP_CONDITIONS = 7303  # moving bodies and low light
 CLIP_SURROUNDINGS = 7304  # what is drawn over the scene, and its clock
 CLIP_CROP = 7305  # offset of the crop of a stabilised video
+CLIP_BARE = 7306  # bare surfaces and long exposures
 # Sequences
 SEQUENCE = 7401  # scene, path, intrinsics, sensor
 NOISE = 7402  # noise of one frame

@@ -6,6 +6,7 @@ import pytest
 
 from dvo.core.errors import DvoError
 from dvo.data import Frame, InertialSamples, StereoView
+from dvo.data.inertial import checked_samples
 from dvo.geometry.camera import Camera
 
 CAMERA = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
@@ -65,3 +66,26 @@ def test_samples_between_two_frames_leave_none_out_and_count_none_twice():
 def test_samples_of_shapes_that_do_not_match():
     with pytest.raises(DvoError, match="do not match"):
         InertialSamples(np.zeros(3), np.zeros((3, 3)), np.zeros((2, 3)))
+
+
+def test_inertial_samples_of_lists_are_arrays_and_others_are_refused() -> None:
+    samples = InertialSamples([0, 1], [[0, 0, 1], [0, 0, 2]], np.ones((2, 3), np.float32), [0, 0, 0, 0, 0, 0, 1])  # type: ignore[arg-type]
+    parts = (samples.timestamps, samples.gyro, samples.accel, samples.T_camera_imu)
+    assert all(isinstance(part, np.ndarray) and part.dtype == np.float64 for part in parts)
+    assert checked_samples(samples) is samples
+    times, three = np.arange(2.0), np.ones((2, 3))
+    for arguments, field in [
+        ((None, three, three), "timestamps"), (("ab", three, three), "timestamps"),
+        ((times, 3j * three, three), "gyro"),
+        ((times, three, [["a", 1, 2]]), "accel"), ((times, three, three, np.eye(4)), "T_camera_imu"),
+        ((times, three, three, None, "phone"), "noise"),
+    ]:  # fmt: skip
+        with pytest.raises(DvoError, match=f"inertial: {field}"):
+            InertialSamples(*arguments)  # type: ignore[arg-type]
+    wrong = [
+        7, np.datetime64("2020"), InertialSamples(times[::-1], three, three),
+        InertialSamples(times, three * np.nan, three), InertialSamples(times, three, three, np.zeros(7)),
+    ]  # fmt: skip
+    for samples_given in wrong:
+        with pytest.raises(DvoError, match="inertial"):
+            checked_samples(samples_given)

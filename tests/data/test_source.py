@@ -33,6 +33,12 @@ def test_no_images(tmp_path):
         open_source(tmp_path, calib=Calibration(50, 50, 31, 23))
 
 
+def test_a_folder_of_videos_names_them(make):
+    video = make.video("my clip.mp4", "mp4v")
+    with pytest.raises(DvoError, match="no images in it, but videos: my clip.mp4. Give a video"):
+        open_source(video.parent, guess=True)
+
+
 def test_no_image_that_decodes(make):
     folder = make.images("clip", ["0.png", "1.png"])
     for image in folder.iterdir():
@@ -135,6 +141,24 @@ def test_groundtruth_option(make):
         open_source(folder, calib=make.calib(), groundtruth="../kitti.txt")
     with pytest.raises(DvoError, match="not a TUM row"):
         open_source(folder, calib=make.calib(), groundtruth=make.text("bad.txt", "1 2 3\n"))
+
+
+def test_a_truth_with_a_row_for_each_image_has_their_times(make):
+    """Unless something else has them: at an assumed rate poses would be compared with those of other images."""
+    folder = make.images("clip", ["0.png", "1.png", "2.png"])
+    tum = make.text("gt.txt", "".join(f"{0.1 * k} {k} 2 3 0 0 0 1\n" for k in range(3)))
+
+    def times(source, **options):
+        opened = open_source(source, calib=make.calib(), groundtruth=tum, **options)
+        return [frame.timestamp for frame in opened], " ".join(opened.warnings)
+
+    found, notes = times(folder)
+    assert found == [0, 0.1, 0.2] and "taking those of gt.txt" in notes and "assuming" not in notes
+    assert times(folder, fps=20)[0] == [0, 0.05, 0.1]
+    assert times(folder, times=make.text("t.txt", "0\n0.2\n0.4\n"))[0] == [0, 0.2, 0.4]
+    assert times(make.images("named/images", ["0.png", "1.png", "2.png"]).parent)[0] == [0, 0.1, 0.2]
+    make.images("clip", ["3.png"])
+    assert times(folder)[0] == pytest.approx([0, 1 / 30, 2 / 30, 0.1])
 
 
 def test_importing_the_readers_is_light():

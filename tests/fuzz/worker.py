@@ -81,6 +81,8 @@ class _Process:
     pipe: int
     said: bytes = b""
     killed: str = ""
+    used: float = 0.0  # seconds of the processor
+    active: float = 0.0  # when these grew last
 
 
 def warm(targets: Iterable[Target]) -> None:
@@ -216,11 +218,14 @@ def _excess(process: _Process, limits: Limits) -> str:
         return ""
     state, used = fields[0], (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
     resident = int(fields[21]) * resource.getpagesize()
-    waited = time.monotonic() - process.begin
+    now = time.monotonic()
+    if used > process.used:
+        process.used, process.active = used, now
     if resident > limits.resident:
         return "memory"
-    # On a busy machine a process may wait long for its turn; then its state is R.
-    if used > limits.seconds or (waited > limits.seconds and state in "SDT") or waited > 6 * limits.seconds:
+    # On a busy machine a process may wait long for its turn, then its state is R, or for the disk, between two turns.
+    idle = now - max(process.active, process.begin) > limits.seconds and state in "SDT"
+    if used > limits.seconds or idle or now - process.begin > 12 * limits.seconds:
         return "hang"
     return ""
 

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import pickle
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from dvo.core.errors import DvoError
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import poses_from_matrices
 from dvo.odometry.protocol import Estimate, Result, Segment, SparseMap, Status
-from tests.support.tiny_tracker import frames, run, tracker
+from tests.support.tiny_tracker import frames, plain, run, tracker
 
 SYSTEMS = ("keyframe", "klt-pnp", "direct", "monoslam")
 IDENTITY = np.array([0.0, 0, 0, 0, 0, 0, 1])
@@ -37,31 +38,38 @@ CONTEXTS = {
 }
 
 
+@pytest.fixture(scope="module")
+def alone():
+    """Estimates and result of the shipped network in a program without settings of its own."""
+    return run(dvo.load("small"), frames(10))
+
+
 @pytest.mark.parametrize("name", CONTEXTS)
-def test_the_settings_of_the_program_change_no_byte(name):
-    clip = frames(10)
-    plain, result = run(dvo.load("small"), clip)
+def test_the_settings_of_the_program_change_no_byte(alone, name):
+    expected, result = alone
     with CONTEXTS[name]():
-        estimates, within = run(dvo.load("small"), clip)
-        assert [e.confidence for e in estimates] == [e.confidence for e in plain], "which is computed when it is read"
+        estimates, within = run(dvo.load("small"), frames(10))
+        assert [e.confidence for e in estimates] == [e.confidence for e in expected], "computed when it is read"
         assert torch.get_default_dtype() is (torch.float64 if name == "dtype" else torch.float32), "it is restored"
     assert within.trajectory.poses_wc.tobytes() == result.trajectory.poses_wc.tobytes()
+
+
+def poses_of(system):
+    """Poses of a few frames, as bytes."""
+    return run(dvo.load(system), frames(6))[1].trajectory.poses_wc.tobytes()
+
+
+@cache
+def poses_alone(system):
+    return poses_of(system)
 
 
 @pytest.mark.parametrize("name", CONTEXTS)
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_systems_without_weights_do_not_mind_either(system, name):
-    clip = frames(6)
-
-    def poses():
-        odometry = dvo.load(system)
-        for frame in clip:
-            odometry.track(frame)
-        return odometry.finish().trajectory.poses_wc
-
-    plain = poses()
+    expected = poses_alone(system)
     with CONTEXTS[name]():
-        assert poses().tobytes() == plain.tobytes()
+        assert poses_of(system) == expected
 
 
 def test_an_own_context_restores_everything():
@@ -81,12 +89,12 @@ def test_an_odometry_is_not_copied(build, duplicate):
 
 
 def test_results_and_estimates_are_copied():
-    estimates, result = run(tracker(), frames(10))
+    estimates, result = plain(10)
     assert repr(copy.deepcopy(result)) == repr(result) and repr(copy.deepcopy(estimates[-1])) == repr(estimates[-1])
 
 
 def test_what_is_printed_is_short():
-    estimates, result = run(tracker(), frames(10))
+    estimates, result = plain(10)
     shown = [*estimates, result, *result.segments, tracker(), *map(dvo.load, (*SYSTEMS, "msckf"))]
     assert all(len(repr(one)) < 120 and "\n" not in repr(one) and " at 0x" not in repr(one) for one in shown)
     assert repr(result).startswith("Result(10 of 10 frames tracked, 1 segment, ")

@@ -36,7 +36,11 @@ def test_a_good_result(film):
     assert quality.initialised_at > film[0].timestamp and quality.fixed == 0
 
 
-@pytest.mark.parametrize(("change", "number"), [(with_crowd, 0), (with_waves, 0), (with_overlay, 2)])
+@pytest.mark.parametrize(
+    ("change", "number"),
+    [pytest.param(with_crowd, 0, marks=pytest.mark.slow), pytest.param(with_waves, 0, marks=pytest.mark.slow),
+     (with_overlay, 2)],
+)  # fmt: skip
 def test_a_failure_is_not_good(film, change, number):
     """A crowd of six to twelve large bodies, a sea of two thirds, a reflection over all of the picture."""
     quality = result_of(change(np.random.default_rng(3), film, number)).quality

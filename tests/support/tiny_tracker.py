@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -38,6 +39,12 @@ def tracker(config=SMALL, seed=0, operator="gated"):
 def run(odometry, images):
     estimates = [odometry.track(frame) for frame in images]
     return estimates, odometry.finish()
+
+
+@cache
+def plain(count):
+    """Estimates and result of the tracker on so many frames, made once for all tests of a process."""
+    return run(tracker(), frames(count))
 
 
 def network(operator="gated"):

@@ -117,7 +117,7 @@ def test_bad_options() -> None:
 
 
 def test_bad_probabilities() -> None:
-    for name in ("movers", "low_light", "surroundings"):
+    for name in ("movers", "low_light", "surroundings", "bare", "blurred"):
         for value in (-0.1, 1.1, float("nan")):
             with pytest.raises(DvoError, match=f"{name}: not a share"):
                 make_clip(SEED, 0, **{name: value})
@@ -227,6 +227,19 @@ def test_what_would_cover_everything_is_left_out() -> None:
     clips = [make_clip(SEED, index, surroundings=1.0, **SMALL) for index in range(30)]
     shown = [clip.moving for clip in clips if clip.moving is not None]
     assert 0 < len(shown) < 30 and all(float(moving.float().mean((1, 2)).max()) <= 0.8 for moving in shown)
+
+
+def test_bare_and_blurred_clips_show_less_of_the_same_scene() -> None:
+    def contrast(images: torch.Tensor) -> float:
+        return float(images.float().diff(dim=-1).abs().mean())
+
+    for option in ("bare", "blurred"):
+        ratios = []
+        for index in range(4):
+            less, usual = (make_clip(SEED, index, **{option: share}, **SMALL) for share in (1.0, 0.0))
+            assert torch.equal(less.depth, usual.depth) and torch.equal(less.poses_cw, usual.poses_cw)
+            ratios.append(contrast(less.images) / contrast(usual.images))
+        assert np.median(ratios) < 0.9, (option, ratios)
 
 
 def test_low_light_is_noise_in_the_pictures_alone() -> None:

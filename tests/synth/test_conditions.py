@@ -24,6 +24,9 @@ def test_probabilities_are_respected() -> None:
         assert (alone.bodies, alone.seed, alone.pace) == (draw.bodies, draw.seed, draw.pace) and alone.light == 1
         certain = draw_conditions(SEED, index, 1.0, 1.0)
         assert certain.bodies > 0 and certain.light < 1 and draw.bodies in (0, certain.bodies)
+        plain = draw_conditions(SEED, index, 0.3, 0.1, bare=1.0, blurred=1.0)
+        assert 0.05 <= plain.texture <= 0.5 and 0.3 <= plain.shutter <= 0.8
+        assert (plain.bodies, plain.light, plain.surroundings) == (draw.bodies, draw.light, "")
 
 
 def test_the_clock_of_the_bodies_follows_the_flow_of_the_camera() -> None:

@@ -106,6 +106,8 @@ class Renderings(BatchStream):
         movers: probability that moving bodies are in a rendered clip; the depth is nan where they are seen.
         low_light: probability that a rendered clip has 3 to 30 % of the usual light.
         surroundings: probability of water, leaves, people, rain, a bonnet..., see :class:`dvo.synth.clip.ClipSpec`.
+        bare: probability that the surfaces of a rendered clip keep little texture.
+        blurred: probability of a long exposure.
 
     Raises:
         DvoError: ``stages`` under both names, sizes of no batch and no clip, a probability that is none, or no
@@ -128,6 +130,8 @@ class Renderings(BatchStream):
         movers: float = 0.0,
         low_light: float = 0.0,
         surroundings: float = 0.0,
+        bare: float = 0.0,
+        blurred: float = 0.0,
     ) -> None:
         super().__init__()
         if stages and courses:
@@ -135,9 +139,11 @@ class Renderings(BatchStream):
         for name, value, least in (("batch_size", batch_size, 1), ("frames", frames, 2), ("workers", workers, 0)):
             if value < least:
                 raise DvoError(f"{value} is too small", field=f"data.{name}", remedy=f"give {least} or more")
-        check_share("data.movers", movers)
-        check_share("data.low_light", low_light)
-        check_share("data.surroundings", surroundings)
+        shares = {
+            "movers": movers, "low_light": low_light, "surroundings": surroundings, "bare": bare, "blurred": blurred,
+        }  # fmt: skip
+        for name, share in shares.items():
+            check_share(f"data.{name}", share)
         if real is not None:
             real.check()
         self.save_hyperparameters(
@@ -147,14 +153,11 @@ class Renderings(BatchStream):
         first = CurriculumStage(0, flow_low, flow_high, sizes or [(120, 160)])
         self.stages = [first, *(stages or courses or [])]
         self.real, self.textures = real, textures
-        self.movers, self.low_light, self.surroundings = movers, low_light, surroundings
+        self.shares = shares
 
     def clips(self, processes: int = 1) -> MixedClips:
         """The clips, in batches that span so many processes."""
-        options = {
-            "frames": self.frames, "textures": self.textures, "movers": self.movers, "low_light": self.low_light,
-            "surroundings": self.surroundings,
-        }  # fmt: skip
+        options = {"frames": self.frames, "textures": self.textures, **self.shares}
         return MixedClips(self.seed, self.stages, self.batch_size * processes, self.real, **options)
 
     def summary(self) -> str:

@@ -13,8 +13,10 @@ import lightning as L
 import numpy as np
 import torch
 
+from train.data.stream import BatchStream
+
 CLIPS = 4
-"""Batches over which the loss is averaged."""
+"""Clips over which the loss is averaged, or one batch: the training process renders them itself."""
 
 
 @contextmanager
@@ -37,25 +39,25 @@ class LossBeforeTraining(L.Callback):
     weights, or goes on, prints nothing.
 
     Args:
-        batches: to average over.
+        clips: to average over, in whole batches.
     """
 
-    def __init__(self, batches: int = CLIPS) -> None:
-        self.batches = batches
+    def __init__(self, clips: int = CLIPS) -> None:
+        self.clips = clips
 
     @torch.no_grad()
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Measure and print."""
         program: Any = pl_module
         data = getattr(trainer, "datamodule", None)
-        if not (program.from_trained and trainer.is_global_zero and hasattr(data, "next_batches")):
+        if not (program.from_trained and trainer.is_global_zero and isinstance(data, BatchStream)):
             return
         context = program.context
         buffers = {name: value.clone() for name, value in context.buffers.items()}
         context = replace(context, net=copy.deepcopy(program.net), buffers=buffers)
         found = []
         with undisturbed():
-            for batch in data.next_batches(self.batches):
+            for batch in data.next_batches(max(1, self.clips // data.batch_size)):
                 moved = program.transfer_batch_to_device(batch, program.device, 0)
                 found.append(program.task.compute_loss(context, moved))
         losses = [float(one.loss) for one in found]

@@ -12,10 +12,12 @@ from dvo.core.registry import Registry
 from dvo.core.yaml_files import MAX_BYTES, is_shell_pipe, read_text
 from dvo.data.calibration.calibration import EXPECTED, Calibration, Dialect
 from dvo.data.calibration.colmap_cameras import split_camera
+from dvo.data.calibration.numpy_files import SUFFIXES
 from dvo.data.files.files import MAX_NUMBER, is_file
 from dvo.geometry.lenses import LENSES
 
 _BUILT_IN = {
+    "numpy": "dvo.data.calibration.numpy_files:DIALECT",
     "colmap": "dvo.data.calibration.colmap_cameras:DIALECT",
     "dso": "dvo.data.calibration.dso:DIALECT",
     "kitti raw": "dvo.data.calibration.kitti_raw:DIALECT",
@@ -29,7 +31,8 @@ _BUILT_IN = {
 DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUILT_IN))
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
-_NUMBERED = frozenset(["colmap", "kitti raw", "json", "yaml", "xml"])  # those whose files may have several cameras
+_NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "json", "yaml", "xml"])  # that may have several cameras
+_BINARY = (".bin", *SUFFIXES)
 _LARGEST = 64 * 1024**2  # of a JSON file, which may list thousands of images beside the camera
 
 
@@ -38,14 +41,15 @@ def read_calibration(path: Path | str) -> Calibration:
 
     docs/inputs.md has the table of dialects and lens models. Text: numbers ``fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5
     k6]]]`` (radial-tangential) separated by blanks or commas, ``#`` comments; the same by name, ``fx=525 fy=525 cx=320
-    cy=240``; or a matrix K of 3x3, 3x4 or 4x4 numbers; ROS's ``ost.txt``; the text of DSO; KITTI's ``calib.txt``, if
-    all its cameras have the same intrinsics, and ``calib_cam_to_cam.txt``. YAML, JSON and OpenCV's XML: ``fx, fy, cx,
-    cy`` with optional ``width, height, model, coefficients``, at the top or in a mapping within; EuRoC, Kalibr, ROS,
-    OpenCV, ORB-SLAM, VINS, basalt, nerfstudio. These may state ``depth_scale`` (ORB-SLAM: ``DepthMapFactor``) and
-    ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too; and ``readout``, the seconds
-    from the first to the last row of a rolling shutter (0, a global one, if it is left out; Kalibr's ``line_delay`` is
-    not read). COLMAP's ``cameras.txt`` and ``cameras.bin``. Of a file of several cameras the first or the left one is
-    read, or that of the number in ``FILE:NUMBER``; COLMAP's have no first one.
+    cy=240``, or in two lines; or a matrix K of 3x3, 3x4 or 4x4 numbers; ROS's ``ost.txt``; the text of DSO; KITTI's
+    ``calib.txt``, if all its cameras have the same intrinsics, and ``calib_cam_to_cam.txt``. YAML, JSON and OpenCV's
+    XML: ``fx, fy, cx, cy`` with optional ``width, height, model, coefficients``, at the top or in a mapping within;
+    EuRoC, Kalibr, ROS, OpenCV, ORB-SLAM, VINS, basalt, nerfstudio. These may state ``depth_scale`` (ORB-SLAM:
+    ``DepthMapFactor``) and ``baseline`` (ORB-SLAM: ``Stereo.b``, or ``Camera.bf``, which is ``fx`` times it) too; and
+    ``readout``, the seconds from the first to the last row of a rolling shutter (0, a global one, if it is left out;
+    Kalibr's ``line_delay`` is not read). COLMAP's ``cameras.txt`` and ``cameras.bin``. Of a file of several cameras the
+    first or the left one is read, or that of the number in ``FILE:NUMBER``; COLMAP's have no first one. NumPy's
+    ``.npz`` of named arrays.
 
     Args:
         path: of the file.
@@ -65,7 +69,7 @@ def read_calibration(path: Path | str) -> Calibration:
         raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
     suffix = path.suffix.lower()
     limit = _LARGEST if suffix == ".json" else MAX_BYTES
-    text = "" if suffix == ".bin" else read_text(path, EXPECTED, limit)
+    text = "" if suffix in _BINARY else read_text(path, EXPECTED, limit)
     names = [*(name for name in DIALECTS if name not in _BUILT_IN), *_BUILT_IN]
     dialects: dict[str, Dialect] = {name: DIALECTS.resolve(name) for name in names}
     name = next(name for name, dialect in dialects.items() if dialect.matches(path, text))

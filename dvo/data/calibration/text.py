@@ -1,7 +1,8 @@
-"""Calibrations of plain text: numbers on one line, the same by name, or a matrix K on three lines."""
+"""Calibrations of plain text: numbers on one line or one a line, the same by name, or a matrix K on three lines."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ def from_text(text: str, path: Path) -> Calibration:
     named = read_named_values(text, path, EXPECTED)
     rows: list[list[float]] = [] if named is None else [named]
     for line in text.splitlines() if named is None else ():
-        fields = line.split("#")[0].replace(",", " ").replace(";", " ").split()
+        fields = _fields(line)
         if not fields:
             continue
         if fields[0].rstrip(":").upper() in ("P0", "P1", "P2", "P3"):
@@ -41,6 +42,8 @@ def from_text(text: str, path: Path) -> Calibration:
             raise DvoError(
                 f"not a number in {line.strip()[:100]!r}", file=path, field="intrinsics", remedy=EXPECTED
             ) from None
+    if len(rows) > 1 and all(len(row) == 1 for row in rows):  # as numpy.savetxt writes a vector
+        rows = [[number for row in rows for number in row]]
     lengths = [len(row) for row in rows]
     if lengths in ([3, 3, 3], [4, 4, 4], [4, 4, 4, 4]):
         return from_matrix(np.array(rows), path)
@@ -54,6 +57,15 @@ def from_text(text: str, path: Path) -> Calibration:
     fx, fy, cx, cy, *coefficients = rows[0]
     model: DistortionModel = "radtan" if any(coefficients) else "none"
     return Calibration(fx, fy, cx, cy, model, tuple(coefficients) if model == "radtan" else (), file=path)
+
+
+def _fields(line: str) -> list[str]:
+    """Words of a line, without comment and the brackets of a printed array; decimal commas as points."""
+    line = line.split("#")[0].replace(";", " ")
+    words = line.split()
+    if len(words) > 3 and all(re.fullmatch(r"-?\d+,\d+", word) for word in words):
+        return [word.replace(",", ".") for word in words]
+    return re.sub(r"[\[\](),]|\barray\b", " ", line).split()
 
 
 def _is_matrix(row: list[float]) -> bool:

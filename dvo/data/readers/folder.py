@@ -8,11 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from dvo.core.errors import DvoError
+from dvo.core.text import visible
 from dvo.data.files.stamps import choose_times, times_from_names
 from dvo.data.images.images import list_images
 from dvo.data.readers.groups import Streams, split_streams
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import MILLIMETRES, Sensors
+from dvo.data.trajectory import read_tum
 
 REPLICA_SCALE = 6553.5
 """Units of a metre in the depth images of the Replica renderings of NICE-SLAM (its ``cam_params.json``)."""
@@ -63,6 +66,30 @@ def camera_streams(folder: Path, warnings: list[str]) -> Streams:
     return replace(streams, images=images)
 
 
+def times_of_rows(request: Request, count: int, warnings: list[str]) -> np.ndarray | None:
+    """Times of the ground truth that the user named, for images without times of their own.
+
+    Args:
+        request: options of the user; a rate in frames a second wins.
+        count: of the images.
+        warnings: receives a sentence if there are such times.
+
+    Returns:
+        ``(count,)`` float64 seconds; None without a file of TUM's format that has a row for each image.
+    """
+    file = request.groundtruth
+    if file is None or request.fps is not None or file.suffix == ".freiburg":
+        return None
+    try:
+        times = read_tum(file).timestamps
+    except DvoError:  # of another format, or malformed: that is told when it is read for its poses
+        return None
+    if len(times) != count:
+        return None
+    warnings.append(f"no times found: taking those of {visible(file.name)}, which has a row for each image")
+    return times
+
+
 def open_folder(path: Path, request: Request) -> Recording:
     """Read a folder of images; no calibration of its own.
 
@@ -77,7 +104,10 @@ def open_folder(path: Path, request: Request) -> Recording:
     streams = camera_streams(path, warnings)
     if not streams.images:  # before a times file can complain about their number
         return ImageRecording("folder", path, [], np.zeros(0))
-    times = choose_times(streams.images, path, times=request.times, fps=request.fps, warnings=warnings)
+    times = choose_times(
+        streams.images, path, times=request.times, fps=request.fps, warnings=warnings,
+        fallback=lambda: times_of_rows(request, len(streams.images), warnings),
+    )  # fmt: skip
     scale = REPLICA_SCALE if streams.depth is not None and _is_replica(streams.images[0]) else MILLIMETRES
     if scale == REPLICA_SCALE:
         warnings.append(f"laid out as the Replica renderings of NICE-SLAM: --depth takes {scale:g} units for a metre")

@@ -15,7 +15,7 @@ from dvo.data.calibration.calibration import Calibration, rectified
 from dvo.data.calibration.read import read_calibration
 from dvo.data.files.stamps import choose_times
 from dvo.data.images.images import has_images
-from dvo.data.readers.folder import camera_streams
+from dvo.data.readers.folder import camera_streams, times_of_rows
 from dvo.data.readers.groups import Streams
 from dvo.data.recording import ImageRecording, Reader, Recording, Request
 from dvo.data.sensors.sensors import MILLIMETRES, Finder, SameName, SameNumbers, Sensors
@@ -110,6 +110,8 @@ def open_sequence(path: Path, request: Request) -> Recording:
     groundtruth = find_groundtruth(path)
 
     def times_of_groundtruth() -> np.ndarray | None:
+        if request.groundtruth is not None:
+            return times_of_rows(request, len(images), warnings)
         return groundtruth.timestamps if groundtruth is not None and len(groundtruth) == len(images) else None
 
     times = choose_times(

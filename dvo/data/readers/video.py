@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -54,7 +56,7 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     if not is_file(path):  # a pipe or a device would never end, or never begin
         raise DvoError("no video file", file=path, remedy="give a file; images of a camera go to dvo.stream")
     with lookups(path), path.open("rb") as file:
-        file.read(1)  # a disk that sleeps wakes before time counts
+        head = file.read(1024)  # a disk that sleeps wakes before time counts
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
     # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
@@ -69,6 +71,8 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
     finally:
         cv2.utils.logging.setLogLevel(level)
     try:
+        if not capture.isOpened() and (other := _no_video(path, head)) is not None:
+            raise DvoError(f"{other} is no video", file=path, remedy="give a video or the folder that holds the images")
         if not capture.isOpened():
             raise DvoError(
                 "this video does not decode",
@@ -87,6 +91,22 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         ) from None
     finally:
         capture.release()
+
+
+def _no_video(path: Path, head: bytes) -> str | None:
+    """What a file is by its content, if that is sound, text, an archive or nothing."""
+    if not head:
+        return "an empty file"
+    if head.startswith((b"PK\x03\x04", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
+        return "an archive"
+    if head.startswith((b"ID3", b"fLaC", b"OggS", b"\xff\xfb")) or head[8:12] in (b"WAVE", b"M4A ", b"M4B "):
+        return "a recording of sound"
+    if head[4:8] == b"ftyp":
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            kinds = set(re.findall(rb"hdlr.{8}(soun|vide)", content, re.DOTALL))
+        if kinds == {b"soun"}:
+            return "a recording of sound"
+    return None if re.search(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]", head) else "a text file"
 
 
 def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:

@@ -28,6 +28,7 @@ from dvo.data.calibration.focal_guess import FocalGuess, guess_from_angle
 from dvo.data.frame import Frame
 from dvo.data.frame_checks import checked_frame
 from dvo.odometry.calibration.camera_estimate import SELF_CALIBRATED, SelfCalibration, pinhole
+from dvo.odometry.frames.fixed_pixels import Bars
 from dvo.odometry.global_ba.focal_length import FocalProfile, find_focal
 from dvo.odometry.global_ba.self_calibration import adjust_segments
 from dvo.odometry.load import load
@@ -137,11 +138,18 @@ def calibrate(
         raise DvoError("no frames", field="frames", remedy="give a video or a folder with images")
     recorded = getattr(frames, "recorded_camera", first.camera)  # frames of large images are reduced
     width, height = recorded.width, recorded.height
+    picture = _Picture.of(first.image, width)
     if guess is None:
         guess = getattr(frames, "guess", None) or guess_from_angle(width, height)
+        if guess.source == "prior" and picture.size != (width, height):
+            guess = replace(guess_from_angle(*picture.size), width=width, height=height)
 
-    def result(focal: float, deviation: float, source: str, count: int, *more: Any) -> SelfCalibration:
-        return SelfCalibration(focal, deviation, source, width, height, count, *more)
+    def result(
+        focal: float, deviation: float, source: str, count: int, reason: str, guess: FocalGuess,
+        aside: tuple[float, float] = (0.0, 0.0), *more: Any,
+    ) -> SelfCalibration:  # fmt: skip
+        aside = aside[0] + picture.aside[0], aside[1] + picture.aside[1]
+        return SelfCalibration(focal, deviation, source, width, height, count, reason, guess, aside, *more)
 
     focal, aside, wanted, reason, count = guess.focal, (0.0, 0.0), options.frames, "", 0
     walk: list[tuple[float, float]] = []
@@ -154,7 +162,8 @@ def calibrate(
         if tracking is None:
             clip = islice(_readable(frames if kept is None else copy(kept)), limit)
             x, y = (value * first.camera.width / width for value in aside)
-            tracking = _Tracking(_loaded(weights, device, seed), clip, focal * first.camera.width / width, (x, y))
+            odometry = _loaded(weights, device, seed)
+            tracking = _Tracking(odometry, clip, focal * first.camera.width / width, (x, y), picture)
         left -= tracking.go_on(wanted, options.interval, left, on_frame)
         profile, count = _profile(tracking.odometry)
         asked = [*walk, (math.log(focal), profile.minimum.value)]
@@ -219,13 +228,46 @@ def _slope(walk: list[tuple[float, float]]) -> float:
     return min(max((walk[-2][1] - step) / (at - walk[-2][0]), 0.4), 1.0)
 
 
+@dataclass(frozen=True)
+class _Picture:
+    """What is between the bars of a letterbox or pillarbox: its middle is where the principal point is looked for.
+
+    Attributes:
+        inside: rows and columns of the frames.
+        size: width and height, pixels of the recorded images.
+        aside: way from their middle to that of the picture, pixels.
+    """
+
+    inside: tuple[slice, slice]
+    size: tuple[int, int]
+    aside: tuple[float, float]
+
+    @classmethod
+    def of(cls, image: np.ndarray, width: int) -> _Picture:
+        """From the first frame and the width of the recorded images."""
+        factor = width / image.shape[1]
+        inside = Bars().with_image(image).inside(image.shape, 1)  # a row or column may be of both
+        if inside is None:
+            inside = slice(0, image.shape[0]), slice(0, image.shape[1])
+        ends = [(each.start, each.stop) for each in inside]
+        (h, w), (y, x) = ([e - s for s, e in ends], [s + e for s, e in ends])
+        aside = (x - image.shape[1]) / 2 * factor, (y - image.shape[0]) / 2 * factor
+        return cls(inside, (round(w * factor), round(h * factor)), aside)
+
+
 class _Tracking:
     """Tracking of the beginning of a clip with a focal length."""
 
     def __init__(
-        self, odometry: PatchOdometry, frames: Iterable[Frame], focal: float, aside: tuple[float, float]
+        self,
+        odometry: PatchOdometry,
+        frames: Iterable[Frame],
+        focal: float,
+        aside: tuple[float, float],
+        picture: _Picture,
     ) -> None:
         self.odometry, self.frames, self.focal, self.aside = odometry, iter(frames), focal, aside
+        self.inside = picture.inside
         self.tracked, self.last = 0, -math.inf
 
     def go_on(
@@ -240,10 +282,12 @@ class _Tracking:
         while self.tracked < wanted and fed < most and (frame := next(self.frames, None)) is not None:
             if frame.timestamp < self.last + interval:
                 continue
-            self.last, height, width = frame.timestamp, frame.camera.height, frame.camera.width
+            image = frame.image[self.inside]
+            mask = None if frame.mask is None else frame.mask[self.inside]
+            self.last, (height, width) = frame.timestamp, image.shape[:2]
             pixels = replace(pinhole(self.focal, self.aside, width, height), readout=frame.camera.readout)
             camera = pixels.camera(width, height)
-            estimate = self.odometry.track(Frame(frame.index, frame.timestamp, frame.image, camera, mask=frame.mask))
+            estimate = self.odometry.track(Frame(frame.index, frame.timestamp, image, camera, mask=mask))
             if on_frame is not None:
                 on_frame(frame, estimate)
             self.tracked, fed = self.tracked + (estimate.status is Status.TRACKING), fed + 1

@@ -178,7 +178,7 @@ def adjust_segment(
             # All but the last find the motion only.
             few = last if number == rounds - 1 else replace(last, iterations=min(_MOTION_ITERATIONS, last.iterations))
             now[rows] = poses
-            track = PoseTrack.through(times[:end], now[:end])
+            track = PoseTrack.through(times[:end], now[:end], rolling)
             corrected = as_global_shutter(part, poses, found, rows, track, rolling)
             poses, found, _ = solve_part(corrected, poses, found, fixed, few)
         now[rows] = poses

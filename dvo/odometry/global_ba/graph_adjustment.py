@@ -172,7 +172,7 @@ class Adjustment:
         if self.shutter.readout > 0:
             frames = graph.members(self.world)
             identifiers = np.array([frame.identifier for frame in frames])
-            track = PoseTrack.through(increasing_times(graph, frames), graph.poses_cw(identifiers))
+            track = PoseTrack.through(increasing_times(graph, frames), graph.poses_cw(identifiers), self.shutter)
             rows = torch.from_numpy(np.searchsorted(identifiers, part.identifiers.numpy()))
             depths = part.patches[:, 2, 0, 0].reshape(len(rows), -1)
             seen = as_global_shutter(part, part.poses_cw, depths, rows, track, self.shutter)

@@ -1,16 +1,19 @@
 """Rolling shutter: measurements in the rows of a frame as if all rows had been read at the time of the frame.
 
 A row is read before or after the middle row, whose time is that of the frame. Between frames the camera moves as a
-polynomial through the poses around; a point whose depth is known can then be moved from the camera at the time of its
-row to the camera at the time of the frame (the rows' motion model of Hedborg et al., "Rolling Shutter Bundle
-Adjustment", CVPR 2012, used to correct the measurements instead of extending the residual).
+polynomial through the poses around, and turns as a gyroscope says where there is one; a point whose depth is known can
+then be moved from the camera at the time of its row to the camera at the time of the frame (the rows' motion model of
+Hedborg et al., "Rolling Shutter Bundle Adjustment", CVPR 2012, used to correct the measurements instead of extending
+the residual).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +25,10 @@ _STENCIL = 5  # poses that a polynomial goes through
 _NEAREST = 0.05  # least depth of a point in front of a camera, in the unit of the poses
 
 
+Turns = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Rotation vectors ``(N, s, 3)`` from the camera at times ``(N,)`` to that ``(s,)`` seconds later; nan if not known."""
+
+
 @dataclass(frozen=True)
 class Shutter:
     """Timing of the rows of a frame.
@@ -29,10 +36,12 @@ class Shutter:
     Attributes:
         readout: seconds from the first to the last row, read from top to bottom.
         rows: height of the feature map, image height over stride.
+        turns: what a gyroscope says of rotations; None without one.
     """
 
     readout: float
     rows: float
+    turns: Turns | None = None
 
     def offsets(self, v: Tensor) -> Tensor:
         """Times of rows relative to that of their frame.
@@ -61,12 +70,13 @@ class PoseTrack:
     twists: Tensor
 
     @classmethod
-    def through(cls, times: Tensor, poses_cw: Tensor) -> PoseTrack:
+    def through(cls, times: Tensor, poses_cw: Tensor, shutter: Shutter | None = None) -> PoseTrack:
         """Interpolate poses.
 
         Args:
             times: ``(N,)`` increasing, seconds.
             poses_cw: ``(N, 7)``.
+            shutter: whose ``turns`` are taken for the rotations during the readout.
 
         Returns:
             The track.
@@ -76,7 +86,16 @@ class PoseTrack:
         first = (torch.arange(n) - size // 2).clamp(0, n - size)
         around = first[:, None] + torch.arange(size)
         twists = se3.log(se3.relative(poses_cw[:, None].expand(n, size, 7), poses_cw[around]))
-        return cls(poses_cw, times[around] - times[:, None], twists)
+        track = cls(poses_cw, times[around] - times[:, None], twists)
+        if shutter is None or shutter.turns is None or shutter.readout <= 0:
+            return track
+        offsets = torch.linspace(-0.5, 0.5, _STENCIL, dtype=times.dtype) * shutter.readout
+        turned = torch.from_numpy(shutter.turns(times.numpy(), offsets.numpy())).to(poses_cw)
+        nodes = offsets.expand(n, _STENCIL)
+        moved = track.motion(torch.arange(n).repeat_interleave(_STENCIL), nodes.flatten())
+        seen = se3.log(moved).view(n, _STENCIL, 6)
+        known = turned.isfinite().all(-1, keepdim=True).all(1, keepdim=True)
+        return cls(poses_cw, nodes, torch.cat([seen[..., :3], torch.where(known, turned, seen[..., 3:])], -1))
 
     def motion(self, frames: Tensor, offsets: Tensor) -> Tensor:
         """Motion from the time of a frame to one a little earlier or later.

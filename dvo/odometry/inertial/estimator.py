@@ -6,7 +6,9 @@ that fails is a reason that is told.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,7 @@ from dvo.odometry.inertial.smoother import (
     upright,
 )
 from dvo.odometry.inertial.stream import SampleStream
-from dvo.odometry.inertial.temporal import align_imu
+from dvo.odometry.inertial.temporal import ImuAlignment, align_imu
 from dvo.odometry.protocol import ScaleState
 
 Array = np.ndarray
@@ -73,6 +75,11 @@ FAILURES = 3
 MOST_PATIENCE = 2.0
 """Seconds from one estimate to the next where all that is known speaks against one."""
 _WAITING = ("too few poses", "too few samples")
+SURE_OFFSET, SURE_TURN = 3e-3, 0.5
+"""Deviation of the time offset, seconds, and of rotations over a third of a second, degrees, of a gyroscope that tells
+the rotation within a readout."""
+LONGEST_GAP = 0.02
+"""Between samples that tell a rotation within a readout, seconds."""
 STILL = (0.02, 0.15)
 """Standard deviations of rates (rad/s) and forces (m/s^2) over :data:`STILL_FOR` of a sensor that stands still."""
 STILL_FOR = 0.4
@@ -363,6 +370,25 @@ class InertialEstimator:
         if not motion.covered.all():
             return None
         return turn @ motion.rotation[0] @ turn.T
+
+    def turns(self, nodes: VisualNodes) -> Callable[[Array, Array], Array] | None:
+        """What the gyroscope tells of rotations about the times of frames, also without an alignment.
+
+        Args:
+            nodes: visual poses of the recording; the longest segment tells time offset and bias.
+
+        Returns:
+            Rotation vectors ``(N, s, 3)`` from the camera at times ``(N,)`` to that ``(s,)`` seconds later, nan without
+            samples; None where time offset and bias are not told for sure.
+        """
+        samples, turn = self.stream.samples(), self.rotation_camera_imu
+        if samples is None or turn is None or not len(nodes):
+            return None
+        longest = nodes.of(int(np.bincount(nodes.segment).argmax()))
+        found = align_imu(longest.times, longest.rotation, samples.timestamps, samples.gyro, turn, fixed=True)
+        if found.reason or found.sigma_offset > SURE_OFFSET or found.residual > SURE_TURN:
+            return None
+        return partial(_turns, samples, found)
 
     def information(self) -> dict[str, Any]:
         """Entries of run.json."""
@@ -704,6 +730,19 @@ def _from_first_camera(found: Smoothed) -> Smoothed:
     origin = found.worlds.translation[-1]
     worlds = replace(found.worlds, translation=found.worlds.translation - origin)
     return replace(found, position=found.position - origin, worlds=worlds)
+
+
+def _turns(samples: InertialSamples, sensor: ImuAlignment, times: Array, offsets: Array) -> Array:
+    """Rotation vectors ``(N, s, 3)`` from the camera at times to the camera later by offsets; nan without samples."""
+    stamps = samples.timestamps - sensor.time_offset
+    steps = 0.5 * (samples.gyro[1:] + samples.gyro[:-1]) * np.diff(stamps)[:, None]
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    ends = np.concatenate([times[:, None] + offsets, times[:, None]], 1)
+    after = np.searchsorted(stamps, ends).clip(1, len(stamps) - 1)
+    covered = (ends >= stamps[0]) & (ends <= stamps[-1]) & (stamps[after] - stamps[after - 1] < LONGEST_GAP)
+    turned = np.stack([np.interp(ends, stamps, column) for column in angle.T], -1)
+    turned = turned[:, :-1] - turned[:, -1:] - sensor.gyro_bias * offsets[:, None]
+    return np.where(covered.all(1)[:, None, None], -turned @ sensor.rotation_camera_imu.T, np.nan)
 
 
 def _words(reason: str) -> str:

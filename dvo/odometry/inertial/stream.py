@@ -6,8 +6,7 @@ import threading
 
 import numpy as np
 
-from dvo.core.errors import DvoError
-from dvo.data.inertial import InertialSamples
+from dvo.data.inertial import InertialSamples, checked_samples
 
 
 class SampleStream:
@@ -30,14 +29,10 @@ class SampleStream:
             samples: with the extrinsic calibration and noise of those before.
 
         Raises:
-            DvoError: times that do not increase, or values that are not finite.
+            DvoError: no samples, times that do not increase, or values that are not finite.
         """
-        if not len(samples):
+        if not len(checked_samples(samples)):
             return
-        values = np.concatenate([samples.timestamps[:, None], samples.gyro, samples.accel], 1)
-        if not np.isfinite(values).all() or not (np.diff(samples.timestamps) > 0).all():
-            remedy = "give finite values in order of time"
-            raise DvoError("times do not increase, or values are not finite", field="inertial", remedy=remedy)
         with self._lock:
             self._parts.append(samples)
             self._whole = None

@@ -15,14 +15,18 @@ import torch
 from torch import Tensor
 
 from dvo.data.frame import Frame
-from dvo.data.inertial import InertialSamples
+from dvo.data.inertial import InertialSamples, checked_samples
 from dvo.data.trajectory import Trajectory
 from dvo.geometry import se3
 from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_matrix, rotation_vector, slerp, split
 from dvo.map.correction import apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
+<<<<<<< HEAD
 from dvo.odometry.inertial.coupling import InertialCoupling
+=======
+from dvo.odometry.global_ba.rolling_shutter import Turns
+>>>>>>> a6ed86e4d3c8281917390ed17da16ddd80b1679d
 from dvo.odometry.inertial.estimator import (
     BodyState,
     InertialEstimator,
@@ -82,6 +86,10 @@ class InertialTracking:
         """True if there are samples, and they are used."""
         return self.estimator.state is not ScaleState.NONE
 
+    def turns(self) -> Turns | None:
+        """Rotations by the gyroscope, for the readout of a rolling shutter; None if it does not tell them."""
+        return self.estimator.turns(self._nodes(-np.inf)[0]) if self.active else None
+
     def observe(self, frame: Frame) -> None:
         """Take the samples of a frame.
 
@@ -97,7 +105,7 @@ class InertialTracking:
         Args:
             samples: of the sensor.
         """
-        if self.options.use and self.graph.recording.segment > 0 and len(samples):
+        if self.options.use and self.graph.recording.segment > 0 and len(checked_samples(samples)):
             self._unused = "a map that is tracked in keeps its own unit and axes"
         elif self.options.use:
             self.estimator.add(samples)

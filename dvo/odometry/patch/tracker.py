@@ -228,6 +228,7 @@ class PatchOdometry:
                 self._begin_segment()
             self._close_segment()
             self.loops.complete(state.adjustable)
+            state.shutter = replace(state.shutter, turns=self.inertial.turns())
             state.info |= finish_segments(self.graph, state, self.config, self.loops)
             state.quality = judge_result(self.graph, self._result({}), state, self.config, self.model.config.STRIDE)
             state.info |= self.inertial.settle(self.loops)
@@ -394,7 +395,10 @@ class PatchOdometry:
         if left is None or missing_content(image, left):  # with too little left of the image, all of it is used
             self.state.hidden, self.window.unfixed = 0.0, None
             return mask
-        self.state.hidden = float((left.size if mask is None else mask.sum()) - left.sum()) / left.size
+        # Bars were left out from the first frame on: the verdict is about what took part until it was found.
+        given = [whole for whole in (mask, fixed.picture) if whole is not None]
+        before = int(np.logical_and.reduce(given).sum()) if given else left.size
+        self.state.hidden = (before - int(left.sum())) / left.size
         return left
 
     def _repeat(self, record: FrameRecord) -> Estimate:

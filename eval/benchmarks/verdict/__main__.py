@@ -15,15 +15,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
 from dvo.core.command_line import OneLineParser
-from dvo.core.threads import settle_threads
 from eval.benchmarks.verdict.trials import KINDS, Outcome, Trial, carry_out
+from eval.execution.fresh_processes import in_fresh_processes
 
 
 def interval(count: int, total: int) -> str:
@@ -84,16 +82,13 @@ def main(given: list[str] | None = None) -> None:
     except (ValueError, TypeError, KeyError) as error:
         parser.error(f"{record}: not an outcome ({error}); give another --out, or remove the line")
     missing = [trial for trial in trials if (trial.kind, trial.number) not in outcomes]
-    context = multiprocessing.get_context("spawn")
-    # New processes now and then: renderings stay in the memory of one.
-    with ProcessPoolExecutor(options.jobs, context, settle_threads, max_tasks_per_child=16) as pool:
-        for done in pool.map(carry_out, missing):
-            outcomes[done.kind, done.number] = done
-            with record.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(done)) + "\n")
-            ate = "" if done.ate is None else f", ATE {done.ate:.2f} %"
-            print(f"{done.kind} {done.number}: {'wrong' if done.wrong else 'right'}{ate}, "
-                  f"{done.quality['verdict']} {done.quality['reason']}", flush=True)  # fmt: skip
+    for done in in_fresh_processes(carry_out, missing, jobs=options.jobs, each=16):
+        outcomes[done.kind, done.number] = done
+        with record.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(asdict(done)) + "\n")
+        ate = "" if done.ate is None else f", ATE {done.ate:.2f} %"
+        print(f"{done.kind} {done.number}: {'wrong' if done.wrong else 'right'}{ate}, "
+              f"{done.quality['verdict']} {done.quality['reason']}", flush=True)  # fmt: skip
     for parity, name in ((0, "scenes that thresholds were chosen by"), (1, "the other scenes")):
         print(f"\n{name}:\n\n" + table([outcomes[t.kind, t.number] for t in trials if t.number % 2 == parity]))
 

@@ -15,9 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import multiprocessing
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,12 +23,12 @@ import numpy as np
 
 from dvo.core.command_line import OneLineParser
 from dvo.core.errors import DvoError
-from dvo.core.threads import settle_threads
 from dvo.data.calibration.calibration import Calibration
 from dvo.data.companions.right_source import VIDEO_SUFFIXES
 from eval.benchmarks.wild.measures import Expected, Measures, backward, difference, measure, read_expected
 from eval.benchmarks.wild.page import write_page
 from eval.benchmarks.wild.runs import Run, Task, Video, carry_out
+from eval.execution.fresh_processes import in_fresh_processes
 
 LEAST_POSES = 0.5
 """Share of the frames that must have a pose in the trajectory of a run that is right."""
@@ -208,15 +206,13 @@ def make_runs(tasks: Sequence[Task], out: Path, jobs: int = 1) -> dict[str, Run]
         if task.key in runs and runs[task.key].video != str(task.video):
             del runs[task.key]
     missing = [task for task in tasks if task.key not in runs]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, settle_threads, max_tasks_per_child=1) as pool:
-        for done in pool.map(carry_out, missing):
-            runs[done.key] = done
-            np.save(out / f"{done.key}.npy", done.poses)
-            values = {name: value for name, value in vars(done).items() if name != "poses"}
-            with record.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(values) + "\n")
-            print(f"{done.key}: {done.error or done.verdict}, {len(done.poses)} of {done.frames} frames", flush=True)
+    for done in in_fresh_processes(carry_out, missing, jobs=jobs):
+        runs[done.key] = done
+        np.save(out / f"{done.key}.npy", done.poses)
+        values = {name: value for name, value in vars(done).items() if name != "poses"}
+        with record.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(values) + "\n")
+        print(f"{done.key}: {done.error or done.verdict}, {len(done.poses)} of {done.frames} frames", flush=True)
     return runs
 
 

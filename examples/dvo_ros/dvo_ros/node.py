@@ -7,9 +7,11 @@ One thread receives messages, the main thread tracks the newest image.
 
 from __future__ import annotations
 
+import os
 import queue
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Iterator
 from functools import partial
@@ -53,6 +55,7 @@ PARAMETERS = {
 UNKNOWN = np.eye(6) * 9999.0  # covariance of what is not known
 PATH_POSES = 1000
 HEADERS = 10  # kept; dvo.stream holds fewer frames back
+GRACE = 1.0  # seconds from SIGINT or SIGTERM to the end
 LEVELS = {
     dvo.Status.TRACKING: DiagnosticStatus.OK,
     dvo.Status.INITIALISING: DiagnosticStatus.WARN,
@@ -266,9 +269,19 @@ def receive(node: Tracker) -> None:
         node.live.stop()
 
 
+def leave(ended: threading.Event) -> None:
+    """End the process after SIGINT or SIGTERM, whatever it is doing: it has nothing to write."""
+    while rclpy.ok():
+        time.sleep(0.1)
+    if not ended.wait(GRACE):
+        os._exit(0)
+
+
 def main() -> None:
     """Run the node."""
     rclpy.init()
+    ended = threading.Event()
+    threading.Thread(target=leave, args=(ended,), daemon=True).start()
     try:
         node = Tracker()
         receiving = threading.Thread(target=receive, args=(node,), daemon=True)
@@ -285,6 +298,7 @@ def main() -> None:
         if rclpy.ok():  # otherwise a message of the last frame came too late
             raise
     finally:
+        ended.set()
         rclpy.try_shutdown()
 
 

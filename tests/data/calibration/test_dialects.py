@@ -533,6 +533,45 @@ def test_what_is_refused(make, name, text, match):
     assert caught.value.file == file and caught.value.remedy
 
 
+@pytest.mark.parametrize("text", [
+    "fx,fy,cx,cy,k1,k2\n500,510,320,240,0.1,-0.2\n", "fx fy cx cy k1 k2\n500 510 320 240 0.1 -0.2\n",
+    "parameter;value\nFX;500\nFY;510\nCX;320\nCY;240\nk1;0.1\nk2;-0.2\n",
+    "fx 500\nfy 510\ncx 320\ncy 240\nk1 0.1\nk2 -0.2\n", "500\n510\n320\n240\n0.1\n-0.2\n0\n0\n",
+    "500,0 510,0 320,0 240,0 0,1 -0,2 0,0 0,0", "[500, 510, 320, 240, 0.1, -0.2, 0, 0]",
+])  # fmt: skip
+def test_tables_and_arrays_in_text(make, text):
+    found = read_calibration(make.text("camera.csv", text))
+    assert (found.fx, found.fy, found.cx, found.cy) == (500, 510, 320, 240)
+    assert found.coefficients[:4] == (0.1, -0.2, 0, 0) and not any(found.coefficients[4:])
+
+
+@pytest.mark.parametrize("text", [
+    "[[500.   0. 320.]\n [  0. 510. 240.]\n [  0.   0.   1.]]",
+    "array([[500.,   0., 320.],\n       [  0., 510., 240.],\n       [  0.,   0.,   1.]])",
+])  # fmt: skip
+def test_a_matrix_as_numpy_prints_it(make, text):
+    found = read_calibration(make.text("k.txt", text))
+    assert (found.fx, found.fy, found.cx, found.cy, found.model) == (500, 510, 320, 240, "none")
+
+
+def test_arrays_that_numpy_has_saved(make):
+    """As the calibration of OpenCV's tutorial is saved; what is pickled, or large, is not read."""
+    K, file = np.array(json.loads(ROWS), float), make.root / "calib.npz"
+    views = np.array([np.zeros(3), np.zeros(2)], dtype=object)
+    np.savez(file, mtx=K, dist=np.array([FIVE]), rvecs=views, corners=np.zeros((400, 400)))
+    found = read_calibration(file)
+    assert (found.fx, found.fy, found.cx, found.cy) == (500, 510, 320, 240)
+    assert (found.model, found.coefficients) == ("radtan", FIVE) and set(found.ignored) == {"rvecs", "corners"}
+    np.savez(file, K=K, lens_warp=np.array(KC))
+    with pytest.raises(DvoError, match="lens_warp"):
+        read_calibration(file)
+    np.save(make.root / "k.npy", K)
+    assert read_calibration(make.root / "k.npy").fy == 510
+    np.save(make.root / "k.npy", views, allow_pickle=True)
+    with pytest.raises(DvoError, match="k.npy: calibration: not an array of NumPy without pickle"):
+        read_calibration(make.root / "k.npy")
+
+
 def test_a_camera_of_several_by_its_number(make):
     file = make.text("camchain.yaml", "cam0: {intrinsics: [1, 2, 3, 4]}\ncam1: {intrinsics: [5, 6, 7, 8]}\n")
     assert read_calibration(file).fx == 1 and read_calibration(f"{file}:1").fx == 5

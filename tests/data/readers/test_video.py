@@ -96,7 +96,7 @@ def test_files_that_are_no_video(make, content, capfd):
         video.write_bytes(b"" if content == "empty" else bytes(np.random.default_rng(0).bytes(5000)))
     capfd.readouterr()
     with pytest.raises(
-        DvoError, match="does not decode|no frame of this video decodes|one image is no video"
+        DvoError, match="does not decode|no frame of this video decodes|one image is no video|an empty file is no"
     ) as caught:
         list(open_source(video, calib=CALIB))
     assert caught.value.file == video and caught.value.remedy
@@ -186,3 +186,14 @@ def test_parts_with_clocks_of_their_own(make, monkeypatch):
     stamps = [frame.timestamp for frame in frames]
     assert len(frames) >= 22 and (np.diff(stamps) > 0).all() and max(np.diff(stamps)[3:21]) < 0.05
     assert any("clock was set back before frame 12" in text for text in source.warnings)
+
+
+@pytest.mark.parametrize(("content", "what"), [
+    (b"frame000.png\nframe001.png\n", "a text file"), (b"PK\x03\x04" + bytes(40), "an archive"), (b"", "an empty file"),
+    (b"RIFF\x24\x00\x00\x00WAVEfmt " + bytes(40), "a recording of sound"),
+    (bytes(3) + b"\x14ftypisom" + bytes(11) + b"\x21hdlr" + bytes(8) + b"soun" + bytes(12), "a recording of sound"),
+])  # fmt: skip
+def test_files_that_are_no_video_at_all_are_named(tmp_path, content, what):
+    (tmp_path / "clip.txt").write_bytes(content)
+    with pytest.raises(DvoError, match=f"clip.txt: {what} is no video. Give a video or the folder"):
+        open_source(tmp_path / "clip.txt", guess=True)

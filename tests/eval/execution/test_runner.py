@@ -69,16 +69,12 @@ def table_without_timings(out: Path) -> list[list[str]]:
     return [[value for i, value in enumerate(line) if i not in drop] for line in lines]
 
 
-def test_kill_and_resume(tmp_path, image_folder, suite_file, walk, capsys):
+def test_kill_and_resume(tmp_path, image_folder, plan, suite_file, walk, capsys):
     """Killed in the middle of the second run: the first is kept, nothing is done twice, the table is the same."""
-    (tmp_path / "walk.py").write_text(SLOW_SYSTEM.replace("PAUSE", "0.0"))
-    arguments = command(tmp_path, suite_file, walk, "whole")
-    assert main(arguments) == 0
-    whole = (tmp_path / "whole/results.csv").read_bytes()
+    (tmp_path / "whole").mkdir()
+    predict_all(replace(plan, systems=(walk,), out=tmp_path / "whole"), lambda text: None, predict_here)
+    assert main(["score", str(tmp_path / "whole")]) == 0
     assert finished(tmp_path) == ["0", "1"]
-    assert main(arguments) == 0  # nothing to do: the same bytes, timings and all
-    assert finished(tmp_path) == ["0", "1"] and (tmp_path / "whole/results.csv").read_bytes() == whole
-    assert capsys.readouterr().err.count("(was there)") == 2
     (tmp_path / "walk.log").unlink()
 
     slow = SLOW_SYSTEM.replace("PAUSE", "0.0 if self.seed == 0 or HURRY.exists() else 0.5")
@@ -104,12 +100,19 @@ def test_kill_and_resume(tmp_path, image_folder, suite_file, walk, capsys):
     before = record.stat().st_mtime_ns
     (tmp_path / "hurry").touch()
 
-    assert main(command(tmp_path, suite_file, walk, "out")) == 0
+    arguments = command(tmp_path, suite_file, walk, "out")
+    assert main(arguments) == 0
     assert finished(tmp_path) == ["0", "1"] and record.stat().st_mtime_ns == before
     assert not list(place.rglob(".part-*"))
     # The whole run had another file: only the version tells them apart.
     tables = [table_without_timings(tmp_path / name) for name in ("whole", "out")]
     assert [[*row[:1], *row[2:]] for row in tables[0]] == [[*row[:1], *row[2:]] for row in tables[1]]
+
+    table = (tmp_path / "out/results.csv").read_bytes()
+    capsys.readouterr()
+    assert main(arguments) == 0  # nothing to do: the same bytes, timings and all
+    assert finished(tmp_path) == ["0", "1"] and (tmp_path / "out/results.csv").read_bytes() == table
+    assert capsys.readouterr().err.count("(was there)") == 2
 
 
 def test_score_of_an_unfinished_evaluation_says_so(plan, image_folder, capsys):

@@ -111,6 +111,26 @@ def leaning(clip, monkeypatch):
     return find
 
 
+def test_the_bars_of_a_letterbox_are_left_out(clip, monkeypatch):
+    """A picture in the lower part of the image: its middle is that of the camera, its longer side that of the guess."""
+    tracked = []
+
+    def track(frame):
+        tracked.append(frame)
+        return Estimate(frame.timestamp, None, Status.TRACKING)
+
+    replace_tracking(monkeypatch, track, lambda: FocalProfile(Minimum(0.0, 0.01, 0.5), 0.5, FLAT))
+    wide = dvo.Camera(150.0, 150.0, 159.5, 99.5, 320, 200)
+    bars = (40, 16), (64, 64), (0, 0)
+    frames = [replace(frame, image=np.pad(frame.image, bars), camera=wide) for frame in clip[:30]]
+    found = calibrate(frames, options=CalibrationOptions(frames=30))
+    guess = guess_from_angle(190, 142)  # without the outermost pixels, which are of both as often as not
+    assert found.focal == pytest.approx(guess.focal) and (found.width, found.height) == (320, 200)
+    assert {(f.camera.width, f.camera.height, f.camera.cx, f.camera.cy) for f in tracked} == {(190, 142, 94.5, 70.5)}
+    assert np.array_equal(tracked[3].image, clip[3].image[1:-1, 1:-1])
+    assert (found.calibration.cx, found.calibration.cy) == (159.5, 111.5)
+
+
 @pytest.mark.parametrize(("lean", "rounds"), [(0.0, 1), (0.3, 3), (0.6, 3)])
 def test_the_secant_finds_the_fixed_point_of_measurements_that_lean(leaning, lean, rounds):
     """Measurements tracked at x ask for (1 - lean) of the way to 0."""

@@ -14,7 +14,7 @@ from dvo.odometry.classical.keyframe.config import KeyframeConfig
 from dvo.odometry.classical.keyframe.system import KeyframeOdometry
 from dvo.odometry.classical.klt_pnp import KltPnp, KltPnpConfig
 from dvo.odometry.classical.monoslam import MonoSlam, MonoSlamConfig
-from dvo.odometry.protocol import Odometry, Result, Status
+from dvo.odometry.protocol import Odometry, Result
 from eval.systems.registry import find_system
 
 SMALL: dict[str, Callable[[], Odometry]] = {
@@ -42,7 +42,7 @@ def test_it_is_a_system(name):
 
 @every
 def test_same_seed_same_bytes(name, film, path):
-    frames = film(path(40))[:16]
+    frames = film(path(40))[:11]
     first, second = (run(name, frames).trajectory.poses_wc.tobytes() for _ in range(2))
     assert first == second and len(first) > 0
 
@@ -68,14 +68,6 @@ def test_rendered_sequence(name, rendered):
     frames, truth = rendered
     metrics = evaluate(run(name, frames).trajectory, truth)
     assert metrics.completeness == 1 and metrics.ate_percent < 3
-
-
-@every
-def test_a_dark_frame_is_lost_and_the_next_is_not(name, film, path, dark):
-    frames = dark(film(path(40))[:32], 24, 25)
-    odometry = SMALL[name]()
-    estimates = [odometry.track(frame) for frame in frames]
-    assert estimates[24].status is Status.LOST and estimates[-1].status is Status.TRACKING
 
 
 @pytest.mark.parametrize(("name", "most"), [("klt-pnp", 0.05), ("keyframe", 0.05), ("direct", 0.1)])

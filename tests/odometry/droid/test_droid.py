@@ -170,9 +170,9 @@ def test_a_moving_body_does_not_pull_the_camera(clip, monkeypatch):
 
 def test_more_updates_than_an_edge_lives_for(clip, knowing):
     settings = replace(CONFIG, initial_updates=6, updates=8, max_age=4)
-    done = run(DroidOdometry(knowing, settings), frames_of(clip)).result
-    truth = se3.inverse(clip.poses_cw.double()).numpy()
-    assert len(done.trajectory) == len(clip.images)
+    done = run(DroidOdometry(knowing, settings), frames_of(clip)[:14]).result
+    truth = se3.inverse(clip.poses_cw[:14].double()).numpy()
+    assert len(done.trajectory) == 14
     assert evaluate(done.trajectory, Trajectory(done.trajectory.timestamps, truth)).ate_percent < 2
 
 

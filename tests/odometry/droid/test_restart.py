@@ -17,9 +17,9 @@ from dvo.odometry.droid.edges import neighbours_of
 from dvo.odometry.droid.restart import better_solution, other_poses, take, window_problem
 from dvo.odometry.droid.window import DenseWindow, FrameEdge, Keyframe
 
-H, W = 24, 32
+H, W = 12, 16
 EXACT = GlobalBAOptions(kernel=KERNEL, max_residual=MAX_RESIDUAL, solver=LMOptions(60, 1e-3))
-CAMERA = torch.tensor([26.0, 26.0, 15.5, 11.5])
+CAMERA = torch.tensor([13.0, 13.0, 7.5, 5.5])
 
 
 def plane(poses_cw):

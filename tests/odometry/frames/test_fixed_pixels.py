@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dvo.odometry.frames.fixed_pixels import SAMPLES, FixedPixels
+from dvo.odometry.frames.fixed_pixels import MARGIN, SAMPLES, Bars, FixedPixels
 
 
 @pytest.fixture(scope="module")
@@ -98,3 +98,57 @@ def test_what_lies_straight_ahead_is_not_fixed(texture):
     overlay = bonnet(texture)
     mask = seen([np.where(overlay > 0, overlay, image) for image in frames]).mask
     assert mask is not None and (~mask[95:]).mean() > 0.4 and mask[:85].mean() > 0.97
+
+
+def boxed(images, above, below, left, right, level=0, quality=None):
+    """The images between bars, as JPEG with artefacts if a quality is given."""
+    for image in images:
+        image = cv2.copyMakeBorder(image, above, below, left, right, cv2.BORDER_CONSTANT, value=(level,) * 3)
+        if quality is not None:
+            image = cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], 1)
+        yield image
+
+
+@pytest.mark.parametrize("widths", [(16, 16, 0, 0), (0, 0, 24, 24), (16, 16, 24, 24), (0, 12, 0, 0), (0, 0, 8, 30)])
+@pytest.mark.parametrize(("level", "quality"), [(0, None), (24, 70)])
+def test_bars_are_known_from_the_first_frame(texture, widths, level, quality):
+    above, below, left, right = widths
+    fixed = seen(boxed(moving(texture, 1, 3.0), *widths, level, quality))
+    height, width = fixed.mask.shape
+    right_one = np.zeros((height, width), bool)
+    rows = slice(above and above + MARGIN, height - (below and below + MARGIN))
+    right_one[rows, slice(left and left + MARGIN, width - (right and right + MARGIN))] = True
+    assert (fixed.mask != right_one).mean() < 0.02 and np.array_equal(fixed.mask, fixed.picture)
+    for image in boxed(moving(texture, 20, 3.0, bonnet(texture)), *widths, level, quality):
+        fixed.see(image)
+    bonnet_rows = slice(above + 97, above + 120)
+    assert (~fixed.mask[bonnet_rows]).mean() > 0.6 and not fixed.mask[~right_one].any(), (
+        "what is found later adds to it"
+    )
+
+
+def test_bars_are_as_narrow_as_in_any_frame(texture):
+    """A dark scene may look like a wider bar; bars that end are none."""
+    first, second = [*boxed(moving(texture, 2, 3.0), 16, 16, 0, 0)]
+    wide = first.copy()
+    wide[:40] = 0
+    bars = Bars().with_image(wide)
+    assert bars.widths == (40, 16, 0, 0) and all(bars.seen[:2])
+    bars = bars.with_image(second)
+    assert bars.widths == (16, 16, 0, 0) and bars.seen == (True, True, False, False)
+    bars = bars.with_image(next(moving(texture, 1, 3.0)))
+    assert bars.widths == (0, 0, 0, 0) and not any(bars.seen)
+
+
+def test_darkness_and_skies_are_no_bars(texture):
+    night = np.zeros((120, 160, 3), np.uint8)
+    assert seen([night]).mask is None
+    dim = next(moving(texture, 1, 3.0)) // 12  # little light everywhere
+    dim[:30] //= 4
+    assert seen([dim]).mask is None
+    sky = next(moving(texture, 1, 3.0))
+    sky[:40] = 255
+    assert seen([sky]).mask is None
+    lamps = night.copy()
+    lamps[60:70, 20:30] = 200  # the darkness above the only lamp ends at no straight edge
+    assert seen([lamps]).mask is None

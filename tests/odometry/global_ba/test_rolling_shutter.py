@@ -46,6 +46,31 @@ def test_a_swaying_camera_is_followed_between_its_frames(count):
     assert error.max() < {1: 0.1, 2: 2e-3, 3: 5e-4}.get(count, 2e-5)
 
 
+def test_a_tremor_between_frames_is_followed_by_a_gyroscope_and_not_by_the_poses():
+    def shaken(times):
+        angle = 0.01 * torch.sin(2 * np.pi * 8.0 * times)
+        turn = torch.stack([angle, -0.5 * angle, 0.2 * angle], -1)
+        return se3.compose(se3.exp(torch.cat([torch.zeros_like(turn), turn], -1)), pose_at(times))
+
+    def turns(times, offsets):
+        moved = torch.from_numpy(times)[:, None] + torch.from_numpy(offsets)
+        from_frame = se3.relative(shaken(torch.from_numpy(times))[:, None].expand(*moved.shape, 7), shaken(moved))
+        found = se3.log(from_frame)[..., 3:].numpy()
+        found[:2] = np.nan  # without samples
+        return found
+
+    times = 0.05 * torch.arange(20, dtype=torch.float64)
+    offsets = torch.full((20,), 0.012, dtype=torch.float64)
+    errors = []
+    for shutter in (None, Shutter(0.03, ROWS), Shutter(0.03, ROWS, turns)):
+        track = PoseTrack.through(times, shaken(times), shutter)
+        moved = se3.compose(track.motion(torch.arange(20), offsets), track.poses_cw)
+        errors.append(se3.log(se3.relative(moved, shaken(times + offsets)))[:, 3:].norm(dim=1))
+    assert torch.equal(errors[0], errors[1])
+    torch.testing.assert_close(errors[2][:2], errors[0][:2], rtol=1e-6, atol=1e-9)
+    assert errors[2][2:].max() < 0.05 * errors[0][2:].max()
+
+
 def test_the_trajectory_of_a_rolling_shutter_is_exact_with_its_readout_time():
     errors = []
     for readout in (0.0, 0.03, 0.06):

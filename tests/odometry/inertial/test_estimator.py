@@ -51,6 +51,26 @@ def test_motion_that_does_not_tell_is_refused_with_the_reason(options: dict[str,
     assert any(word in reason for reason in reasons)
 
 
+@pytest.mark.parametrize("grade", ["euroc", "phone"])
+@pytest.mark.parametrize(
+    "options",
+    [{"turning": False}, {"turning": False, "speed": (0.5, 0.1, 0.0)}, {}, {"turning": False, "swing": 0.17}],
+    ids=["still", "constant velocity", "pure rotation", "one axis"],
+)
+def test_no_alignment_is_wrong_during_and_after_such_motion(options: dict[str, object], grade: str) -> None:
+    recording = record(40, still=4.0, seconds=10.0, grade=grade, walk=2e-3, **options)  # type: ignore[arg-type]
+    estimator, before = InertialEstimator(InertialOptions()), -np.inf
+    for time in recording.times:
+        estimator.add(recording.samples.between(before, time))
+        before = time
+        if estimator.due(time):
+            estimator.update(recording.nodes(time - 20.0, time), [0])
+        for world in estimator.worlds.values():
+            assert world.scale == pytest.approx(SCALE, rel=0.1)
+            assert (world.rotation @ recording.turn)[2, 2] > np.cos(np.deg2rad(5.0))
+    assert estimator.aligned
+
+
 def test_alignment_follows_a_stretch_that_does_not_tell() -> None:
     estimator, _ = drive(record(2, still=5.0, turning=False, seconds=11.0))
     assert estimator.aligned
@@ -205,6 +225,26 @@ def test_at_the_end_motion_that_does_not_tell_is_refused() -> None:
     estimator.add(recording.samples)
     assert estimator.settle(recording.nodes(0.1, 5.5), [0]) is None
     assert not estimator.aligned and "acceleration" in estimator.reason
+
+
+def test_the_gyroscope_tells_rotations_about_the_times_of_frames_without_an_alignment() -> None:
+    recording = record(12, seconds=9.0, grade="phone")
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(recording.samples.between(-np.inf, 8.0))
+    turns = estimator.turns(recording.nodes(0.1, 7.5))
+    assert turns is not None and not estimator.aligned
+    camera, step = recording.body[0] @ CAMERA_IMU.T, float(np.diff(recording.times).mean())
+    found = turns(recording.times, np.array([-step, step]))
+    inside = recording.times[1:-1] < 7.5
+    for k, other in enumerate((slice(None, -2), slice(2, None))):
+        true = rotation_vector(np.swapaxes(camera[other], -1, -2) @ camera[1:-1])
+        assert np.linalg.norm(true, axis=-1)[inside].max() > 0.02
+        assert np.linalg.norm(found[1:-1, k] - true, axis=-1)[inside].max() < 2e-3
+    assert np.isnan(found[-1]).all()
+    swapped = recording.with_samples(gyro=recording.samples.gyro[:, [1, 0, 2]])
+    estimator = InertialEstimator(InertialOptions())
+    estimator.add(swapped.samples)
+    assert estimator.turns(recording.nodes(0.1, 7.5)) is None
 
 
 def test_drift_of_the_scale_of_the_images_is_taken_back() -> None:

@@ -107,7 +107,7 @@ def test_other_scenes_are_found_back_as_well(scene):
 
 @pytest.mark.parametrize(
     ("scene", "other", "lit", "dark", "after"),
-    [(63, 105, 22, 6, range(18)), pytest.param(63, 105, LIT, DARK, range(30), marks=pytest.mark.slow),
+    [(63, 105, 22, 6, range(14)), pytest.param(63, 105, LIT, DARK, range(30), marks=pytest.mark.slow),
      pytest.param(105, 103, LIT, DARK, range(30), marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_another_scene_begins_a_world_of_its_own(scene, other, lit, dark, after):

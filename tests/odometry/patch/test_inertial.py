@@ -16,7 +16,7 @@ from dvo.odometry.inertial.smoother import GRAVITY, Similarities, Smoothed
 from dvo.odometry.patch.inertial import _led, _runs, _spaced
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Estimate, ScaleState, Status
-from tests.support.tiny_tracker import SMALL, frames, tracker
+from tests.support.tiny_tracker import SMALL, frames, plain, tracker
 
 UPRIGHT = so3_exp(np.array([-np.pi / 2, 0.0, 0.0]))  # y down to z up
 SPEED = np.array([0.4, 0.0, 0.0])
@@ -60,13 +60,13 @@ def dark(images: list[Frame], first: int, last: int) -> list[Frame]:
 
 
 def test_until_it_is_aligned_the_output_equals_that_without_samples() -> None:
-    plain, aided = tracker(), tracker()
-    for frame, other in zip(frames(12), with_samples(frames(12)), strict=True):
-        a, b = plain.track(frame), aided.track(other)
+    (alone, first), aided = plain(14), tracker()
+    for a, other in zip(alone, with_samples(frames(14)), strict=True):
+        b = aided.track(other)
         assert a.scale_state is ScaleState.NONE and b.scale_state is ScaleState.INITIALISING
         assert (a.pose_wc is None) == (b.pose_wc is None)
         assert a.pose_wc is None or b.pose_wc is None or a.pose_wc.tobytes() == b.pose_wc.tobytes()
-    first, second = plain.finish(), aided.finish()
+    second = aided.finish()
     assert first.trajectory.poses_wc.tobytes() == second.trajectory.poses_wc.tobytes()
     assert second.info["inertial"]["state"] == "initialising" and second.info["inertial"]["reason"]
     assert "inertial" not in first.info and not second.metric
@@ -80,9 +80,9 @@ def test_samples_are_ignored_on_request() -> None:
 
 
 def test_another_source_of_metres_is_left_alone() -> None:
-    plain, aided = tracker(), tracker(replace(SMALL, scale={"distances": [[0.5, 1.0, 2.0]]}))
-    for k, (frame, other) in enumerate(zip(frames(12), with_samples(frames(12)), strict=True)):
-        a, b = plain.track(frame), aided.track(other)
+    aided = tracker(replace(SMALL, scale={"distances": [[0.5, 1.0, 2.0]]}))
+    for k, (a, other) in enumerate(zip(plain(14)[0], with_samples(frames(14)), strict=True)):
+        b = aided.track(other)
         if k == 9:
             align(aided, other.timestamp)
         assert a.pose_wc is None or b.pose_wc is None or a.pose_wc.tobytes() == b.pose_wc.tobytes()
@@ -92,10 +92,10 @@ def test_another_source_of_metres_is_left_alone() -> None:
 
 
 def test_poses_turn_upright_and_metric_and_so_does_the_result() -> None:
-    plain, aided = tracker(), tracker()
+    (alone, before), aided = plain(14), tracker()
     aided.patch_window.sensors = ()  # in which the samples would change the visual poses as well
-    for k, (frame, other) in enumerate(zip(frames(14), with_samples(frames(14)), strict=True)):
-        a, b = plain.track(frame), aided.track(other)
+    for k, (a, other) in enumerate(zip(alone, with_samples(frames(14)), strict=True)):
+        b = aided.track(other)
         if k == 9:
             align(aided, other.timestamp)
         if k > 9:
@@ -106,7 +106,7 @@ def test_poses_turn_upright_and_metric_and_so_does_the_result() -> None:
             assert a.covariance is not None and b.covariance is not None
             np.testing.assert_allclose(b.covariance[:3, :3], 4 * a.covariance[:3, :3], rtol=1e-6)
     so_far = aided.current()
-    before, result = plain.finish(), aided.finish()
+    result = aided.finish()
     assert result.metric and result.info["scale"]["source"] == "inertial"
     expected = 2 * before.trajectory.positions @ UPRIGHT.T
     np.testing.assert_allclose(result.trajectory.positions, expected, atol=1e-5)

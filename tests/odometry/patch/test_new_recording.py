@@ -105,12 +105,18 @@ def test_the_map_stays_as_it_was(old, back, tmp_path):
     assert third.finish().info["localised"] is None and third.finish().frames_read == 1
 
 
-def test_a_recording_that_was_not_recognised_is_saved_with_its_map(old, tmp_path):
-    odometry = begin(old[0])
+@pytest.fixture(scope="module")
+def elsewhere(old, tmp_path_factory):
+    """Result of a recording of another place in the map, and the map that was saved before its end."""
+    odometry, file = begin(old[0]), tmp_path_factory.mktemp("maps") / "both.dvo"
     for frame in street(16):
         odometry.track(frame)
-    odometry.save(tmp_path / "both.dvo")
-    found = dvo.load_map(tmp_path / "both.dvo")
+    odometry.save(file)
+    return odometry.finish(), file
+
+
+def test_a_recording_that_was_not_recognised_is_saved_with_its_map(old, elsewhere):
+    found = dvo.load_map(elsewhere[1])
     assert len(found.graph.recordings) == 2 and found.loops.finder.kept[-1] >= found.graph.recording.keyframe
     result = found.finish()
     assert result.info["localised"] is None and result.frames_read == 16
@@ -118,9 +124,8 @@ def test_a_recording_that_was_not_recognised_is_saved_with_its_map(old, tmp_path
     assert np.array_equal(found.graph.log.trajectory(0).poses_wc, old[1].trajectory.poses_wc)
 
 
-def test_another_place_is_not_recognised(old):
-    odometry = begin(old[0])
-    result = dvo.run(odometry, street(16)).result
+def test_another_place_is_not_recognised(elsewhere):
+    result = elsewhere[0]
     assert result.info["localised"] is None and result.info["loops"] == []
     assert result.segments and not any(segment.in_map for segment in result.segments)
     assert set(result.trajectory.timestamps) <= {k / 15 for k in range(16)}

@@ -1,7 +1,10 @@
 """Maps in files: saving leaves the tracker as it is, and a loaded map is that of the moment."""
 
 import json
+import shutil
+import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,12 +138,20 @@ def test_a_finished_map_is_a_map_and_takes_no_frames(tmp_path):
     assert graph.archive[0].image().shape == (72, 96, 3)
 
 
-def saved(tmp_path, count=9, **settings):
-    odometry = tracker(replace(SMALL, **settings))
-    for frame in frames(count):
+@pytest.fixture(scope="module")
+def nine(tmp_path_factory):
+    """Map file of a tracker on nine frames."""
+    file, odometry = tmp_path_factory.mktemp("maps") / "nine.dvo", tracker()
+    for frame in frames(9):
         odometry.track(frame)
-    odometry.save(tmp_path / "a.dvo")
-    return tmp_path / "a.dvo"
+    odometry.save(file)
+    return file
+
+
+@pytest.fixture
+def saved(nine, tmp_path):
+    """Copy of it that may be changed."""
+    return Path(shutil.copy(nine, tmp_path / "a.dvo"))
 
 
 WRONG = [
@@ -163,26 +174,24 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("description", "arrays", "match"), WRONG)
-def test_a_map_that_would_fail_later_is_refused(description, arrays, match, tmp_path):
-    file = saved(tmp_path)
-    rewritten(file, description, arrays)
+def test_a_map_that_would_fail_later_is_refused(description, arrays, match, saved):
+    rewritten(saved, description, arrays)
     with pytest.raises(DvoError, match=match) as caught:
-        dvo.load_map(file, weights=network())
-    assert caught.value.file == file and caught.value.field and caught.value.remedy
+        dvo.load_map(saved, weights=network())
+    assert caught.value.file == saved and caught.value.field and caught.value.remedy
 
 
-def test_other_weights_are_refused(tmp_path):
-    file = saved(tmp_path)
+def test_other_weights_are_refused(saved, tmp_path):
     with pytest.raises(DvoError, match="no name.*Give the file of the weights"):
-        dvo.load_map(file)
+        dvo.load_map(saved)
     torch.manual_seed(7)
     other = LoadedWeights.of(PatchVO(preset("tiny")), "other")
     for weights in (other, "small"):
         with pytest.raises(DvoError, match="other weights than"):
-            dvo.load_map(file, weights=weights)
-    rewritten(file, {"weights.name": str(tmp_path / "gone.safetensors")}, {})
+            dvo.load_map(saved, weights=weights)
+    rewritten(saved, {"weights.name": str(tmp_path / "gone.safetensors")}, {})
     with pytest.raises(DvoError, match="weights are not found"):
-        dvo.load_map(file)
+        dvo.load_map(saved)
 
 
 def test_a_graph_alone_is_no_tracker(tmp_path):
@@ -191,10 +200,8 @@ def test_a_graph_alone_is_no_tracker(tmp_path):
         dvo.load_map(tmp_path / "a.dvo")
 
 
-def test_the_description_is_readable(tmp_path):
-    import zipfile
-
-    with zipfile.ZipFile(saved(tmp_path)) as container:
+def test_the_description_is_readable(nine):
+    with zipfile.ZipFile(nine) as container:
         found = json.loads(container.read("map.json"))
     assert (found["format"], found["version"]) == ("dvo-map", 3)
     assert TrackerConfig.from_dict(found["map"]["config"]) == SMALL

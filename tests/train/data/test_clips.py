@@ -40,7 +40,7 @@ def test_surroundings_are_in_the_clips():
     assert any(found) and all(torch.isfinite(none[index]["depth"]).all() for index in range(4))
 
 
-@pytest.mark.parametrize("name", ["movers", "low_light", "surroundings"])
+@pytest.mark.parametrize("name", ["movers", "low_light", "surroundings", "bare", "blurred"])
 def test_a_probability_is_from_0_to_1(name):
     for value in (-0.1, 1.5, float("nan")):
         with pytest.raises(DvoError, match=f"data.{name}: not a share"):

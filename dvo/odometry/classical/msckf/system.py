@@ -19,7 +19,7 @@ from dvo.core.arguments import checked_arguments
 from dvo.core.errors import DvoError
 from dvo.core.settings import changed
 from dvo.data.frame import Frame
-from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples
+from dvo.data.inertial import NOISE_PRESETS, ImuNoise, InertialSamples, checked_samples
 from dvo.geometry.poses import poses_from_matrices, skew, so3_exp
 from dvo.map.keyframe_log import KeyframeLog
 from dvo.odometry.classical.frame_log import map_of
@@ -152,6 +152,8 @@ class Msckf:
     def _samples(self, frame: Frame) -> InertialSamples | None:
         """Samples of a frame; a source without any is refused."""
         samples, frames = frame.inertial, self._log.frames
+        if samples is not None:
+            checked_samples(samples)
         awaited = bool(frames) and self._calibration is None
         silent = awaited and frame.timestamp - frames[0].timestamp > SILENCE
         if (awaited and samples is None) or (silent and len(samples or ()) == 0):

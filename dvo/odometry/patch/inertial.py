@@ -22,11 +22,8 @@ from dvo.geometry.poses import matrix_to_quaternion, pose_from, quaternion_to_ma
 from dvo.map.correction import apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
-<<<<<<< HEAD
-from dvo.odometry.inertial.coupling import InertialCoupling
-=======
 from dvo.odometry.global_ba.rolling_shutter import Turns
->>>>>>> a6ed86e4d3c8281917390ed17da16ddd80b1679d
+from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import (
     BodyState,
     InertialEstimator,

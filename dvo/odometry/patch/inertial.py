@@ -248,7 +248,8 @@ class InertialTracking:
     # ------------------------------------------------------------------------------------------------------------------
 
     def _similarity(self) -> Similarity | None:
-        return self.estimator.worlds.get(self.graph.world_of(self.graph.segment))
+        """From the present world to the metric one; None: not known, or not by samples."""
+        return None if self.metric else self.estimator.worlds.get(self.graph.world_of(self.graph.segment))
 
     def _turned(self, time: float) -> np.ndarray | None:
         """Orientation ``(3, 3)`` of the camera by the gyroscope, from the last frame with a pose on."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from dvo.data.inertial import NOISE_PRESETS, InertialSamples
 from dvo.geometry.poses import matrix_to_quaternion, quaternion_to_matrix, rotation_vector, so3_exp
-from dvo.odometry.inertial.smoother import GRAVITY, Smoother, VisualNodes
+from dvo.odometry.inertial.smoother import GRAVITY, SHIFTED, Smoother, VisualNodes
 
 Array = np.ndarray
 RATE = 1000
@@ -70,6 +70,8 @@ def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] =
            walk: float = 0.0, unit: float = 0.0) -> Recording:  # fmt: skip
     """Recording of a hand that moves about.
 
+    Images tell a turn and a shift sideways apart by parallax alone: a wrong orientation comes with a wrong place.
+
     Args:
         seed: of everything.
         still: seconds without acceleration at the beginning.
@@ -117,14 +119,16 @@ def record(seed: int, *, still: float = 0.0, speed: tuple[float, float, float] =
     for k, error in enumerate(errors):
         step = camera[frames[k]].T @ camera[frames[k + 1]]
         drifted[k + 1] = drifted[k] @ step @ error
-    seen = drifted @ so3_exp(rng.normal(0, 1e-3, (len(frames), 3)))
+    wrong = rng.normal(0, 1e-3, (len(frames), 3))
+    seen, shifts = drifted @ so3_exp(wrong), SHIFTED * DEPTH * np.cross([0.0, 0.0, 1.0], wrong)
     logs = drift * (time[frames] - time[frames[0]])
     logs[1:] += np.cumsum(unit * spans[:, 0] * further.normal(size=len(spans)))
     steps = np.diff(path[frames], axis=0, prepend=path[frames[:1]]) * np.exp(-logs)[:, None]
     bent = drifted @ np.swapaxes(turn @ camera[frames], -1, -2) @ turn
     steps[0] = path[frames[0]]
     shown = np.cumsum((bent @ steps[..., None])[..., 0], 0)
-    places = (shown + rng.normal(0, 1e-3 * DEPTH, (len(frames), 3)) @ turn.T) / SCALE
+    noise_of_places = rng.normal(0, 1e-3 * DEPTH, (len(frames), 3)) @ turn.T
+    places = (shown + noise_of_places + (drifted @ shifts[..., None])[..., 0]) / SCALE
     samples = InertialSamples(stamps + OFFSET, gyro, accel, extrinsic, noise)
     return Recording(samples, time[frames], seen, places, turn, (rotation[frames], position[frames], velocity[frames]))
 

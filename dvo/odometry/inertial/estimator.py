@@ -270,6 +270,25 @@ class InertialEstimator:
         """State of the newest node of the solution; None without one."""
         return None if self.solution is None else _newest(self.solution, self._covariance()[:STATE, :STATE])
 
+    def state_at(self, time: float) -> BodyState | None:
+        """State at a time within the solution, or soon after it; None without one.
+
+        Args:
+            time: seconds, clock of the camera.
+
+        Returns:
+            The node before, carried on by samples; its covariance is that of the newest node.
+        """
+        s, last = self.solution, self.last_state()
+        if s is None or last is None or time < s.times[0] or time > last.time + self.options.longest:
+            return None
+        at = int(np.searchsorted(s.times, time + 1e-9, "right")) - 1
+        state = replace(
+            last, time=float(s.times[at]), rotation=s.rotation[at], position=s.position[at], velocity=s.velocity[at],
+            gyro_bias=s.gyro_bias[at], accel_bias=s.accel_bias[at],
+        )  # fmt: skip
+        return state if time <= state.time + 1e-6 else self.predict(state, np.array([time]))[0]
+
     def beside(self, time: float, rotation: Array, position: Array) -> tuple[BodyState, Array]:
         """State at a frame whose pose is that of the images in metres, and what is known of both.
 

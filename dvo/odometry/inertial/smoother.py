@@ -35,6 +35,8 @@ SHIFT = 5e-4
 """Change of the time offset, seconds, after which samples are integrated anew."""
 WIDTH = 6.0
 """Of the robust kernel of visual residuals, deviations."""
+SHIFTED = 0.8
+"""Visual shift that goes with a visual turn that is wrong, in usual depths of the scene."""
 USUAL = 10.0
 """Measurements that the usual noise of visual poses counts for, where it is estimated."""
 _FIXED = 1e18  # information of an unknown that is held
@@ -621,7 +623,12 @@ def _displacements(problem: Smoother, values: Values) -> tuple[_Residuals, float
     moved = _apply(back, np.diff(camera, axis=0))
     shrunk = np.exp(-values.scales(segment)[:-1])[:, None]
     sigma = np.sqrt(options.variances(np.diff(nodes.times), nodes.depth[segment[:-1]])[1])[:, None]
-    residual = (moved * shrunk - seen) / sigma
+    # Images tell a turn and a shift sideways apart by parallax alone: where the visual turn is wrong, so is the shift.
+    turned = nodes.rotation @ body
+    between = _turn(values.rotation[:-1]) @ values.rotation[1:]
+    wrong = rotation_vector(_turn(turned[:-1]) @ turned[1:] @ _turn(between))
+    arm = SHIFTED * nodes.depth[segment[:-1], None, None] * skew(body[2])
+    residual = (moved * shrunk - seen + _apply(arm, wrong)) / sigma
     across = segment[1:] != segment[:-1]
     residual[across] = 0.0
     robust, cost = _robust(residual)
@@ -631,9 +638,13 @@ def _displacements(problem: Smoother, values: Values) -> tuple[_Residuals, float
     after[:, :, :3] = -back @ values.rotation[1:] @ skew(problem.lever)
     before[:, :, :3] = skew(moved) + skew(problem.lever)
     before[:, :, NODE - 1] = -moved
+    arm = arm / shrunk[..., None]
+    before[:, :, :3] += arm
+    after[:, :, :3] -= arm @ between
     speed = values.velocity + _apply(values.rotation, np.cross(rates, lever))
     shared = np.zeros((len(moved), 3, _SEGMENT + 4 * problem.segments))
     shared[:, :, _TIME] = _apply(back, np.diff(speed, axis=0)) + np.cross(moved, rates[:-1])
+    shared[:, :, _TIME] += _apply(arm, rates[:-1] - _apply(between, rates[1:]))
     for k in range(problem.segments):
         mine = segment[:-1] == k
         shared[mine, :, _SEGMENT + 4 * k] = -moved[mine]

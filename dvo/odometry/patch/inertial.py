@@ -23,6 +23,7 @@ from dvo.map.correction import apply_similarities, keyframes_of
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.keyframe_log import FrameRecord
 from dvo.odometry.global_ba.rolling_shutter import Turns
+from dvo.odometry.inertial.coupling import InertialCoupling
 from dvo.odometry.inertial.estimator import (
     BodyState,
     InertialEstimator,
@@ -54,15 +55,22 @@ class InertialTracking:
         options: settings.
         graph: of the tracker.
         metric: the scale has another source: the samples predict rotations alone.
+        variance: of a visual measurement of weight 1, feature pixels squared.
+        optimised: number of newest keyframes whose poses move in the window.
 
     Attributes:
         estimator: of scale, vertical, velocity and biases.
+        coupling: measurements for the window.
     """
 
-    def __init__(self, options: InertialOptions, graph: KeyframeGraph, *, metric: bool = False) -> None:
+    def __init__(
+        self, options: InertialOptions, graph: KeyframeGraph, *, metric: bool = False, variance: float = 1.0,
+        optimised: int = 8,
+    ) -> None:  # fmt: skip
         self.options, self.graph, self.metric = options, graph, metric
         self._unused = ""  # why samples are not used
         self.estimator = InertialEstimator(options)
+        self.coupling = InertialCoupling(self.estimator, self._similarity, variance, optimised)
         self._errors: tuple[float, float] | None = None  # squared, of the gyroscope and of the motion model, rad^2
         self._last: tuple[float, np.ndarray] | None = None  # time and pose T_wc of the last frame with one
         self._before: tuple[float, np.ndarray] | None = None  # and of the one before it
@@ -240,7 +248,8 @@ class InertialTracking:
     # ------------------------------------------------------------------------------------------------------------------
 
     def _similarity(self) -> Similarity | None:
-        return self.estimator.worlds.get(self.graph.world_of(self.graph.segment))
+        """From the present world to the metric one; None: not known, or not by samples."""
+        return None if self.metric else self.estimator.worlds.get(self.graph.world_of(self.graph.segment))
 
     def _turned(self, time: float) -> np.ndarray | None:
         """Orientation ``(3, 3)`` of the camera by the gyroscope, from the last frame with a pose on."""

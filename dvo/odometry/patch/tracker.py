@@ -122,12 +122,16 @@ class PatchOdometry:
         self.sensors: list[WindowSensor] = [
             WINDOW_SENSORS.resolve(name)(self.model, self.device) for name in config.sensors
         ]
-        self.patch_window = PatchWindow(self.model, self.window, config.measuring, self.device, self.sensors)
+        self.inertial = InertialTracking(
+            config.inertial, self.graph, metric=config.scale.source != "none", variance=config.variance,
+            optimised=config.optimisation,
+        )  # fmt: skip
+        sensors = *self.sensors, self.inertial.coupling
+        self.patch_window = PatchWindow(self.model, self.window, config.measuring, self.device, sensors)
         self.aligner: FrameAlignment | None = None
         if config.aligned_motion > 0 and not self.sensors:
             self.aligner = FrameAlignment(self.patch_window, config.alignment, config.motion_damping)
         self.loops = loop_closer(self.model, config, self.graph, self.device, self.state)
-        self.inertial = InertialTracking(config.inertial, self.graph, metric=config.scale.source != "none")
 
     @property
     def window(self) -> Window:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dvo.geometry.poses import so3_exp
 from dvo.odometry.inertial import smoother
 from dvo.odometry.inertial.smoother import Similarities, Values, first_values, linear_start, smooth, upright
-from tests.support.visual_inertial import OFFSET, SCALE, Recording, record
+from tests.support.visual_inertial import CAMERA_IMU, DEPTH, LEVER, OFFSET, SCALE, Recording, record
 
 
 def solved(recording: Recording, end: float) -> smoother.Smoothed:
@@ -96,3 +98,21 @@ def test_a_random_heading_of_the_world_changes_nothing() -> None:
         start: Values = first_values(problem, Similarities(np.array([np.log(scale)]), rotation[None], np.zeros((1, 3))))
         costs.append(smooth(problem, start).cost)
     assert costs[0] == pytest.approx(costs[1], rel=1e-3)
+
+
+def test_a_shift_that_goes_with_a_turn_is_told_by_the_gyroscope(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images confuse a turn with a shift sideways: the errors of both go together."""
+    recording = record(5, seconds=8.0)
+    camera = recording.body[0] @ CAMERA_IMU.T
+    wrong = np.random.default_rng(0).normal(0, 2e-3, (len(camera), 3))
+    place = recording.body[1] + recording.body[0] @ LEVER
+    shifted = place + (camera @ (smoother.SHIFTED * DEPTH * np.cross([0.0, 0.0, 1.0], wrong))[..., None])[..., 0]
+    seen = replace(
+        recording, rotation=recording.turn @ camera @ so3_exp(wrong), position=shifted @ recording.turn.T / SCALE
+    )
+    found = solved(seen, 7.0)
+    monkeypatch.setattr(smoother, "SHIFTED", 0.0)
+    apart = solved(seen, 7.0)
+    assert found.visual_error[1] < 0.1 * apart.visual_error[1]
+    errors = [abs(float(np.exp(x.worlds.log_scale[0])) / SCALE - 1) for x in (found, apart)]
+    assert errors[0] < errors[1]

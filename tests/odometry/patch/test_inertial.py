@@ -93,6 +93,7 @@ def test_another_source_of_metres_is_left_alone() -> None:
 
 def test_poses_turn_upright_and_metric_and_so_does_the_result() -> None:
     (alone, before), aided = plain(14), tracker()
+    aided.patch_window.sensors = ()  # in which the samples would change the visual poses as well
     for k, (a, other) in enumerate(zip(alone, with_samples(frames(14)), strict=True)):
         b = aided.track(other)
         if k == 9:
@@ -198,3 +199,17 @@ def test_what_is_missing_at_the_end_is_spread_over_the_time() -> None:
     led = _led(poses, np.array([1.0, 2.0, 3.0]), 0.0, 4.0, IDENTITY, goal)
     np.testing.assert_allclose(led[:, 0], [0.075, 0.15, 0.225])
     np.testing.assert_allclose(2 * np.arcsin(led[:, 5]), [0.1, 0.2, 0.3])
+
+
+def test_the_window_measures_samples_from_the_alignment_on_until_it_is_withdrawn() -> None:
+    odometry, measured = tracker(), []
+    for k, frame in enumerate(with_samples(frames(18))):
+        if k == 9:
+            align(odometry, odometry.window.frames[0].timestamp)
+        if k == 15:
+            odometry.inertial.estimator.state = ScaleState.INITIALISING
+            odometry.inertial.estimator.worlds = {}
+        assert odometry.track(frame).status in (Status.TRACKING, Status.INITIALISING)
+        measured.append(bool(odometry.inertial.coupling.factors(odometry.window)))
+    assert measured == [False] * 9 + [True] * 6 + [False] * 3
+    assert any("velocity" in frame.states for frame in odometry.window.frames)

@@ -22,6 +22,7 @@ _BUILT_IN = {
     "dso": "dvo.data.calibration.dso:DIALECT",
     "kitti raw": "dvo.data.calibration.kitti_raw:DIALECT",
     "transforms": "dvo.data.calibration.transforms:DIALECT",
+    "opensfm": "dvo.data.calibration.opensfm:DIALECT",
     "ost": "dvo.data.calibration.values:OST",
     "xml": "dvo.data.calibration.values:XML",
     "json": "dvo.data.calibration.values:JSON",
@@ -32,6 +33,10 @@ DIALECTS = Registry("calibration dialect", "dvo.calibration_dialects", dict(_BUI
 """Names to ``"module:DIALECT"``, each a :class:`dvo.data.calibration.calibration.Dialect`. Those of other packages come
 first, because ``text`` takes any file."""
 _NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "json", "yaml", "xml"])  # that may have several cameras
+SHORTEST = 0.01
+"""Focal length at least, widths of the images: below it, it is no number of pixels."""
+_UNSTATED = 200
+"""Width that is assumed for this where the file states none."""
 _BINARY = (".bin", *SUFFIXES)
 _LARGEST = 64 * 1024**2  # of a JSON file, which may list thousands of images beside the camera
 
@@ -82,6 +87,11 @@ def read_calibration(path: Path | str) -> Calibration:
         raise DvoError("not a finite number", file=path, field="intrinsics", remedy=EXPECTED)
     if calibration.fx <= 0 or calibration.fy <= 0:
         raise DvoError("focal length must be positive", file=path, field="intrinsics", remedy=EXPECTED)
+    if min(calibration.fx, calibration.fy) < SHORTEST * (calibration.width or _UNSTATED):
+        raise DvoError(
+            f"a focal length of {min(calibration.fx, calibration.fy):g} pixels: a share of the size of the images?",
+            file=path, field="intrinsics", remedy="give fx, fy, cx, cy in pixels",
+        )  # fmt: skip
     try:
         LENSES[calibration.model].check(calibration.coefficients, calibration.model)
     except DvoError as error:

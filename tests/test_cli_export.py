@@ -103,7 +103,7 @@ def test_the_only_segment_has_the_number_0(given, image_folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [(["--to", "obj"], "no trajectory format 'obj'. Use one of tum, kitti, euroc"),
+    [(["--to", "obj"], "--to: no export format 'obj'. Use one or more of colmap, colmap-text, nerfstudio, tum, kitti"),
      (["--to", "tum", "--segment", "2"], "no segment 2"), (["--to", "tum", "--segment", "-1"], "must be 0 or more"),
      ([], "--to")],
 )  # fmt: skip
@@ -115,9 +115,12 @@ def test_bad_input(options, message, results, tmp_path, capsys):
 
 def test_no_results_folder_and_no_new_folder(results, tmp_path, capsys):
     assert main(["export", str(tmp_path / "none"), str(tmp_path / "new"), "--to", "tum"]) == 2
+    (tmp_path / "images").mkdir()
+    assert main(["export", str(tmp_path / "images"), str(tmp_path / "new"), "--to", "tum"]) == 2
     assert main(["export", str(results), str(results), "--to", "tum"]) == 2
-    first, second = errors(capsys.readouterr().err)
-    assert "not a results folder" in first and "is not an empty folder" in second
+    first, other, second = errors(capsys.readouterr().err)
+    assert "not a results folder" in first and "images: not a results folder" in other
+    assert "is not an empty folder" in second
 
 
 def test_export_of_a_map_file(tmp_path, capsys):

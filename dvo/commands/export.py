@@ -71,8 +71,11 @@ def export(arguments: argparse.Namespace) -> int:
         )
     if name in MAP_FORMATS and name not in TRAJECTORY_FORMATS:
         return _export_recorded(folder, arguments, image_choice(arguments))
-    TRAJECTORY_FORMATS.target(name)  # before any file is read
-    trajectory = read_tum(_trajectory_file(folder, arguments.segment))
+    check_formats([name], option="--to")  # before any file is read
+    file = _trajectory_file(folder, arguments.segment)
+    if not file.is_file():
+        raise DvoError("not a results folder", file=folder, remedy="give a folder that dvo run has written")
+    trajectory = read_tum(file)
     export_trajectory(trajectory, arguments.out, name)
     say(f"exported to {arguments.out}: {describe_rows(name, len(trajectory), _frames_read(folder))}")
     return 0
@@ -242,7 +245,7 @@ def _reopened(folder: Path, facts: dict[str, Any]) -> Source:
 
 def _export_map_file(file: Path, out: str, name: str, segment: int | None) -> int:
     """Write the last recording of a map file: a segment, or the world with the most poses."""
-    check_formats([name])
+    check_formats([name], option="--to")
     graph = load_graph(file)
     result, main = result_of_log(graph.log, {}, None, graph.worlds, graph.recording)
     if segment is not None and segment >= len(result.segments):

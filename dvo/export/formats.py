@@ -194,12 +194,13 @@ def describe_rows(format: str, rows: int, frames: int | None) -> str:
     return f"{text}{note}; times.txt has the time of each row"
 
 
-def check_formats(formats: Iterable[str], odometry: Odometry | None = None) -> None:
+def check_formats(formats: Iterable[str], odometry: Odometry | None = None, *, option: str = "--export") -> None:
     """Check names of formats before a run.
 
     Args:
         formats: the names.
         odometry: that they are asked of; None for the names alone.
+        option: that names them, for messages.
 
     Raises:
         DvoError: an unknown name, or a map format of an odometry without a keyframe graph.
@@ -210,7 +211,7 @@ def check_formats(formats: Iterable[str], odometry: Odometry | None = None) -> N
                 graph_of(odometry)
         elif name not in TRAJECTORY_FORMATS:
             known = ", ".join([*MAP_FORMATS, *TRAJECTORY_FORMATS])
-            raise DvoError(f"no export format '{name}'", field="--export", remedy=f"use one or more of {known}")
+            raise DvoError(f"no export format '{name}'", field=option, remedy=f"use one or more of {known}")
 
 
 def graph_of(source: object) -> KeyframeGraph:

@@ -85,6 +85,9 @@ class Prediction:
         segments: ``rows`` and ``joined_to`` of each segment; empty for a trajectory of one.
         breaks: :attr:`dvo.odometry.protocol.Result.breaks` of the system.
         info: :attr:`dvo.odometry.protocol.Result.info` of the system.
+        verdict: of :attr:`dvo.odometry.protocol.Result.quality`, without a second run; empty from systems that judge
+            nothing.
+        doubt: its reason.
     """
 
     status: str
@@ -105,6 +108,8 @@ class Prediction:
     segments: list[dict[str, Any]] = field(default_factory=list)
     breaks: list[dict[str, Any]] = field(default_factory=list)
     info: dict[str, Any] = field(default_factory=dict)
+    verdict: str = ""
+    doubt: str = ""
 
 
 def predict(job: Job) -> Prediction:
@@ -210,6 +215,8 @@ def drive(odometry: Odometry, source: Source, log: StreamLog | None = None) -> t
         segments=[{"rows": len(segment), "joined_to": segment.joined_to} for segment in segments],
         breaks=[asdict(gap) for gap in result.breaks],
         info=result.info,
+        verdict="" if result.quality is None else result.quality.verdict,
+        doubt="" if result.quality is None else result.quality.reason,
     )
     broken = sum(int((~np.isfinite(segment.trajectory.poses_wc)).any(axis=1).sum()) for segment in segments)
     rows = _all_rows(segments).timestamps

@@ -33,6 +33,7 @@ if TYPE_CHECKING:  # these know the suites, which know the metrics that sequence
 
 SAME_FRAME = 1e-4  # seconds between the stamps of a frame and of its pose
 AUC_METRES = 1.0  # DPVO's "AUC" of a run is max(0, 1 - ATE / 1 m); a table's is the mean over runs, failed ones 0
+WRONG = 2.0  # percent of the path: an ATE that a verdict has to tell
 NEVER_MADE = ("no data", "not run", "unavailable")
 """States of runs that were never made."""
 
@@ -122,6 +123,15 @@ def _false_poses(run: Scored) -> float:
     return false_pose_share(run.prediction.unseen, run.segments) if run.prediction.status == "ok" else math.nan
 
 
+def _doubted(run: Scored) -> float:
+    return float(run.prediction.verdict != "good") if run.prediction.verdict else math.nan
+
+
+def _silent(run: Scored) -> float:
+    error = math.nan if run.errors.metrics is None else run.errors.metrics.ate_percent
+    return float(run.prediction.verdict == "good" and error > WRONG) if run.prediction.verdict else math.nan
+
+
 def _inertial(name: str) -> Callable[[Scored], float]:
     """Value of an attribute of :class:`eval.scoring.inertial.InertialErrors`."""
     return lambda run: float(getattr(run.inertial, name))
@@ -159,6 +169,9 @@ _OWN = (
     # Frames without a view (eval.scoring.blackout.without_view), and the share of them that carries a pose.
     Metric("unseen", "frames without a view", "", 0, lambda run: len(run.prediction.unseen), ""),
     Metric("false_poses", "false poses %", "%", 0, _false_poses, "low", 100.0),
+    # Whether the verdict of the system is not good; whether it is good and the ATE above WRONG.
+    Metric("doubted", "doubted %", "%", 0, _doubted, "", 100.0, "mean"),
+    Metric("silent", "wrong, called good %", "%", 0, _silent, "low", 100.0, "mean"),
     # See eval.scoring.loops.LoopErrors.
     Metric("loops", "loops", "", 0, lambda run: run.loops.loops, ""),
     Metric("false_loops", "false loops", "", 0, lambda run: run.loops.false),
@@ -247,6 +260,8 @@ SEGMENTS = columns("segments", "scored")
 """Where a run has several segments."""
 FALSE_POSES = columns("false_poses")
 """Where there are frames without a view."""
+VERDICTS = columns("doubted", "silent")
+"""Where a verdict is not good, or should not be."""
 RESOURCES = columns("fps", "latency_p95_ms", "peak_memory_mb")
 """Which failed runs have too."""
 OVERALL = columns(

@@ -15,7 +15,7 @@ import numpy as np
 
 from dvo.metrics.table import Metric
 from eval.execution.plan import Manifest
-from eval.scoring.metric_table import DARK, FALSE_POSES, INERTIAL, METRICS, SEGMENTS
+from eval.scoring.metric_table import DARK, FALSE_POSES, INERTIAL, METRICS, SEGMENTS, VERDICTS
 from eval.scoring.metric_table import NEVER_MADE as VOID
 from eval.scoring.score import Row
 from eval.suites.suite import Sequence as Recording
@@ -177,7 +177,7 @@ def inertial_columns(suite: Suite, rows: Iterable[Row]) -> list[Metric]:
 
 
 def segment_columns(rows: Iterable[Row]) -> list[Metric]:
-    """Columns on segments and on frames without a view that a table of some runs needs.
+    """Columns on segments, frames without a view and verdicts that a table of some runs needs.
 
     Args:
         rows: of the table.
@@ -185,7 +185,11 @@ def segment_columns(rows: Iterable[Row]) -> list[Metric]:
     rows = list(rows)
     unseen = any(row.unseen for row in rows)
     several = any(row.segments > 1 for row in rows)
-    return [*(SEGMENTS if several or any(row.blackouts for row in rows) else ()), *(FALSE_POSES if unseen else ())]
+    told = any(row.doubted == 1 or row.silent == 1 for row in rows)
+    return [
+        *(SEGMENTS if several or any(row.blackouts for row in rows) else ()),
+        *(FALSE_POSES if unseen else ()), *(VERDICTS if told else ()),
+    ]  # fmt: skip
 
 
 def count_cell(rows: Iterable[Row], metric: Metric) -> Cell:
@@ -195,7 +199,12 @@ def count_cell(rows: Iterable[Row], metric: Metric) -> Cell:
         rows: of some runs.
         metric: the column.
     """
-    return summarise([metric.factor * float(getattr(row, metric.name)) for row in rows if row.tracked])
+    values = [metric.factor * float(getattr(row, metric.name)) for row in rows if row.tracked]
+    known = [value for value in values if not math.isnan(value)]
+    if metric.over_runs == "mean" and known:
+        mean = float(np.mean(known))
+        return Cell(mean, mean, mean, 0, len(values))
+    return summarise(values)
 
 
 def best_of(cells: Mapping[str, Cell], digits: int | None = None) -> set[str]:

@@ -1,10 +1,14 @@
 """Metrics of other packages beside those of the package."""
 
+import math
+from types import SimpleNamespace
+
 import pytest
 
 from dvo.core.errors import DvoError
 from dvo.core.registry import Registry
 from dvo.metrics.table import Metric
+from eval.execution.predict import Prediction
 from eval.scoring import metric_table
 
 ENDS = Metric("ends", "ends m", "m", 3, lambda run: 0.0)
@@ -23,3 +27,16 @@ def test_a_metric_has_one_name_of_its_own(name, words):
 def test_a_metric_is_added_at_the_end():
     found = metric_table.all_metrics(Registry("metric", targets={"ends": f"{__name__}:ENDS"}))
     assert list(found)[-1] == "ends" and list(found)[:-1] == list(metric_table.all_metrics(Registry("metric")))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "ate", "doubted", "silent"),
+    [("good", 1.9, 0, 0), ("good", 2.1, 0, 1), ("doubtful", 9.0, 1, 0), ("good", math.nan, 0, 0)],
+)
+def test_a_wrong_run_that_is_called_good_is_counted(verdict, ate, doubted, silent):
+    metrics = metric_table.METRICS
+    errors = SimpleNamespace(metrics=SimpleNamespace(ate_percent=ate))
+    run = SimpleNamespace(prediction=Prediction("ok", verdict=verdict), errors=errors)
+    assert (metrics["doubted"].find(run), metrics["silent"].find(run)) == (doubted, silent)
+    unjudged = SimpleNamespace(prediction=Prediction("ok"), errors=errors)
+    assert math.isnan(metrics["doubted"].find(unjudged)) and math.isnan(metrics["silent"].find(unjudged))

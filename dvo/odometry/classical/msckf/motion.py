@@ -80,10 +80,11 @@ def propagate(
     R, p, v = motion.R.copy(), motion.p.copy(), motion.v.copy()
     densities = np.array([noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk], float)
     # The kernel is compiled anew for each layout of its arguments.
-    constant = (np.ascontiguousarray(x) for x in (first.R, first.p, first.v, bias[:3], bias[3:]))
+    R0, p0, v0, bg, ba = (np.ascontiguousarray(x) for x in (first.R, first.p, first.v, bias[:3], bias[3:]))
     transition, covariance = motion_kernels.propagate(
-        stretch.times, stretch.gyro, stretch.accel, R, p, v, *constant, gravity, densities, LONGEST_STEP, UNKNOWN
-    )
+        stretch.times, stretch.gyro, stretch.accel, R, p, v, R0, p0, v0, bg, ba, gravity, densities, LONGEST_STEP,
+        UNKNOWN,
+    )  # fmt: skip
     u, _, vt = np.linalg.svd(R)
     return Motion(u @ vt, p, v), transition, covariance
 

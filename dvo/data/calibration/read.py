@@ -35,7 +35,7 @@ first, because ``text`` takes any file."""
 _NUMBERED = frozenset(["numpy", "colmap", "kitti raw", "json", "yaml", "xml"])  # that may have several cameras
 SHORTEST = 0.01
 """Focal length at least, widths of the images: below it, it is no number of pixels."""
-_UNSTATED = 200
+_UNSTATED = 100
 """Width that is assumed for this where the file states none."""
 _BINARY = (".bin", *SUFFIXES)
 _LARGEST = 64 * 1024**2  # of a JSON file, which may list thousands of images beside the camera
@@ -89,7 +89,7 @@ def read_calibration(path: Path | str) -> Calibration:
         raise DvoError("focal length must be positive", file=path, field="intrinsics", remedy=EXPECTED)
     if min(calibration.fx, calibration.fy) < SHORTEST * (calibration.width or _UNSTATED):
         raise DvoError(
-            f"a focal length of {min(calibration.fx, calibration.fy):g} pixels: a share of the size of the images?",
+            f"a focal length of {min(calibration.fx, calibration.fy):g} pixels, as if it were a share of the size",
             file=path, field="intrinsics", remedy="give fx, fy, cx, cy in pixels",
         )  # fmt: skip
     try:

@@ -524,7 +524,8 @@ REFUSED = [
      "p1"),
     ("o.json", json.dumps({"a": {"projection_type": "brown", "width": 640, "height": 480, "focal_x": 1, "b1": 1}}),
      "b1"),
-    ("shares.json", json.dumps({"fx": 0.8, "fy": 1.1, "cx": 0.5, "cy": 0.5, "width": 640, "height": 480}), "a share of"),
+    ("shares.json", json.dumps({"fx": 0.8, "fy": 1.1, "cx": 0.5, "cy": 0.5, "width": 640, "height": 480}),
+     "a share of"),
     ("shares.txt", "0.8 1.1 0.5 0.5", "a share of"),
     ("o.json", json.dumps({k: {"projection_type": "perspective", "width": 640, "height": 480, "focal": f} for k, f in
      (("a", 0.8), ("b", 0.9))}), "2 cameras in it"),

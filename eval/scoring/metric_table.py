@@ -128,7 +128,8 @@ def _doubted(run: Scored) -> float:
 
 
 def _silent(run: Scored) -> float:
-    error = math.nan if run.errors.metrics is None else run.errors.metrics.ate_percent
+    found, shape = run.errors.metrics, _shape_percent(run)  # a verdict tells nothing of metres
+    error = shape if math.isfinite(shape) or found is None else found.ate_percent
     return float(run.prediction.verdict == "good" and error > WRONG) if run.prediction.verdict else math.nan
 
 

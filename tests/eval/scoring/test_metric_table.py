@@ -30,12 +30,20 @@ def test_a_metric_is_added_at_the_end():
 
 
 @pytest.mark.parametrize(
-    ("verdict", "ate", "doubted", "silent"),
-    [("good", 1.9, 0, 0), ("good", 2.1, 0, 1), ("doubtful", 9.0, 1, 0), ("good", math.nan, 0, 0)],
+    ("verdict", "ate", "shape", "doubted", "silent"),
+    [
+        ("good", 1.9, math.nan, 0, 0),
+        ("good", 2.1, math.nan, 0, 1),
+        ("doubtful", 9.0, math.nan, 1, 0),
+        ("good", math.nan, math.nan, 0, 0),
+        ("good", 9.0, 0.1, 0, 0),
+        ("good", 9.0, 0.3, 0, 1),
+    ],  # fmt: skip
 )
-def test_a_wrong_run_that_is_called_good_is_counted(verdict, ate, doubted, silent):
+def test_a_wrong_run_that_is_called_good_is_counted(verdict, ate, shape, doubted, silent):
+    """Where the alignment leaves the scale to the system, by the error after a similarity (metres of 10 m)."""
     metrics = metric_table.METRICS
-    errors = SimpleNamespace(metrics=SimpleNamespace(ate_percent=ate))
+    errors = SimpleNamespace(metrics=SimpleNamespace(ate_percent=ate, path_length=10.0), shape=shape)
     run = SimpleNamespace(prediction=Prediction("ok", verdict=verdict), errors=errors)
     assert (metrics["doubted"].find(run), metrics["silent"].find(run)) == (doubted, silent)
     unjudged = SimpleNamespace(prediction=Prediction("ok"), errors=errors)

@@ -13,8 +13,6 @@ import lightning as L
 import numpy as np
 import torch
 
-from train.data.stream import BatchStream
-
 CLIPS = 4
 """Clips over which the loss is averaged, or one batch: the training process renders them itself."""
 
@@ -50,7 +48,7 @@ class LossBeforeTraining(L.Callback):
         """Measure and print."""
         program: Any = pl_module
         data = getattr(trainer, "datamodule", None)
-        if not (program.from_trained and trainer.is_global_zero and isinstance(data, BatchStream)):
+        if not (program.from_trained and trainer.is_global_zero and hasattr(data, "next_batches")):
             return
         context = program.context
         buffers = {name: value.clone() for name, value in context.buffers.items()}

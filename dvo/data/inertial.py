@@ -122,7 +122,7 @@ def checked_samples(samples: object) -> InertialSamples:
         )  # fmt: skip
     finite = all(np.isfinite(part).all() for part in (samples.timestamps, samples.gyro, samples.accel))
     pose = samples.T_camera_imu
-    if pose is not None and not (np.isfinite(pose).all() and np.linalg.norm(pose[3:]) > 0.5):
+    if pose is not None and not (np.isfinite(pose).all() and abs(np.linalg.norm(pose[3:]) - 1) < 0.01):
         remedy = "give metres and a unit quaternion"
         raise DvoError(f"{pose} is not a pose", field="inertial: T_camera_imu", remedy=remedy)
     if not finite or not (np.diff(samples.timestamps) > 0).all():

@@ -85,6 +85,7 @@ def test_inertial_samples_of_lists_are_arrays_and_others_are_refused() -> None:
     wrong = [
         7, np.datetime64("2020"), InertialSamples(times[::-1], three, three),
         InertialSamples(times, three * np.nan, three), InertialSamples(times, three, three, np.zeros(7)),
+        InertialSamples(times, three, three, [0, 0, 0, 0, 0, 0, 2]),
     ]  # fmt: skip
     for samples_given in wrong:
         with pytest.raises(DvoError, match="inertial"):

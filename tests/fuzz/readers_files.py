@@ -59,6 +59,9 @@ CALIBRATIONS = {
                               '"cx": 31.5, "cy": 23.5, "xi": -0.2, "alpha": 0.6}}],', '"resolution": [[64, 48]]}}']),
     "transforms": ("transforms.json", ['{"fl_x": 50, "fl_y": 51, "cx": 32, "cy": 24, "w": 64, "h": 48, "k1": 0.1,',
                                        '"camera_model": "OPENCV", "frames": [{"file_path": "a.png"}]}']),
+    "opensfm": ("camera_models.json", ['{"v2 a b 64": {"projection_type": "brown", "width": 64, "height": 48,',
+                                       '"focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01, "c_y": 0, "k1": 0.1, "k2": 0.01,',
+                                       '"k3": 0, "p1": 0.001, "p2": 0}}']),
     "xml": ("calib.xml", ['<?xml version="1.0"?>', "<opencv_storage>", "<fisheye_model>1</fisheye_model>",
                           '<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>',
                           "<data>50 0 31.5 0 51 23.5 0 0 1</data></camera_matrix>",
@@ -216,6 +219,11 @@ def _one(name: str, file: str, rows: list[str], read: Any) -> Target:
     return Target(name, partial(_write, name=file, rows=rows), read, modules=MODULES)
 
 
+def _numpy(folder: Path) -> None:
+    camera = np.array([[50, 0, 31.5], [0, 51, 23.5], [0, 0, 1]])
+    np.savez(folder / "calib.npz", mtx=camera, dist=np.array([[-0.1, 0.01, 0.001, 0.001, 0.0]]), rvecs=np.ones((20, 3)))
+
+
 def _samples(mark: str) -> list[str]:
     return [mark.join(f"{value:.4f}" for value in (0.01 * k, 0.1, 0.2 * k, 0.3, 0.1, 9.8, 0.2)) for k in range(30)]
 
@@ -247,6 +255,7 @@ def _imu_calibration(folder: Path, random: np.random.Generator | None) -> None:
 TARGETS = (
     *(_one(f"calibration_{name}", file, rows, partial(_calibration, name=file + SELECTED.get(name, "")))
       for name, (file, rows) in CALIBRATIONS.items()),
+    Target("calibration_numpy", _numpy, partial(_calibration, name="calib.npz"), modules=MODULES),
     _one("times", "times.txt", ["time", *(f"{0.1 * i:.3f}" for i in range(5))], _times),
     _one("times_ns", "times.txt", [str(1_403_636_579_763_555_584 + 50_000_000 * i) for i in range(5)], _times),
     _one("trajectory", "trajectory.txt", ["# text", *poses(6)], _tum),

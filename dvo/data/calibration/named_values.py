@@ -28,7 +28,7 @@ def read_named_values(text: str, path: Path, remedy: str) -> list[float] | None:
     """
     lines = [re.sub("[,;]", " ", line.split("#")[0]).replace("=", " = ").split() for line in text.splitlines()]
     lines = [line for line in lines if line]
-    if len(lines) > 1 and lines[0][0].lower() not in NAMES and {len(line) for line in lines} == {2}:
+    if len(lines) > 1 and {len(line) for line in lines} == {2} and not any(map(_is_number, lines[0])):
         lines = lines[1:]  # the header of a table of names and values
     is_named = bool(lines) and lines[0][0].lower() in NAMES
     if is_named and len(lines) == 2 and len(lines[0]) == len(lines[1]) > 3:
@@ -59,3 +59,11 @@ def read_named_values(text: str, path: Path, remedy: str) -> list[float] | None:
         )
     values = [found.get(name, 0.0) for name in NAMES]
     return values if any(values[9:]) else values[:9]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

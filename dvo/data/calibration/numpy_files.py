@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,8 @@ from dvo.data.calibration.values import from_matrix, from_values
 SUFFIXES = (".npz", ".npy")
 _LARGEST = 16  # numbers of an array that is read: poses and corners of the board stand beside the camera
 _LARGEST_BYTES = 4096  # of the file of such an array
+_UNREAD = "array that is not read"  # so that coefficients of a lens are refused by their name, and others ignored
+_DAMAGED = (zipfile.BadZipFile, zlib.error, struct.error)
 
 
 def numpy_calibration(path: Path, camera: int | None) -> Calibration:
@@ -38,22 +42,22 @@ def numpy_calibration(path: Path, camera: int | None) -> Calibration:
                 return from_matrix(found.astype(np.float64), path)
             sizes = [member.file_size for member in found.zip.infolist()]
             arrays = {
-                name: _small(found, name) if size <= _LARGEST_BYTES else None
+                name: _small(found, name) if size <= _LARGEST_BYTES else _UNREAD
                 for name, size in zip(found.files, sizes, strict=True)
             }
-    except (OSError, ValueError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, TypeError, EOFError, MemoryError, RuntimeError, KeyError, *_DAMAGED) as error:
         message = f"not an array of NumPy without pickle ({' '.join(str(error).split())[:80]})"
         raise DvoError(message, file=path, field="calibration", remedy=EXPECTED) from None
     return from_values(arrays, path, camera)
 
 
 def _small(found: Any, name: str) -> Any:
-    """An array as plain values; None for one of more numbers, and for one that is pickled."""
+    """An array as plain values; a word for one of more numbers, and for one that is pickled."""
     try:
         array = found[name]
     except ValueError:
-        return None
-    return array.tolist() if array.size <= _LARGEST and array.dtype.kind in "fiubU" else None
+        return _UNREAD
+    return array.tolist() if array.size <= _LARGEST and array.dtype.kind in "fiubU" else _UNREAD
 
 
 DIALECT = Dialect(

@@ -7,6 +7,7 @@ https://opensfm.org/docs/geometry.html.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from dvo.core.errors import DvoError
 from dvo.data.calibration.calibration import Calibration, Dialect
 from dvo.data.calibration.documents import load_json
 from dvo.data.calibration.values import from_values
+from dvo.data.files.files import MAX_NUMBER
 
 _LENSES = {
     "perspective": ("radtan", ("k1", "k2", "", "")),
@@ -63,7 +65,8 @@ def _calibration(values: dict[str, Any], path: Path) -> Calibration:
         raise DvoError(
             f"{kind[:40]!r} is not known", file=path, field="projection_type", remedy=f"use {', '.join(_LENSES)}"
         )
-    unknown = sorted(set(values) - _KEYS)
+    priors = tuple(name for name in values if name.endswith("_prior"))  # what the estimate began with
+    unknown = sorted(set(values) - _KEYS - set(priors))
     if unknown:
         raise DvoError("not known here", file=path, field=str(unknown[0])[:40], remedy="remove it if it is 0")
 
@@ -71,24 +74,33 @@ def _calibration(values: dict[str, Any], path: Path) -> Calibration:
         value = next((values[name] for name in names if name in values), default)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise DvoError("no number", file=path, field=names[0], remedy="give it as OpenSfM does")
+        if abs(value) > MAX_NUMBER:
+            raise DvoError("too large", file=path, field=names[0], remedy="give it as OpenSfM does")
         return float(value)
+
+    def pixels(name: str) -> int:
+        value = number(name)
+        if not value.is_integer() or value < 1:  # NaN is none either
+            raise DvoError("no number of pixels", file=path, field=name, remedy="give a whole number")
+        return int(value)
 
     model, names = _LENSES[kind]
     left_out = [name for name in ("k1", "k2", "k3", "k4", "p1", "p2") if name not in names and values.get(name)]
     if left_out:
         raise DvoError(f"{kind} has none", file=path, field=left_out[0], remedy="remove it, or name another type")
-    width, height = number("width"), number("height")
+    width, height = pixels("width"), pixels("height")
     side = max(width, height)
-    return from_values(
+    found = from_values(
         {
             "fx": side * number("focal_x", "focal"), "fy": side * number("focal_y", "focal_x", "focal"),
             "cx": side * number("c_x", default=0.0) + (width - 1) / 2,
             "cy": side * number("c_y", default=0.0) + (height - 1) / 2,
-            "width": int(width), "height": int(height), "model": model,
+            "width": width, "height": height, "model": model,
             "coefficients": [number(name, default=0.0) if name else 0.0 for name in names],
         },
         path,
     )  # fmt: skip
+    return replace(found, ignored=(*found.ignored, *priors))
 
 
 DIALECT = Dialect(is_opensfm, lambda path, text, camera: opensfm_calibration(path, text))

@@ -29,7 +29,7 @@ def from_text(text: str, path: Path) -> Calibration:
     named = read_named_values(text, path, EXPECTED)
     rows: list[list[float]] = [] if named is None else [named]
     for line in text.splitlines() if named is None else ():
-        fields = _fields(line)
+        fields = _fields(line, path)
         if not fields:
             continue
         if fields[0].rstrip(":").upper() in ("P0", "P1", "P2", "P3"):
@@ -59,11 +59,15 @@ def from_text(text: str, path: Path) -> Calibration:
     return Calibration(fx, fy, cx, cy, model, tuple(coefficients) if model == "radtan" else (), file=path)
 
 
-def _fields(line: str) -> list[str]:
+def _fields(line: str, path: Path) -> list[str]:
     """Words of a line, without comment and the brackets of a printed array; decimal commas as points."""
     line = line.split("#")[0].replace(";", " ")
     words = line.split()
     if len(words) > 3 and all(re.fullmatch(r"-?\d+,\d+", word) for word in words):
+        fx, fy = map(int, words[0].split(","))
+        if fy < 3 * fx < 9 * fy:
+            message = f"commas between numbers, or within them, in {line.strip()[:100]!r}"
+            raise DvoError(message, file=path, field="intrinsics", remedy="write decimal points, and blanks between")
         return [word.replace(",", ".") for word in words]
     return re.sub(r"[\[\](),]|\barray\b", " ", line).split()
 

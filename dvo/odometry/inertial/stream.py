@@ -56,7 +56,8 @@ class SampleStream:
         """
         with self._lock:
             parts = [part for part in self._parts if part.timestamps[-1] > after and part.timestamps[0] <= until]
-        return self._merged([part.between(after, until) for part in parts]) if parts else None
+        near = [part for part in (part.between(after, until) for part in parts) if len(part)]  # none within a gap
+        return self._merged(near) if near else None
 
     def __len__(self) -> int:
         return sum(len(part) for part in self._parts)

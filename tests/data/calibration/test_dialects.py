@@ -369,6 +369,8 @@ READ = [
     ("camera_models.json", json.dumps({"v2 a b 640": {"projection_type": "brown", "width": 640, "height": 480,
      "focal_x": 500 / 640, "focal_y": 510 / 640, "c_x": 0.5 / 640, "c_y": 0.5 / 640, "k1": 0.1, "k2": -0.2, "p1": 0.003,
      "p2": 0.004, "k3": 0.05}}), NUMBERS, "radtan", FIVE, (640, 480)),
+    ("old.json", json.dumps({"a": {"projection_type": "perspective", "width": 640, "height": 480, "focal": 0.75,
+     "k1": 0.1, "k2": 0, "focal_prior": 0.8}}), (480, 480, 319.5, 239.5), "radtan", (0.1, 0, 0, 0), (640, 480)),
     ("opensfm.json", json.dumps({"a": {"projection_type": "perspective", "width": 480, "height": 640, "focal": 0.75,
      "k1": 0.1, "k2": 0}}), (480, 480, 239.5, 319.5), "radtan", (0.1, 0, 0, 0), (480, 640)),
     ("realsense.json", json.dumps({"width": 640, "height": 480, "ppx": 320, "ppy": 240, "fx": 500, "fy": 510,
@@ -526,6 +528,12 @@ REFUSED = [
      "b1"),
     ("shares.json", json.dumps({"fx": 0.8, "fy": 1.1, "cx": 0.5, "cy": 0.5, "width": 640, "height": 480}),
      "a share of"),
+    ("o.json", '{"projection_type": "perspective", "width": NaN, "height": 480, "focal": 1}', "width"),
+    ("o.json", '{"projection_type": "perspective", "width": 1e999, "height": 480, "focal": 1}', "width"),
+    ("o.json", '{"projection_type": "perspective", "width": 64.5, "height": 480, "focal": 1}', "width"),
+    ("width.txt", "width 640\nfx 500\nfy 500\ncx 320\ncy 240\n", "not a number in 'width 640'"),
+    ("skew.csv", "skew,0.5\nfx,500\nfy,500\ncx,320\ncy,240\n", "not a number in 'skew,0.5'"),
+    ("pairs.txt", "525,525 319,239 0,0 0,0", "commas between numbers, or within them"),
     ("shares.txt", "0.8 1.1 0.5 0.5", "a share of"),
     ("o.json", json.dumps({k: {"projection_type": "perspective", "width": 640, "height": 480, "focal": f} for k, f in
      (("a", 0.8), ("b", 0.9))}), "2 cameras in it"),
@@ -579,6 +587,16 @@ def test_arrays_that_numpy_has_saved(make):
     assert (found.model, found.coefficients) == ("radtan", FIVE) and set(found.ignored) == {"rvecs", "corners"}
     np.savez(file, K=K, lens_warp=np.array(KC))
     with pytest.raises(DvoError, match="lens_warp"):
+        read_calibration(file)
+    for unread in (np.array(KC, dtype=object), np.zeros(30), np.array([1j, 0, 0, 0])):
+        np.savez(file, K=K, dist=unread)
+        with pytest.raises(DvoError, match="dist"):
+            read_calibration(file)
+    np.savez(file, K=K)
+    content = file.read_bytes()
+    at = content.index(b"PK\x01\x02") + 8  # flags of the first member: encrypted
+    file.write_bytes(content[:at] + b"\x01" + content[at + 1 :])
+    with pytest.raises(DvoError, match="not an array of NumPy"):
         read_calibration(file)
     np.save(make.root / "k.npy", K)
     assert read_calibration(make.root / "k.npy").fy == 510

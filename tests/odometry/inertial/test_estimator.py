@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dvo.data.inertial import InertialSamples
 from dvo.geometry.poses import rotation_vector, so3_exp
 from dvo.odometry.inertial.estimator import BodyState, InertialEstimator
 from dvo.odometry.inertial.options import InertialOptions
 from dvo.odometry.inertial.smoother import VisualNodes
+from dvo.odometry.inertial.stream import SampleStream
 from dvo.odometry.protocol import ScaleState
 from tests.support.visual_inertial import CAMERA_IMU, LEVER, SCALE, Recording, record
 
@@ -294,3 +296,12 @@ def test_a_new_segment_after_the_dark_is_joined_and_withdraws_nothing() -> None:
     shown = recording.position[late][0]
     first, second = estimator.worlds[0].points(shown), estimator.worlds[4].points(unit * turn @ shown)
     assert np.linalg.norm(first - second) < 0.3
+
+
+def test_a_time_within_a_gap_of_the_samples_has_none_near_it():
+    times = np.concatenate([np.arange(0, 1, 0.005), np.arange(3, 4, 0.005)])
+    stream = SampleStream()
+    stream.add(InertialSamples(times, np.zeros((len(times), 3)), np.ones((len(times), 3))))
+    assert stream.near(1.9, 2.1) is None
+    near = stream.near(0.9, 3.1)
+    assert near is not None and len(near) == np.sum((times > 0.9) & (times <= 3.1))

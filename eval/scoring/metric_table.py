@@ -130,7 +130,9 @@ def _doubted(run: Scored) -> float:
 def _silent(run: Scored) -> float:
     found, shape = run.errors.metrics, _shape_percent(run)  # a verdict tells nothing of metres
     error = shape if math.isfinite(shape) or found is None else found.ate_percent
-    return float(run.prediction.verdict == "good" and error > WRONG) if run.prediction.verdict else math.nan
+    if run.prediction.verdict != "good":
+        return 0.0 if run.prediction.verdict else math.nan
+    return math.nan if math.isnan(error) else float(error > WRONG)
 
 
 def _inertial(name: str) -> Callable[[Scored], float]:

@@ -76,8 +76,11 @@ def _answers(host: str, port: int) -> bool:
     return True
 
 
-def import_rerun() -> Any:
+def import_rerun(option: str = "--rerun") -> Any:
     """Import the package ``rerun``.
+
+    Args:
+        option: that asks for it, for messages.
 
     Returns:
         The module.
@@ -89,7 +92,7 @@ def import_rerun() -> Any:
         import rerun
     except ImportError:
         raise DvoError(
-            "the package rerun-sdk is not installed", field="--rerun", remedy="run pip install 'dvo[viz]'"
+            "the package rerun-sdk is not installed", field=option, remedy="run pip install 'dvo[viz]'"
         ) from None
     return rerun
 
@@ -114,7 +117,7 @@ class RerunLog:
     """
 
     def __init__(self, file: Path | None, name: str, address: str | None = None) -> None:
-        self._rr = rr = import_rerun()
+        self._rr = rr = import_rerun("--rerun" if address is None else "--rerun-connect")
         url = None if address is None else reached(address)
         if file is None and url is None and not has_display():
             remedy = "write a file with --rerun FILE.rrd, or show it on another machine with --rerun-connect ADDRESS"

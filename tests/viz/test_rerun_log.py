@@ -21,12 +21,15 @@ def rerun():
     return pytest.importorskip("rerun", reason="needs rerun-sdk (pip install 'dvo[viz]')")
 
 
-def test_without_the_package_the_remedy_is_named(given, image_folder, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(("option", "value"), [("--rerun", "a.rrd"), ("--rerun-connect", "127.0.0.1:9876")])
+def test_without_the_package_the_remedy_is_named(option, value, given, image_folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     odometry = given()
-    assert main(arguments(image_folder, tmp_path / "out", "--rerun", str(tmp_path / "a.rrd"))) == 2
+    assert main(arguments(image_folder, tmp_path / "out", option, str(tmp_path / value))) == 2
     (line,) = errors(capsys.readouterr().err)
-    assert "rerun-sdk is not installed" in line and "pip install 'dvo[viz]'" in line
+    assert (
+        line.startswith(f"error: {option}: the package rerun-sdk is not installed") and "pip install 'dvo[viz]'" in line
+    )
     assert not odometry.asked and not (tmp_path / "out").exists(), "before the weights load"
 
 

@@ -18,7 +18,7 @@ from dvo.core.settings import check_settings
 from dvo.data.images.image_header import image_size
 from dvo.geometry.camera import Camera
 from dvo.geometry.poses import pose_matrices
-from dvo.map.archive import ArchivedKeyframe
+from dvo.map.archive import ArchivedKeyframe, encode_mask
 from dvo.map.keyframe_graph import KeyframeGraph
 from dvo.map.map import MIN_NEARNESS
 from dvo.map.measurements import ArchivedEdges
@@ -180,6 +180,7 @@ def reconstruct(
     found = [_camera(intrinsics[image], sizes[image]) for image in images]
     cameras = tuple(dict.fromkeys(found))
     image_of = np.where(shown, np.cumsum(shown) - 1, -1)
+    masks = [frames[image].mask for image in images]
     return Reconstruction(
         cameras=cameras,
         camera_of=np.array([cameras.index(camera) for camera in found]),
@@ -188,6 +189,7 @@ def reconstruct(
         T_cw=T_cw[images],
         jpegs=tuple(contents[image] for image in images),
         without_image=int((kept & ~shown).sum()),
+        masks=_masks(masks, found) if any(mask is not None for mask in masks) else (),
         **_content(graph, frames, T_cw, intrinsics, image_of, found, options),
     )
 
@@ -279,6 +281,13 @@ def _camera(intrinsics: np.ndarray, size: tuple[int, int] | None) -> Camera:
     assert size is not None
     fx, fy, cx, cy = intrinsics.tolist()
     return Camera(fx, fy, cx, cy, *size)
+
+
+def _masks(masks: list[np.ndarray | None], cameras: list[Camera]) -> list[bytes]:
+    """Mask of each image, white for one without."""
+    sizes = [(camera.height, camera.width) for camera in cameras]
+    found = zip(masks, sizes, strict=True)
+    return [(encode_mask(np.ones(size, bool)) if mask is None else mask).tobytes() for mask, size in found]
 
 
 def _patches(frames: list[ArchivedKeyframe], T_cw: np.ndarray, intrinsics: np.ndarray) -> _Patches:

@@ -66,6 +66,8 @@ class ArchivedKeyframe:
         jpeg: ``(n,)`` uint8 content of a JPEG file with the working image, None if not kept.
         measured: ``(M, 2)`` float32 inverse depths (1/m) by a depth camera and their weights, 0 for none; None without
             a depth camera, or once released with the patches.
+        mask: ``(n,)`` uint8 content of a PNG file of the size of the working image, white where it was used and black
+            elsewhere; None for all of it, or if the image is not kept.
     """
 
     identifier: int
@@ -80,11 +82,12 @@ class ArchivedKeyframe:
     context: np.ndarray | None = None
     jpeg: np.ndarray | None = None
     measured: np.ndarray | None = None
+    mask: np.ndarray | None = None
 
     @property
     def feature_bytes(self) -> int:
         """Memory of features and image."""
-        arrays = (self.matching, self.context, self.jpeg)
+        arrays = (self.matching, self.context, self.jpeg, self.mask)
         return sum(a.nbytes for a in arrays if a is not None)
 
     @property
@@ -266,7 +269,7 @@ class Archive:
         """Release memory until the bound holds: features and images, then edges, then patches, each oldest first."""
         limit = self.config.max_bytes
         while self._bytes > limit and self._with_features:
-            self._change(self._with_features.popleft(), matching=None, context=None, jpeg=None)
+            self._change(self._with_features.popleft(), matching=None, context=None, jpeg=None, mask=None)
         while self._bytes > limit and self._edges:
             self._bytes -= self._edges.popleft().nbytes
         while self._bytes > limit and self._with_patches:
@@ -278,15 +281,16 @@ class Archive:
     def _stored(self, keyframe: ArchivedKeyframe) -> ArchivedKeyframe:
         """Keyframe with its arrays in the storage."""
         features, patches = self._storage["features"].keep, self._storage["patches"].keep
-        matching, context, jpeg = (
-            None if array is None else features(array) for array in (keyframe.matching, keyframe.context, keyframe.jpeg)
+        matching, context, jpeg, mask = (
+            None if array is None else features(array)
+            for array in (keyframe.matching, keyframe.context, keyframe.jpeg, keyframe.mask)
         )
         centres, depth, colors = map(patches, (keyframe.centres, keyframe.inverse_depth, keyframe.colors))
         intrinsics, pose_cw = map(self._storage["poses"].keep, (keyframe.intrinsics, keyframe.pose_cw))
         measured = None if keyframe.measured is None else patches(keyframe.measured)
         return replace(
             keyframe, intrinsics=intrinsics, pose_cw=pose_cw, centres=centres, inverse_depth=depth, colors=colors,
-            matching=matching, context=context, jpeg=jpeg, measured=measured,
+            matching=matching, context=context, jpeg=jpeg, measured=measured, mask=mask,
         )  # fmt: skip
 
     def _change(self, identifier: int, **fields: object) -> None:
@@ -310,3 +314,17 @@ def encode_jpeg(image: np.ndarray, quality: int) -> np.ndarray:
 
     _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data.ravel()
+
+
+def encode_mask(mask: np.ndarray) -> np.ndarray:
+    """Compress a mask.
+
+    Args:
+        mask: ``(H, W)`` bool.
+
+    Returns:
+        ``(n,)`` uint8 content of a PNG file, white where the mask is True.
+    """
+    import cv2
+
+    return cv2.imencode(".png", np.uint8(255) * mask)[1].ravel()

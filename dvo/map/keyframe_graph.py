@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dvo.geometry import se3
-from dvo.map.archive import ArchiveConfig, ArchivedKeyframe, encode_jpeg
+from dvo.map.archive import ArchiveConfig, ArchivedKeyframe, encode_jpeg, encode_mask
 from dvo.map.heap import release_free_memory
 from dvo.map.map import Map
 from dvo.map.measurements import ArchivedEdges
@@ -243,6 +243,7 @@ class KeyframeGraph(Map):
                 measured=None
                 if frame.measured is None or identifier is not None
                 else frame.measured.float().cpu().numpy(),
+                mask=None if image is None or frame.mask is None else encode_mask(frame.mask),
             )
         )
         if len(self.archive) % RELEASE_INTERVAL == 0:

@@ -51,7 +51,7 @@ class Snapshot:
         """Copy without features, images and a log of frames, to be corrected at will."""
         copy = Map(self.per_frame, ArchiveConfig(_UNBOUNDED, False, False))
         for keyframe in self.keyframes:
-            copy.archive.add(replace(keyframe, matching=None, context=None, jpeg=None))
+            copy.archive.add(replace(keyframe, matching=None, context=None, jpeg=None, mask=None))
         for part in self.parts:
             copy.archive.add_part(part)
         copy.segment, copy.starts, copy.worlds = self.segment, list(self.starts), dict(self.worlds)

@@ -40,6 +40,7 @@ class Keyframe:
             patches, 1 / feature-map pixel; 0 where the surface is not known; None: that of no patch is.
         prior: ``(M, 2)`` inverse depths of its patches in the unit of the window, known from elsewhere, and their
             weights in bundle adjustment, 0 for none; None: of no patch.
+        mask: ``(H, W)`` bool, pixels of the image that are used; None for all.
         states: ``(D,)`` values of further unknowns of the frame, by name, such as a velocity.
         guest: it is archived already, and takes part because the window was located by it: its pose is held, and of
             what leaves the window only its measurements are archived. Guests are the first keyframes of a window.
@@ -57,6 +58,7 @@ class Keyframe:
     measured: Tensor | None = None
     slopes: Tensor | None = None
     prior: Tensor | None = None
+    mask: np.ndarray | None = None
     guest: bool = False
     states: dict[str, Tensor] = field(default_factory=dict)
 

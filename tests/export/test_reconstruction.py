@@ -5,6 +5,7 @@ import pytest
 
 from dvo.core.errors import DvoError
 from dvo.export.reconstruction import PointOptions, longest_segment, reconstruct
+from dvo.map.io.serialisation import load_graph, save_graph
 from dvo.map.keyframe_log import FrameRecord
 from tests.support.archived_walk import INTRINSICS, M
 from tests.support.reconstructions import SIDE, image, walk
@@ -122,3 +123,19 @@ def test_longest_segment():
 def test_options_out_of_range():
     with pytest.raises(DvoError, match="min_images"):
         PointOptions(min_images=0)
+
+
+def test_masks_of_keyframes_go_along_and_a_keyframe_without_one_uses_all(tmp_path):
+    import cv2
+
+    mask = np.ones((SIDE, SIDE), bool)
+    mask[:20] = False
+    graph = walk(5, dropped=(2,), masks={1: mask})
+    save_graph(tmp_path / "a.dvo", graph)
+    for kept in (graph, load_graph(tmp_path / "a.dvo")):
+        found = reconstruct(kept, 0)
+        decoded = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_UNCHANGED) for one in found.masks]
+        assert found.identifiers.tolist() == [0, 1, 3, 4] and len(decoded) == 4
+        np.testing.assert_array_equal(decoded[1], 255 * mask.astype(np.uint8))
+        assert all((one == 255).all() and one.shape == mask.shape for one in decoded[:1] + decoded[2:])
+    assert not reconstruct(walk(5), 0).masks

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -64,6 +65,8 @@ def test_a_map_of_masked_frames_is_saved(tmp_path):
     odometry.save(tmp_path / "half.dvo")
     loaded = load_map(tmp_path / "half.dvo", weights=weights)
     assert [frame.identifier for frame in loaded.graph.archive] == list(range(7))
+    kept = [frame for frame in loaded.graph.archive if frame.jpeg is not None]
+    assert kept and all((cv2.imdecode(frame.mask, 0) == 255 * MASK).all() for frame in kept)
     assert outcome(odometry, images[7:])[-2] == 9
 
 

@@ -20,17 +20,18 @@ def image(number):
     return np.full((SIDE, SIDE, 3), (10 + 4 * (number % 50), 200, 90), np.uint8)
 
 
-def walk(frames: int = 12, wrong: float = 0.0, dropped: tuple[int, ...] = (), **config) -> KeyframeGraph:
+def walk(frames: int = 12, wrong: float = 0.0, dropped: tuple[int, ...] = (), masks=None, **config) -> KeyframeGraph:
     """Graph of a walk that is archived with images and true poses.
 
     Args:
         frames, wrong, dropped: of :func:`tests.support.archived_walk.archived_walk`.
+        masks: number of a frame to ``(SIDE, SIDE)`` bool.
         config: of the archive.
     """
     archive = ArchiveConfig(**config)
     graph, truth = archived_walk(frames, wrong, dropped, archive, archived=False)
     for frame in graph.window.frames:
-        frame.image = image(frame.identifier)
+        frame.image, frame.mask = image(frame.identifier), (masks or {}).get(frame.identifier)
         frame.colors = torch.arange(3 * M, dtype=torch.uint8).reshape(M, 3) + frame.identifier
     while len(graph.window):
         graph.archive_oldest()

@@ -229,6 +229,7 @@ def _archive_arrays(graph: KeyframeGraph) -> Arrays:
     patched = [frame for frame in frames if len(frame.inverse_depth)]
     described = [frame for frame in frames if frame.matching is not None and frame.context is not None]
     edges = ArchivedEdges.concatenate([part.unpack() for part in parts])
+    masks = [frame.mask for frame in frames]
     return {
         "archive/keyframes": np.array([frame.identifier for frame in frames], np.int64),
         "archive/times": np.array([frame.timestamp for frame in frames], np.float64),
@@ -242,8 +243,8 @@ def _archive_arrays(graph: KeyframeGraph) -> Arrays:
         "archive/has_features": np.array([f.matching is not None and f.context is not None for f in frames], np.uint8),
         "archive/matching": _stack([f.matching for f in described], np.float16, (m, 0, p, p)),
         "archive/context": _stack([f.context for f in described], np.float16, (m, 0)),
-        "archive/jpeg_bytes": np.array([-1 if f.jpeg is None else len(f.jpeg) for f in frames], np.int64),
-        "archive/jpeg": np.concatenate([np.zeros(0, np.uint8), *(f.jpeg for f in frames if f.jpeg is not None)]),
+        **_file_arrays("archive/jpeg", [frame.jpeg for frame in frames]),
+        **(_file_arrays("archive/mask", masks) if any(mask is not None for mask in masks) else {}),
         "edges/parts": np.array([len(part) for part in parts], np.int64),
         "edges/source": edges.source,
         "edges/patch": edges.patch,
@@ -271,7 +272,11 @@ def _read_archive(source: MapReader, graph: KeyframeGraph) -> None:
     described, feature_row = _rows(source.array("archive/has_features", np.uint8, (n,), 0, 1))
     matching = source.array("archive/matching", np.float16, (described, m, None, p, p))
     context = source.array("archive/context", np.float16, (described, m, None))
-    images = _split_jpeg(source, n)
+    images = _split_files(source, "archive/jpeg", n)
+    masks = _split_files(source, "archive/mask", n) if source.has("archive/mask") else [None] * n
+    pairs = [(mask, image) for mask, image in zip(masks, images, strict=True) if mask is not None]
+    fits = all(image is not None and _size(mask) == _size(image) for mask, image in pairs)
+    source.require(fits, "holds masks without an image of their size", "archive/mask")
     for i, identifier in enumerate(identifiers.tolist()):
         a, b = int(patch_row[i]), int(feature_row[i])
         graph.archive.add(
@@ -287,6 +292,7 @@ def _read_archive(source: MapReader, graph: KeyframeGraph) -> None:
                 matching=None if b < 0 else matching[b].copy(),
                 context=None if b < 0 else context[b].copy(),
                 jpeg=images[i],
+                mask=masks[i],
             )
         )
     _read_edges(source, graph, m)
@@ -306,23 +312,35 @@ def _read_edges(source: MapReader, graph: KeyframeGraph, per_frame: int) -> None
         graph.archive.add_edges(edges.select(np.arange(end - length, end)))
 
 
-def _split_jpeg(source: MapReader, count: int) -> list[np.ndarray | None]:
-    """JPEG of each archived keyframe, all of one size."""
-    lengths = source.array("archive/jpeg_bytes", np.int64, (count,), -1, 2**31)
+def _file_arrays(name: str, files: list[np.ndarray | None]) -> Arrays:
+    """Contents of files, one after the other, and their lengths, -1 for none."""
+    return {
+        f"{name}_bytes": np.array([-1 if file is None else len(file) for file in files], np.int64),
+        name: np.concatenate([np.zeros(0, np.uint8), *(file for file in files if file is not None)]),
+    }
+
+
+def _size(file: np.ndarray) -> tuple[int, int] | None:
+    return image_size(file.tobytes())
+
+
+def _split_files(source: MapReader, name: str, count: int) -> list[np.ndarray | None]:
+    """Image file of each archived keyframe, all of one size."""
+    lengths = source.array(f"{name}_bytes", np.int64, (count,), -1, 2**31)
     total = int(lengths.clip(min=0).sum())
-    content = source.array("archive/jpeg", np.uint8, (total,))
+    content = source.array(name, np.uint8, (total,))
     found: list[np.ndarray | None] = []
     sizes, start = set(), 0
     for length in lengths.tolist():
         found.append(None if length < 0 else content[start : start + length])
         start += max(length, 0)
-        jpeg = found[-1]
-        if jpeg is not None:
-            sizes.add(image_size(jpeg.tobytes()))
-    source.require(len(sizes) <= 1, "holds images of different sizes", "archive/jpeg")
+        file = found[-1]
+        if file is not None:
+            sizes.add(_size(file))
+    source.require(len(sizes) <= 1, "holds images of different sizes", name)
     for size in sizes:
         fits = size is not None and 0 < size[0] * size[1] <= MAX_PIXELS
-        source.require(fits, "holds images without a size, or too large ones", "archive/jpeg")
+        source.require(fits, "holds images without a size, or too large ones", name)
     return found
 
 

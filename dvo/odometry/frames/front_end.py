@@ -35,6 +35,7 @@ class Observation:
         measured: ``(M, 2)`` inverse depths of the patches by a depth camera (1/m) and their weights in bundle
             adjustment, both 0 for a patch without one; None if depth is not used.
         slopes: ``(M, 2)`` of the surfaces of the patches, see :class:`dvo.map.window.Keyframe`; None: not known.
+        mask: ``(H, W)`` bool, pixels of the image that are used; None for all.
     """
 
     image: np.ndarray
@@ -48,6 +49,7 @@ class Observation:
     visible: Tensor | None = None
     measured: Tensor | None = None
     slopes: Tensor | None = None
+    mask: np.ndarray | None = None
 
     @property
     def bounds(self) -> tuple[int, int]:
@@ -80,7 +82,7 @@ def keyframe_of(view: View, identifier: int, map_slot: int) -> Keyframe:
     """
     s = view.seen
     features = s.matching, s.context, s.colors, s.intrinsics, s.image, s.visible, s.measured, s.slopes
-    return Keyframe(identifier, view.records[0].timestamp, map_slot, *features)
+    return Keyframe(identifier, view.records[0].timestamp, map_slot, *features, mask=s.mask)
 
 
 def encode_image(model: PatchVO, image: np.ndarray, device: torch.device) -> Features:
@@ -145,4 +147,5 @@ def observe(
         context=context[0],
         colors=rgb[:, y.clamp(max=camera.height - 1), x.clamp(max=camera.width - 1)].T.cpu(),
         visible=None if mask is None else visible_features(mask, model.config.patch_size, device),
+        mask=mask,
     )

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
-from dvo.map.archive import ArchiveConfig, encode_jpeg
+from dvo.map.archive import ArchiveConfig, encode_jpeg, encode_mask
 from dvo.map.io.map_file import VERSION, open_map_file, write_map_file
 from dvo.map.io.serialisation import graph_arrays, load_graph, save_graph
 from dvo.map.keyframe_graph import KeyframeGraph
@@ -133,6 +133,17 @@ def test_images_of_another_size_are_refused(tmp_path):
     graph.archive.add(replace(graph.archive[0], jpeg=small))
     save_graph(tmp_path / "a.dvo", graph)
     with pytest.raises(DvoError, match="different sizes"):
+        load_graph(tmp_path / "a.dvo")
+
+
+@pytest.mark.parametrize(("shape", "jpeg"), [((8, 8), True), ((32, 40), False)])
+def test_masks_without_an_image_of_their_size_are_refused(shape, jpeg, tmp_path):
+    graph = walk()
+    first = graph.archive[0]
+    mask = encode_mask(np.ones(shape, bool))
+    graph.archive.add(replace(first, mask=mask, jpeg=first.jpeg if jpeg else None))
+    save_graph(tmp_path / "a.dvo", graph)
+    with pytest.raises(DvoError, match="masks without an image"):
         load_graph(tmp_path / "a.dvo")
 
 

@@ -98,7 +98,7 @@ def _show(arguments: argparse.Namespace) -> int:
     for name, row in rows.items():
         if row is not None:
             say(f"{name:<13}{row}")
-    for note in found.notes:
+    for note in found.doubts(found.width, found.height) if found.width and found.height else found.notes:
         warn(note, "note")
     return OK
 

@@ -19,6 +19,8 @@ _TURN = (
     "the images stand upright, the calibration is that of the sensor: turn it too (fx and fy, and cx and cy, change "
     "places)"
 )
+_EXCHANGED = "its principal point is the centre of images of these sides: exchange width and height in it"
+_NEAR_CORNER = 0.05  # of the sides: no principal point lies there
 
 _OTHER_SIZE = 0.15  # of the principal point's distance from the corner: more than that of a lens that is off centre
 _SAME_SHAPE = 0.06
@@ -70,7 +72,7 @@ class Calibration:
 
         Raises:
             DvoError: the intrinsics do not fit: another resolution stated, a focal length below 0.1 or above 20 image
-                widths, a principal point outside of the image; or a readout outside of 0 to 1 s.
+                widths, a principal point outside of the image or in its corner; or a readout outside of 0 to 1 s.
         """
         remedy = f"give the calibration of these {width}x{height} images"
         if (self.width or width, self.height or height) != (width, height):
@@ -78,7 +80,9 @@ class Calibration:
                 f"calibration is for {self.width}x{self.height} images, but these are {width}x{height}",
                 file=self.file,
                 field="intrinsics",
-                remedy=_TURN if (self.width, self.height) == (height, width) else remedy,
+                remedy=remedy
+                if (self.width, self.height) != (height, width)
+                else (_EXCHANGED if self._fits_turned(height, width) else _TURN),
             )
         LENSES[self.model].check(self.coefficients, self.model)
         factor = magnification(self.model, self.coefficients)
@@ -90,6 +94,14 @@ class Calibration:
                     field="intrinsics",
                     remedy=f"{remedy}, in pixels",
                 )
+        if abs(self.cx) < _NEAR_CORNER * width and abs(self.cy) < _NEAR_CORNER * height:
+            raise DvoError(
+                f"the principal point ({self.cx:g}, {self.cy:g}) of {width}x{height} images, as if it were an offset "
+                "from their centre or a share of the size",
+                file=self.file,
+                field="intrinsics",
+                remedy=f"give cx and cy in pixels from the corner (centre: {(width - 1) / 2:g}, {(height - 1) / 2:g})",
+            )
         try:
             numbers = (self.fx, self.fy, self.cx, self.cy)
             return Camera(*numbers, width, height, self.model, self.coefficients, self.readout)

@@ -75,7 +75,7 @@ def load_json(text: str, path: Path) -> Any:
 
 
 def load_xml(text: str, path: Path) -> Any:
-    """Parse the XML of OpenCV's FileStorage.
+    """Parse the XML of OpenCV's FileStorage, and other XML of elements and attributes.
 
     Args:
         text: of the file.
@@ -99,17 +99,23 @@ def load_xml(text: str, path: Path) -> Any:
 def _value(element: Any, path: Path, depth: int) -> Any:
     if depth > MAX_DEPTH:
         raise DvoError("XML nested too deeply", file=path, field="calibration", remedy=EXPECTED)
-    if len(element):
+    attributes = [(name, _of_text(text)) for name, text in element.attrib.items() if name != "type_id"]
+    if len(element) or (attributes and not (element.text or "").strip()):
         children = [(child.tag, _value(child, path, depth + 1)) for child in element]
-        if all(tag == "_" for tag, _ in children):
+        if children and all(tag == "_" for tag, _ in children):
             return [value for _, value in children]
+        children += attributes
         found = dict(children)
         if len(found) < len(children):
             raise DvoError("a key twice", file=path, field=str(element.tag)[:60], remedy=EXPECTED)
         if "data" in found and not isinstance(found["data"], list):
             found["data"] = [found["data"]]
         return found
-    words = (element.text or "").split()
+    return _of_text(element.text or "")
+
+
+def _of_text(text: str) -> Any:
+    words = text.split()
     try:
         numbers = [float(word) for word in words]
     except ValueError:

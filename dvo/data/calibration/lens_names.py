@@ -32,7 +32,7 @@ _MODELS |= dict.fromkeys(["pinhole", "perspective", "simplepinhole", "pinholecam
 _FLAGS = frozenset(["true", "false", "yes", "no", "on", "off", "0", "1"])
 
 _WORDS = re.compile(
-    r"(distor|fisheye|lens|skew|radial|tangential|prism|kannala|coef|mirror|poly|omni|rational|warp|barrel|pincushion|"
+    r"(disto|fisheye|lens|skew|radial|tangential|prism|kannala|coef|mirror|poly|omni|rational|warp|barrel|pincushion|"
     r"aberration|curvature|kappa|brown|conrady|anamorph|shear|optic|nonlinear|deform|bend|tilt|division|squeeze|"
     r"equidist|radtan|plumb|scaramuzza|equirect|wide_?angle)"
 )
@@ -59,17 +59,19 @@ _WHOLE = frozenset(
         "c_d_e",
     ]
 )
-_SCALAR = re.compile(r"(k|p|s|d|b|t|r|xi|tau|kc|lambda|mu|nu|a|e)_?\d{1,2}")  # k1, p2, d0; not matrices P1 or D2
+_SCALAR = re.compile(  # k1, p2, d0; not matrices P1 or D2, nor t_00 and r_12 of a pose
+    r"(k|p|s|d|b|xi|tau|kc|lambda|mu|nu|a|e)_?\d{1,2}|[tr]_?\d"
+)
 _KIND = re.compile(
     r"(fisheye|equisolid|equidistant|stereographic|orthographic|equirect|panoram|kannala|brown.?conrady|plumb.?bob|"
     r"radial.?tangential|radtan|cubemap|catadioptric)"
 )
 _OTHER = re.compile(  # keys that speak of something else though they have such a word
-    r"(undist|rectif|error|flag|name|file|path|topic|mask|serial|facing|distance|iter|thresh|min_|max_|uncert|std|stdev|"
+    r"(polymorph|undist|rectif|error|flag|name|file|path|topic|mask|serial|facing|distance|iter|thresh|min_|max_|uncert|std|stdev|"
     r"covar|sigma|weight|optical_?flow|optimi|criteria|aspect|rms|imu|gyro|acc)"
 )
 _BENIGN = re.compile(  # lists of as many numbers as a lens may have coefficients
-    r"(^t$|^t_|^tf|transf|extrin|^r$|^r_|^r\d|rot|rect|^p$|^p_|^p\d|^q$|proj|trans|quat|pose|posit|orient|roi|crop|imu|"
+    r"(^t$|^t_|^tf|transf|extrin|^r$|^r_|^r\d|rot|rect|^p$|^p_|^p\d|^q(_|$)|proj|trans|quat|pose|posit|orient|roi|crop|imu|"
     r"body|accel|gyro|noise|bias|grav|euler|rpy|xyz|error|reproj|view|std|cov|shift|rate|mask|border|bound|colou?r|rgb|"
     r"scale|offset|mean|backgr|window|grid|pattern|board|square|overlap|center|centre|viewer|line|point|range|depth|"
     r"size|resol|shape|time|stamp|frame|matrix|ids?$|aabb|box|plane|white|exposure|gain|norm)"

@@ -22,6 +22,7 @@ _BUILT_IN = {
     "dso": "dvo.data.calibration.dso:DIALECT",
     "kitti raw": "dvo.data.calibration.kitti_raw:DIALECT",
     "transforms": "dvo.data.calibration.transforms:DIALECT",
+    "gyroflow": "dvo.data.calibration.gyroflow:DIALECT",
     "opensfm": "dvo.data.calibration.opensfm:DIALECT",
     "ost": "dvo.data.calibration.values:OST",
     "xml": "dvo.data.calibration.values:XML",
@@ -96,4 +97,11 @@ def read_calibration(path: Path | str) -> Calibration:
         LENSES[calibration.model].check(calibration.coefficients, calibration.model)
     except DvoError as error:
         raise DvoError(error.message, file=path, field=error.field, remedy=error.remedy or EXPECTED) from None
+    if not calibration.width and max(abs(calibration.cx), abs(calibration.cy)) <= 1:
+        raise DvoError(
+            f"a principal point of ({calibration.cx:g}, {calibration.cy:g}), as if it were a share of the size",
+            file=path, field="intrinsics", remedy="give fx, fy, cx, cy in pixels",
+        )  # fmt: skip
+    if calibration.width and calibration.height:
+        calibration.camera(calibration.width, calibration.height)  # what is stated fits together
     return calibration

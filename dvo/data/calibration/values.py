@@ -40,6 +40,14 @@ _FISHEYE_FLAGS = ("fisheyemodel", "isfisheye", "fisheye", "usefisheye", "bfishey
 _RADTAN_FLAT = LENSES["radtan"].names
 _FIRST = ("cam0", "camera0", "camera", "camera1", "left", "leftcamera", "cameraleft", "camleft", "0", "l", "1", "color",
           "colour", "rgb", "rgbcamera", "cam", "cam1", "camleftrect", "leftcam", "00", "02")  # fmt: skip
+_IF_ZERO = ("inversebrownconrady", "modifiedbrownconrady")  # RealSense: models without coefficients as a rule
+_UNIT = frozenset(["unit", "units", "focalunit", "focallengthunit", "focalunits", "focallengthunits"])
+_OTHER_UNITS = ("mm", "millimeter", "millimeters", "millimetre", "millimetres", "normalized", "normalised", "relative")
+_SENSOR = frozenset(["sensorwidth", "sensorwidthmm", "sensorsize", "sensorsizemm", "sensor", "pixelsize", "pixelpitch",
+                     "filmback", "filmwidth", "apwidth"])  # fmt: skip
+_WIDEST = 0.3  # focal length, widths of the images: below it, a lens is wider than a pinhole camera shows
+_USUAL = 640  # width that is assumed for this where the file states none
+_LONGEST = 3.0  # baseline of a pair of cameras on one device, metres
 _BRACE = re.compile(r'\s*\{\s*"')
 _PAIRED = re.compile(r"(k|m|(?:camera_?)?matrix|camera_?mat|mtx|intrinsics?)_?(left|right|l|r|[0-2]|0[0-3])")
 _SUFFIX = re.compile(r"(.+?)_?(left|right|l|r|[0-2]|0[0-3])")
@@ -104,7 +112,7 @@ def from_values(data: Any, path: Path, camera: int | None = None) -> Calibration
 
 def _missing(mappings: Sequence[dict[str, Any]]) -> str:
     keys = [str(key)[:40] for mapping in mappings for key in mapping]
-    named = f": {', '.join(keys[:8])}{', ...' if len(keys) > 8 else ''}" if keys else ""
+    named = f": {', '.join(keys[:8])}{' and more' if len(keys) > 8 else ''}" if keys else ""
     return f"no fx, fy, cx, cy in it, nor a camera matrix{named}"
 
 
@@ -121,9 +129,17 @@ def _split(value: Any) -> Any:
         parts = _SUFFIX.fullmatch(str(key).lower())
         if parts and isinstance(item, list) and parts[2] in paired and not isinstance(found.get(parts[2], {}), list):
             found.setdefault(parts[2], {})[parts[1]] = item
+        elif bare(str(key)) == "calibration" and _is_row(item) and not {"intrinsics", "coefficients"} & set(value):
+            found |= {"intrinsics": item[:4], "coefficients": item[4:]}  # MASt3R-SLAM
         else:
             found[key] = _split(item)
     return found
+
+
+def _is_row(value: Any) -> bool:
+    """True for ``fx fy cx cy [k1 k2 p1 p2 ...]`` in a list."""
+    is_numbers = isinstance(value, list) and all(isinstance(number, int | float) for number in value)
+    return is_numbers and len(value) in (4, 8, 9, 12) and value[1] != 0
 
 
 def _choose(named: list[tuple[str, Entries]], camera: int | None, path: Path) -> Entries:
@@ -175,19 +191,54 @@ def _calibration(entries: Entries, path: Path) -> Calibration:
     if skew is not None:
         _refuse_skew(float(skew.ravel()[0]), 1.0, path, "skew")
     if model != "none":
-        entries.take("distorted", "isdistorted", "hasdistortion")
+        told = entries.entry("distorted", "isdistorted", "hasdistortion")
+        if told is not None and says_nothing(told.value):
+            message = f"{str(told.value).lower()}, but there are coefficients of a lens"
+            raise DvoError(message, file=path, field=told.name, remedy="leave what is true of the images")
+        matrix = next((one for one in entries.found if one.used and "newcameramatrix" in one.calls), None)
+        if matrix is not None:
+            message = "is that of undistorted images, but there are coefficients of a lens"
+            raise DvoError(message, file=path, field=matrix.name, remedy="give the matrix of the recorded images")
     entries.refuse_unread()
-    return replace(calibration, model=model, coefficients=coefficients, ignored=entries.ignored, notes=_notes(entries))
+    _refuse_millimetres(calibration, entries, path)
+    notes = (*calibration.notes, *_notes(entries))
+    return replace(calibration, model=model, coefficients=coefficients, ignored=entries.ignored, notes=notes)
+
+
+def _refuse_millimetres(calibration: Calibration, entries: Entries, path: Path) -> None:
+    """Refuse a focal length in another unit than pixels: one that is named, or that of a lens beside its sensor."""
+
+    def first(names: frozenset[str]) -> fields.Entry | None:
+        return next((entry for entry in entries.found if names & set(entry.calls)), None)
+
+    unit, sensor = first(_UNIT), first(_SENSOR)
+    if unit is not None and bare(str(unit.value)) in _OTHER_UNITS:
+        raise DvoError(f"{str(unit.value)[:40]!r}", file=path, field=unit.name, remedy="give fx, fy, cx, cy in pixels")
+    if sensor is not None and min(calibration.fx, calibration.fy) < _WIDEST * (calibration.width or _USUAL):
+        raise DvoError(
+            f"a focal length of {calibration.fx:g} beside {sensor.name}, as if it were in millimetres",
+            file=path, field="intrinsics",
+            remedy="give it in pixels: divided by the width of the sensor, times the width of the images",
+        )  # fmt: skip
 
 
 def _notes(entries: Entries) -> tuple[str, ...]:
     """Stereo files of ORB-SLAM2 and OpenVSLAM state the cameras as recorded too, and the rectified one as Camera."""
     left = [name for name in entries.elsewhere if name in ("LEFT", "StereoRectifier.left")]
-    return tuple(
+    found = [
         f"the calibration is that of rectified images (Camera); {name} in the same file is that of the images as "
         "recorded, and was not used"
         for name in left
-    )
+    ]
+    used = [entry for entry in entries.found if entry.used and not says_nothing(entry.value)]
+    listed = [one for one in used if set(_COEFFICIENTS) & set(one.calls) and np.size(one.value) == 4]
+    named = {*_MODEL_KEYS, *_FISHEYE_FLAGS, "type", "xi", "alpha"} - set(_COEFFICIENTS)
+    if listed and not any(named & set(entry.calls) for entry in used):
+        found.append(
+            f"{listed[0].name} has 4 numbers and no lens model is named: read as radtan, k1 k2 p1 p2 (those of a "
+            "fisheye need 'model: fisheye' beside them)"
+        )
+    return tuple(found)
 
 
 def _intrinsics(entries: Entries, path: Path) -> tuple[Calibration, list[float]]:
@@ -219,14 +270,14 @@ def _intrinsics(entries: Entries, path: Path) -> tuple[Calibration, list[float]]
 def _size(entries: Entries, path: Path) -> tuple[int | None, int | None]:
     entry = entries.entry(
         "resolution", "imagesize", "imagedimension", "imageresolution", "imgsize", "imsize", "framesize", "size",
-        "imagedimensions", "sensorresolution", "imageresolutionpx", "dims", shape="list",
+        "imagedimensions", "sensorresolution", "imagewh", "dim", "imageresolutionpx", "dims", shape="list",
     ) or entries.entry("resolution", "imagesize", "imageresolution", "size")  # fmt: skip
     pair: Any
     if entry is None:
         width = entries.take("width", "imagewidth", "cols", "w", "imgwidth", "imwidth", "xres", "resolutionx",
-                             shape="scalar")  # fmt: skip
+                             "imgw", "imagew", "imw", "pixelwidth", "resolutionwidth", shape="scalar")  # fmt: skip
         height = entries.take("height", "imageheight", "rows", "h", "imgheight", "imheight", "yres", "resolutiony",
-                              shape="scalar")  # fmt: skip
+                              "imgh", "imageh", "imh", "pixelheight", "resolutionheight", shape="scalar")  # fmt: skip
         pair = [width or 0, height or 0]
     else:
         pair = entry.value
@@ -260,7 +311,15 @@ def _with_sensors(calibration: Calibration, entries: Entries, path: Path) -> Cal
             raise DvoError(f"expected {expected}", file=path, field=name, remedy="give a number, or leave it out")
         found[name] = None if number is None else float(number)
     scale, baseline, readout = found["depth_scale"], found["baseline"], found["readout"] or 0.0
-    return replace(calibration, depth_scale=scale, baseline=baseline, readout=readout)
+    notes = list(calibration.notes)
+    if scale is not None and scale < 1:
+        notes.append(
+            f"a depth scale of {scale:g} is no number of units to a metre, and is not used: give --depth-scale"
+        )
+        scale = None
+    if baseline is not None and baseline > _LONGEST:
+        notes.append(f"a baseline of {baseline:g} m is that of no camera: give --baseline in metres if it is another")
+    return replace(calibration, depth_scale=scale, baseline=baseline, readout=readout, notes=tuple(notes))
 
 
 def _model(entries: Entries, path: Path) -> DistortionModel | None:
@@ -273,6 +332,9 @@ def _model(entries: Entries, path: Path) -> DistortionModel | None:
             if key in ("lens", "distortion", "projection") and not isinstance(entry.value, str):
                 continue
             model = model_of(entry.value)
+            if model is None and bare(str(entry.value)).removeprefix("distortion") in _IF_ZERO:
+                lists = [one.value for one in entries.found if set(_COEFFICIENTS) & set(one.calls)]
+                model = "none" if lists and all(map(says_nothing, lists)) else None
             if model is None:
                 raise DvoError(
                     f"unknown distortion model {str(entry.value)[:60]!r}",
@@ -291,8 +353,8 @@ def _model(entries: Entries, path: Path) -> DistortionModel | None:
                            remedy=f"use one of {', '.join(LENSES)}")  # fmt: skip
         named.setdefault(model, flag.name)
     kind = entries.take("type", shape="scalar")
-    if isinstance(kind, str) and not named and model_of(kind) is not None:
-        named[str(model_of(kind))] = "type"
+    if isinstance(kind, str) and model_of(kind) is not None:
+        named.setdefault(str(model_of(kind)), "type")
     pinhole = named.pop(PINHOLE, None)
     if len(named) > 1 and "none" in named and set(named) & {"ucm", "mei", "eucm", "double_sphere", "fov"}:
         del named["none"]

@@ -109,7 +109,7 @@ def test_an_exported_model_gives_the_camera_back(tmp_path):
 
 
 def test_a_camera_by_its_number(make):
-    file = make.text("cameras.txt", row(2, "SIMPLE_PINHOLE", (500, 320, 240)) + row(5, "PINHOLE", (101, 102, 3, 4)))
+    file = make.text("cameras.txt", row(2, "SIMPLE_PINHOLE", (500, 320, 240)) + row(5, "PINHOLE", (101, 102, 300, 200)))
     assert read_calibration(f"{file}:2").fx == 500 and read_calibration(f"{file}:5").fy == 102
     with pytest.raises(DvoError, match=r"2 cameras in it: 2, 5. Name one: cameras.txt:2"):
         read_calibration(file)

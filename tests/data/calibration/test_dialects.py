@@ -18,6 +18,12 @@ EIGHT = (*FIVE, 0.06, 0.07, 0.08)
 MATRIX = "[500, 0, 320, 0, 510, 240, 0, 0, 1]"
 ROWS = "[[500, 0, 320], [0, 510, 240], [0, 0, 1]]"
 PINHOLE = "fx: 500\nfy: 510\ncx: 320\ncy: 240\n"
+GYROFLOW = {
+    "camera_model": "HERO9 Black", "lens_model": "Wide", "calib_dimension": {"w": 640, "h": 480}, "digital_lens": None,
+    "frame_readout_time": 15.0, "input_horizontal_stretch": 1.0, "input_vertical_stretch": 1.0, "asymmetrical": False,
+    "fisheye_params": {"RMS_error": 0.4, "camera_matrix": [[500, 0, 320], [0, 510, 240], [0, 0, 1]],
+                       "distortion_coeffs": KC, "radial_distortion_limit": None},
+}  # fmt: skip
 SLAM = """%YAML:1.0
 
 #--------------------------------------------------------------------------------------------
@@ -411,6 +417,18 @@ READ = [
      (640, 480)),
     ("dso_five.txt", "500 510 320 240 0.93\n640 480\ncrop\n640 480\n", NUMBERS, "fov", (0.93,), (640, 480)),
     ("dso_none.txt", "Pinhole 500 510 320 240 0\n640 480\nnone\n640 480\n", NUMBERS, "none", (), (640, 480)),
+    ("mast3r.yaml", f"width: 640\nheight: 480\ncalibration: {[500, 510, 320, 240, *FIVE]}\n",
+     NUMBERS, "radtan", FIVE, (640, 480)),
+    ("mast3r4.yaml", "width: 640\nheight: 480\ncalibration: [500, 510, 320, 240]\n", NUMBERS, "none", (), (640, 480)),
+    ("maplab.yaml", "cameras:\n- camera:\n    image_width: 640\n    image_height: 480\n    type: unified-projection\n"
+     "    intrinsics: {rows: 5, cols: 1, data: [1.5, 500, 510, 320, 240]}\n    distortion:\n"
+     f"      type: radial-tangential\n      parameters: {{rows: 4, cols: 1, data: {list(KC)}}}\n",
+     NUMBERS, "mei", (1.5, *KC), (640, 480)),
+    ("polycam.json", json.dumps({"fx": 500, "fy": 510, "cx": 320, "cy": 240, "width": 640, "height": 480,
+     **{f"t_{k}{n}": 0.1 * n for k in range(3) for n in range(4)}}), NUMBERS, "none", (), (640, 480)),
+    ("attributes.xml", '<camera model="fisheye" width="640" height="480"><fx>500</fx><fy>510</fy>'
+     "<cx>320</cx><cy>240</cy><d>.1 -.2 .003 .004</d></camera>", NUMBERS, "fisheye", KC, (640, 480)),
+    ("profile.json", json.dumps(GYROFLOW), NUMBERS, "fisheye", KC, (640, 480)),
     ("calib_cam_to_cam.txt", KITTI_RAW, (721.5377, 721.5377, 609.5593, 172.854), "none", (), (1242, 375)),
     ("kitti_recorded.txt", KITTI_RAW.replace("_rect", "_left"), (984.2439, 980.8141, 690, 233.1966), "radtan",
      (-0.3728755, 0.2037299, 0.002219027, 0.001383707, -0.07233722), (1392, 512)),
@@ -451,6 +469,7 @@ def test_names_of_coefficients(make, key):
     [
         "image_width: 640\nimage_height: 480", "cols: 640\nrows: 480", "w: 640\nh: 480", "W: 640\nH: 480",
         "resolution: [640, 480]", "size: [640, 480]", "image_size: [640, 480]", "imageSize: {width: 640, height: 480}",
+        "img_w: 640\nimg_h: 480", "resolution_width: 640\nresolution_height: 480", "DIM: [640, 480]",
         "img_width: 640\nimg_height: 480", "Camera.width: 640\nCamera.height: 480", "resolution: 640x480",
     ],
 )  # fmt: skip
@@ -467,7 +486,7 @@ LENS_KEYS = [
     "poly_parameters: {p0: 1.0, p1: 2.0}", "Camera.kappa: 0.3", "inner: {distortion_coefficients: [0.1, 0, 0, 0]}",
     "undocumented: {fisheye: true, k1: 0.2}", "curvature: -0.1",
     "mapping: equisolid", "optics_kind: stereographic", "wide_angle: true", "distortion_coefficients: some",
-    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1",
+    "cam_d0: [0.1]\nmodel: none", "camera_k7: 0.1", "disto_k3: [-0.2, 0.05, 0.01]",
 ]  # fmt: skip
 
 
@@ -488,6 +507,8 @@ def test_a_lens_that_is_not_understood_is_refused_by_name(make, line):
         "rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}", "T_cam_imu: [1, 2, 3, 4]",
         "camera_name: lens 4", "per_view_errors: [0.1, 0.2, 0.3, 0.4]", "distortion_model: ''", "k1: 0.0",
         "roi: [1, 2, 3, 4]",
+        "t_00: 0.98\nt_13: -0.4", "extrinsic: {q_bc: [0, 0, 0, 1]}", "polymorphic_id: 7", "r_22: 1",
+        "model: inverse_brown_conrady\ncoeffs: [0, 0, 0, 0, 0]", "model: distortion.modified_brown_conrady\nd: [0]",
         "quaternion: [0, 0, 0, 1]", "distance: 4", "serial: abc", "P1: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]",
     ],
 )  # fmt: skip
@@ -545,6 +566,24 @@ REFUSED = [
     ("calib_cam_to_cam.txt", KITTI_RAW.replace("P_rect_00: 7", "P_rect_00: x"), "not a number"),
     ("realsense.json", json.dumps({"fx": 500, "fy": 510, "ppx": 320, "ppy": 240, "model": "inverse_brown_conrady",
      "coeffs": [0.1] * 5}), "inverse_brown_conrady"),
+    ("metashape.xml", "<calibration><projection>fisheye</projection><width>640</width><height>480</height><f>500</f>"
+     "<cx>3.5</cx><cy>4.5</cy></calibration>", "an offset from their centre"),
+    ("sensor.xml", '<a><sensor type="frame"><calibration type="frame"><resolution width="640" height="480"/><f>500</f>'
+     "<cx>3.5</cx><cy>4.5</cy></calibration></sensor></a>", "an offset from their centre"),
+    ("centre.yaml", "fx: 500\nfy: 510\ncx: 0.5\ncy: 0.5\nwidth: 640\nheight: 480\n", "or a share of the size"),
+    ("centre.txt", "500 510 0.5 0.5", "a share of the size"),
+    ("meshroom.json", json.dumps({"intrinsics": [{"width": "640", "height": "480", "sensorWidth": "36",
+     "type": "pinhole", "focalLength": "29.5", "principalPoint": ["320", "240"], "distortionParams": ""}]}),
+     "sensorWidth.*millimetres"),
+    ("blender.json", '{"focal_length": 50, "sensor_width": 36, "cx": 159.5, "cy": 119.5, "width": 320, "height": 240}',
+     "sensor_width.*millimetres"),
+    ("unit.yaml", "fx: 25\nfy: 25\ncx: 18\ncy: 12\nunits: mm\n", "units: 'mm'"),
+    ("distorted.yaml", PINHOLE + "k1: 0.1\nk2: 0.2\np1: 0\np2: 0\ndistorted: False\n", "distorted: false, but"),
+    ("new.yaml", f"new_camera_matrix: {ROWS}\ndist: {list(FIVE)}\n", "that of undistorted images"),
+    ("stated.yaml", "fx: 50\nfy: 50\ncx: 320\ncy: 240\nwidth: 640\nheight: 480\n", "fx=50 does not fit"),
+    ("profile.json", json.dumps(GYROFLOW | {"digital_lens": "gopro_superview"}), "digital_lens: 'gopro_superview'"),
+    ("profile.json", json.dumps(GYROFLOW | {"distortion_model": "poly5"}), "distortion_model: 'poly5'"),
+    ("profile.json", json.dumps(GYROFLOW | {"fisheye_params": 3}), "not a mapping"),
 ]  # fmt: skip
 
 
@@ -655,3 +694,36 @@ def test_a_size_that_is_no_size_is_left_out(make):
 def test_a_large_transforms_file(make):
     text = transforms([{"sharpness": 31.123456789} for _ in range(12_000)], **FULL)
     assert len(text) > 1024**2 and read_calibration(make.text("transforms.json", text)).fx == 500
+
+
+def test_the_readout_of_a_lens_profile_is_in_milliseconds(make):
+    assert read_calibration(make.text("profile.json", json.dumps(GYROFLOW))).readout == 0.015
+
+
+def test_a_size_whose_sides_are_exchanged_is_told_as_such(make):
+    found = read_calibration(make.text("c.yaml", f"{PINHOLE}ImageSize: [480, 640]\n"))
+    with pytest.raises(DvoError, match="exchange width and height in it"):
+        found.camera(640, 480)
+    assert "is the centre of 640x480 images" in found.doubts(480, 640)[0]
+    turned = read_calibration(make.text("d.yaml", "fx: 500\nfy: 510\ncx: 239.5\ncy: 319.5\nsize: [480, 640]\n"))
+    with pytest.raises(DvoError, match="turn it too"):
+        turned.camera(640, 480)
+
+
+@pytest.mark.parametrize(
+    ("line", "note"),
+    [
+        ("depth_scale: 0.001", "a depth scale of 0.001 is no number of units"),
+        ("baseline: 120", "a baseline of 120 m"),
+        (f"D: {list(KC)}", "D has 4 numbers and no lens model is named"),
+    ],
+)
+def test_values_in_another_unit_and_coefficients_without_a_model_are_told(make, line, note):
+    found = read_calibration(make.text("c.yaml", f"{PINHOLE}{line}\n"))
+    assert note in found.notes[0] and found.depth_scale is None and found.doubts(640, 480) == list(found.notes)
+
+
+@pytest.mark.parametrize("line", [f"D: {list(FIVE)}", f"model: radtan\nD: {list(KC)}", "k1: 0.1\nk2: 0.1\np1: 0\np2: 0",
+                                  f"fisheye: 1\nD: {list(KC)}", "depth_scale: 5000\nbaseline: 0.12"])  # fmt: skip
+def test_what_is_plain_needs_no_note(make, line):
+    assert not read_calibration(make.text("c.yaml", f"{PINHOLE}{line}\n")).notes

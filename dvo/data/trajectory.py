@@ -222,27 +222,33 @@ def interpolate(trajectory: Trajectory, timestamps: np.ndarray, max_gap: float =
     return Trajectory(wanted, np.concatenate([positions, slerp(a[:, 3:], b[:, 3:], weight)], axis=1))
 
 
-def read_kitti_poses(path: Path | str) -> np.ndarray:
+def read_kitti_poses(path: Path | str, numbers: int = 12) -> np.ndarray:
     """Read a KITTI pose file: a row-major 3x4 camera-to-world matrix a line.
 
     Args:
         path: the file.
+        numbers: of a row; 16 for 4x4 matrices.
 
     Returns:
         ``(N, 7)`` float64 poses, camera to world. The file holds no times.
 
     Raises:
-        DvoError: missing file, no rows, or a row that is not 12 finite numbers with a rotation.
+        DvoError: missing file, no rows, or a row that is not so many finite numbers with a rotation.
     """
     path = Path(path)
-    table, numbers = read_numbers(path, 12, "KITTI row", "12 numbers, a 3x4 matrix")
-    matrices = table.reshape(-1, 3, 4)
+    table, lines = read_numbers(path, numbers, "KITTI row", f"{numbers} numbers, a {numbers // 4}x4 matrix")
+    matrices = table.reshape(-1, numbers // 4, 4)
+    wrong = np.flatnonzero((matrices[:, 3:] != [0, 0, 0, 1]).any(axis=(1, 2)))
+    if len(wrong):
+        where = f"line {lines[int(wrong[0])]}"
+        raise DvoError("the last row of the matrix is not 0 0 0 1", file=path, field=where, remedy="correct the row")
+    matrices = matrices[:, :3]
     rotations = matrices[:, :, :3]
     products = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero(~((products < 0.02) & (np.linalg.det(rotations) > 0)))
     if len(bad):
         raise DvoError(
-            "the matrix is no rotation", file=path, field=f"line {numbers[int(bad[0])]}", remedy="correct the row"
+            "the matrix is no rotation", file=path, field=f"line {lines[int(bad[0])]}", remedy="correct the row"
         )
     return poses_from_matrices(matrices)
 

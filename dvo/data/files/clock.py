@@ -309,7 +309,7 @@ def header_cells(line: str) -> list[str]:
     """
     text = re.sub(r"\s+(?=[\[(])", "", line.strip().lstrip("#%").split("#", 1)[0].strip())
     cells = re.split(r"[,;\t]", text) if re.search(r"[,;\t]", text) else text.split()
-    return [cell.strip() for cell in cells if cell.strip()]
+    return [name for cell in cells if (name := cell.strip().strip('"').strip())]
 
 
 def unit_of_name(name: str) -> str | None:

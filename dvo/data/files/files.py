@@ -95,12 +95,12 @@ def read_rows(path: Path, remedy: str, field: str | None = None) -> Iterator[tup
 
 
 def fields_of(line: str) -> list[str]:
-    """Fields of a row, see :func:`read_rows`.
+    """Fields of a row, without double quotes around them; see :func:`read_rows`.
 
     Args:
         line: the row.
     """
-    return line.split("#", 1)[0].replace(",", " ").replace(";", " ").split()
+    return [word.strip('"') for word in line.split("#", 1)[0].replace(",", " ").replace(";", " ").split()]
 
 
 def read_lines(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from dvo.core.errors import DvoError
 from dvo.data.files.clock import Clock, in_seconds, is_time_name, parse_time, read_table, unit_of, unit_of_name
 from dvo.data.files.files import MAX_NUMBER, parse_number
+from dvo.geometry.poses import poses_from_matrices
 
 HEADER = "timestamp tx ty tz qx qy qz qw"
 _NUMBERS = 8
@@ -39,14 +40,17 @@ class _Columns:
 _TUM = _Columns(0, None, tuple(range(1, _NUMBERS)))
 _EUROC = _Columns(0, "ns", (1, 2, 3, 5, 6, 7, 4))  # state_groundtruth_estimate0/data.csv: velocity and biases follow
 _EUROC_NUMBERS = 17
+_RIGID = 0.02  # largest deviation of a rotation from an orthogonal matrix
+_MATRIX = {13: 12, 17: 16}  # numbers of a row of a time and a matrix, and of the matrix
 
 
 def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
     """Read rows of a time and a pose.
 
     A header that names the columns is followed: in any order, with ``q_w`` before or behind ``q_x``, and further
-    columns besides. Without one a row is ``timestamp tx ty tz qx qy qz qw``, or one of 17 numbers of EuRoC. Rows whose
-    position or quaternion is NaN throughout are left out: there is no pose at that time.
+    columns besides. Without one a row is ``timestamp tx ty tz qx qy qz qw``, one of 17 numbers of EuRoC, or a time and
+    a 3x4 or 4x4 matrix, row by row. Rows whose position or quaternion is NaN throughout, or whose matrix is not finite,
+    are left out: there is no pose at that time.
 
     Args:
         path: text or CSV file.
@@ -72,6 +76,9 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
     if named != width:  # an empty field would shift the others
         message = f"the header names {named} columns, this row has {width}"
         raise DvoError(message, file=path, field=f"line {table.lines[0]}", remedy="give each column a name and a value")
+    if columns is None and _are_matrices(table.rows):
+        table = replace(table, rows=[_of_matrix(fields) for fields in table.rows])
+        width = _NUMBERS
     columns = columns or (_EUROC if width == _EUROC_NUMBERS else _TUM)
     expected = width if columns is not _TUM else _NUMBERS
     times: list[int | float] = []
@@ -99,6 +106,29 @@ def read_pose_table(path: Path) -> tuple[Clock, np.ndarray, list[int]]:
         raise _no_row(path, lines[int(beyond[0])])
     values[:, :3] *= columns.length
     return Clock(seconds, unit, columns.time), values, lines
+
+
+def _are_matrices(rows: Sequence[Sequence[str]]) -> bool:
+    """True for rows of a time and a rigid 3x4 or 4x4 matrix."""
+    count = _MATRIX.get(len(rows[0]))
+    if count is None or any(len(fields) != 1 + count for fields in rows):
+        return False
+    try:
+        matrices = np.array([[float(field) for field in fields[1:]] for fields in rows]).reshape(len(rows), -1, 4)
+    except ValueError:
+        return False
+    matrices = matrices[np.isfinite(matrices).all(axis=(1, 2))]
+    rotations = matrices[:, :3, :3]
+    products = rotations @ np.swapaxes(rotations, 1, 2)
+    is_rigid = np.abs(products - np.eye(3)).max(initial=0) < _RIGID and (np.linalg.det(rotations) > 0).all()
+    return bool(len(matrices) and is_rigid and (matrices[:, 3:] == [0, 0, 0, 1]).all())
+
+
+def _of_matrix(fields: Sequence[str]) -> list[str]:
+    """The same pose as ``tx ty tz qx qy qz qw``."""
+    matrix = np.array([float(field) for field in fields[1:]]).reshape(-1, 4)[:3]
+    pose = poses_from_matrices(matrix) if np.isfinite(matrix).all() else np.full(_NUMBERS - 1, np.nan)
+    return [fields[0], *map(repr, pose.tolist())]
 
 
 def _no_row(path: Path, line: int) -> DvoError:

@@ -22,7 +22,8 @@ def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
     ============================  ================================================================================
     8 numbers, or a header        TUM: ``timestamp tx ty tz qx qy qz qw``; see :func:`dvo.data.trajectory.read_tum`
     8 numbers, ``*.freiburg``     ICL-NUIM: as TUM, but the stamp counts images from 1
-    12 numbers                    KITTI: a row-major 3x4 matrix, one row per image
+    12 or 16 numbers              KITTI: a row-major 3x4 (or 4x4) matrix, one row per image
+    13 or 17 numbers              a time and such a matrix
     7 numbers                     TartanAir: ``tx ty tz qx qy qz qw`` of the NED camera frame, one row per image
     ============================  ================================================================================
 
@@ -44,9 +45,9 @@ def read_groundtruth(file: Path, timestamps: np.ndarray | None) -> Trajectory:
         if not inside.any():
             raise _no_times(len(poses), times, file)
         return Trajectory(np.asarray(times[numbers[inside]]), poses[inside])
-    if columns not in (7, 12):
+    if columns not in (7, 12, 16):
         return _on_clock(read_tum(file), timestamps)
-    poses = read_kitti_poses(file) if columns == 12 else read_ned_poses(file)
+    poses = read_ned_poses(file) if columns == 7 else read_kitti_poses(file, columns)
     times = np.zeros(0) if timestamps is None else timestamps
     if len(times) != len(poses):
         raise _no_times(len(poses), times, file)

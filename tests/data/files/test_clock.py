@@ -106,6 +106,29 @@ def test_rows_of_nan_have_no_pose(make):
         read_tum(make.text("t.txt", f"0.1 {nan}\n"))
 
 
+@pytest.mark.parametrize("last", ["", " 0 0 0 1"])
+def test_a_time_and_a_matrix_in_a_row(make, last):
+    rows = [f"{i / 10:.1f} 0 -1 0 {i} 1 0 0 2 0 0 1 3{last}\n" for i in range(4)]
+    rows[2] = "0.2 " + " ".join(["-inf"] * 12) + last + "\n"  # ScanNet's frames without a pose
+    expected = [[i, 2, 3, 0, 0, np.sqrt(0.5), np.sqrt(0.5)] for i in (0, 1, 3)]
+    found = read_tum(make.text("t.txt", "".join(rows)))
+    assert found.timestamps.tolist() == [0, 0.1, 0.3]
+    np.testing.assert_allclose(found.poses_wc, expected, atol=1e-12)
+    rows = [row.split(" ", 1)[1] for row in rows[:2]]
+    counted = read_groundtruth(make.text("k.txt", "".join(rows)), np.array([5.0, 6.0]))
+    np.testing.assert_allclose(counted.poses_wc, expected[:2], atol=1e-12)
+    with pytest.raises(DvoError, match="line 1: (the matrix is no rotation|the last row of the matrix)"):
+        read_groundtruth(make.text("k.txt", "1 0 0 0 0 1 0 0 0 0 " + ("1 0 1 0 0 1" if last else "2 0")), np.zeros(1))
+
+
+def test_quotes_around_fields(make):
+    file = make.text("t.csv", '"qw","qx","qy","qz","x","y","z","time [ms]"\n' + '".9",.1,.2,.3,1,2,3,"40"\n')
+    found = read_tum(file)
+    assert found.timestamps.tolist() == [0.04] and found.poses_wc[0, :3].tolist() == [1, 2, 3]
+    times = make.text("times.csv", '"frame","time"\n"0","0.5"\n"1","0.7"\n')
+    assert read_times(times, 2).tolist() == [0.5, 0.7]
+
+
 @pytest.mark.parametrize("header", ["time,roll,pitch,yaw,x,y,z,w_x", "frame,tx,ty,tz,qx,qy,qz,qw", "a,b,c,d,e,f,g,h"])
 def test_headers_without_a_pose_are_named(make, header):
     with pytest.raises(DvoError, match="header: the header .* does not name a time, a position and a quaternion"):

@@ -24,7 +24,10 @@ _ROLES = {
     "left": {"left", "l", "lft"},
     "colour": {"color", "colour", "rgb", "image", "images", "img", "im", "frame", "col", "c"},
 }  # fmt: skip
-_CAMERA = re.compile(r"(cam|camera|image|img|view|c)[_-]?$", re.IGNORECASE)
+_CAMERA = re.compile(
+    r"(cam|camera|image|img|view|c|infra|infrared|ir|fisheye|sensor|lens|eye|device|dev|port|channel|ch|stream|stereo|mono|"
+    r"gr[ae]y|rgb|colou?r)[_-]?$", re.IGNORECASE
+)  # fmt: skip
 _FEW = 8  # cameras whose numbers stand in names
 _LEAST = 2  # images of a stream
 _COMMON = 0.5  # of the numbers of the smaller stream, that the other has too

@@ -33,6 +33,8 @@ def write(make, folder, *patterns, count=4):
         (("imgL_{}.png", "imgR_{}.png"), "right"),
         (("cam0_{:03d}.png", "cam1_{:03d}.png"), "right"),
         (("{:03d}-1.png", "{:03d}-2.png"), "right"),
+        (("infra1_{:04d}.png", "infra2_{:04d}.png"), "right"),
+        (("{:04d}_sensor-3.png", "{:04d}_sensor-5.png"), "right"),
         (("left-{}.png", "right-{}.png", "disparity_{}.png"), "right"),
     ],
 )

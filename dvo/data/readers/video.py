@@ -109,6 +109,12 @@ def _no_video(path: Path, head: bytes) -> str | None:
     return None if re.search(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]", head) else "a text file"
 
 
+def _is_row_of_jpegs(path: Path) -> bool:
+    """True for JPEG images one after the other, without a container: FFmpeg gives them the times of 25 a second."""
+    with lookups(path), path.open("rb") as file:
+        return file.read(2) == b"\xff\xd8"
+
+
 def _grabs(capture: cv2.VideoCapture) -> Iterator[tuple[int, float, int]]:
     """``(index, container milliseconds, failed grabs just before)`` of every frame that decodes."""
     import cv2
@@ -222,7 +228,8 @@ class VideoRecording:
                 self.warnings.append("inertial samples of the telemetry are not used: frames have no times of the file")
         self._fps = fps or (rate if np.isfinite(rate) and RATES[0] <= rate <= RATES[1] else NOMINAL_FPS)
         self.rate = self._fps if self._times is None else None
-        if self._times is None and not self._use_container and request.fps is None:
+        is_stated = self._use_container and not _is_row_of_jpegs(path)
+        if self._times is None and not is_stated and request.fps is None:
             known = "the stated" if self._fps == rate else "a guessed"
             self.warnings.append(
                 f"the video has no times: assuming {known} {self._fps:g} frames a second (or give --fps)"

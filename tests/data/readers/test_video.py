@@ -33,6 +33,16 @@ def test_stride_fps_and_times(make):
     assert [f.timestamp for f in open_source(video, calib=CALIB, times=times)] == [100 + i * i for i in range(20)]
 
 
+def test_a_row_of_jpegs_has_no_times(make):
+    code = b"".join(cv2.imencode(".jpg", make.image(i))[1].tobytes() for i in range(5))
+    (make.root / "v.mjpeg").write_bytes(code)
+    source = open_source(make.root / "v.mjpeg", calib=make.calib())
+    assert [frame.timestamp for frame in source] == pytest.approx(np.arange(5) / 25)
+    assert any("the video has no times: assuming the stated 25" in warning for warning in source.warnings)
+    source = open_source(make.root / "v.mjpeg", calib=make.calib(), fps=10)
+    assert [frame.timestamp for frame in source] == pytest.approx(np.arange(5) / 10) and not source.warnings
+
+
 def test_wrong_number_of_times(make):
     video = make.video("v.mp4", "mp4v")
     with pytest.raises(DvoError, match="19 rows for 20 images"):

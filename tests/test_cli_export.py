@@ -154,9 +154,11 @@ def test_a_map_after_the_run(given, image_folder, tmp_path, capsys):
     camera = (tmp_path / "colmap" / "sparse" / "0" / "cameras.txt").read_text().splitlines()[-1].split()
     assert camera[2:4] == ["64", "48"] and [float(x) for x in camera[4:]] == [50, 50, 32, 24]
     assert main(["export", str(out), str(tmp_path / "nerf"), "--to", "nerfstudio"]) == 0
-    assert main(["export", str(out), str(tmp_path / "nerf"), "--to", "nerfstudio"]) == 2, "not empty"
-    image_folder.rename(image_folder.parent / "moved")
     capsys.readouterr()
+    assert main(["export", str(out), str(tmp_path / "nerf"), "--to", "nerfstudio"]) == 2
+    (line,) = errors(capsys.readouterr().err)  # before any image is read
+    assert "is not an empty folder" in line
+    image_folder.rename(image_folder.parent / "moved")
     assert main(["export", str(out), str(tmp_path / "again"), "--to", "colmap"]) == 2
     assert "the source of the run is not there" in capsys.readouterr().err and not (tmp_path / "again").exists()
 

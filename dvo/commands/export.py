@@ -15,6 +15,7 @@ from dvo.commands.camera import CALIBRATION
 from dvo.commands.console import TrackingProgress, say
 from dvo.commands.picture import world_root
 from dvo.core.errors import DvoError
+from dvo.data.files.output import check_empty
 from dvo.data.frame import Frame
 from dvo.data.open import open_source
 from dvo.data.source import Source
@@ -57,6 +58,7 @@ def export(arguments: argparse.Namespace) -> int:
             is not there any more, or a folder that is not empty.
     """
     folder, name = Path(arguments.source), arguments.to
+    check_empty(Path(arguments.out))  # before images are read
     if arguments.every is not None or arguments.count is not None:
         arguments.export_images = arguments.export_images or SOURCE
     check_image_options(arguments, [name], "--to")

@@ -151,6 +151,11 @@ class Source:
         masks = None if self.masks is None else self.masks.at_recorded_size()
         return self.changed(selection=replace(self.reading.selection, reduction=None), masks=masks)
 
+    def __repr__(self) -> str:
+        count = "?" if self.frame_count is None else self.frame_count
+        size = f"{self.recorded_camera.width}x{self.recorded_camera.height}"
+        return f"Source({self.name!r}, {self.kind}, {count} frames of {size})"
+
     def __len__(self) -> int:
         """``frame_count``.
 

@@ -44,6 +44,10 @@ class Trajectory:
         if self.timestamps.ndim != 1 or self.poses_wc.shape != (len(self.timestamps), 7):
             raise ValueError(f"timestamps {self.timestamps.shape} and poses {self.poses_wc.shape} do not match")
 
+    def __repr__(self) -> str:
+        span = f", {self.timestamps[0]:.3f} to {self.timestamps[-1]:.3f} s" if len(self) else ""
+        return f"Trajectory({len(self)} poses{span})"
+
     def __len__(self) -> int:
         return len(self.timestamps)
 

@@ -167,12 +167,12 @@ def new_folder(folder: Path | str) -> Iterator[Path]:
     place = folder if is_mounted else folder.parent
     place.mkdir(parents=True, exist_ok=True)
     sweep_parts(place)
-    _check_empty(folder)
+    check_empty(folder)
     part = place / _part_name(folder)
     part.mkdir()
     try:
         yield part
-        _check_empty(folder, part)
+        check_empty(folder, part)
         if is_mounted:
             for child in list(part.iterdir()):
                 os.rename(child, folder / child.name)
@@ -182,7 +182,7 @@ def new_folder(folder: Path | str) -> Iterator[Path]:
         try:
             os.rename(part, folder)
         except OSError:
-            _check_empty(folder)
+            check_empty(folder)
             raise
     finally:
         shutil.rmtree(part, ignore_errors=True)
@@ -330,7 +330,16 @@ def _is_abandoned(part: Path) -> bool:
         return False
 
 
-def _check_empty(folder: Path, but: Path | None = None) -> None:
+def check_empty(folder: Path, but: Path | None = None) -> None:
+    """Refuse a place that a new folder cannot take.
+
+    Args:
+        folder: to be written.
+        but: what may lie in it.
+
+    Raises:
+        DvoError: it is there, and no empty folder.
+    """
     if os.path.lexists(folder) and (not folder.is_dir() or any(child != but for child in folder.iterdir())):
         raise DvoError("is not an empty folder", file=folder, remedy="give a new folder")
 

@@ -50,6 +50,9 @@ def find_reader(path: Path, name: str | None = None) -> Reader:
         reader: Reader = READERS.resolve(candidate)
         if reader.matches(path):
             return reader
+    if path.is_fifo() or path.is_char_device():
+        remedy = f"give images of a pipe as standard input: - < {path}"
+        raise DvoError("a pipe or a device, no file", file=path, remedy=remedy)
     raise DvoError("neither a file nor a folder", file=path, remedy="give a video, a folder of images or a sequence")
 
 

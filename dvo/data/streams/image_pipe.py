@@ -88,9 +88,14 @@ def split_images(read: Callable[[], bytes], name: str) -> Iterator[bytes]:
         Bytes of each image, as soon as the last one has arrived. An image that is cut off by the end is left out.
 
     Raises:
-        DvoError: a megabyte without an image, or an image of more than :data:`MAX_BYTES`.
+        DvoError: a megabyte without an image, a stream that ends with bytes and without an image, or an image of more
+            than :data:`MAX_BYTES`.
     """
     buffer = _Buffer(read, name)
+    if not buffer.find_start():
+        if buffer.data:
+            raise DvoError("no JPEG or PNG image in what arrives", file=name, remedy=_REMEDY)
+        return
     while buffer.find_start():
         try:
             end = _png_end(buffer) if buffer.data[0] == 0x89 else _jpeg_end(buffer)

@@ -96,9 +96,9 @@ def test_evaluation_uses_the_same_readers(own):
     assert source.kind == "mine" and len(truth) == 4
 
 
-def test_what_is_no_file_and_no_folder(tmp_path):
+def test_a_named_pipe_is_read_as_standard_input(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(DvoError, match="neither a file nor a folder"):
+    with pytest.raises(DvoError, match=r"a pipe or a device, no file. Give images .*: - < .*pipe"):
         open_source(tmp_path / "pipe")
 
 

@@ -74,6 +74,13 @@ def test_bounds(monkeypatch):
         next(split_images(chunks(encoded(".png"), 2**16), "pipe"))
 
 
+def test_bytes_of_something_else_are_told_from_a_silent_pipe():
+    assert list(split_images(chunks(b"", 100), "pipe")) == []
+    video = b"\0\0\0\x18ftypmp42" + bytes(5000)
+    with pytest.raises(DvoError, match=r"pipe: no JPEG or PNG image in what arrives. .*image2pipe"):
+        list(split_images(chunks(video, 100), "pipe"))
+
+
 def test_reading_a_pipe_can_be_stopped():
     """A reader that waits for a writer which sends nothing ends when it is told to."""
     out, into = os.pipe()

@@ -297,8 +297,10 @@ def test_a_damaged_image_is_named_by_its_number(make):
 
 
 def test_pipes_that_hold_nothing(make):
-    with pytest.raises(DvoError, match="ends without an image"):
+    with pytest.raises(DvoError, match="no JPEG or PNG image in what arrives"):
         open_stream(io.BytesIO(b"no image"))
+    with pytest.raises(DvoError, match="ends without an image"):
+        open_stream(io.BytesIO(b""))
     with pytest.raises(DvoError, match="first image does not decode"):
         open_stream(io.BytesIO(b"\xff\xd8\xff\xd9"))
     leader, terminal = os.openpty()

@@ -13,13 +13,14 @@ from dvo.core.yaml_files import MAX_DEPTH, parse_yaml
 from dvo.data.calibration.calibration import EXPECTED
 
 _TIGHT = re.compile(r"^(\s*[A-Za-z_][\w.]*):(?=[\w.+\-\"'\[{])", re.MULTILINE)  # OpenCV reads "Viewer.PointSize:2"
+_PADDED = re.compile(r"(?<=[ \[,])0+(?=[1-9][0-9]*(?:[ ,\]]|$))", re.MULTILINE)  # no octal numbers
 _END = re.compile(r"^(?:---|\.\.\.)(?=\s|$)", re.MULTILINE)
 _HEADING = re.compile(r"[A-Za-z][A-Za-z _]*")
 
 
 def load_documents(text: str, path: Path) -> list[Any]:
     """Parse YAML of one document or several, also with OpenCV's ``%YAML:1.0`` head, its ``!!opencv-matrix`` tags, keys
-    without a blank after the colon, and tabs for blanks.
+    without a blank after the colon, zeros before a number, and tabs for blanks.
 
     Args:
         text: of the file.
@@ -33,7 +34,7 @@ def load_documents(text: str, path: Path) -> list[Any]:
     """
     lines = ["" if line.startswith("%") else line for line in text.replace("\t", " ").splitlines()]
     parts = _END.split("\n".join(lines))
-    found = [parse_yaml(_TIGHT.sub(r"\1: ", part), path, remedy=EXPECTED) for part in parts]
+    found = [parse_yaml(_PADDED.sub("", _TIGHT.sub(r"\1: ", part)), path, remedy=EXPECTED) for part in parts]
     return [document for document in found if document is not None]
 
 

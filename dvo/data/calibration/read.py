@@ -72,7 +72,8 @@ def read_calibration(path: Path | str) -> Calibration:
     """
     path, camera = split_camera(Path(path))
     if not (is_file(path) or is_shell_pipe(path)):
-        raise DvoError("no such file", file=path, field="calibration", remedy="give an existing calibration file")
+        message = "a folder, no file" if path.is_dir() else "no such file"
+        raise DvoError(message, file=path, field="calibration", remedy="give an existing calibration file")
     suffix = path.suffix.lower()
     limit = _LARGEST if suffix == ".json" else MAX_BYTES
     text = "" if suffix in _BINARY else read_text(path, EXPECTED, limit)

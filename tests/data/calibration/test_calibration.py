@@ -228,3 +228,8 @@ def test_focal_lengths_of_zero_are_one_error():
     assert calibration.doubts(640, 480)
     with pytest.raises(DvoError):
         calibration.camera(640, 480)
+
+
+def test_a_folder_is_no_calibration(tmp_path):
+    with pytest.raises(DvoError, match="calibration: a folder, no file"):
+        read_calibration(tmp_path)

@@ -469,7 +469,8 @@ def test_names_of_coefficients(make, key):
     [
         "image_width: 640\nimage_height: 480", "cols: 640\nrows: 480", "w: 640\nh: 480", "W: 640\nH: 480",
         "resolution: [640, 480]", "size: [640, 480]", "image_size: [640, 480]", "imageSize: {width: 640, height: 480}",
-        "img_w: 640\nimg_h: 480", "width: 0640\nheight: 0480", "size: [0640,0480]", "resolution_width: 640\nresolution_height: 480", "DIM: [640, 480]",
+        "img_w: 640\nimg_h: 480", "width: 0640\nheight: 0480", "size: [0640,0480]",
+        "resolution_width: 640\nresolution_height: 480", "DIM: [640, 480]",
         "img_width: 640\nimg_height: 480", "Camera.width: 640\nCamera.height: 480", "resolution: 640x480",
     ],
 )  # fmt: skip

@@ -105,7 +105,8 @@ class Reconstruction:
 
     def __str__(self) -> str:
         left = f", {self.without_image} keyframes without an image left out" if self.without_image else ""
-        counts = f"{len(self.jpegs)} images, {len(self.points)} points, {len(self.residuals)} observations"
+        masks = " with masks" if self.masks else ""
+        counts = f"{len(self.jpegs)} images{masks}, {len(self.points)} points, {len(self.residuals)} observations"
         return f"{counts}, mean reprojection error {self.mean_error:.2f} px{left}"
 
 

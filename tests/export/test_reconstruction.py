@@ -135,7 +135,7 @@ def test_masks_of_keyframes_go_along_and_a_keyframe_without_one_uses_all(tmp_pat
     for kept in (graph, load_graph(tmp_path / "a.dvo")):
         found = reconstruct(kept, 0)
         decoded = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_UNCHANGED) for one in found.masks]
-        assert found.identifiers.tolist() == [0, 1, 3, 4] and len(decoded) == 4
+        assert found.identifiers.tolist() == [0, 1, 3, 4] and len(decoded) == 4 and "4 images with masks" in str(found)
         np.testing.assert_array_equal(decoded[1], 255 * mask.astype(np.uint8))
         assert all((one == 255).all() and one.shape == mask.shape for one in decoded[:1] + decoded[2:])
     assert not reconstruct(walk(5), 0).masks

@@ -162,12 +162,14 @@ def is_log(file: Path) -> bool:
     Args:
         file: the file.
     """
+    if not file.is_file() or file.is_symlink():
+        return False
     try:
         with open(file, "rb") as log:
             first = log.read(100)
     except OSError:
         return False
-    return file.is_file() and not file.is_symlink() and (not first or first.startswith(LOG_BEGIN.encode()))
+    return not first or first.startswith(LOG_BEGIN.encode())
 
 
 def _check_settings(arguments: argparse.Namespace) -> None:

@@ -140,7 +140,7 @@ def read_images(path: Path) -> list[tuple[float, bytes]]:
         As ``images`` of :class:`RunPage`; none of what is not a page of a run, or has none.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8") if path.is_file() else ""
         data = json.loads(text.split(_DATA, 1)[1].split("</script>", 1)[0])
         start = float(data["start"])
         found = [(start + float(time), base64.b64decode(jpeg, validate=True)) for time, jpeg in data["images"]]

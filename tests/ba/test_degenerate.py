@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from dvo.ba.layer.layer import BADamping
+from dvo.ba.layer.layer import BADamping, BAOptions, bundle_adjust
 from dvo.geometry import se3
 
 Maker = Callable[..., Any]
@@ -135,3 +135,24 @@ def test_one_bad_element_of_a_batch_does_not_harm_the_other(problem: Maker) -> N
     torch.testing.assert_close(poses[:1].detach(), good.solve()[0].detach())
     torch.testing.assert_close(mixed.targets.grad[:1], good.targets.grad, atol=1e-10, rtol=0)
     assert torch.isfinite(mixed.weights.grad).all()
+
+
+@pytest.mark.parametrize(("edges", "refine"), [(0, "focal"), (1, "all"), (1, "focal")])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_second_derivatives_of_what_nothing_determines_are_finite(edges, refine, dtype):
+    """Intrinsics without an edge, or with one from a frame to itself, and no damping."""
+    poses = torch.tensor([[[0, 0, 0, 0, 0, 0, 1], [0.1, 0, 0, 0, 0, 0, 1]]], dtype=dtype)
+    patches = torch.tensor([17.0, 25, 0.5], dtype=dtype)[None, None, :, None, None]
+    intrinsics = torch.tensor([50.0, 50, 20, 15], dtype=dtype).repeat(1, 2, 1)
+    targets, weights = (torch.full((1, edges, 2), x, dtype=dtype) for x in (5.0, 0.5))
+    leaves = [x.requires_grad_() for x in (poses, patches, intrinsics, targets, weights)]
+    index = torch.ones(edges, dtype=torch.long)
+    options = BAOptions(
+        damping=BADamping(0, 0, 0), iterations=3, refine_intrinsics=refine, motion_only=True, structure_only=not edges
+    )
+    result = bundle_adjust(*leaves, index, index, 0 * index, options)
+    total = result.poses_cw.sum() + result.intrinsics.sum()
+    first = torch.autograd.grad(total, leaves, create_graph=True, allow_unused=True)
+    sums = [x.sum() for x in first if x is not None and x.requires_grad]
+    second = torch.autograd.grad(sums, leaves, allow_unused=True) if sums else ()
+    assert all(torch.isfinite(x).all() for x in (*first, *second) if x is not None)

@@ -226,7 +226,8 @@ def test_indices_of_a_graph_may_be_of_any_whole_type():
     "make",
     [
         lambda: LMOptions(max_iterations=-1), lambda: LMOptions(max_iterations=1.5),
-        lambda: LMOptions(damping=math.nan), lambda: LMOptions(tolerance=-1.0), lambda: LMOptions(solver="dense"), lambda: LMOptions(cg=None),
+        lambda: LMOptions(damping=math.nan), lambda: LMOptions(tolerance=-1.0),
+        lambda: LMOptions(solver="dense"), lambda: LMOptions(cg=None),
         lambda: GlobalBAOptions(kernel="huber"), lambda: GlobalBAOptions(max_residual=math.nan),
         lambda: GlobalBAOptions(depth_range=(10, 1)), lambda: GlobalBAOptions(depth_range=3),
         lambda: GlobalBAOptions(move_poses=1), lambda: GlobalBAOptions(solver=None),

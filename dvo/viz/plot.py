@@ -252,8 +252,10 @@ def _decorate(plot: Axes, axes: tuple[int, int], unit: str) -> None:
 def _add_title(plot: Axes, title: str, subtitle: str) -> None:
     plot.set_title(_filled(title), loc="left", fontsize=12, fontweight="bold", color=INK, pad=22 if subtitle else 8)
     if subtitle:
-        place = {"xycoords": "axes fraction", "textcoords": "offset points"}
-        plot.annotate(literal(subtitle), (0, 1), (0, 8), fontsize=9.5, color=INK, **place)
+        text = literal(subtitle)
+        plot.annotate(
+            text, (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", fontsize=9.5, color=INK
+        )
 
 
 def _filled(title: str) -> str:

@@ -122,6 +122,72 @@ def test_the_page_of_a_run_is_not_written_over_its_other_files(given, image_fold
     assert content(out) == before and truth.read_text().startswith("#")
 
 
+def test_no_picture_is_drawn_over_a_trajectory(tmp_path, capsys, monkeypatch):
+    """Whatever the name that it has: a link, or a trajectory that is named as a picture."""
+    rows = "".join(f"{k} {k} {k * k} 0 0 0 0 1\n" for k in range(9))
+    for name in ("truth.txt", "estimate.png", "folder/trajectory.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(rows)
+    (tmp_path / "link.png").symlink_to("truth.txt")
+    (tmp_path / "run.png").symlink_to("folder/trajectory.txt")
+    monkeypatch.chdir(tmp_path)
+    before = content(tmp_path)
+    for out in ("link.png", "./estimate.png", "run.png"):
+        assert main(["evaluate", "truth.txt", "estimate.png", "folder", "--out", out]) == 2
+        assert "would replace" in errors(capsys.readouterr().err)[-1]
+    assert content(tmp_path) == before
+    (tmp_path / "free.png").symlink_to("picture")  # the name of the link says what kind of file it is
+    assert main(["evaluate", "truth.txt", "estimate.png", "--out", "free.png"]) == 0
+    assert (tmp_path / "picture").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", ["samples.csv", "imu.yaml", "noise.yaml", "calib.txt", "times.txt", "walk.csv"])
+def test_findings_of_inertial_samples_are_not_written_over_what_is_read(video, capsys, monkeypatch, name):
+    monkeypatch.chdir(video.parent)
+    rows = ["#time [s],gyro x,gyro y,gyro z,acc x,acc y,acc z"]
+    rows += [f"{k / 100},0.0{k % 7},0,0,0,0.0{k % 5},9.81" for k in range(400)]
+    for file in ("samples.csv", "walk.csv"):
+        Path(file).write_text("\n".join(rows))
+    Path("imu.yaml").write_text("update_rate: 100\n")
+    Path("noise.yaml").write_text("gyroscope_noise_density: 0.001\n")
+    Path("times.txt").write_text("".join(f"{k / 10}\n" for k in range(20)))
+    before = content(video.parent)
+    line = ["imu", "check", "walk.mp4", "--no-vision", "--json", name]
+    if name != "walk.csv":  # which is found beside the video
+        line += ["--imu", "samples.csv", "--imu-calib", "imu.yaml,noise.yaml", "--calib", "calib.txt"]
+        line += ["--times", "times.txt"]
+    assert main(line) == 2
+    assert "would replace" in errors(capsys.readouterr().err)[-1] and content(video.parent) == before
+
+
+def test_a_sheet_of_a_mesh_is_not_drawn_over_its_texture(tmp_path, capsys):
+    pytest.importorskip("trimesh")
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    faces = "f 1/1 2/2 3/3\nf 2/1 3/2 4/3\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\n"
+    (tmp_path / "room.obj").write_text(f"mtllib room.mtl\nusemtl wall\n{corners}{faces}")
+    (tmp_path / "room.mtl").write_text("newmtl wall\nmap_Kd room.png\n")
+    cv2.imwrite(str(tmp_path / "room.png"), np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    before = content(tmp_path)
+    line = ["synth", "preview", str(tmp_path / "room.obj"), "--rows", "1", "--size", "32x32", "--out"]
+    assert main([*line, str(tmp_path / "room.png")]) == 2
+    assert "would replace" in errors(capsys.readouterr().err)[-1] and content(tmp_path) == before
+
+
+def test_a_link_with_the_name_of_a_video_to_an_image_of_the_source(given, image_folder, tmp_path, capsys):
+    odometry = given()
+    (tmp_path / "view.mp4").symlink_to(image_folder / "0003.png")
+    before = content(image_folder)
+    assert main(arguments(image_folder, tmp_path / "out", "--overlay", str(tmp_path / "view.mp4"))) == 2
+    assert "is the source" in capsys.readouterr().err and content(image_folder) == before and not odometry.frames
+
+
+@pytest.mark.parametrize("name", ["calib.txt", ".dvo.lock", "export", "export/tum", "export/tum/a.dvo"])
+def test_no_map_takes_the_place_of_what_the_run_writes(given, image_folder, tmp_path, capsys, name):
+    odometry = given()
+    assert main(arguments(image_folder, tmp_path / "out", "--save-map", str(tmp_path / "out" / name))) == 2
+    assert "file of the results" in errors(capsys.readouterr().err)[-1] and not odometry.frames
+
+
 # -- folders that hold something -----------------------------------------------------------------------------------
 
 
@@ -237,3 +303,27 @@ def test_a_device_stays_a_device(given, image_folder, tmp_path, capsys, option, 
     assert main(arguments(image_folder, tmp_path / "run")) == 0
     assert main(["summary", str(tmp_path / "run"), "--out", str(place)]) == 2
     assert place.stat().st_mode == mode
+
+
+@pytest.mark.parametrize("name", ["run.json", "batch.csv", "logs/walk.log", "walk/run.json", "calib.txt"])
+def test_a_pipe_of_the_name_of_a_result_ends_no_command_waiting(given, video, tmp_path, capsys, name):
+    given()
+    out = tmp_path / "out"
+    (out / name).parent.mkdir(parents=True)
+    os.mkfifo(out / name)
+    command = {"run.json": "run", "calib.txt": "calibrate"}.get(name, "batch")
+    line = [command, str(video), "--out", str(out), "--overwrite", "--device", "cpu"]
+    line += ["--board", "5x4"] if command == "calibrate" else ["--calib", str(video.parent / "calib.txt")]
+    assert main(line) in ((1, 2) if name.startswith("walk/") else (2,))
+    assert Path(name).name in "".join(capsys.readouterr()) and stat.S_ISFIFO((out / name).stat().st_mode)
+
+
+def test_results_with_a_pipe_in_place_of_a_file(given, image_folder, tmp_path, capsys):
+    given()
+    out = tmp_path / "out"
+    assert main(arguments(image_folder, out)) == 0
+    for name, more in (("summary.html", ["--out", str(tmp_path / "new.html")]), ("run.json", [])):
+        (out / name).unlink()
+        os.mkfifo(out / name)
+        assert main(["summary", str(out), *more]) == (2 if name == "run.json" else 0)
+    assert "run.json: not a regular file" in errors(capsys.readouterr().err)[-1]

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from dvo.ba.edges import free_slots
 from dvo.ba.kernels import Kernel
+from dvo.ba.limits import HEAVIEST, REAL, WHOLE, check_kind, check_tensor, check_within
 from dvo.ba.planar_edges import PLANE, cotangent_terms, flattened, in_plane, planar_edges
 from dvo.ba.pose_graph_start import relaxation, spanning_tree
 from dvo.ba.sparse.equations import SparseSystem
@@ -59,6 +60,10 @@ class PoseGraphOptions:
     kernel: Kernel = field(default_factory=Kernel)
     solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=100, damping=1e-12, decrease=0.1))
     start: Literal["best", "given"] = "best"
+
+    def __post_init__(self) -> None:
+        check_kind(self.kernel, "kernel", Kernel)
+        check_kind(self.solver, "solver", LMOptions)
 
 
 LOOP_OPTIONS = PoseGraphOptions(solver=LMOptions(max_iterations=100, damping=1e-6, solver="tiles"), start="given")
@@ -111,14 +116,17 @@ def optimise_pose_graph(
         Poses of the lowest chi2 found, and how it went.
 
     Raises:
-        DvoError: shapes or indices that do not fit, or information that is not positive semi-definite.
+        DvoError: types, shapes or indices that do not fit, numbers that are not finite or larger than 1e8 (information:
+            1e16), scales that are not positive, or information that is not positive semi-definite.
 
     Example:
         >>> result = optimise_pose_graph(poses_cw, ii, jj, measurements)
         >>> result.poses_cw, result.chi2
     """
     use_threads()
+    check_kind(options, "options", PoseGraphOptions)
     dim = _check(poses_cw, ii, jj, measurements, options)
+    ii, jj = ii.long(), jj.long()
     with torch.no_grad(), full_precision(poses_cw.device):
         measurements = measurements.to(poses_cw)
         full = _full_information(information, dim, len(ii))
@@ -314,13 +322,13 @@ def _full_information(information: Tensor | None, dim: int, edges: int) -> Tenso
     """``(E, D, D)`` float64."""
     if information is None:
         return None
+    check_tensor(information, "information", REAL, None)
     if information.shape not in ((edges, dim, dim), (edges, dim)):
         raise DvoError(
             f"has shape {tuple(information.shape)}", field="information", remedy=f"give ({edges}, {dim}, {dim})"
         )
     full = information.double() if information.dim() == 3 else torch.diag_embed(information.double())
-    if not bool(torch.isfinite(full).all()):
-        raise DvoError("not finite", field="information", remedy="give finite numbers")
+    check_within(full, "information", -HEAVIEST, HEAVIEST)
     return full
 
 
@@ -337,6 +345,13 @@ def _square_root(full: Tensor, like: Tensor, diagonal: bool) -> Tensor:
 
 def _check(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, options: PoseGraphOptions) -> int:
     """Dimension of the tangent."""
+    device = getattr(poses_cw, "device", None)
+    for name, tensor in (("poses_cw", poses_cw), ("measurements", measurements)):
+        check_tensor(tensor, name, REAL, device)
+    for name, tensor in (("ii", ii), ("jj", jj)):
+        check_tensor(tensor, name, WHOLE, device)
+        if tensor.dim() != 1:
+            raise DvoError(f"has shape {tuple(tensor.shape)}", field=name, remedy="give (E,)")
     if poses_cw.dim() != 2 or poses_cw.shape[-1] not in (7, 8):
         raise DvoError(f"has shape {tuple(poses_cw.shape)}", field="poses_cw", remedy="give (N, 7) or (N, 8)")
     if options.chart not in get_args(Chart):
@@ -351,4 +366,8 @@ def _check(poses_cw: Tensor, ii: Tensor, jj: Tensor, measurements: Tensor, optio
     for name, index in (("ii", ii), ("jj", jj)):
         if len(index) and (int(index.min()) < 0 or int(index.max()) >= len(poses_cw)):
             raise DvoError(f"has an index outside 0..{len(poses_cw) - 1}", field=name, remedy="give existing frames")
+    for name, tensor in (("poses_cw", poses_cw), ("measurements", measurements)):
+        check_within(tensor, name)
+        check_within(torch.linalg.vector_norm(tensor[:, 3:7], dim=-1), f"{name}, length of quaternions", 0.95, 1.05)
+        check_within(tensor[:, 7:], f"{name}, scales", 1e-8)
     return poses_cw.shape[1] - 1

@@ -40,7 +40,7 @@ from dvo.commands.run_options import INPUTS, OUTPUTS, as_arguments, given_option
 from dvo.core import cluster, processes
 from dvo.core.errors import DvoError
 from dvo.core.processes import Ending, StoppedError, run_limited
-from dvo.core.text import first_line, print_line
+from dvo.core.text import first_line, print_line, visible
 from dvo.core.threads import process_environment, share_cores
 from dvo.data.readers.rosbag import split_topic
 from dvo.data.streams.capture import is_stream
@@ -162,12 +162,14 @@ def is_log(file: Path) -> bool:
     Args:
         file: the file.
     """
+    if not file.is_file() or file.is_symlink():
+        return False
     try:
         with open(file, "rb") as log:
             first = log.read(100)
     except OSError:
         return False
-    return file.is_file() and not file.is_symlink() and (not first or first.startswith(LOG_BEGIN.encode()))
+    return not first or first.startswith(LOG_BEGIN.encode())
 
 
 def _check_settings(arguments: argparse.Namespace) -> None:
@@ -327,7 +329,7 @@ def run_one(job: Job, folder: Path, log: Path) -> Ending:
     line = ["run", *as_arguments(job.options), f"--out={folder}", *overwrite, "--", job.source]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = process_environment(job.threads, {**os.environ, "PYTHONPATH": path})
-    begin = f"{LOG_BEGIN}{job.threads} dvo {shlex.join(line)}\n"
+    begin = f"{LOG_BEGIN}{job.threads} dvo {visible(shlex.join(line))}\n"
     log.write_text(begin, encoding="utf-8", errors="replace")
     program = [sys.executable, "-m", "dvo.commands.batch_worker", str(os.getpid())]
     return run_limited([*program, *line], environment, None, log)

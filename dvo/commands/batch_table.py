@@ -132,7 +132,8 @@ def read_table(file: Path) -> list[dict[str, str]]:
     try:
         if not file.exists() and not file.is_symlink():
             return []
-        reader = csv.DictReader(io.StringIO(file.read_text(encoding="utf-8")))
+        text = file.read_text(encoding="utf-8") if file.is_file() else ""
+        reader = csv.DictReader(io.StringIO(text))
         rows = list(reader) if tuple(reader.fieldnames or ()) == COLUMNS else None
     except (OSError, ValueError, csv.Error):
         rows = None

@@ -15,11 +15,11 @@ import dvo
 from dvo.boards.board import Board, CharucoBoard, Checkerboard
 from dvo.boards.calibrate import HEADER, BoardCalibration, BoardOptions, calibrate_board
 from dvo.commands import NOTHING_TRACKED, OK
-from dvo.commands.camera import CALIBRATION
 from dvo.commands.console import StderrConsole, TrackingProgress, device_of, say, say_all, seed_everything, warn
 from dvo.commands.places import check_outputs
 from dvo.core.errors import DvoError
 from dvo.data.calibration.read import read_calibration
+from dvo.data.files.files import is_file
 from dvo.data.files.output import replaced, write_text
 from dvo.data.images.reduction import MAX_PIXELS
 from dvo.data.source import Source
@@ -63,7 +63,7 @@ def calibrate(arguments: argparse.Namespace) -> int:
     source = dvo.open(arguments.source, guess=True, undistort=False, fps=fps, max_pixels=limit)
     for warning in source.warnings:
         warn(warning, "note")
-    file = FISHEYE if options.fisheye else CALIBRATION
+    file = FISHEYE if options.fisheye else results.CALIBRATION
     with results.locked_folder(arguments.out, source.name) as folder:
         names = (file,) if board is None else (file, FACTS, PICTURE)
         taken = [name for name in names if os.path.lexists(folder / name)]
@@ -105,12 +105,14 @@ def _show(arguments: argparse.Namespace) -> int:
 
 def _is_ours(file: Path) -> bool:
     """True for a calibration file that dvo has written."""
+    if not is_file(file):
+        return False
     try:
         with file.open("rb") as stream:
             found = stream.read(len(HEADER)).startswith(HEADER.encode())
     except OSError:
         return False
-    return found or (file.is_file() and not is_foreign(file))
+    return found or not is_foreign(file)
 
 
 def _board(arguments: argparse.Namespace) -> Board | None:
@@ -138,7 +140,7 @@ def _with_board(source: Source, board: Board, options: BoardOptions, folder: Pat
     say_all(found)
     for warning in found.warnings:
         warn(warning)
-    file = folder / (FISHEYE if options.fisheye else CALIBRATION)
+    file = folder / (FISHEYE if options.fisheye else results.CALIBRATION)
     found.write(file)
     write_text(folder / FACTS, json.dumps(_facts(found, str(source.path)), indent=2) + "\n")
     with replaced(folder / PICTURE) as part:
@@ -177,7 +179,7 @@ def _without_board(source: Source, folder: Path, arguments: argparse.Namespace) 
             on_round=progress.begin_round,
         )  # fmt: skip
     say_all(found)
-    file = folder / CALIBRATION
+    file = folder / results.CALIBRATION
     found.write(file)
     say(f"calibration in {file}")
     return OK if found.found else NOTHING_TRACKED

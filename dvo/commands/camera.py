@@ -17,10 +17,7 @@ from dvo.odometry.calibration.calibrate import calibrate
 from dvo.odometry.calibration.camera_estimate import SelfCalibration
 from dvo.odometry.patch.tracker import PatchOdometry
 from dvo.odometry.protocol import Odometry
-from dvo.session.results import files_of_run
-
-CALIBRATION = "calib.txt"
-"""Calibration file in the results folder of a run without a calibration, for the next run."""
+from dvo.session.results import CALIBRATION, files_of_run
 
 
 def with_calibration(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from dvo.commands import NOTHING_TRACKED, OK
 from dvo.commands.console import say, warn
+from dvo.commands.places import check_outputs
 from dvo.commands.report import error_text
 from dvo.core.errors import DvoError
 from dvo.data.files.output import check_place, replaced
@@ -46,6 +47,8 @@ def evaluate(arguments: argparse.Namespace) -> int:
         if out.suffix.lower() not in PICTURES:
             remedy = f"name it {', '.join(PICTURES)}"
             raise DvoError("not the name of a picture", file=out, field="--out", remedy=remedy)
+        inputs = {f"ESTIMATE {text}": _file(text) for text in arguments.estimates}
+        check_outputs({"--out": out}, {"REFERENCE": _file(arguments.reference), **inputs})
         check_place(out, "--out")
     reference = _read(arguments.reference)
     found = []
@@ -63,11 +66,14 @@ def evaluate(arguments: argparse.Namespace) -> int:
     return OK if good else NOTHING_TRACKED
 
 
-def _read(text: str) -> Trajectory:
-    """Trajectory of a file, or of a results folder."""
+def _file(text: str) -> Path:
+    """File of a trajectory: in a results folder, the one of the run."""
     path = Path(text)
-    if path.is_dir():
-        path = path / results.TRAJECTORY
+    return path / results.TRAJECTORY if path.is_dir() else path
+
+
+def _read(text: str) -> Trajectory:
+    path = _file(text)
     if not path.is_file():
         raise DvoError("no such file", file=path, remedy="give trajectories (TUM), or results folders of dvo run")
     return read_groundtruth(path, None)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from dvo.commands.camera import CALIBRATION
 from dvo.commands.console import TrackingProgress, say
 from dvo.commands.picture import world_root
 from dvo.core.errors import DvoError
@@ -234,7 +233,7 @@ def _reopened(folder: Path, facts: dict[str, Any]) -> Source:
             file=folder,
             remedy="put it back, or track again with --save-map and export the map file",
         )
-    own, was_found = folder / CALIBRATION, facts.get("calibration_file")
+    own, was_found = folder / results.CALIBRATION, facts.get("calibration_file")
     if was_found and not own.is_file():
         raise DvoError("the calibration that the run has found is not there", file=own, remedy="put it back")
     calib = str(own) if was_found else path("calib") or options.get("calib")

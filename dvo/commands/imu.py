@@ -37,6 +37,7 @@ from dvo.odometry.inertial.sensor_check import check_sensor
 from dvo.session.session import run
 
 UNUSABLE = NOTHING_TRACKED
+_INPUTS = ("imu", "imu_calib", "calib", "times")
 _TABLES = (".csv", ".txt", ".jsonl")
 
 
@@ -58,9 +59,11 @@ def check(arguments: argparse.Namespace) -> int:
     if arguments.imu == NONE:
         raise DvoError("there is nothing to check", field="--imu", remedy="leave out --imu none")
     if arguments.json is not None:
-        check_outputs({"--json": arguments.json}, {"--imu": arguments.imu}, arguments.source)
+        inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in _INPUTS}
+        check_outputs({"--json": arguments.json}, inputs, arguments.source)
         check_place(Path(arguments.json), "--json")
     source, given = _opened(arguments)
+    check_outputs({"--json": arguments.json}, {"the samples": given.file})  # found beside the source
     samples = given.rough()
     refusal = _refusal(given)
     times, rotations = (None, None) if arguments.no_vision or source is None else _seen(source, arguments)

@@ -7,8 +7,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from dvo.core.errors import DvoError
-from dvo.session.results import EXPORT, is_result
+from dvo.data.files.output import LOCK
+from dvo.session.results import CALIBRATION, EXPORT, is_result
 
+_OUR_KINDS = (".dvo", ".rrd", ".mp4", ".avi")
 _Given = Mapping[str, Path | str | None]
 
 
@@ -37,12 +39,12 @@ def check_outputs(
                 raise _error(output, option, name)
         if source and _is_same(output, Path(source)):
             raise _error(output, option, "the source")
-        if source and _is_in(output, Path(source)) and output.suffix.lower() not in (".dvo", ".rrd", ".mp4", ".avi"):
+        if source and _is_in(output, Path(source)) and not _is_of_our_kind(output):
             raise _error(output, option, "the source")
         for other, path in written.items():
             if other != option and _is_same(output, path):
                 raise DvoError(f"is also the file of {other}", file=output, field=option, remedy="give another file")
-        if folder is not None and _is_same(output.parent, folder) and is_result(output.name):
+        if folder is not None and _is_taken(output, folder):
             raise DvoError("is a file of the results", file=output, field=option, remedy="give another file")
     if folder is None:
         return
@@ -51,6 +53,19 @@ def check_outputs(
             within = is_result(place.name) and _is_same(place.parent, folder)
             if os.path.lexists(place) and (within or _is_in(place, folder / EXPORT)):
                 raise _error(place, "--out", name)
+
+
+def _is_of_our_kind(output: Path) -> bool:
+    """True for a name, of the file itself where it is a link, that only an output has."""
+    return all(Path(path).suffix.lower() in _OUR_KINDS for path in (output, os.path.realpath(output)))
+
+
+def _is_taken(output: Path, folder: Path) -> bool:
+    """True for a file that the run itself writes into its results folder."""
+    place, folder = Path(os.path.realpath(output)), Path(os.path.realpath(folder))
+    if _is_same(place.parent, folder):
+        return is_result(place.name) or place.name in (CALIBRATION, EXPORT, LOCK)
+    return place.is_relative_to(folder / EXPORT)
 
 
 def _error(file: Path, option: str, name: str) -> DvoError:
@@ -62,13 +77,15 @@ def places(path: Path | str, source: Path | str | None) -> Iterator[Path]:
     """Files that the value of an option may name, in the order in which they are looked up.
 
     Args:
-        path: the value; a suffix ``:ID`` of a calibration is left out too.
+        path: the value; a suffix ``:ID`` of a calibration is left out too, and several files are parted at commas.
         source: in whose folder a relative path is looked up after the working directory.
     """
     spellings = [str(path)]
     head, colon, _ = str(path).rpartition(":")
     if colon and head:
         spellings.append(head)  # of several cameras, the one with an identifier
+    if "," in str(path):
+        spellings += filter(None, str(path).split(","))  # several files
     for text in spellings:
         yield Path(text)
         if source and not os.path.isabs(text):

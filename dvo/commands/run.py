@@ -16,7 +16,7 @@ import torch
 import dvo
 from dvo.commands import NOTHING_TRACKED, OK, Terminated
 from dvo.commands.base_frame import base_observers
-from dvo.commands.camera import CALIBRATION, calibration_origin, with_calibration
+from dvo.commands.camera import calibration_origin, with_calibration
 from dvo.commands.console import InterruptSwitch, TrackingProgress, device_of, say, seed_everything, warn
 from dvo.commands.export import SOURCE, check_image_options, export_images, image_choice
 from dvo.commands.input_options import input_facts, input_settings, print_input
@@ -128,7 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
     )  # checked before the weights load
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(folders)
-        _check_outputs(arguments, folder)
+        _check_outputs(arguments, folder, source)
         observers = stack.enter_context(open_observers(arguments, source.name, folder))
         observers += base_observers(arguments, folder, source.path)
         observers += scale_observers(arguments, folder)
@@ -158,11 +158,15 @@ def run(arguments: argparse.Namespace) -> int:
         return code
 
 
-def _check_outputs(arguments: argparse.Namespace, folder: Path) -> None:
+def _check_outputs(arguments: argparse.Namespace, folder: Path, source: Source) -> None:
     """Refuse outputs that are inputs, and places that cannot be written."""
     outputs = {"--save-map": arguments.save_map, "--overlay": arguments.overlay, "--rerun": arguments.rerun}
     inputs = {f"--{name.replace('_', '-')}": getattr(arguments, name) for name in INPUTS}
     check_outputs(outputs, inputs, arguments.source, folder)
+    found = {"the samples": getattr(source.reading.inertial, "file", None)}  # beside the source
+    if source.calibration is not None:
+        found["the calibration"] = source.calibration.file
+    check_outputs(outputs, found)
     if arguments.save_map is not None:
         check_place(Path(arguments.save_map), "--save-map")
 
@@ -349,7 +353,7 @@ def track(
             warn(warning)
         if facts.get("inertial") and "inertial" not in done.result.info:
             warn("the inertial samples are not used by this odometry with these settings", "note")
-        print_report(folder, done, scores, [CALIBRATION] * (facts.get("calibration_file") is not None))
+        print_report(folder, done, scores, [results.CALIBRATION] * (facts.get("calibration_file") is not None))
         for observer in observers:
             file = getattr(observer, "file", None)
             # Files in the folder are listed already; a video without a frame is removed.

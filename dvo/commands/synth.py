@@ -61,6 +61,8 @@ def preview(arguments: argparse.Namespace) -> int:
             raise DvoError("a mesh brings its own textures", field="--textures", remedy="leave it out")
         rows = arguments.rows or 3
         mesh, form = _mesh(arguments, arguments.source), SequenceFormat(60, height, width, fps=10)
+        for file in mesh.files:
+            check_outputs({"--out": out}, {"SOURCE": file})
         sequences = [mesh_sequence(mesh, arguments.seed + i, form) for i in range(rows)]
         sheet = np.concatenate([sequence_rows(sequence) for sequence in sequences])
     with replaced(out) as part, spelled_in_text(part) as name:

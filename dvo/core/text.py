@@ -18,6 +18,7 @@ HIDDEN = "***"
 # a scheme may have been forgotten.
 _KNOWN = r"(?:rtsps?|rtmp[a-z]{0,2}|https?|s?ftps?|udp|tcp|srt|mms|h264\+rtsp|rstp|htpp?s?)"
 _SCHEME = re.compile(rf"[a-z][a-z0-9+-]{{1,30}}:[/\\]+|(?<![\w./\\]){_KNOWN}[/\\]+|(?<!\S):[/\\]+", re.IGNORECASE)
+_AT = str.maketrans("\uff20\ufe6b", "@@")
 _PORT = re.compile(r"[^\s/@:]*:\d{1,5}(?![^\s/?#,.;:'\")\]])")
 _USER = re.compile(r"[^\s/@:\[]+:")
 # user:password@host without a scheme, or behind one without its colon
@@ -27,9 +28,17 @@ _BARE = re.compile(
 _HEADER = re.compile(r"\b(authorization|cookie)(\s*[:=]\s*)\S+(?: \S+)?", re.IGNORECASE)
 _SECRET_PARTS = (
     "token", "secret", "pass", "pwd", "auth", "sig", "key", "cred", "session", "cookie", "jwt", "hmac", "hash",
-    "ticket", "user", "login", "account", "nonce", "policy", "bearer",
+    "ticket", "user", "login", "account", "nonce", "policy", "bearer", "usr", "psw", "pswd", "tkn",
 )  # fmt: skip
 _SECRET_NAMES = ("code", "pin", "otp", "sid", "k", "p", "pw", "s", "st", "u", "hdnts", "hdnea")
+# Of a query, what does not look like a setting of a camera is taken for a secret, whatever its name.
+_SETTINGS = (
+    "channel", "stream", "subtype", "profile", "resolution", "size", "fps", "codec", "format", "transport", "camera",
+)  # fmt: skip
+_PLAIN = re.compile(r"[a-z]{0,5}|\d{1,5}(?:[x.]\d{1,5})?", re.IGNORECASE)
+_UNNAMED = re.compile(r"(?<=[?&])[^\s=&#]{5,}[^\s=&#.,;:'\")\]](?=[.,;:'\")\]]*(?:[&#\s]|\Z))")
+_STREAM_KEY = re.compile(r"(rtmp[a-z]{0,2}:[/\\]+[^\s/]+/[^\s/]+/)[^\s:,;'\")\]]+", re.IGNORECASE)
+_ENCODED = re.compile(r"(?<=%3a%2f%2f)\S*%40", re.IGNORECASE)  # an address in the query of another
 _PIECE = 5000  # characters of a line that are looked at together
 _LONG = 20  # characters of a value that is taken for a secret whatever its name
 
@@ -56,8 +65,8 @@ def redacted(text: str, whole: bool = False) -> str:
     """Text without the user names, passwords and tokens of the addresses in it.
 
     What stands between ``scheme://`` and the last ``@`` is left out, as passwords may hold ``@``, ``/`` and blanks; of
-    the values behind ``?name=``, those that may be secrets are replaced. Addresses with any scheme count, and those
-    whose slashes a path has joined.
+    the values behind ``?name=``, those that may be secrets are replaced: all but short numbers, short words and
+    settings of a camera. Addresses with any scheme count, and those whose slashes a path has joined.
 
     Args:
         text: any; lines are taken one by one.
@@ -70,7 +79,7 @@ def redacted(text: str, whole: bool = False) -> str:
         >>> redacted("rtsp://admin:p@ss/word@camera:554/live?token=42&channel=1")
         'rtsp://camera:554/live?token=***&channel=1'
     """
-    if not any(mark in text for mark in "@=:"):
+    if not any(mark in text for mark in "@=:%"):
         return text
     return _redacted_line(text, True) if whole else "\n".join(_redacted_line(line, False) for line in text.split("\n"))
 
@@ -78,6 +87,7 @@ def redacted(text: str, whole: bool = False) -> str:
 def _redacted_line(line: str, whole: bool) -> str:
     if len(line) > _PIECE:  # the time of what follows grows with the square
         return "".join(_redacted_line(piece, whole) for piece in _pieces(line))
+    line = _ENCODED.sub("", line)
     found = _SCHEME.search(line)
     while found:
         start = found.end()
@@ -85,6 +95,7 @@ def _redacted_line(line: str, whole: bool) -> str:
         found = _SCHEME.search(line, start)
     if not _SCHEME.search(line):
         line = _BARE.sub("", line)
+    line = _STREAM_KEY.sub(rf"\1{HIDDEN}", line)
     return _HEADER.sub(rf"\1\2{HIDDEN}", _without_values(line, whole))
 
 
@@ -101,10 +112,12 @@ def _pieces(line: str) -> Iterator[str]:
 
 def _userinfo(rest: str, whole: bool) -> int:
     """Length of what stands before the host, behind the scheme of an address."""
-    run = rest if whole else rest.split(maxsplit=1)[0] if rest[:1].strip() else ""
+    rest = rest.translate(_AT)
+    inner = rest.lstrip()
+    run = rest if whole else rest[: len(rest) - len(inner)] + inner.split(maxsplit=1)[0] if inner else ""
     at = run.rfind("@")
     # A user name with a colon behind it begins a password, in which there may be blanks; host:554 does not.
-    if (":" in run[: max(at, 0)]) or (at < 0 and _USER.match(rest) and not _PORT.match(rest)):
+    if (":" in run[: max(at, 0)]) or (at < 0 and _USER.match(inner) and not _PORT.match(inner)):
         at = rest.rfind("@")
     return at + 1
 
@@ -113,16 +126,20 @@ def _without_values(line: str, whole: bool) -> str:
     scheme = _SCHEME.search(line)
     start = len(line) if scheme is None else scheme.start()
     queried, in_address = _VALUES[whole]
-    return _hide(queried, line[:start]) + _hide(in_address, _hide(queried, line[start:]))
+    address = _hide(in_address, _hide(queried, line[start:]))
+    return _hide(queried, line[:start]) + _UNNAMED.sub(HIDDEN, _hide(queried, address, strict=True))
 
 
-def _hide(pairs: re.Pattern[str], text: str) -> str:
-    """Replace the values of names that say, and of values that look, secret."""
+def _hide(pairs: re.Pattern[str], text: str, strict: bool = False) -> str:
+    """Replace the values of names that say, and of values that look, secret; if strict, all that are no settings."""
     found = pairs.search(text)
     while found:
         name, value = unquote(found[1]).lower(), found[2]
         start, end = found.span(2)
-        if value and (name in _SECRET_NAMES or any(part in name for part in _SECRET_PARTS) or len(value) >= _LONG):
+        is_named = name in _SECRET_NAMES or any(part in name for part in _SECRET_PARTS) or len(value) >= _LONG
+        is_setting = any(part in name for part in _SETTINGS) and not name.endswith("id")
+        is_odd = strict and not _PLAIN.fullmatch(value) and not is_setting
+        if value and value != HIDDEN and (is_named or is_odd):
             text, start = text[:start] + HIDDEN + text[end:], start + len(HIDDEN)
         found = pairs.search(text, start)
     return text

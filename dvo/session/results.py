@@ -37,6 +37,8 @@ TRAJECTORY, MAP, PICTURE, SUMMARY = "trajectory.txt", "map.ply", "trajectory.png
 FRAMES, PAGE = "frames.csv", "summary.html"
 BASE = "trajectory_base.txt"
 CLOUD, MESH = "cloud.ply", "mesh.ply"
+CALIBRATION = "calib.txt"
+"""Calibration file in the results folder of a run without a calibration, for the next run."""
 RECORDING = "run.rrd"  # of --rerun without a display
 FILES = (TRAJECTORY, MAP, PICTURE, FRAMES, PAGE, CLOUD, MESH, SUMMARY, BASE, RECORDING)
 VIEWS = (PICTURE, FRAMES, PAGE)

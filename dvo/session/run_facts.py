@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -140,7 +141,10 @@ def read_json(file: Path) -> dict[str, Any]:
         DvoError: it cannot be read, or is no table in JSON.
     """
     try:
-        if file.stat().st_size > _LIMIT:
+        about = file.stat()
+        if not stat.S_ISREG(about.st_mode):  # a pipe would not end
+            raise DvoError("not a regular file", file=file, remedy=REMEDY)
+        if about.st_size > _LIMIT:
             raise DvoError("too large", file=file, remedy=REMEDY)
         facts = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:

@@ -10,7 +10,7 @@ import numpy as np
 from dvo.boards.calibrate import BoardCalibration
 from dvo.core.errors import DvoError
 from dvo.geometry.undistort import Undistorter
-from dvo.viz.plot import ACCENT, INK, PAPER, START, TRUTH
+from dvo.viz.plot import ACCENT, INK, PAPER, START, TRUTH, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,7 @@ def plot_board_calibration(path: Path | str, found: BoardCalibration) -> None:
     figure = Figure(figsize=(11.0, 1.4 + 11.0 * ratio), dpi=DPI, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
     (coverage, errors), (recorded, ideal) = figure.subplots(2, 2)
-    figure.suptitle(str(found), fontsize=8.5, color=INK, family="monospace", ha="left", x=0.02)
+    figure.suptitle(literal(str(found)), fontsize=8.5, color=INK, family="monospace", ha="left", x=0.02)
     _coverage(coverage, found)
     _errors(errors, found)
     _recorded(recorded, found)
@@ -46,7 +46,7 @@ def plot_board_calibration(path: Path | str, found: BoardCalibration) -> None:
         _show(ideal, undistorter(found.example), "without distortion")
     except DvoError as error:
         ideal.set_axis_off()
-        ideal.text(0.5, 0.5, error.message, ha="center", va="center", wrap=True, fontsize=8, color=INK)
+        ideal.text(0.5, 0.5, literal(error.message), ha="center", va="center", wrap=True, fontsize=8, color=INK)
     figure.savefig(path, format="png")
 
 

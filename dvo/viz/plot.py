@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dvo.core.text import visible
 from dvo.data.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -88,6 +89,16 @@ class Panel:
     loops: np.ndarray | None = None
 
 
+def literal(text: str) -> str:
+    """Text that a plot shows letter for letter, without mathematics between dollars and without control characters.
+
+    Args:
+        text: any, such as the name of a file; line feeds stay.
+    """
+    shown = visible(text, lines=True).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown  # a label with it would be left out of a legend
+
+
 def plot_trajectory(
     path: Path | str,
     estimate: Trajectory,
@@ -124,6 +135,7 @@ def plot_panels(path: Path | str, panels: Sequence[Panel], *, title: str = "", s
 
     figure = Figure(figsize=SIZE_INCHES, dpi=DPI, facecolor=PAPER, layout="constrained")
     FigureCanvasAgg(figure)
+    panels = [replace(one, tracks=tuple(replace(t, label=literal(t.label)) for t in one.tracks)) for one in panels]
     if len(panels) == 1:
         _draw_alone(figure, panels[0], title, subtitle)
     else:
@@ -148,9 +160,9 @@ def _draw_side_by_side(figure: Figure, panels: Sequence[Panel], title: str, subt
         names = [track.label for track in panel.tracks]
         handles = [line for line in plot.get_lines() if line.get_label() in names or line.get_marker() == "D"]
         plot.legend(handles=handles, loc="lower left", bbox_to_anchor=(0, 1), frameon=False, fontsize=9)
-    figure.suptitle(textwrap.fill(title, _WIDTH), x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
+    figure.suptitle(_filled(title), x=0.01, ha="left", fontsize=12, fontweight="bold", color=INK)
     note = "every panel has a world and a scale of its own; a dot marks a start"
-    figure.supxlabel(f"{subtitle}\n{note}".strip(), x=0.01, ha="left", fontsize=9.5, color=INK)
+    figure.supxlabel(literal(f"{subtitle}\n{note}".strip()), x=0.01, ha="left", fontsize=9.5, color=INK)
 
 
 def _draw_panel(plot: Axes, panel: Panel, ratio: float) -> None:
@@ -238,9 +250,13 @@ def _decorate(plot: Axes, axes: tuple[int, int], unit: str) -> None:
 
 
 def _add_title(plot: Axes, title: str, subtitle: str) -> None:
-    title = textwrap.fill(title, _WIDTH)
-    plot.set_title(title, loc="left", fontsize=12, fontweight="bold", color=INK, pad=22 if subtitle else 8)
+    plot.set_title(_filled(title), loc="left", fontsize=12, fontweight="bold", color=INK, pad=22 if subtitle else 8)
     if subtitle:
+        text = literal(subtitle)
         plot.annotate(
-            subtitle, (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", fontsize=9.5, color=INK
+            text, (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", fontsize=9.5, color=INK
         )
+
+
+def _filled(title: str) -> str:
+    return literal(textwrap.fill(visible(title), _WIDTH))

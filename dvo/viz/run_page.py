@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from dvo.core.text import in_utf8
+from dvo.core.text import in_utf8, visible
 from dvo.data.trajectory import Trajectory
 from dvo.geometry.poses import quaternion_to_matrix
 from dvo.session.frame_table import SKIPPED, FrameRow
@@ -105,16 +105,16 @@ def write_page(path: Path, page: RunPage) -> None:
     """
     template = Template((ASSETS / "page.html").read_text(encoding="utf-8"))
     scripts = "\n".join((ASSETS / f"{name}.js").read_text(encoding="utf-8") for name in ("view", "charts", "page"))
-    facts = (f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>\n" for name, value in page.facts)
+    facts = (f"<div><dt>{_shown(name)}</dt><dd>{_shown(value)}</dd></div>\n" for name, value in page.facts)
     data = json.dumps(page_data(page), separators=(",", ":"), allow_nan=False)
     text = in_utf8(
         template.substitute(
-            title=escape(page.title),
-            subtitle=escape(page.subtitle),
+            title=_shown(page.title),
+            subtitle=_shown(page.subtitle),
             verdict=_verdict(*page.verdict),
-            notices="".join(f'<p class="notice">{escape(text)}</p>\n' for text in page.notices),
+            notices="".join(f'<p class="notice">{_shown(text)}</p>\n' for text in page.notices),
             facts="".join(facts),
-            tables=page.tables,
+            tables=visible(page.tables, lines=True),
             style=(ASSETS / "page.css").read_text(encoding="utf-8"),
             script=scripts,
             data=data.replace("<", "\\u003c"),  # a text may hold "</script>"
@@ -123,11 +123,15 @@ def write_page(path: Path, page: RunPage) -> None:
     path.write_text(text, encoding="utf-8")
 
 
+def _shown(text: str) -> str:
+    return escape(visible(text))
+
+
 def _verdict(word: str, reason: str) -> str:
     if not word:
         return ""
     kind = word if word in ("good", "doubtful", "failed") else "doubtful"
-    return f'<p class="verdict {kind}"><strong>verdict: {escape(word)}</strong> {escape(reason)}</p>\n'
+    return f'<p class="verdict {kind}"><strong>verdict: {_shown(word)}</strong> {_shown(reason)}</p>\n'
 
 
 def read_images(path: Path) -> list[tuple[float, bytes]]:
@@ -140,7 +144,7 @@ def read_images(path: Path) -> list[tuple[float, bytes]]:
         As ``images`` of :class:`RunPage`; none of what is not a page of a run, or has none.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8") if path.is_file() else ""
         data = json.loads(text.split(_DATA, 1)[1].split("</script>", 1)[0])
         start = float(data["start"])
         found = [(start + float(time), base64.b64decode(jpeg, validate=True)) for time, jpeg in data["images"]]

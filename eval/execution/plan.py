@@ -136,7 +136,7 @@ def claim_folder(out: Path) -> None:
         write_text(out / MANIFEST, json.dumps({"suites": [], "systems": [], "runs": []}) + "\n")
         return
     try:
-        found = json.loads((out / MANIFEST).read_text(encoding="utf-8"))
+        found = json.loads((out / MANIFEST).read_text(encoding="utf-8")) if (out / MANIFEST).is_file() else None
     except (OSError, ValueError):
         found = None
     if not isinstance(found, dict) or not {"suites", "systems", "runs"} <= set(found):

@@ -19,7 +19,7 @@ from dvo.data.trajectory import Trajectory
 from dvo.metrics import align_trajectory, associate, relative_rotation_errors
 from dvo.metrics.segment_metrics import World, match_worlds, scored_worlds
 from dvo.odometry.protocol import Segment
-from dvo.viz.plot import INK, PAPER, plan_axes, with_gaps
+from dvo.viz.plot import INK, PAPER, literal, plan_axes, with_gaps
 from eval.scoring.metric_table import METRICS
 from eval.scoring.summary import quartiles
 from eval.suites.suite import Suite
@@ -95,9 +95,10 @@ def plot_sequence(
         worlds = match_worlds(estimates[name], groundtruth)
         tracks = drawn_tracks(estimates[name], worlds)
         if not tracks:
-            plan.plot([], [], **look, label=f"{name}: no trajectory")
+            plan.plot([], [], **look, label=literal(f"{name}: no trajectory"))
             continue
-        label = name if len(worlds) == 1 else f"{name} ({len(worlds)} segments{_left_out(len(worlds) - len(tracks))})"
+        left_out = "" if len(worlds) == 1 else f" ({len(worlds)} segments{_left_out(len(worlds) - len(tracks))})"
+        label = literal(f"{name}{left_out}")
         medians = []
         for position, track in enumerate(tracks):
             aligned = align_trajectory(track, groundtruth, suite.alignment)
@@ -188,7 +189,7 @@ def plot_axis(title: str, unit: str, values: Mapping[str, Sequence[float]], null
     plot.set_xscale("log")
     plot.set_xlim(low / 1.25, edge * 1.06)
     plot.set_ylim(len(names) - 0.4, -0.6)
-    plot.set_yticks(range(len(names)), names, fontsize=9)
+    plot.set_yticks(range(len(names)), [literal(name) for name in names], fontsize=9)
     plot.xaxis.set_major_formatter(_number)
     plot.xaxis.set_minor_formatter(_one_two_five if high / low < 30 else (lambda value, place: ""))
     plot.tick_params(axis="x", which="both", labelsize=8)
@@ -208,7 +209,7 @@ def plot_speed(points: Mapping[str, Sequence[tuple[float, float]]], unit: str) -
     for name, style in styles(list(points)).items():
         table = np.array([pair for pair in points[name] if all(map(math.isfinite, pair)) and min(pair) > 0])
         lost = len(points[name]) - len(table)
-        label = f"{name} ({lost} of {len(points[name])} without a figure)" if lost else name
+        label = literal(f"{name} ({lost} of {len(points[name])} without a figure)" if lost else name)
         marker = "d" if style.marker == "|" else style.marker
         if not len(table):
             plot.plot([], [], marker, color=style.color, label=label)
@@ -288,7 +289,7 @@ def _tidy(*plots: Any) -> None:
 
 
 def _title(plot: Any, text: str) -> None:
-    plot.set_title(text, loc="left", fontsize=10.5, color=INK)
+    plot.set_title(literal(text), loc="left", fontsize=10.5, color=INK)
 
 
 def _one_two_five(value: float, place: int) -> str:

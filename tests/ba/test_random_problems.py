@@ -187,9 +187,25 @@ def is_fine(draw: Callable[..., Any]) -> str:
         wrong.append("covariance")
     outputs = [x for x in (result.poses_cw, result.patches, result.intrinsics) if x.requires_grad]
     if outputs:
-        sum(x.sum() for x in outputs).backward()
+        sum(x.sum() for x in outputs).backward(retain_graph=True)
+    if outputs and draw(st.sampled_from((False, False, True))):
+        wrong += wrong_again(sum(x.sum() for x in outputs), dict(leaves))
     wrong += [f"gradient of {name}" for name, x in leaves if x.grad is not None and not torch.isfinite(x.grad).all()]
     return ", ".join(wrong)
+
+
+def wrong_again(total: Tensor, leaves: dict[str, Tensor]) -> list[str]:
+    """Derivatives of first and second order that are not finite, of a graph that is recorded."""
+    first = torch.autograd.grad(total, list(leaves.values()), create_graph=True, allow_unused=True)
+    sums = [x.sum() for x in first if x is not None and x.requires_grad and x.sum().isfinite()]
+    second = torch.autograd.grad(sums, list(leaves.values()), allow_unused=True) if sums else [None] * len(leaves)
+    found = {"recorded gradient": first, "second derivative": second}
+    return [
+        f"{what} of {name}"
+        for what, each in found.items()
+        for name, x in zip(leaves, each, strict=True)
+        if x is not None and not x.isfinite().all()
+    ]
 
 
 SETTINGS = settings(deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None)

@@ -42,7 +42,11 @@ def test_no_password_is_left(scheme, password):
         "http://h/v?x=1;auth=Xq9", "http://h/v?AUTHORIZATION=Xq9", "http://h/v?%74oken=Xq9", "http://h/v#id_token=Xq9",
         "rtsp://h/user=Xq9_password=Xq9_channel=1", "http://h/v?X-Amz-Signature=Xq9", "http://h/?key=Xq9:", "x?pwd=Xq9",
         "http://h/v?z=Xq9Xq9Xq9Xq9Xq9Xq9Xq9", "http://h/v?password=a&key=Xq9/@+=", "rtsp://admin:Xq9@h?user=Xq9",
-        "admin:Xq9@192.168.0.2/live", "rtsp//admin:Xq9@h", "rtsp:admin:Xq9@h", "Authorization: Basic Xq9=",
+        "http://h/v?refresh=Xq9abc", "http://h/v?a=1&tkn=Xq9", "http://h/v?usr=Xq9", "http://h/v?md5=Xq9abc&e=1",
+        "http://h/v?Xq9abc", "http://h/v?a=1&Xq9abc", "http://h/v?token%3DXq9", "srt://h?streamid=Xq9abc",
+        "rtmp://h/app/live_Xq9", "http%3A%2F%2Fu%3AXq9%40h", "http://h/v?next=http%3A%2F%2Fu%3AXq9%40h",
+        "rtsp:// admin:Xq9@h", "rtsp://admin:Xq9\uff20h", "admin:Xq9@192.168.0.2/live",
+        "rtsp//admin:Xq9@h", "rtsp:admin:Xq9@h", "Authorization: Basic Xq9=",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("frame", ["{}", "cannot open {}: refused", "'{}' failed", "{}: {}. Try again"])
@@ -56,6 +60,8 @@ def test_no_token_is_left(address, frame):
         "/data/a@b.png: cannot be read", "C:/a@b.png", "D:\\a@b", "x: /tmp/a@b.png", "http://host:554/live?channel=1",
         "see https://example.org/page; write to me@example.org", "keyframes=5, token=3", "bag.mcap:/camera/image",
         "/data/12:30@home/x.png", "/data//a@b.png", "http://[::1]:80/x, a@b", "webcam:0", "", "rtsp://h/v?t=30&v=2",
+        "rtsp://h/v?channel=1&subtype=main&size=1920x1080&codec=h264-high", "use rtsp://, http:// or webcam:0",
+        "a%3Ab.png",
     ],
 )  # fmt: skip
 def test_other_texts_stay(text):

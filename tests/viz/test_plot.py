@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
+
 import cv2
 import numpy as np
 import pytest
 
 from dvo.data.trajectory import Trajectory
-from dvo.viz.plot import COLOURS, Panel, Track, plan_axes, plot_panels, plot_trajectory, with_gaps
+from dvo.viz.plot import COLOURS, Panel, Track, literal, plan_axes, plot_panels, plot_trajectory, with_gaps
 
 
 def line(count: int, step: tuple[float, float, float]) -> Trajectory:
@@ -126,3 +128,14 @@ def test_segments_in_one_world_share_a_panel(tmp_path):
     picture = picture[: 6 * len(picture) // 8]  # without the legend
     left, right = (np.argwhere(colour_of(picture, k))[:, 1] for k in range(2))
     assert left.max() < right.min() + 20 and min(np.ptp(left), np.ptp(right)) > 200
+
+
+@pytest.mark.parametrize("name", ["$x^{_$", "$x", "a\x1b[31m\x7f", "\udcff.tum", "_run.tum", "a\nb", "50 %"])
+def test_names_are_shown_as_they_are(tmp_path, name):
+    """No name of a file is mathematics, a warning about a letter that steers a terminal, or none in the legend."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tracks = tuple(Track(line(9, (1, k, 0)), f"{name}{k}", k) for k in range(2))
+        for count in (1, 2):
+            plot_panels(tmp_path / "p.png", [Panel(tracks)] * count, title=name, subtitle=name)
+    assert not literal(name).startswith("_") and (tmp_path / "p.png").stat().st_size > 10000

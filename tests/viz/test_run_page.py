@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -94,6 +95,18 @@ def test_texts_of_the_user_are_no_markup(tmp_path):
     assert "alert(1)</script>" not in text and text.count("</script>") == 2
     data = json.loads(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])
     assert data["states"][0][3] == bad
+
+
+def test_texts_of_the_user_do_not_steer_a_terminal(tmp_path):
+    """A page that is printed, or opened by an editor."""
+    strange = "\x1b[2J\x9b\u202e\u200b"
+    found = replace(
+        page(walk(5)), title=strange, subtitle=strange, notices=(strange,), facts=((strange, strange),),
+        tables=f"<p>{strange}</p>", verdict=("good", strange),
+    )  # fmt: skip
+    write_page(tmp_path / "p.html", found)
+    text = (tmp_path / "p.html").read_text(encoding="utf-8")
+    assert not set("\x1b\x9b\u202e\u200b") & set(text) and text.count(r"\x1b[2J\x9b\u202e\u200b") >= 7
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node to check the scripts")

@@ -12,7 +12,7 @@ from torch import Tensor
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES
 from dvo.ba.edges import EdgePlan, edge_numbers
 from dvo.ba.factors import DepthDamping, DepthPrior, PosePrior, RelativePose
-from dvo.ba.limits import LARGEST, SHORTEST_FOCAL
+from dvo.ba.limits import LARGEST, REAL, SHORTEST_FOCAL, WHOLE, check_tensor
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import check_further
 from dvo.core.errors import DvoError
@@ -20,8 +20,6 @@ from dvo.core.settings import shown
 
 FLOATS = ("poses_cw", "patches", "intrinsics", "targets", "weights")
 INDICES = ("ii", "jj", "kk")
-REAL = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
-WHOLE = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
 _HELP = "see the help of bundle_adjust"
 
 
@@ -45,16 +43,7 @@ def _check_tensors(given: PatchProblem) -> None:
         kinds += [("sensors.source", sensors.source, WHOLE), ("sensors.target", sensors.target, WHOLE)]
     device = getattr(given.poses_cw, "device", None)
     for name, tensor, dtypes in kinds:
-        if not isinstance(tensor, Tensor):
-            raise DvoError(f"is {type(tensor).__name__}, not a tensor", field=name, remedy="give a torch.Tensor")
-        if tensor.dtype not in dtypes:
-            remedy = "give floating-point numbers" if dtypes is REAL else "give whole numbers"
-            raise DvoError(f"has dtype {tensor.dtype}", field=name, remedy=remedy)
-        if tensor.device != device:
-            remedy = "give all tensors on one device"
-            raise DvoError(f"is on {tensor.device}, poses_cw is on {device}", field=name, remedy=remedy)
-        if tensor.layout != torch.strided:
-            raise DvoError(f"has layout {tensor.layout}", field=name, remedy="give a dense tensor")
+        check_tensor(tensor, name, dtypes, device)
 
 
 def _check_shapes(given: PatchProblem) -> None:

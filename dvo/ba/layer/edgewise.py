@@ -23,7 +23,7 @@ from dvo.ba.layer import step
 from dvo.ba.layer.grouped import GroupedReprojection, group_measurements
 from dvo.ba.layer.reprojection import MARGIN, PatchReprojection
 from dvo.ba.layer.step import normal_equations
-from dvo.ba.layer.transforms import composed, pulled_back
+from dvo.ba.layer.transforms import composed, finite, pulled_back
 from dvo.ba.options import BADamping
 from dvo.ba.problem import Factor, Linearisation, NormalEquations, Problem, State
 from dvo.core.kernels import is_transformed, use_kernels
@@ -246,9 +246,9 @@ class _Recorded(torch.autograd.Function):
             found = composed(partial(pulled_back, twin, needed, len(tensors)), *tensors, *grads)
         else:
             every = _taken_back(ctx.path, ctx.problem, ctx.settings, tensors, grads)
-            found = step.finite([every[i] for i in needed], grads)
+            found = [every[i] for i in needed]
         out: list[Tensor | None] = [None] * len(tensors)
-        for i, gradient in zip(needed, found, strict=True):
+        for i, gradient in zip(needed, finite(found, grads), strict=True):
             out[i] = gradient
         return None, None, *out
 

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from dvo.ba.layer.adjoint import adjoint_constants, gradients
-from dvo.ba.layer.schur import SchurFactor, damped, eliminate, factorise, invert_blocks, sums_up
-from dvo.ba.layer.transforms import Tensors, composed, pulled_back
+from dvo.ba.layer.schur import SchurFactor, damped, eliminate, factorise, invert_blocks
+from dvo.ba.layer.transforms import Tensors, composed, finite, pulled_back
 from dvo.ba.limits import LARGEST
 from dvo.ba.options import BADamping
 from dvo.ba.problem import NormalEquations, Problem
@@ -160,15 +160,6 @@ def refuse_dual_numbers() -> None:
     DvoError: always.
     """
     raise DvoError("dual numbers are not followed", field="bundle_adjust", remedy="use torch.func.jvp")
-
-
-def finite(found: Sequence[Tensor | None], grads: tuple[Tensor, ...]) -> list[Tensor | None]:
-    """Of finite gradients ``grads`` come finite ones: what is too large for its type is none. A NaN stays one."""
-    given = [x for x in found if x is not None]
-    if not is_transformed() and sums_up(*(x.detach() for x in given)):
-        return list(found)
-    nothing = (grads[0] * 0).sum() + (grads[1] * 0).sum()
-    return [None if x is None else torch.nan_to_num(x, 0.0, 0.0, 0.0) + nothing for x in found]
 
 
 def _recorded(problem: Problem, damping: BADamping, *tensors: Tensor) -> Tensors:

@@ -14,6 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dvo.ba.layer.schur import sums_up
+from dvo.core.kernels import is_transformed
+
 Tensors = tuple[Tensor, ...]
 Function = Callable[..., Tensors]
 
@@ -30,6 +33,15 @@ def composed(function: Function, *tensors: Tensor) -> Tensors:
     """
     found: Tensors = _Composed.apply(function, *tensors)
     return found
+
+
+def finite(found: Sequence[Tensor | None], grads: Sequence[Tensor]) -> list[Tensor | None]:
+    """Of finite gradients ``grads`` come finite ones: what is too large for its type is none. A NaN stays one."""
+    given = [x for x in found if x is not None]
+    if not is_transformed() and sums_up(*(x.detach() for x in given)):
+        return list(found)
+    nothing = sum((g * 0).sum() for g in grads if g.is_floating_point())
+    return [None if x is None else torch.nan_to_num(x, 0.0, 0.0, 0.0) + nothing for x in found]
 
 
 class _Composed(torch.autograd.Function):
@@ -51,7 +63,7 @@ class _Composed(torch.autograd.Function):
         needed = tuple(i for i in range(len(tensors)) if ctx.needs_input_grad[i + 1])
         back = composed(partial(pulled_back, ctx.function, needed, len(tensors)), *tensors, *grads)
         out: list[Tensor | None] = [None] * (len(tensors) + 1)
-        for i, gradient in zip(needed, back, strict=True):
+        for i, gradient in zip(needed, finite(back, grads), strict=True):
             out[i + 1] = gradient
         return tuple(out)
 

@@ -6,8 +6,9 @@ number of edges, not with frames times patches, and each step has to lower the c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -15,6 +16,19 @@ from torch import Tensor
 from dvo.ba.blocks import INTRINSICS, INVERSE_DEPTHS, POSES, intrinsics_block, inverse_depth_block, pose_block
 from dvo.ba.edges import check_index, plan_edges
 from dvo.ba.kernels import Kernel
+from dvo.ba.limits import (
+    HEAVIEST,
+    LARGEST,
+    REAL,
+    SHORTEST_FOCAL,
+    WHOLE,
+    check_kind,
+    check_positive,
+    check_range,
+    check_switch,
+    check_tensor,
+    check_within,
+)  # fmt: skip
 from dvo.ba.patch_problem import PatchProblem
 from dvo.ba.problem import Factor, State, StateBlock, check_further
 from dvo.ba.sparse.block_parts import PART, BlockParts
@@ -39,6 +53,9 @@ class GlobalBAOptions:
         depth_range: inverse depths are clamped to it.
         move_poses, move_depths: what is refined.
         solver: of Levenberg-Marquardt and its linear systems.
+
+    Raises:
+        DvoError: a value of another type or out of its limits.
     """
 
     fixed: int | Tensor | Sequence[bool] = 1
@@ -48,6 +65,15 @@ class GlobalBAOptions:
     move_poses: bool = True
     move_depths: bool = True
     solver: LMOptions = field(default_factory=lambda: LMOptions(max_iterations=20))
+
+    def __post_init__(self) -> None:
+        check_kind(self.kernel, "kernel", Kernel)
+        check_kind(self.solver, "solver", LMOptions)
+        if self.max_residual != math.inf:
+            check_positive(self.max_residual, "max_residual")
+        check_range(self.depth_range, "depth_range", 0.0, LARGEST)
+        for name in ("move_poses", "move_depths"):
+            check_switch(getattr(self, name), name)
 
 
 @dataclass(frozen=True)
@@ -92,11 +118,13 @@ def global_bundle_adjust(
     """Refine all poses and inverse depths of a graph.
 
     Args:
-        poses_cw: ``(N, 7)`` world to camera; their dtype, float32 or float64, is that of the computation.
+        poses_cw: ``(N, 7)`` world to camera, unit quaternions; their dtype, float32 or float64, is that of the
+            computation. No number of poses, patches and intrinsics is larger than 1e8.
         patches: ``(K, 3, p, p)`` x, y (pixels) and inverse depth; all pixels of a patch share that of its centre.
         intrinsics: ``(N, 4)`` fx fy cx cy in the same pixels.
-        targets: ``(E, 2)`` where the patch centres are seen, pixels of frame j.
-        weights: ``(E, 2)`` confidence per axis, not negative.
+        targets: ``(E, 2)`` where the patch centres are seen, pixels of frame j; an edge with a target that is not
+            finite, or larger than 1e8, does not count.
+        weights: ``(E, 2)`` confidence per axis, from 0 to 1e16.
         ii, jj, kk: ``(E,)`` source frame, target frame and patch of each edge, in any order. All edges of a patch
             have the same source frame.
         options: see :class:`GlobalBAOptions`.
@@ -110,7 +138,8 @@ def global_bundle_adjust(
         Poses and patches of the lowest cost found, and how it went.
 
     Raises:
-        DvoError: shapes, indices or weights that do not fit, or a further block that is eliminated or a batch.
+        DvoError: types, shapes, numbers, indices or weights that do not fit, options of another type, or a further
+            block that is eliminated or a batch.
 
     Example:
         >>> result = global_bundle_adjust(poses_cw, patches, intrinsics, targets, weights, ii, jj, kk)
@@ -123,7 +152,8 @@ def global_bundle_adjust(
 def adjust_sparse(problem: PatchProblem, options: GlobalBAOptions) -> GlobalBAResult:
     """The sparse solution of one graph; see :func:`global_bundle_adjust` and :func:`dvo.ba.solve.solve`."""
     use_threads()
-    _check(problem)
+    check_kind(options, "options", GlobalBAOptions)
+    problem, unseen = _checked(problem)
     with torch.no_grad(), full_precision(problem.poses_cw.device):
         system = SparseProblem(problem, options)
         move, solver = system.parts.moved, options.solver
@@ -137,7 +167,7 @@ def adjust_sparse(problem: PatchProblem, options: GlobalBAOptions) -> GlobalBARe
             problem.patches,
             outcome.initial_cost,
             outcome.cost,
-            system.inliers(state),
+            system.inliers(state) if unseen is None else system.inliers(state) & ~unseen,
             outcome.iterations,
             outcome.converged,
             system.pattern.stored_blocks,
@@ -264,10 +294,19 @@ def _fast_edges(
     )
 
 
-def _check(problem: PatchProblem) -> None:
+def _checked(problem: PatchProblem) -> tuple[PatchProblem, Tensor | None]:
+    """The problem with indices of one type, and edges without a target as such of no weight; which these are."""
     check_further(problem.factors, problem.blocks)
+    sensors, device = problem.sensors, getattr(problem.poses_cw, "device", None)
+    for name in ("poses_cw", "patches", "intrinsics", "targets", "weights"):
+        check_tensor(getattr(problem, name), name, REAL, device)
+    indices = {name: getattr(problem, name) for name in ("ii", "jj", "kk")}
+    for name, index in indices.items():
+        check_tensor(index, name, WHOLE, device)
+    if any(x.dim() == 0 for x in (problem.poses_cw, problem.patches, *indices.values())):
+        raise DvoError("a number alone", field="poses_cw", remedy="give one graph")
     n, e, k = problem.poses_cw.shape[0], len(problem.ii), problem.patches.shape[0]
-    side, sensors = problem.patches.shape[-1], problem.sensors
+    side = problem.patches.shape[-1]
     cameras = n if sensors is None else sensors.from_body.shape[-2]
     wanted = {"poses_cw": (n, 7), "patches": (k, 3, side, side), "intrinsics": (cameras, 4)}
     wanted |= {"targets": (e, 2), "weights": (e, 2), "ii": (e,), "jj": (e,), "kk": (e,)}
@@ -281,10 +320,22 @@ def _check(problem: PatchProblem) -> None:
         raise DvoError(f"has dtype {problem.poses_cw.dtype}", field="poses_cw", remedy="use float32 or float64")
     if e == 0:
         raise DvoError("a graph without edges", field="ii", remedy="give at least one edge")
-    indices = [("ii", problem.ii, n), ("jj", problem.jj, n), ("kk", problem.kk, k)]
+    sizes = [("ii", problem.ii, n), ("jj", problem.jj, n), ("kk", problem.kk, k)]
     if sensors is not None:
-        indices += [("sensors.source", sensors.source, cameras), ("sensors.target", sensors.target, cameras)]
-    for name, index, size in indices:
+        sizes += [("sensors.source", sensors.source, cameras), ("sensors.target", sensors.target, cameras)]
+    for name, index, size in sizes:
         check_index(index, size, name)
-    if not bool(torch.isfinite(problem.weights).all() and (problem.weights >= 0).all()):
-        raise DvoError("negative or not finite", field="weights", remedy="give weights of zero or more")
+    check_within(problem.weights, "weights", 0.0, HEAVIEST)
+    for name in ("poses_cw", "patches", "intrinsics"):
+        check_within(getattr(problem, name), name)
+    check_within(
+        torch.linalg.vector_norm(problem.poses_cw[:, 3:], dim=-1), "poses_cw, length of quaternions", 0.95, 1.05
+    )
+    check_within(problem.intrinsics[:, :2], "intrinsics, focal lengths", SHORTEST_FOCAL)
+    if any(index.dtype != torch.int64 for index in indices.values()):
+        problem = replace(problem, **{name: index.long() for name, index in indices.items()})
+    unseen = ~(torch.isfinite(problem.targets) & (problem.targets.abs() <= LARGEST)).all(-1)
+    if not bool(unseen.any()):
+        return problem, None
+    targets, weights = (x.masked_fill(unseen[:, None], 0.0) for x in (problem.targets, problem.weights))
+    return replace(problem, targets=targets, weights=weights), unseen

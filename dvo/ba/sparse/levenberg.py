@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, get_args
 
+from dvo.ba.limits import check_kind, check_number, check_whole
 from dvo.ba.sparse.block_matrix import CGOptions, LinearSolver
+from dvo.core.errors import DvoError
+from dvo.core.settings import shown
 
 MIN_DIAGONAL, MAX_DIAGONAL = 1e-6, 1e32
 """Bounds of the diagonal that damping is a fraction of, as in Ceres: directions without measurement are damped too."""
@@ -26,6 +29,9 @@ class LMOptions:
         decrease: the damping falls to no less than this fraction of itself after a step.
         solver: of the linear system, see :data:`dvo.ba.sparse.block_matrix.LinearSolver`.
         cg: options of conjugate gradients.
+
+    Raises:
+        DvoError: a value of another type, a negative number, or an unknown solver.
     """
 
     max_iterations: int = 50
@@ -34,6 +40,15 @@ class LMOptions:
     decrease: float = 1 / 3
     solver: LinearSolver = "auto"
     cg: CGOptions = field(default_factory=CGOptions)
+
+    def __post_init__(self) -> None:
+        check_whole(self.max_iterations, "max_iterations")
+        for name, high in (("tolerance", 1.0), ("damping", 1e16), ("decrease", 1.0)):
+            check_number(getattr(self, name), name, 0.0, high)
+        if self.solver not in get_args(LinearSolver):
+            known = ", ".join(get_args(LinearSolver))
+            raise DvoError(f"unknown solver {shown(self.solver)}", field="solver", remedy=f"use one of {known}")
+        check_kind(self.cg, "cg", CGOptions)
 
 
 State = TypeVar("State")

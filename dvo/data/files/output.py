@@ -118,7 +118,7 @@ def begin_part(path: Path | str) -> Path:
     """
     target = _target(path)
     sweep_parts(target.parent)
-    return target.with_name(_part_name(target))
+    return target.with_name(_part_name(target, Path(path).suffix))
 
 
 def end_part(part: Path, path: Path | str) -> None:
@@ -302,10 +302,12 @@ def _target(path: Path | str) -> Path:
     raise OSError(errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL, reason, str(path))
 
 
-def _part_name(target: Path) -> str:
+def _part_name(target: Path, suffix: str = "") -> str:
     name = target.name
+    if target.suffix != suffix:  # the target of a link, with another name
+        name += suffix
     if len(os.fsencode(name)) > _LONGEST:
-        name = f"long{target.suffix}" if len(os.fsencode(target.suffix)) < _LONGEST else "long"
+        name = f"long{suffix}" if len(os.fsencode(suffix)) < _LONGEST else "long"
     return f"{PART}{_HOST}-{os.getpid()}-{_PROCESS}-{next(_NUMBERS)}-{name}"
 
 

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 # Half a minute of 30 Hz video without a frame is taken for the end.
 _GIVE_UP_AFTER = 900
 _JUMP = 5000.0  # milliseconds: frames in another order than that of their times lie far less apart
+_BINARY = re.compile(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]")
+_NAMES_FILES = re.compile(rb"(\xef\xbb\xbf)?\s*(ffconcat|#EXTM3U|<\?xml|v=0)", re.IGNORECASE)
 _SECONDS = 4  # to open, and to find the next frame: gigabytes without one are no video
 
 
@@ -57,6 +59,9 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
         raise DvoError("no video file", file=path, remedy="give a file; images of a camera go to dvo.stream")
     with lookups(path), path.open("rb") as file:
         head = file.read(1024)  # a disk that sleeps wakes before time counts
+    if _NAMES_FILES.match(head) or not (_BINARY.search(head) or head.startswith(b"YUV4MPEG") or not head):
+        # FFmpeg would follow the names in it, or show the text itself
+        raise DvoError("a text file is no video", file=path, remedy="give a video or the folder that holds the images")
     if path.suffix.lower() in SUFFIXES:  # FFmpeg would read it as a video of one frame
         raise DvoError("one image is no video", file=path, remedy="give the folder that holds the images")
     # FFmpeg reports every damaged block on stderr, thousands of lines in one bad video; we count frames instead
@@ -94,7 +99,7 @@ def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
 
 
 def _no_video(path: Path, head: bytes) -> str | None:
-    """What a file is by its content, if that is sound, text, an archive or nothing."""
+    """What a file is by its content, if that is sound, an archive or nothing."""
     if not head:
         return "an empty file"
     if head.startswith((b"PK\x03\x04", b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!")):
@@ -106,7 +111,7 @@ def _no_video(path: Path, head: bytes) -> str | None:
             kinds = set(re.findall(rb"hdlr.{8}(soun|vide)", content, re.DOTALL))
         if kinds == {b"soun"}:
             return "a recording of sound"
-    return None if re.search(rb"[^\t\n\r\x0c\x20-\x7e\x80-\xff]", head) else "a text file"
+    return None
 
 
 def _is_row_of_jpegs(path: Path) -> bool:

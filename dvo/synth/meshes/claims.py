@@ -182,12 +182,14 @@ class FolderFiles:
 
     Attributes:
         refused: the first name that was refused; trimesh passes over errors of materials and pictures.
+        read: files that were read.
     """
 
     def __init__(self, mesh: Path) -> None:
         self.folder, self.mesh = mesh.absolute().parent, mesh
         self.file_name, self.file_path = mesh.name, str(mesh)
         self.refused: DvoError | None = None
+        self.read: list[Path] = []
 
     def get(self, name: str) -> bytes:
         """Content of a file.
@@ -228,6 +230,7 @@ class FolderFiles:
         if size is not None and place.stat().st_size > MAX_JSON:
             raise DvoError("names a huge picture", file=self.mesh, field=text[:200], remedy="replace the picture")
         data = place.read_bytes()
+        self.read.append(place)
         if size is not None and not is_complete(data):
             raise DvoError(
                 "a picture that is cut short", file=self.mesh, field=text[:200], remedy="replace the picture"

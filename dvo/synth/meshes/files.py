@@ -77,7 +77,9 @@ def load_mesh(
     if files.refused is not None:
         raise files.refused
     rotate = (up or ("z" if path.suffix.lower() in (".ply", ".stl", ".off") else "y")) == "y"
-    return mesh_scene(loaded, rotate=rotate, view=view, ground=ground, light=light, seed=seed, file=path)
+    scene = mesh_scene(loaded, rotate=rotate, view=view, ground=ground, light=light, seed=seed, file=path)
+    scene.files = (path, *files.read)
+    return scene
 
 
 def mesh_scene(

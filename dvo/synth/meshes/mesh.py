@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ class MeshScene:
         hints: information for path planning, as in :class:`dvo.synth.Scene`.
         family: name for sequences.
         warnings: changes made to the file's content, one sentence each.
+        files: the mesh file, and those that it names.
     """
 
     corners: Array
@@ -43,6 +45,7 @@ class MeshScene:
     hints: dict[str, Any] = field(default_factory=dict)
     family: str = "mesh"
     warnings: list[str] = field(default_factory=list)
+    files: tuple[Path, ...] = ()
     _cache: dict[str, dict[str, Tensor]] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:

@@ -158,7 +158,7 @@ class StampsLike:
 )
 def test_times_of_the_container(make, monkeypatch, milliseconds, times, warned):
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: StampsLike(milliseconds))
-    source = open_source(make.text("v.mp4", "stand-in"), calib=CALIB)
+    source = open_source(make.text("v.mp4", "stand-in\0"), calib=CALIB)
     assert [frame.timestamp for frame in source] == pytest.approx(times)
     assert any(warned in warning for warning in source.warnings) if warned else source.warnings == []
 
@@ -200,6 +200,8 @@ def test_parts_with_clocks_of_their_own(make, monkeypatch):
 
 @pytest.mark.parametrize(("content", "what"), [
     (b"frame000.png\nframe001.png\n", "a text file"), (b"PK\x03\x04" + bytes(40), "an archive"), (b"", "an empty file"),
+    (b"ffconcat version 1.0\nfile clip.mp4\n", "a text file"), (b"\xef\xbb\xbf#EXTM3U\n#\0\n", "a text file"),
+    (b"0.05 images/001.png\n" * 24, "a text file"),
     (b"RIFF\x24\x00\x00\x00WAVEfmt " + bytes(40), "a recording of sound"),
     (bytes(3) + b"\x14ftypisom" + bytes(11) + b"\x21hdlr" + bytes(8) + b"soun" + bytes(12), "a recording of sound"),
 ])  # fmt: skip

@@ -9,7 +9,7 @@ from dvo.core.errors import DvoError
 from dvo.data.inertial_files.columns import columns_of
 from dvo.data.inertial_files.tables import read_inertial_table
 from dvo.data.inertial_files.tidy import STANDARD_GRAVITY
-from tests.data.inertial_files.test_tables import ACCEL, COUNT, GYRO, NS, TIMES, _motion, check, write
+from tests.support.inertial_tables import ACCEL, COUNT, GYRO, NS, TIMES, check, motion, write
 
 ZERO, TWO = np.zeros((COUNT, 3)), np.repeat([[0, 1]], COUNT, axis=0).ravel()
 MANY = {
@@ -56,9 +56,7 @@ def test_each_sensor_has_the_times_beside_it(tmp_path):
              for axis in "xyz"]  # fmt: skip
     header = ",".join(f'"{name}"' for name in ("Time (s)", *names[:3], "Time (s)", *names[3:]))
     later = TIMES + 0.004
-    check(
-        read_inertial_table(write(tmp_path / "all.csv", header, [later, _motion(later)[1], TIMES, GYRO], form="%.9g"))
-    )
+    check(read_inertial_table(write(tmp_path / "all.csv", header, [later, motion(later)[1], TIMES, GYRO], form="%.9g")))
 
 
 def _lines(tmp_path, header, *columns):

@@ -151,9 +151,9 @@ def _flat(data: dict[Any, Any], camera: str | None, path: Path) -> dict[str, Any
             remedy = "give timeshift_cam_imu, or time_offset outside of imu0: t_imu = t_cam + time_offset"
             raise DvoError(message, file=path, field="time_offset", remedy=remedy)
         rest |= {str(key): value for key, value in part.items() if key != "time_offset"}
-    part = cameras.get(chosen) if chosen else None
-    if isinstance(part, dict):
-        rest |= {str(key): value for key, value in part.items()}
+    entries = cameras.get(chosen) if chosen else None
+    if isinstance(entries, dict):
+        rest |= {str(key): value for key, value in entries.items()}
     return rest
 
 

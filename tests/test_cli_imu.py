@@ -115,6 +115,8 @@ def test_bad_input_ends_in_one_line(sequence, imu, tmp_path, capsys):
         ([str(sequence), "--imu", "none"], "nothing to check"),
         ([str(sequence), "--imu", str(tmp_path / "none.csv")], "none.csv"),
         ([str(file), "--json", str(file)], "would replace"),
+        ([str(file), "--imu", str(file)], "a table of samples itself"),
+        ([str(file), "--imu-topic", "/imu"], "a table of samples itself"),
     ):
         code, out, err = checked(capsys, *line)
         assert code == 2 and not out and words in err and err.count("\n") == 1

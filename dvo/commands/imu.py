@@ -80,6 +80,9 @@ def _opened(arguments: argparse.Namespace) -> tuple[Source | None, InertialInput
     """The source, None for a table of samples, and the samples, of which nothing is read yet."""
     path = Path(arguments.source)
     if path.is_file() and path.suffix.lower() in _TABLES:
+        for name, given in (("--imu", arguments.imu != AUTO), ("--imu-topic", arguments.imu_topic is not None)):
+            if given:
+                raise DvoError(f"{path} is a table of samples itself", field=name, remedy=f"leave out {name}")
         calibration = imu_calibration_of(arguments.imu_calib, path) or ImuCalibration()
         return None, InertialInput(lambda rough=False: read_inertial_file(path, rough=rough), calibration, None, path)
     is_auto = arguments.imu == AUTO

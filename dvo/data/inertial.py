@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -19,6 +19,9 @@ class ImuNoise:
         accel: m/s^2/sqrt(Hz).
         accel_walk: m/s^3/sqrt(Hz).
         gyro_bias, accel_bias: standard deviation of the initial bias, rad/s and m/s^2.
+
+    Raises:
+        DvoError: no finite numbers of at least 0.
     """
 
     gyro: float = 1.6968e-4
@@ -27,6 +30,14 @@ class ImuNoise:
     accel_walk: float = 3.0e-3
     gyro_bias: float = 2e-3
     accel_bias: float = 2e-2
+
+    def __post_init__(self) -> None:
+        for name in fields(self):
+            value = getattr(self, name.name)
+            is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if not is_number or not 0 <= value < np.inf:
+                message = f"is {str(value)[:60]}"
+                raise DvoError(message, field=f"inertial: noise.{name.name}", remedy="give a number of at least 0")
 
 
 NOISE_PRESETS: dict[str, ImuNoise] = {

@@ -38,14 +38,15 @@ _DENSITIES = {
 }
 """Names of Kalibr and of EuRoC's ``sensor.yaml``; units rad/s/sqrt(Hz), rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz) and
 m/s^3/sqrt(Hz)."""
+_LONGEST_ARM = 10.0  # metres: numbers above it are millimetres
 _OWN = {field.name for field in fields(ImuNoise)}
 _OTHER = re.compile(  # entries of the same files that say nothing of the inertial sensor
     r"^(rostopic|update_rate|rate_hz|sensor_type|comment|cam_overlaps|camera_model|distortion_\w+|intrinsics|resolution|"
     r"T_cn_cnm1|line_delay|frequency)$"
 )
 _LOOKS = re.compile(
-    r"^t_|^r_|^t[wagi]$|imu|gyr|acc|noise|walk|densit|bias|offset|shift|delay|factor|scale|misalign|gravity|extrinsic|preset|rot|"
-    r"trans|sigma|var|std|^[mac]$|quat",
+    r"^[tpqr]_|_[tqr]_|^t[a-z]{1,2}$|^t_?(cb|bc|ic|ci)[0-9]?$|^dt$|imu|gyr|acc|noise|walk|densit|bias|offset|shift|delay|latenc|"
+    r"lag(_|$)|factor|scale|misalign|gravity|extrinsic|preset|rot|trans|lever|pose|sigma|var|std|^[mac]$|quat",
     re.IGNORECASE,
 )
 
@@ -124,6 +125,9 @@ def _read(given: str) -> ImuCalibration:
     entries = _Entries(_flat(data, camera, path), path)
     found = _of_entries(entries)
     entries.check_used()
+    if found.T_camera_imu is not None and np.linalg.norm(found.T_camera_imu[:3]) > _LONGEST_ARM:
+        message = f"the sensor is {np.linalg.norm(found.T_camera_imu[:3]):.4g} m from the camera"
+        raise DvoError(message, file=path, field="T_camera_imu", remedy="give metres")
     if found.noise is None and found.T_camera_imu is None and found.time_offset is None:
         raise DvoError("states nothing of an inertial sensor", file=path, remedy=_REMEDY)
     return found
@@ -141,9 +145,15 @@ def _flat(data: dict[Any, Any], camera: str | None, path: Path) -> dict[str, Any
         raise DvoError(f"no {camera} in it, but {there}", file=path, remedy="name a camera of the file, FILE:0")
     if len(imus) > 1:
         raise DvoError("several inertial sensors in it", file=path, remedy="give a file of one")
-    for part in (*imus, cameras.get(chosen) if chosen else None):
-        if isinstance(part, dict):
-            rest |= {str(key): value for key, value in part.items()}
+    for part in (part for part in imus if isinstance(part, dict)):
+        if not _says_nothing(part.get("time_offset")):  # Kalibr's, to the first of several sensors
+            message = "of a sensor in imu0 is that to another sensor, not to the camera"
+            remedy = "give timeshift_cam_imu, or time_offset outside of imu0: t_imu = t_cam + time_offset"
+            raise DvoError(message, file=path, field="time_offset", remedy=remedy)
+        rest |= {str(key): value for key, value in part.items() if key != "time_offset"}
+    entries = cameras.get(chosen) if chosen else None
+    if isinstance(entries, dict):
+        rest |= {str(key): value for key, value in entries.items()}
     return rest
 
 
@@ -180,9 +190,21 @@ class _Entries:
     def check_used(self) -> None:
         """Refuse entries that look like calibration and were not used."""
         for name, value in self.values.items():
-            if name not in self.used and not _OTHER.match(name) and _LOOKS.search(name) and not _says_nothing(value):
-                raise DvoError("is not used, though it looks like calibration", file=self.path, field=name[:80],
+            found = None if name in self.used else _unused(name, value)
+            if found is not None:
+                raise DvoError("is not used, though it looks like calibration", file=self.path, field=found[:80],
                                remedy=f"remove the entry, or {_REMEDY}")  # fmt: skip
+
+
+def _unused(name: str, value: Any) -> str | None:
+    """Name of an entry, or of one in a mapping or list, that looks like calibration; None for none."""
+    if _OTHER.match(name) or _says_nothing(value):
+        return None
+    if _LOOKS.search(name):
+        return name
+    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return next((f"{name}.{below}" for key, part in inner if isinstance(part, dict | list) or isinstance(key, str)
+                 if (below := _unused(str(key), part)) is not None), None)  # fmt: skip
 
 
 def _says_nothing(value: Any) -> bool:

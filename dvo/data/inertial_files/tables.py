@@ -12,16 +12,17 @@ import contextlib
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dvo.core.errors import DvoError
-from dvo.data.files.clock import NAMES, PARTS, is_number, is_time_name, parse_time, unit_of_name
+from dvo.data.files.clock import NAMES, PARTS, is_number, parse_time, unit_of_name
 from dvo.data.files.files import is_file, read_lines
 from dvo.data.inertial import InertialSamples
+from dvo.data.inertial_files.columns import NAMED, RATE_UNITS, Columns, columns_of, first_instance, time_columns
 from dvo.data.inertial_files.tidy import GRAVITY_RANGE, STANDARD_GRAVITY, check_gravity, joined, tidy
 
 RATES = (15.0, 5000.0)
@@ -31,20 +32,11 @@ REMEDY = (
     "'time [ns], gx [rad/s], gy [rad/s], gz [rad/s], ax [m/s^2], ay [m/s^2], az [m/s^2]'"
 )
 
-_UNIT = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
-_FORCES = {"m/s^2": 1.0, "m/s2": 1.0, "m/s²": 1.0, "ms^-2": 1.0, "ms-2": 1.0, "m s^-2": 1.0, "m/s/s": 1.0,
-           "g": STANDARD_GRAVITY, "mg": STANDARD_GRAVITY / 1000}  # fmt: skip
-_RATES = {"rad/s": 1.0, "rads^-1": 1.0, "rad s^-1": 1.0, "rad/sec": 1.0, "deg/s": math.pi / 180,
-          "°/s": math.pi / 180, "dps": math.pi / 180, "deg/sec": math.pi / 180}  # fmt: skip
-_WITHOUT_GRAVITY = re.compile(r"lin|user|without")
-_GYRO = re.compile(r"(?:.*(?:gyr|angular|rotation ?rate|gyrorotation|omega).*?|w ?(?:rs s )?|alpha ?|g)([xyz])$")
-_ACCEL = re.compile(r"(?:.*acc.*?|a ?(?:rs s )?|total ?acceleration.*?)([xyz])$")
-_G_FORCE = re.compile(r"g ?f(?:orce)? ?([xyz])$")
 _APPLE = re.compile(r"alpha_[xyz]$|accelerometerAcceleration[XYZ]")  # Stray Scanner, SensorLog: g at rest points down
-_OTHER = re.compile(r"mag|grav|orient|quat|euler|bias|cov|temper|pos|vel(?!ocity)|attitude|^gps")
-_FILES = ((re.compile(r"gyr", re.IGNORECASE), "gyro"), (re.compile(r"acc", re.IGNORECASE), "accel"))
 _PARTNERS = ("TotalAcceleration", "AccelerometerUncalibrated", "Accelerometer")  # of Sensor Logger, in this order
+_XSENS = {"0.1 ms": 10**4, "us": 10**6}  # units of SampleTimeFine, of MT and of DOT
 _SMOOTH = 0.2  # seconds over which gravity is averaged where it is compared with the gyroscope
+_TURN_RATIO = (0.13, 7.5)  # of the turn of gravity to that of the gyroscope: half way to another unit
 _TELLS = 0.3  # share of the change of gravity that the gyroscope explains
 _FASTEST = 20.0  # rad/s: numbers of the gyroscope that exceed it are degrees
 
@@ -109,6 +101,8 @@ def read_inertial_table(path: Path, *, rough: bool = False) -> InertialSamples:
     for name in ("gyro", "accel"):
         if name not in sensors:
             raise DvoError(f"no columns of the {_noun(name)}", file=path, field=name, remedy=REMEDY)
+        if not np.isfinite(sensors[name].values).all(axis=1).any():
+            raise DvoError(f"no row with three numbers of the {_noun(name)}", file=path, field=name, remedy=REMEDY)
     gyro, accel = sensors["gyro"], sensors["accel"]
     if rough:
         force, rate = accel.factor or 1.0, gyro.factor or 1.0
@@ -150,15 +144,15 @@ def _in_folder(folder: Path) -> Path:
 
 def _partner(path: Path, sensor: str) -> Path:
     """File of the accelerometer beside that of the gyroscope, or the other way round."""
-    words = {"gyro": r"gyroscope|gyrometer|gyro|gyr", "accel": r"accelerometer|acceleration|accel|acce|acc"}
+    words = {"gyro": r"gyroscope|gyrometer|gyro|gyr", "accel": r"accelerometer|acceleration|accel|accl|acce|acc"}
     other = "accel" if sensor == "gyro" else "gyro"
     shape = re.sub(words[sensor], "*", path.stem, count=1, flags=re.IGNORECASE).lower()
     there = sorted(child for child in path.parent.iterdir() if child.suffix.lower() == path.suffix.lower())
-    preferred = [child for name in _PARTNERS for child in there if child.stem == name] if other == "accel" else []
-    fit = [child for child in there if re.sub(words[other], "*", child.stem, count=1, flags=re.IGNORECASE).lower()
-           == shape and child != path and re.search(words[other], child.stem, re.IGNORECASE)]  # fmt: skip
-    found = [child for child in fit if not _WITHOUT_GRAVITY.search(child.stem.lower())]
-    if path.stem == "Gyroscope" and preferred:
+    names = _PARTNERS if other == "accel" else ("Gyroscope",)
+    preferred = [child for name in names for child in there if child.stem == name]
+    found = [child for child in there if re.sub(words[other], "*", child.stem, count=1, flags=re.IGNORECASE).lower()
+             == shape and child != path and re.search(words[other], child.stem, re.IGNORECASE)]  # fmt: skip
+    if preferred and path.stem in ("Gyroscope", *_PARTNERS):
         found = preferred[:1]
     if len(found) != 1:
         what = "several files" if found else "no file"
@@ -170,8 +164,11 @@ def _partner(path: Path, sensor: str) -> Path:
 def _text(path: Path) -> _Text:
     """Rows of a text file, their cells apart by commas, semicolons or tabs, or else by blanks."""
     lines = [line.strip("\r\n ") for _, line in read_lines(path, REMEDY, "imu") if line.strip()]
-    comments = [line.lstrip("#% ") for line in lines if line[0] in "#%"]
-    rows = [line for line in lines if line[0] not in "#%"]
+    if lines and re.fullmatch(r"sep=.", lines[0]):  # told to a spreadsheet
+        lines = lines[1:]
+    marks = ("#", "%", "//")
+    comments = [line.lstrip("#%/ ") for line in lines if line.startswith(marks)]
+    rows = [line for line in lines if not line.startswith(marks)]
     if not rows:
         raise DvoError("no rows in it", file=path, field="imu", remedy=REMEDY)
     mark = next((mark for mark in ("\t", ";", ",") if mark in rows[-1]), None)
@@ -201,7 +198,7 @@ def _text(path: Path) -> _Text:
     if texts and len(texts[-1]) != width:  # a recording that was cut off
         texts = texts[:-1]
         notes.append(f"{path.name}: the last row is not whole and was dropped")
-    decimal = mark in (";", "\t") and any("," in cell for row in texts[:3] for cell in row)
+    decimal = mark in (";", "\t") and any("," in cell for row in texts for cell in row)
     if decimal:
         texts = [[cell.replace(",", ".") for cell in row] for row in texts]
     table = np.array([[_float(cell) for cell in row] for row in texts], dtype=np.float64).reshape(-1, width)
@@ -222,71 +219,61 @@ def _of_text(path: Path) -> tuple[dict[str, _Sensor], list[str]]:
         raise DvoError("no rows in it", file=path, field="imu", remedy=REMEDY)
     if not text.header:
         return _unnamed(text, path)
-    columns = _columns(text.header, path)
+    kept, note = first_instance(text.header, text.rows)
+    if kept is not None:
+        text = replace(text, table=text.table[kept], rows=[text.rows[k] for k in kept])
+        text.notes.append(f"{path.name}: {note}")
+    columns = columns_of(text.header, path)
     if not columns:
         raise DvoError("no columns of a gyroscope or an accelerometer", file=path, field="header", remedy=REMEDY)
-    times, notes = _times(text, {place for places, _ in columns.values() for place in places}, path)
-    found = {name: _Sensor(times, text.table[:, places], factor) for name, (places, factor) in columns.items()}
+    clocks, notes = _times(text, columns, path)
+    found = {name: _Sensor(clocks[name], text.table[:, one.places], one.factor) for name, one in columns.items()}
+    for name, one in columns.items():
+        if one.rivals:
+            taken = text.header[one.places[0]]
+            notes.append(f"{path.name}: {taken} is taken for the {_noun(name)}, not {', '.join(one.rivals)}"[:200])
     if "accel" in found and any(_APPLE.match(name) for name in text.header):
         found["accel"] = replace(found["accel"], values=-found["accel"].values)
         notes.append(f"{path.name}: the sign of the accelerometer is Apple's and was changed")
-    return found, [*text.notes, *notes]
+    return _apart(found), [*text.notes, *notes]
 
 
-def _columns(header: Sequence[str], path: Path) -> dict[str, tuple[list[int], float | None]]:
-    """Columns of each sensor, and the factor of the unit that they state."""
-    by_sensor: dict[str, dict[str, int]] = {}
-    for place, name in enumerate(header):
-        plain = " ".join(re.sub(r"[._:-]", " ", _UNIT.sub("", name).lower()).split())
-        for sensor, pattern in (("g-force", _G_FORCE), ("accel", _ACCEL), ("gyro", _GYRO)):
-            match = pattern.fullmatch(plain)
-            is_other = _OTHER.search(plain) or (sensor == "accel" and _WITHOUT_GRAVITY.search(plain))
-            if match and not is_other:
-                by_sensor.setdefault(sensor, {}).setdefault(match[1], place)
-                break
-    if not by_sensor:
-        bare = {_UNIT.sub("", name).strip().lower(): place for place, name in enumerate(header)}
-        kind = next((kind for pattern, kind in _FILES if pattern.search(path.stem)), None)
-        if kind is not None and {"x", "y", "z"} <= bare.keys():
-            by_sensor[kind] = {axis: bare[axis] for axis in "xyz"}
-    if "g-force" in by_sensor:  # Physics Toolbox: ax, ay, az beside them are without gravity
-        by_sensor["accel"] = by_sensor.pop("g-force")
-        unit: float | None = STANDARD_GRAVITY
-    else:
-        unit = None
-    found = {}
-    for sensor, places in by_sensor.items():
-        if len(places) == 3:
-            chosen = [places[axis] for axis in "xyz"]
-            factor = unit if sensor == "accel" and unit else _stated([header[k] for k in chosen], sensor, path)
-            found[sensor] = (chosen, factor)
-    return found
+def _apart(found: dict[str, _Sensor]) -> dict[str, _Sensor]:
+    """The sensors, each at the rows that it has, where they take turns in the rows of a table."""
+    rows = {name: np.isfinite(sensor.values).all(axis=1) for name, sensor in found.items()}
+    if len(found) < 2 or 2 * (rows["gyro"] & rows["accel"]).sum() >= min(part.sum() for part in rows.values()):
+        return found
+    return {name: replace(one, times=one.times[rows[name]], values=one.values[rows[name]])
+            for name, one in found.items()}  # fmt: skip
 
 
-def _stated(names: Sequence[str], sensor: str, path: Path) -> float | None:
-    """Factor of the unit in the names of three columns; None for none."""
-    units = {match[1].lower().replace(" ", "") for name in names if (match := _UNIT.search(name))}
-    if not units:
-        return None
-    known = {unit.replace(" ", ""): factor for unit, factor in (_FORCES if sensor == "accel" else _RATES).items()}
-    factors = {known.get(unit) for unit in units}
-    if len(factors) != 1 or None in factors:
-        remedy = f"name one of {', '.join(_FORCES if sensor == 'accel' else _RATES)}"
-        raise DvoError(f"the unit {', '.join(sorted(units))[:60]} is not known", file=path, field=sensor, remedy=remedy)
-    return factors.pop()
-
-
-def _times(text: _Text, others: set[int], path: Path) -> tuple[np.ndarray, list[str]]:
-    """Seconds of the rows, by the first column whose name is that of a time."""
-    names = {place: name for place, name in enumerate(text.header) if place not in others}
-    bare = {k: _UNIT.sub("", name) for k, name in names.items()}  # m/s is no time
-    column = next((k for k, name in bare.items() if is_time_name(name) or "time" in name.lower()), None)
-    if column is None:
+def _times(text: _Text, columns: dict[str, Columns], path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Seconds of the rows for each sensor; the same array for those with one column of times."""
+    places = time_columns(text.header, text.rows, columns)
+    if not places:
         raise DvoError("no column of times", file=path, field="time", remedy=REMEDY)
-    return _in_seconds([row[column] for row in text.rows], unit_of_name(text.header[column]), path)
+    known: dict[int | tuple[int, int], np.ndarray] = {}
+    notes: list[str] = []
+    for place in places.values():
+        if place in known:
+            continue
+        if isinstance(place, tuple):
+            seconds, nanos = text.table[:, place[0]], text.table[:, place[1]]
+            whole = np.isfinite(seconds) & np.isfinite(nanos)
+            cells = [str(int(s) * PARTS["ns"] + int(n)) if ok else "" for s, n, ok in
+                     zip(seconds, nanos, whole, strict=True)]  # fmt: skip
+            known[place], _ = _in_seconds(cells, "ns", path)
+            continue
+        name, cells = text.header[place], [row[place] for row in text.rows]
+        units = _XSENS if name.strip().lower() == "sampletimefine" else PARTS
+        known[place], told = _in_seconds(cells, unit_of_name(name), path, units)
+        notes += told
+    return {name: known[place] for name, place in places.items()}, notes
 
 
-def _in_seconds(cells: Sequence[str], unit: str | None, path: Path) -> tuple[np.ndarray, list[str]]:
+def _in_seconds(
+    cells: Sequence[str], unit: str | None, path: Path, units: Mapping[str, int] = PARTS
+) -> tuple[np.ndarray, list[str]]:
     """Seconds of times as text; a cell that holds no number is NaN."""
     values: list[int | float | None] = []
     for cell in cells:
@@ -304,17 +291,17 @@ def _in_seconds(cells: Sequence[str], unit: str | None, path: Path) -> tuple[np.
         raise DvoError("times that do not increase", file=path, field="time", remedy=REMEDY)
     step, notes = float(np.median(steps)), []
     if unit is None:
-        unit = next((name for name, parts in PARTS.items() if RATES[0] <= parts / step <= RATES[1]), None)
+        unit = next((name for name, parts in units.items() if RATES[0] <= parts / step <= RATES[1]), None)
         if unit is None:
             message = f"the unit of the times is not clear: one is {step:.6g} after the other"
             raise DvoError(message, file=path, field="time", remedy="name it in the header, such as 'time [ns]'")
         if unit != "s":
-            notes.append(f"{path.name}: times are taken for {NAMES[unit]}")
-    if not RATES[0] <= PARTS[unit] / step <= RATES[1]:
-        message = f"{PARTS[unit] / step:.4g} samples a second"
+            notes.append(f"{path.name}: times are taken for {NAMES.get(unit, unit)}")
+    if not RATES[0] <= units[unit] / step <= RATES[1]:
+        message = f"{units[unit] / step:.4g} samples a second"
         remedy = f"give {RATES[0]:g} to {RATES[1]:g} a second, and the unit of the times in the header"
         raise DvoError(message, file=path, field="time", remedy=remedy)
-    parts = PARTS[unit]
+    parts = units[unit]
     return np.array([math.nan if value is None else value / parts for value in values]), notes
 
 
@@ -324,7 +311,7 @@ def _unnamed(text: _Text, path: Path) -> tuple[dict[str, _Sensor], list[str]]:
     width = text.table.shape[1]
     increasing = [k for k in (0, width - 1) if (np.diff(text.table[:, k]) > 0).mean() > 0.95] if len(text.rows) > 1 \
         else []  # fmt: skip
-    sensor = next((kind for pattern, kind in _FILES if pattern.search(path.stem)), None)
+    sensor = next((kind for pattern, kind in NAMED if pattern.search(path.stem)), None)
     if len(increasing) != 1 or not (width == 7 or (width == 4 and sensor)):
         message = f"{width} columns without a header, which do not tell what they are"
         raise DvoError(message, file=path, field="header", remedy=REMEDY)
@@ -362,17 +349,24 @@ def _force_unit(accel: _Sensor, path: Path) -> tuple[float, list[str]]:
 
 
 def _rate_unit(gyro: _Sensor, accel: _Sensor, path: Path) -> tuple[float, list[str]]:
-    """Factor to rad/s, and a note if it is a guess."""
-    if gyro.factor is not None:
-        return gyro.factor, []
-    name, reason = "rad/s", "the usual unit"
+    """Factor to rad/s, and a note if it is a guess, or if gravity turns otherwise."""
     ratio = turn_of_gravity(gyro.times, gyro.values, accel.times, accel.values)
+    if gyro.factor is not None:
+        if ratio is None or _TURN_RATIO[0] <= ratio / gyro.factor <= _TURN_RATIO[1]:
+            return gyro.factor, []
+        note = f"the stated unit of the gyroscope does not fit: gravity turns {ratio / gyro.factor:.3g} times as fast"
+        return gyro.factor, [f"{path.name}: {note}; see dvo imu check"]
+    name, reason = "rad/s", "the usual unit"
     if ratio is not None:
         name = "rad/s" if ratio > 0.13 else "deg/s"  # half way between 1 and pi / 180
         reason = "as gravity turns"
+        if not _TURN_RATIO[0] <= ratio / RATE_UNITS[name] <= _TURN_RATIO[1]:
+            message = f"the gyroscope is neither in rad/s nor in deg/s: gravity turns {ratio:.3g} times as fast"
+            remedy = "name its unit in the header, such as 'gx [rad/s]'; counts of the sensor are none"
+            raise DvoError(message, file=path, field="gyro", remedy=remedy)
     elif np.nanquantile(np.abs(gyro.values), 0.99) > _FASTEST:
         name, reason = "deg/s", "numbers too large for rad/s"
-    return _RATES[name], [f"{path.name}: the gyroscope is taken for {name} ({reason})"]
+    return RATE_UNITS[name], [f"{path.name}: the gyroscope is taken for {name} ({reason})"]
 
 
 def turn_of_gravity(
@@ -455,6 +449,6 @@ def is_inertial_table(path: Path) -> bool:
         return False
     names = [cell.strip().strip('"# ') for cell in re.split(r"[,;\t]", header)]
     try:
-        return _columns(names, Path("table")).keys() >= {"gyro", "accel"}
+        return columns_of(names, Path("table")).keys() >= {"gyro", "accel"}
     except DvoError:
         return False

@@ -114,6 +114,13 @@ def test_the_inverse_of_kalibr(tmp_path):
         (f"{DENSITIES}gyro_noise: 0.1\n", "gyro_noise: is not used"),
         ("gyroscope_noise_density: 0.1\n", "is missing"),
         ("preset: car\n", "preset: no preset car"),
+        *((f"preset: phone\n{entry}\n", f"{entry.split(':')[0]}: is not used") for entry in (
+            f"Tbc: {TURN}", f"body_T_cam0: {TURN}", "td: 0.02", "dt: 0.02", "latency_ms: 5", "q_ic: [0, 0, 0.6, 0.8]",
+            "p_ic: [0.1, 0, 0]")),
+        (f"preset: phone\ncalibration:\n  T_camera_imu: {TURN}\n", "calibration.T_camera_imu: is not used"),
+        (f"preset: phone\ncameras:\n- T_SC: {TURN}\n", "cameras.0.T_SC: is not used"),
+        ("T_camera_imu: [100, 20, 30, 0, 0, 0, 1]\n", "T_camera_imu: the sensor is 106.3 m from the camera"),
+        ("imu0:\n  time_offset: 0.01\n", "to another sensor, not to the camera"),
         ("noise_factor: 10\n", "no noise that it multiplies"),
         (f"{DENSITIES}noise_factor: -1\n", "noise_factor: is -1"),
         ("noise:\n  gyr: 1\n", "noise.gyr: no name of noise"),
@@ -137,6 +144,13 @@ def test_what_says_nothing_is_left(tmp_path):
     ideal = f"Tw: {np.eye(3).tolist()}\nTg: {np.zeros((3, 3)).tolist()}\nmodel: kalibr\nT_i_b: {np.eye(4).tolist()}\n"
     indented = "".join(f"  {line}\n" for line in (DENSITIES + ideal).splitlines())
     assert read_imu_calibration(write(tmp_path, f"imu0:\n{indented}")).noise is not None
+
+
+def test_the_files_of_openvins_complete_each_other(tmp_path):
+    indented = "".join(f"  {line}\n" for line in f"{DENSITIES}time_offset: 0.0".splitlines())
+    chain = f"cam0:\n  T_imu_cam: {TURN}\n  timeshift_cam_imu: 0.02\n"
+    both = [write(tmp_path, f"imu0:\n{indented}"), write(tmp_path, chain, "chain.yaml")]
+    assert read_imu_calibration(both).time_offset == 0.02
 
 
 def test_two_files_that_state_the_same_are_refused(tmp_path):

@@ -11,44 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dvo.core.errors import DvoError
-from dvo.data.inertial import InertialSamples
 from dvo.data.inertial_files.tables import is_inertial_table, read_inertial_table
 from dvo.data.inertial_files.tidy import STANDARD_GRAVITY, joined, tidy
+from tests.support.inertial_tables import ACCEL, COUNT, GYRO, NS, RATE, TIMES, check, motion, write
 
-COUNT, RATE = 600, 100.0
-TIMES = np.arange(COUNT) / RATE
-
-
-def _motion(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A sensor that turns about x, gravity with it: ``da/dt = -w x a``."""
-    angle = 0.8 * np.sin(1.5 * times)
-    rate = 1.2 * np.cos(1.5 * times)
-    gyro = np.column_stack([rate, 0.01 * np.ones(COUNT), -0.02 * np.ones(COUNT)])
-    accel = STANDARD_GRAVITY * np.column_stack([0.05 * np.ones(COUNT), np.cos(angle), -np.sin(angle)])
-    return gyro, accel
-
-
-GYRO, ACCEL = _motion(TIMES)
-
-
-def write(file: Path, header: str, columns: list[np.ndarray], mark: str = ",", form: str = "%.9g") -> Path:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    table = np.column_stack(columns)
-    forms = [form] * table.shape[1]
-    lines = ([header] if header else []) + [mark.join(f % v for f, v in zip(forms, row, strict=True)) for row in table]
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return file
-
-
-def check(samples: InertialSamples, start: float = 0.0) -> None:
-    assert len(samples) >= COUNT - 2 and samples.rate == pytest.approx(RATE, rel=1e-3)
-    k = np.rint((samples.timestamps - start) * RATE).astype(int)
-    assert samples.timestamps == pytest.approx(start + k / RATE, abs=2e-5)
-    assert samples.gyro == pytest.approx(GYRO[k], abs=1e-4)
-    assert samples.accel == pytest.approx(ACCEL[k], abs=1e-3)
-
-
-NS = 1_600_000_000 * 10**9 + np.rint(TIMES * 1e9).astype(np.int64)
 APPS = {
     "euroc": ("#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],a_RS_S_x [m s^-2],"
               "a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]", [TIMES * 1e9, GYRO, ACCEL], ","),
@@ -94,7 +60,7 @@ def test_guesses_are_told(tmp_path, app):
 def test_the_accelerometer_is_interpolated_to_the_gyroscope(tmp_path):
     """Sensor Logger: columns z y x, nanoseconds beside seconds, Accelerometer.csv without gravity."""
     late = NS + 2_000_000
-    accel = _motion(TIMES + 0.002)[1]
+    accel = motion(TIMES + 0.002)[1]
     header = "time,seconds_elapsed,z,y,x"
     for name, stamps, values in (("Gyroscope", NS, GYRO), ("TotalAcceleration", late, accel),
                                  ("Accelerometer", late, 0 * accel)):  # fmt: skip

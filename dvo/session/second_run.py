@@ -76,14 +76,15 @@ def compare_again(
 
     Returns:
         The quality with the difference; a doubtful one if it is large, unless the second run is good and fits its
-        measurements worse.
+        measurements worse, and one if the second run finds no motion to compare where the first one has.
     """
     assert result.quality is not None
     # Backward the rows are read from the last one on, which no camera states: without a readout time.
     kept = [_kept(checked_frame(frame)) for frame in islice(frames, 0, FRAMES * stride, stride)]
     times = {}
+    stopped = False
     for frame in reversed(kept):
-        if should_stop():
+        if stopped := should_stop():
             break
         time = kept[-1].timestamp - frame.timestamp
         times[time] = frame.timestamp
@@ -93,11 +94,25 @@ def compare_again(
     forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])
     difference = _difference(forward, result.trajectory)
     mine, other = result.quality, again.quality
+    if np.isnan(difference) and not stopped and _has_begun(mine, kept):
+        return replace(
+            mine, verdict="doubtful", reason="a second run, backward with another seed, finds no motion", remedy=FILM
+        )
     worse = other is not None and other.verdict == "good" and other.residual > MAX_RESIDUAL_RATIO * mine.residual
     if worse or not difference > MAX_DIFFERENCE:  # NaN: nothing is known
         return replace(result.quality, second=difference)
     reason = f"a second run, backward with another seed, differs by {difference:.0f}% of the path"
     return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
+
+
+def _has_begun(quality: Quality, frames: list[Frame]) -> bool:
+    """True if the run has measured poses in the second half of the frames at least, and they are enough to compare."""
+    later = frames[len(frames) // 2 :]
+    return (
+        len(later) >= MIN_COMMON_FRAMES
+        and quality.initialised_at is not None
+        and quality.initialised_at <= later[0].timestamp
+    )
 
 
 def _kept(frame: Frame) -> Frame:

@@ -84,6 +84,22 @@ def test_a_second_run_that_fits_its_measurements_worse_says_nothing_of_the_first
         assert quality.verdict == verdict and quality.second > 3
 
 
+def test_a_second_run_that_finds_no_motion_leaves_doubt():
+    """Where the first has begun in the first half of the frames, and there are enough of them."""
+
+    class Lost(Walk):
+        def finish(self):
+            return replace(super().finish(), trajectory=Trajectory(np.zeros(0), np.zeros((0, 7))))
+
+    for begun, source, verdict in ((0.2, frames(30), "doubtful"), (2.5, frames(30), "good"), (0.2, frames(12), "good"),
+                                   (None, frames(30), "good")):  # fmt: skip
+        quality = ran(Lost, first=replace(UNSURE, initialised_at=begun), source=source).result.quality
+        assert quality.verdict == verdict and np.isnan(quality.second)
+        assert ("finds no motion" in quality.reason) is (verdict == "doubtful") and bool(quality.remedy) is (
+            verdict == "doubtful"
+        )
+
+
 def test_the_beginning_alone_is_tracked_again(monkeypatch):
     monkeypatch.setattr(second_run, "FRAMES", 5)
     other = Walk()

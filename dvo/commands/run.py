@@ -152,7 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
             images=images,
             save_map=save_map,
             observers=observers,
-            again=None if arguments.map else partial(load_odometry, _reseeded(arguments), device),
+            again=None if arguments.map else lambda number: load_odometry(_reseeded(arguments, number), device),
         )
         print_counts(source)
         return code
@@ -171,9 +171,9 @@ def _check_outputs(arguments: argparse.Namespace, folder: Path, source: Source) 
         check_place(Path(arguments.save_map), "--save-map")
 
 
-def _reseeded(arguments: argparse.Namespace) -> argparse.Namespace:
+def _reseeded(arguments: argparse.Namespace, number: int) -> argparse.Namespace:
     """Arguments with another seed."""
-    return argparse.Namespace(**{**vars(arguments), "seed": (arguments.seed + 1) % 2**63})
+    return argparse.Namespace(**{**vars(arguments), "seed": (arguments.seed + number) % 2**63})
 
 
 def _map_file(text: str, odometry: Odometry) -> Path:
@@ -272,7 +272,7 @@ def track(
     images: ImageChoice | None = None,
     save_map: Path | None = None,
     observers: Sequence[Observer] = (),
-    again: Callable[[], Odometry] | None = None,
+    again: Callable[[int], Odometry] | None = None,
 ) -> int:
     """Track a clip, fill the results folder and print a summary.
 
@@ -291,7 +291,7 @@ def track(
         images: of the clip for the exported maps; None for those of the keyframes.
         save_map: map file to write at the end; the odometry is :class:`dvo.odometry.protocol.Saveable`.
         observers: told of every frame and of the result; the caller closes them.
-        again: builds the odometry with another seed, for a result that leaves doubt.
+        again: builds the odometry anew with a seed for each number above 0, for a result that leaves doubt.
 
     Returns:
         Exit code: 0, 1 if no frame was tracked, 129, 130 or 143 after SIGHUP, Ctrl-C or SIGTERM.

@@ -1,5 +1,8 @@
 """Second run over the beginning of a sequence, backward and with another seed, where the first one leaves doubt.
 
+Where the two differ a third one, forward and with a seed of its own, decides: what chance has found it rarely finds
+twice.
+
 Images and masks alone are tracked: with measured depths there is no second solution, and no second run.
 
 Measurements may fit a wrong motion nearly as well as the right one: of a flat scene, say, or a picture of which little
@@ -34,6 +37,8 @@ MAX_PIXELS = 640 * 480
 """Size of the images that are kept for it, about, at most."""
 MAX_DIFFERENCE = 3.0
 """Largest RMS difference of the two after a similarity, percent of the path."""
+MAX_DISPUTED = 1.0
+"""Largest RMS difference of a third run and the first, percent of the path, with which they outvote the second."""
 MAX_RESIDUAL_RATIO = 1.25
 """Residual of a good second run over that of the first above which their difference says nothing about the first."""
 
@@ -60,7 +65,7 @@ def is_due(result: Result, source: object) -> bool:
 
 def compare_again(
     result: Result,
-    odometry: Odometry,
+    build: Callable[[int], Odometry],
     frames: Iterable[Frame],
     stride: int = 1,
     should_stop: Callable[[], bool] = lambda: False,
@@ -69,41 +74,65 @@ def compare_again(
 
     Args:
         result: of the first run, with its quality.
-        odometry: newly built, with another seed.
+        build: makes the odometry anew, with a seed for each number above 0.
         frames: of the sequence, from the first on.
         stride: distance of tracked frames.
         should_stop: called before each frame; True ends the second run, and what it has is compared.
 
     Returns:
-        The quality with the difference; a doubtful one if it is large, unless the second run is good and fits its
-        measurements worse.
+        The quality with the difference. It is doubtful if the difference is large, unless the second run is good and
+        fits its measurements worse, or a third run agrees with the first; and if the second run finds no motion to
+        compare where the first one has.
     """
     assert result.quality is not None
-    # Backward the rows are read from the last one on, which no camera states: without a readout time.
+    mine = result.quality
     kept = [_kept(checked_frame(frame)) for frame in islice(frames, 0, FRAMES * stride, stride)]
-    times = {}
-    for frame in reversed(kept):
-        if should_stop():
-            break
-        time = kept[-1].timestamp - frame.timestamp
-        times[time] = frame.timestamp
-        odometry.track(replace(frame, timestamp=time))
-    again = odometry.finish()
+    times = {kept[-1].timestamp - frame.timestamp: frame.timestamp for frame in kept}
+    # Backward the rows are read from the last one on, which no camera states: without a readout time.
+    backward = [
+        replace(frame, timestamp=time, camera=replace(frame.camera, readout=0.0))
+        for time, frame in zip(reversed(times), reversed(kept), strict=True)
+    ]
+    again, stopped = _tracked(build(1), backward, should_stop)
     found = again.trajectory
     forward = Trajectory(np.array([times[time] for time in found.timestamps[::-1]]), found.poses_wc[::-1])
-    difference = _difference(forward, result.trajectory)
-    mine, other = result.quality, again.quality
+    difference, other = _difference(forward, result.trajectory), again.quality
+    if np.isnan(difference) and not stopped and _has_begun(mine, kept):
+        reason = "a second run, backward with another seed, finds no motion"
+        return replace(mine, verdict="doubtful", reason=reason, remedy=FILM)
     worse = other is not None and other.verdict == "good" and other.residual > MAX_RESIDUAL_RATIO * mine.residual
     if worse or not difference > MAX_DIFFERENCE:  # NaN: nothing is known
-        return replace(result.quality, second=difference)
+        return replace(mine, second=difference)
+    third, stopped = _tracked(build(2), kept, should_stop)
+    if not stopped and _difference(third.trajectory, result.trajectory) <= MAX_DISPUTED:
+        return replace(mine, second=difference)
     reason = f"a second run, backward with another seed, differs by {difference:.0f}% of the path"
-    return replace(result.quality, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
+    return replace(mine, second=difference, verdict="doubtful", reason=reason, remedy=FILM)
+
+
+def _tracked(odometry: Odometry, frames: Iterable[Frame], should_stop: Callable[[], bool]) -> tuple[Result, bool]:
+    """Result of tracking frames, and whether it was stopped before their end."""
+    for frame in frames:
+        if should_stop():
+            return odometry.finish(), True
+        odometry.track(frame)
+    return odometry.finish(), False
+
+
+def _has_begun(quality: Quality, frames: list[Frame]) -> bool:
+    """True if the run has measured poses in the second half of the frames at least, and they are enough to compare."""
+    later = frames[len(frames) // 2 :]
+    return (
+        len(later) >= MIN_COMMON_FRAMES
+        and quality.initialised_at is not None
+        and quality.initialised_at <= later[0].timestamp
+    )
 
 
 def _kept(frame: Frame) -> Frame:
-    """Image of a frame and its mask, of few pixels, since many are kept; without a readout time (see above)."""
+    """Image of a frame and its mask, of few pixels, since many are kept."""
     image, camera, mask = working_image(frame, MAX_PIXELS)
-    return Frame(frame.index, frame.timestamp, image, replace(camera, readout=0.0), mask=mask)
+    return Frame(frame.index, frame.timestamp, image, camera, mask=mask)
 
 
 def _difference(one: Trajectory, other: Trajectory) -> float:

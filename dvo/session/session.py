@@ -62,7 +62,7 @@ def run(
     in_haste: Callable[[], bool] | None = None,
     on_phase: Callable[[str], None] | None = None,
     strict: bool = False,
-    again: Callable[[], Odometry] | None = None,
+    again: Callable[[int], Odometry] | None = None,
 ) -> Run:
     """Run an odometry over a source.
 
@@ -82,8 +82,9 @@ def run(
             from an odometry that has one (:class:`dvo.odometry.protocol.Interim`), with a warning.
         on_phase: called with ``adjusting`` before the final optimisation, and with ``checking`` before a second run.
         strict: raise errors and interruptions instead.
-        again: builds the odometry with another seed. Where the result leaves doubt, and the source can be read again,
-            its beginning is tracked a second time, backward, and compared (:mod:`dvo.session.second_run`).
+        again: builds the odometry anew, with a seed for each number above 0. Where the result leaves doubt, and the
+            source can be read again, its beginning is tracked a second time, backward, and compared
+            (:mod:`dvo.session.second_run`).
 
     Returns:
         The result with its timings. Poses are ``T_wc``.
@@ -140,7 +141,7 @@ def run(
         stop = should_stop or (lambda: False)
         with contextlib.suppress(DvoError, OSError, KeyboardInterrupt):  # the result stands without it
             beginning = itertools.takewhile(lambda _: not stop(), source)
-            result = replace(result, quality=compare_again(result, again(), beginning, stride, stop))
+            result = replace(result, quality=compare_again(result, again, beginning, stride, stop))
         feeding.seconds["checking"] = time.perf_counter() - started
     return Run(
         result=over_source(

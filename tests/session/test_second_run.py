@@ -49,7 +49,7 @@ def ran(again, first=UNSURE, source=None, **options):
 def test_it_is_made_where_a_good_result_leaves_doubt():
     assert leaves_doubt(UNSURE) and not leaves_doubt(SURE) and not leaves_doubt(None)
     assert not leaves_doubt(replace(UNSURE, verdict="doubtful", deviation=0.5))
-    never = lambda: pytest.fail("a second run of a sure result")  # noqa: E731
+    never = lambda number: pytest.fail("a second run of a sure result")  # noqa: E731
     assert "checking" not in ran(never, first=SURE).seconds
     ran(never, source=iter(frames(30)))
 
@@ -62,14 +62,14 @@ def test_measured_depths_need_none():
 
 
 def test_runs_that_agree_stay_good():
-    done = ran(lambda: Walk(0.0))
+    done = ran(lambda number: Walk(0.0))
     assert done.result.quality.verdict == "good" and done.result.quality.second == pytest.approx(0, abs=1e-6)
     assert done.seconds["checking"] > 0 and done.frames_fed == 30
 
 
 @pytest.mark.parametrize("stride", [1, 3])
 def test_runs_that_differ_are_doubtful(stride):
-    quality = ran(lambda: Walk(2.0), stride=stride).result.quality
+    quality = ran(lambda number: Walk(2.0), stride=stride).result.quality
     assert quality.verdict == "doubtful" and quality.second > 3 and quality.remedy
     assert f"differs by {quality.second:.0f}% of the path" in quality.reason
 
@@ -80,31 +80,69 @@ def test_a_second_run_that_fits_its_measurements_worse_says_nothing_of_the_first
         ("good", 0.25, "doubtful"), ("good", 0.4, "good"), ("doubtful", 0.4, "doubtful"), ("good", np.nan, "doubtful")
     ):  # fmt: skip
         again = Walk(2.0, quality=replace(UNSURE, verdict=own, residual=residual))
-        quality = ran(lambda again=again: again, first=replace(UNSURE, residual=0.3)).result.quality
+        quality = ran(lambda number, again=again: again, first=replace(UNSURE, residual=0.3)).result.quality
         assert quality.verdict == verdict and quality.second > 3
+
+
+def test_a_second_run_that_finds_no_motion_leaves_doubt():
+    """Where the first has begun in the first half of the frames, and there are enough of them."""
+
+    class Lost(Walk):
+        def __init__(self, number):
+            super().__init__()
+
+        def finish(self):
+            return replace(super().finish(), trajectory=Trajectory(np.zeros(0), np.zeros((0, 7))))
+
+    for begun, source, verdict in ((0.2, frames(30), "doubtful"), (2.5, frames(30), "good"), (0.2, frames(12), "good"),
+                                   (None, frames(30), "good")):  # fmt: skip
+        quality = ran(Lost, first=replace(UNSURE, initialised_at=begun), source=source).result.quality
+        assert quality.verdict == verdict and np.isnan(quality.second)
+        assert ("finds no motion" in quality.reason) is (verdict == "doubtful") and bool(quality.remedy) is (
+            verdict == "doubtful"
+        )
+
+
+@pytest.mark.parametrize("third, verdict", [(0.0, "good"), (0.3, "doubtful")])
+def test_a_third_run_decides_where_they_differ(third, verdict):
+    """Forward, and with a seed of its own; the difference of the second is told all the same."""
+    walks = {1: Walk(2.0), 2: Walk(third)}
+    quality = ran(walks.pop).result.quality
+    assert quality.verdict == verdict and quality.second > 3 and not walks
+
+
+def test_no_third_run_where_they_agree_or_after_a_stop():
+    never = {1: Walk(0.0)}
+    assert ran(never.pop).result.quality.verdict == "good" and not never
+    first, second, third = Walk(), Walk(2.0), Walk(0.0)
+    for frame in frames(30):
+        first.track(frame)
+    stop = lambda: len(third.times) >= 12  # noqa: E731
+    quality = compare_again(first.finish(), {1: second, 2: third}.pop, frames(30), should_stop=stop)
+    assert quality.verdict == "doubtful" and len(third.times) == 12
 
 
 def test_the_beginning_alone_is_tracked_again(monkeypatch):
     monkeypatch.setattr(second_run, "FRAMES", 5)
     other = Walk()
-    compare_again(Walk().finish(), other, frames(30), stride=2)
+    compare_again(Walk().finish(), lambda number: other, frames(30), stride=2)
     assert other.times == [pytest.approx(0.2 * k) for k in range(5)] and other.numbers == [8, 6, 4, 2, 0]
 
 
 def test_large_images_are_kept_small(monkeypatch):
     monkeypatch.setattr(second_run, "MAX_PIXELS", 40 * 30)
     other = Walk()
-    assert compare_again(Walk().finish(), other, frames(12)).verdict == "good"
+    assert compare_again(Walk().finish(), lambda number: other, frames(12)).verdict == "good"
     ((height, width, *camera),) = other.sizes
     assert height * width <= 1.1 * 40 * 30 and camera == [height, width]
 
 
 def test_a_second_run_that_fails_or_is_stopped_leaves_the_first():
-    assert ran(lambda: Walk(fail=True)).result.quality == UNSURE
+    assert ran(lambda number: Walk(fail=True)).result.quality == UNSURE
     pressed = []
     other = Walk()
 
-    def begin():
+    def begin(number):
         pressed.append(True)
         return other
 

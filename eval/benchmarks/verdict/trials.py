@@ -6,7 +6,6 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -113,7 +112,7 @@ def carry_out(trial: Trial) -> Outcome:
             failures.spoil(odometry.model, trial.number)
         return odometry
 
-    result = session.run(build(0), changed, again=partial(build, 1)).result
+    result = session.run(build(0), changed, again=build).result
     quality = jsonable(asdict(result.quality))
     rows = len(result.trajectory)
     if trial.kind == "still":

@@ -39,6 +39,7 @@ _DENSITIES = {
 """Names of Kalibr and of EuRoC's ``sensor.yaml``; units rad/s/sqrt(Hz), rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz) and
 m/s^3/sqrt(Hz)."""
 _LONGEST_ARM = 10.0  # metres: numbers above it are millimetres
+_LARGEST = 1e30  # of a number
 _OWN = {field.name for field in fields(ImuNoise)}
 _OTHER = re.compile(  # entries of the same files that say nothing of the inertial sensor
     r"^(rostopic|update_rate|rate_hz|sensor_type|comment|cam_overlaps|camera_model|distortion_\w+|intrinsics|resolution|"
@@ -221,8 +222,8 @@ def _number(value: Any, name: str, low: float, path: Path) -> float:
     if isinstance(value, str):  # YAML takes 1e-3 for a text
         with contextlib.suppress(ValueError):
             value = float(value)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not low <= value < math.inf:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGEST
+    if not is_number or value < low:
         what = "a number" if low == -math.inf else f"a number of at least {low:g}"
         raise DvoError(f"is {str(value)[:60]}", file=path, field=name, remedy=f"give {what}")
     return float(value)

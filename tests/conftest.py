@@ -37,7 +37,7 @@ def pytest_runtest_call(item):
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 CORE = ("geometry", "ba", "nets", "map", "data", "metrics", "eval/scoring")
-"""Rooms whose tests are the marker ``core``, but for those that are slow."""
+"""Rooms whose tests are the marker ``core``, but for those that are slow or long."""
 FOLDERS = tuple(f"{REPOSITORY / 'tests' / room}{os.sep}" for room in CORE)
 
 # Python compiles what many processes of the tests import once, as it does numba's kernels.
@@ -63,7 +63,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
     """Mark the tests of the core rooms, before they are chosen by their markers."""
     for item in items:
-        if str(item.path).startswith(FOLDERS) and item.get_closest_marker("slow") is None:
+        is_quick = not any(item.get_closest_marker(name) for name in ("slow", "long"))
+        if is_quick and str(item.path).startswith(FOLDERS):
             item.add_marker(pytest.mark.core)
     yield
     gc.collect()
